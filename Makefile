@@ -1,0 +1,47 @@
+# Everything sets itself up: `make demo` and `make test` work on a machine with Python >= 3.11, git and make.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN     = $(VENV)/bin
+READY   = $(VENV)/.ready
+OUT    ?= demo
+
+.PHONY: setup demo test test-slow check bench bench-peers notebooks clean
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, found " + sys.version)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch numpy
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/metalens demo $(OUT) --force
+
+test: setup
+	$(BIN)/python -m pytest -m 'not slow and not peers'
+
+test-slow: setup
+	$(BIN)/python -m pytest -m 'slow and not peers'
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/python -m benchmarks
+
+# The projects that the benchmarks compare with live in an environment of their own: never a dependency.
+bench-peers: setup
+	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet -c constraints.txt torch numpy
+	.venv-peers/bin/python -m pip install --quiet -r benchmarks/peers.txt
+	.venv-peers/bin/python -m pip install --quiet -c constraints.txt -e .
+	.venv-peers/bin/python -m benchmarks --peers
+
+notebooks: setup
+	$(BIN)/python -m examples.run
+
+clean:
+	rm -rf $(VENV) .venv-peers build *.egg-info $(OUT)

@@ -1,0 +1,78 @@
+"""The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails its own check, 2 on bad input.
+
+A verb lives beside its stage, as a frozen dataclass of its options and a function ``run(options) -> int``; only
+the verb that is asked for is imported.
+"""
+
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from metalens.errors import MetalensError, nearest
+
+SUCCESS, FAILED_CHECK, BAD_INPUT = 0, 1, 2
+
+# verb: (module that holds ``Options`` and ``run``, one line of help)
+VERBS: dict[str, tuple[str, str]] = {
+    "library": (
+        "metalens.commands.library",
+        "CELL.toml -> library.h5: pillar sweep with an error bar on every entry",
+    ),
+    "design": (
+        "metalens.commands.design",
+        "DESIGN.toml -> lens.h5: hyperbolic, double helix, cubic, Fisher, own map",
+    ),
+    "psf": (
+        "metalens.commands.psf",
+        "lens.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
+    ),
+    "layout": ("layout.command", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
+    "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
+    "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb; returns the exit status."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        sys.stdout.write(_help())
+        return SUCCESS if words else BAD_INPUT
+    if words[0] == "--version":
+        from metalens import __version__
+
+        sys.stdout.write(f"metalens {__version__}\n")
+        return SUCCESS
+    if words[0] not in VERBS:
+        return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        return _dispatch(words[0], words[1:])
+    except (MetalensError, OSError) as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        return _refuse("interrupted; nothing half-written is left", 130)
+
+
+def _dispatch(verb: str, words: list[str]) -> int:
+    import tyro
+
+    module = importlib.import_module(VERBS[verb][0])
+    options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
+    return int(module.run(options))
+
+
+def _help() -> str:
+    rows = "\n".join(f"  {verb:<10} {summary}" for verb, (_, summary) in VERBS.items())
+    return f"usage: metalens COMMAND ... (metalens COMMAND --help for its options)\n\n{rows}\n"
+
+
+def _refuse(message: str, status: int = BAD_INPUT) -> int:
+    sys.stderr.write(f"metalens: error: {message}\n")
+    return status
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt

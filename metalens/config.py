@@ -1,0 +1,150 @@
+"""TOML configs read into frozen dataclasses; an unknown key is an error that names the nearest one."""
+
+import dataclasses
+import math
+import tomllib
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+from metalens.errors import ConfigError, nearest
+
+Record = TypeVar("Record")
+
+
+def load(path: str | Path, record: type[Record]) -> Record:
+    """Read a TOML file into ``record``, a frozen dataclass (nested dataclasses are tables).
+
+    Raises:
+        ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
+            record refuses; the message gives file and key.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; need a TOML config ({record.__name__})") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file ({error})") from None
+    return loads(text, record, where=str(path))
+
+
+def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
+    """As :func:`load`, from TOML text; ``where`` names it in errors."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not valid TOML: {error}") from None
+    return typing.cast(Record, _build(table, record, where, ""))
+
+
+def dumps(record: Any) -> str:
+    """TOML text of a config record; ``loads`` gives the same record back. Fields that are None are left out."""
+    lines: list[str] = []
+    _dump(record, "", lines)
+    return "\n".join(lines) + "\n"
+
+
+def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
+    fields = {f.name: f for f in dataclasses.fields(record) if f.init}
+    hints = typing.get_type_hints(record)
+    for key in table:
+        if key not in fields:
+            raise ConfigError(f"{where}: unknown key {prefix + key!r}{nearest(key, fields)}")
+    values = {k: _convert(v, hints[k], where, prefix + k) for k, v in table.items()}
+    for name, f in fields.items():
+        needed = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        if needed and name not in values:
+            raise ConfigError(f"{where}: missing key {prefix + name!r} in {record.__name__}")
+    try:
+        return record(**values)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{where}: {prefix or 'top level: '}{error}") from error
+
+
+def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
+    if typing.get_origin(hint) is typing.Annotated:
+        hint = typing.get_args(hint)[0]
+    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(value, options, where, key)
+    if origin is typing.Literal:
+        if value not in options:
+            raise ConfigError(f"{where}: {key} is {value!r}{nearest(str(value), map(str, options))}")
+        return value
+    if origin is tuple:
+        return _convert_tuple(value, options, where, key)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise _wrong(value, "a table", where, key)
+        return _build(value, hint, where, key + ".")
+    return _convert_scalar(value, hint, where, key)
+
+
+def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -> Any:
+    errors = []
+    for option in options:
+        if option is type(None):
+            continue
+        try:
+            return _convert(value, option, where, key)
+        except ConfigError as error:
+            errors.append(error)
+    raise errors[-1]
+
+
+def _convert_tuple(value: Any, options: tuple[Any, ...], where: str, key: str) -> Any:
+    if not isinstance(value, list):
+        raise _wrong(value, "a list", where, key)
+    if len(options) == 2 and options[1] is ...:
+        options = (options[0],) * len(value)
+    if len(options) != len(value):
+        raise ConfigError(f"{where}: {key} has {len(value)} entries, need {len(options)}")
+    pairs = zip(value, options, strict=True)
+    return tuple(_convert(v, hint, where, f"{key}[{i}]") for i, (v, hint) in enumerate(pairs))
+
+
+def _convert_scalar(value: Any, hint: Any, where: str, key: str) -> Any:
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if math.isnan(value):
+            raise ConfigError(f"{where}: {key} is nan, need a number")
+        return float(value)
+    if hint in (int, str, bool) and type(value) is hint:
+        return value
+    raise _wrong(value, getattr(hint, "__name__", str(hint)), where, key)
+
+
+def _wrong(value: Any, need: str, where: str, key: str) -> ConfigError:
+    return ConfigError(f"{where}: {key} is {value!r} ({type(value).__name__}), need {need}")
+
+
+def _dump(record: Any, prefix: str, lines: list[str]) -> None:
+    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record) if f.init}
+    tables = {k: v for k, v in values.items() if dataclasses.is_dataclass(v)}
+    lists = {k: v for k, v in values.items() if isinstance(v, tuple) and v and dataclasses.is_dataclass(v[0])}
+    for key, value in values.items():
+        if key not in tables and key not in lists and value is not None:
+            lines.append(f"{key} = {_text(value)}")
+    for key, value in tables.items():
+        lines += ["", f"[{prefix}{key}]"]
+        _dump(value, f"{prefix}{key}.", lines)
+    for key, entries in lists.items():
+        for entry in entries:
+            lines += ["", f"[[{prefix}{key}]]"]
+            _dump(entry, f"{prefix}{key}.", lines)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_text(v) for v in value) + "]"
+    if isinstance(value, str | Path):
+        escaped = str(value).replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+        return f'"{escaped}"'
+    return repr(value)

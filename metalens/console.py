@@ -1,0 +1,72 @@
+"""What a command shows: results as lines or JSON, progress with rate and ETA on a terminal, plain lines otherwise."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class Console:
+    """Standard output of one command.
+
+    quiet: only errors are shown.
+    json: results as one JSON object on standard output; progress is silent.
+    """
+
+    quiet: bool = False
+    json: bool = False
+
+    def say(self, text: str) -> None:
+        """One line for a person."""
+        if not (self.quiet or self.json):
+            sys.stdout.write(text + "\n")
+            sys.stdout.flush()
+
+    def result(self, values: dict[str, Any], text: str) -> None:
+        """The outcome: ``values`` with --json, else ``text``."""
+        if self.json:
+            sys.stdout.write(json.dumps(values, indent=1, default=float) + "\n")
+        else:
+            self.say(text)
+
+    def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
+        """Pass ``items`` through, showing how far it is, the rate and the time left."""
+        if self.quiet or self.json:
+            yield from items
+        elif sys.stdout.isatty():
+            yield from _bar(items, total, label)
+        else:
+            yield from self._lines(items, total, label)
+
+    def _lines(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+        start = shown = time.monotonic()
+        for done, item in enumerate(items, 1):
+            yield item
+            now = time.monotonic()
+            if now - shown > 10 or (done == total and now - start > 2):
+                rate = done / (now - start)
+                left = (total - done) / rate
+                self.say(f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left")
+                shown = now
+
+
+def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.speed:.3g}/s"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, transient=True) as bar:
+        task = bar.add_task(label, total=total)
+        for item in items:
+            yield item
+            bar.advance(task)

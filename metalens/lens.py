@@ -1,0 +1,137 @@
+"""The lens that is handed on: a diameter map, and what is needed to know its phase at any wavelength."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens import config, store
+from metalens.cell import Cell
+from metalens.errors import LensError
+from metalens.proxy import Proxy
+from metalens.store import Array, Provenance
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DiameterMap:
+    """Pillar diameters on a square lattice; the lens axis sits at index ((ny-1)/2, (nx-1)/2).
+
+    diameter_um: (y, x), 0 where there is no pillar and no light passes; +x right, +y down.
+    pitch_um: lattice constant.
+
+    Raises:
+        LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and column named); no pillar.
+    """
+
+    diameter_um: Array
+    pitch_um: float
+
+    def __post_init__(self) -> None:
+        d = self.diameter_um
+        if d.ndim != 2:
+            raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
+        widest, thinnest = float(d.max(initial=0)), float(d.min(initial=0))
+        if not (thinnest >= 0 and widest < self.pitch_um):
+            row, column = (int(i) for i in np.argwhere(~((d >= 0) & (d < self.pitch_um)))[0])
+            raise LensError(
+                f"diameter at row {row}, column {column} is {d[row, column]} um, "
+                f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
+            )
+        if widest == 0:
+            raise LensError("empty aperture: the map holds no pillar; check the aperture and the profile")
+
+    @property
+    def x_um(self) -> Array:
+        """(x,) positions of the columns."""
+        return _axis(self.diameter_um.shape[1], self.pitch_um)
+
+    @property
+    def y_um(self) -> Array:
+        """(y,) positions of the rows."""
+        return _axis(self.diameter_um.shape[0], self.pitch_um)
+
+    @property
+    def radius_um(self) -> float:
+        """Distance from the axis to the outermost pillar centre."""
+        rows, columns = np.nonzero(self.diameter_um)
+        return float(np.sqrt((self.y_um[rows] ** 2 + self.x_um[columns] ** 2).max()))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A designed (or as-built) metalens.
+
+    diameters: of every pillar.
+    cell: the pillar cell that the proxy was made for.
+    proxy: diameter and wavelength to phase and transmission (paper Eq. 2).
+    wavelength_um: of the design.
+    sensor_distance_um: lens to sensor, in the cover medium.
+    source_distance_um: object distance of best focus (inf for a collimated beam).
+    profile: name of the design (hyperbolic, double-helix, cubic, fisher, map, as-built).
+    provenance: config and inputs that made it.
+    """
+
+    diameters: DiameterMap
+    cell: Cell
+    proxy: Proxy
+    wavelength_um: float
+    sensor_distance_um: float
+    source_distance_um: float
+    profile: str
+    provenance: Provenance = field(default_factory=Provenance)
+
+    def phase_rad(self, wavelength_um: float | None = None) -> Array:
+        """(y, x) phase of every pillar through the proxy; 0 where there is none."""
+        d = self.diameters.diameter_um
+        phase = self.proxy.phase_rad(np.where(d > 0, d, self.proxy.domain_um[0]), self._at(wavelength_um))
+        return np.where(d > 0, phase, 0)
+
+    def transmission(self, wavelength_um: float | None = None) -> Array:
+        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none."""
+        d = self.diameters.diameter_um
+        level = self.proxy.transmission(np.where(d > 0, d, self.proxy.domain_um[0]), self._at(wavelength_um))
+        return np.where(d > 0, level, 0)
+
+    def _at(self, wavelength_um: float | None) -> float:
+        return self.wavelength_um if wavelength_um is None else wavelength_um
+
+
+def save(path: str | Path, lens: Lens) -> None:
+    """Write a lens file (kind ``lens``); diameters as float64."""
+    arrays: dict[str, Array] = {"diameter_um": np.asarray(lens.diameters.diameter_um, float)}
+    arrays |= {f"proxy/{name}": array for name, array in lens.proxy.to_arrays().items()}
+    attributes: dict[str, Any] = {
+        "pitch_um": lens.diameters.pitch_um,
+        "cell": config.dumps(lens.cell),
+        "wavelength_um": lens.wavelength_um,
+        "sensor_distance_um": lens.sensor_distance_um,
+        "source_distance_um": lens.source_distance_um,
+        "profile": lens.profile,
+    }
+    store.save(path, "lens", arrays, attributes=attributes, provenance=lens.provenance)
+
+
+def load(path: str | Path) -> Lens:
+    """Read a lens file.
+
+    Raises:
+        StoreError: not a lens file; LensError: its diameters are invalid.
+    """
+    stored = store.load(path, "lens")
+    about = stored.attributes
+    proxy = {name[6:]: array for name, array in stored.arrays.items() if name.startswith("proxy/")}
+    return Lens(
+        diameters=DiameterMap(stored.arrays["diameter_um"], about["pitch_um"]),
+        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
+        proxy=Proxy.from_arrays(proxy),
+        wavelength_um=about["wavelength_um"],
+        sensor_distance_um=about["sensor_distance_um"],
+        source_distance_um=about["source_distance_um"],
+        profile=about["profile"],
+        provenance=stored.provenance,
+    )
+
+
+def _axis(count: int, pitch_um: float) -> Array:
+    return (np.arange(count) - (count - 1) / 2) * pitch_um

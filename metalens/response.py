@@ -1,0 +1,29 @@
+"""What every solver of a pillar cell returns."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """Zero-order response of one pillar cell, power-normalised: |t|² + |r|² = 1 when lossless and subwavelength.
+
+    The phase runs from the plane of the pillar's foot to the plane of its top; incidence from the substrate;
+    time factor exp(-iwt). For films under or over the pillar the planes are the outer faces of the films.
+
+    t, r: co-polarised transmission and reflection amplitudes.
+    t_error: estimate of |t - exact|, not below the true error.
+    orders: harmonics (RCWA) or degrees of freedom (modal) of the finest solution used.
+    energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a defect if lossless).
+    engine: ``rcwa``, ``modal`` or ``film``.
+    converged: whether ``t_error`` meets the tolerance that was asked for.
+    reason: why the solver stopped, in words.
+    """
+
+    t: complex
+    r: complex
+    t_error: float
+    orders: int
+    energy: float
+    engine: str
+    converged: bool
+    reason: str

@@ -1,0 +1,193 @@
+"""Artefact files: one HDF5 header checked when opened, written whole or not at all, same input same bytes."""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from metalens.errors import StoreError
+
+Array = np.ndarray[Any, np.dtype[Any]]
+Attribute = str | int | float | bool
+_RECORDED = ("numpy", "scipy", "torch", "h5py")
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where an artefact comes from.
+
+    config: the settings that made it, as TOML text.
+    inputs: {file name: SHA-256} of every file read.
+    seed: of the random generator, -1 where none was used.
+    versions: {package: version}.
+    """
+
+    config: str = ""
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    seed: int = -1
+    versions: Mapping[str, str] = field(default_factory=lambda: dict(package_versions()))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stored:
+    """The content of an artefact file: ``arrays`` by name (``group/name``), ``attributes`` of the header."""
+
+    kind: str
+    version: int
+    arrays: dict[str, Array]
+    attributes: dict[str, Any]
+    provenance: Provenance
+
+
+def package_versions() -> Iterator[tuple[str, str]]:
+    """(name, version) of the packages whose numbers enter an artefact."""
+    yield "python", ".".join(map(str, sys.version_info[:3]))
+    for name in ("metalens-toolchain", *_RECORDED):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            yield name, importlib.metadata.version(name)
+
+
+def sha256(path: str | Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Give a scratch path beside ``path``; flush it and rename it over ``path`` only if the block succeeds.
+
+    Whatever ends the block early (error, Ctrl-C, disk full), the old file stays and the scratch file goes.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        with open(part, "rb+") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+        _sync_folder(path.parent)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file (UTF-8) whole or not at all."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def save(
+    path: str | Path,
+    kind: str,
+    arrays: Mapping[str, Array],
+    *,
+    version: int = 1,
+    attributes: Mapping[str, Attribute] | None = None,
+    provenance: Provenance | None = None,
+    compress: bool = True,
+) -> None:
+    """Write an artefact: header (kind, version, units), arrays, provenance. Same input gives the same bytes.
+
+    Args:
+        path: target, replaced atomically.
+        arrays: by name; ``a/b`` makes group ``a``.
+        compress: gzip level 1 with byte shuffle for arrays above 64 KiB.
+
+    Raises:
+        OSError: the target cannot be written (the old file stays).
+    """
+    with replacing(path) as part, h5py.File(part, "w", track_order=False) as file:
+        file.attrs["kind"] = kind
+        file.attrs["version"] = version
+        file.attrs["units"] = "um, rad"
+        for name, value in sorted((attributes or {}).items()):
+            file.attrs[name] = value
+        for name in sorted(arrays):
+            _write_array(file, name, np.asarray(arrays[name]), compress)
+        _write_provenance(file, provenance or Provenance())
+
+
+def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stored:
+    """Read an artefact and check its header.
+
+    Args:
+        kind: the kind that is needed; None takes any (``metalens info``).
+
+    Raises:
+        StoreError: no such file, not HDF5, truncated, or of another kind or version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(path, file, kind, version)
+    except (OSError, KeyError, RuntimeError) as error:
+        raise StoreError(f"{path}: truncated or not an HDF5 file of this toolchain ({error})") from error
+
+
+def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored:
+    found = file.attrs.get("kind")
+    if found is None:
+        raise StoreError(f"{path}: an HDF5 file without 'kind', not made by this toolchain")
+    if kind is not None and (found != kind or int(file.attrs["version"]) != version):
+        raise StoreError(
+            f"{path} holds {found!r} version {int(file.attrs['version'])}, need {kind!r} version {version}; "
+            "make it again with this release or give another file"
+        )
+    arrays: dict[str, Array] = {}
+    file.visititems(
+        lambda name, item: (
+            arrays.__setitem__(name, item[...])
+            if isinstance(item, h5py.Dataset) and not name.startswith("provenance/")
+            else None
+        )
+    )
+    attributes = {k: _plain(v) for k, v in file.attrs.items() if k not in ("kind", "version", "units")}
+    return Stored(str(found), int(file.attrs["version"]), arrays, attributes, _read_provenance(file))
+
+
+def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
+    if array.dtype.kind == "U":
+        file.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype(), track_times=False)
+    elif compress and array.nbytes > 65536:
+        file.create_dataset(name, data=array, track_times=False, compression="gzip", compression_opts=1, shuffle=True)
+    else:
+        file.create_dataset(name, data=array, track_times=False)
+
+
+def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
+    group = file.create_group("provenance")
+    group.attrs["config"] = provenance.config
+    group.attrs["seed"] = provenance.seed
+    for part in ("inputs", "versions"):
+        entries = group.create_group(part)
+        for name, value in sorted(getattr(provenance, part).items()):
+            entries.attrs[name] = value
+
+
+def _read_provenance(file: h5py.File) -> Provenance:
+    group = file["provenance"]
+    inputs, versions = ({k: str(v) for k, v in group[part].attrs.items()} for part in ("inputs", "versions"))
+    return Provenance(str(group.attrs["config"]), inputs, int(group.attrs["seed"]), versions)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
