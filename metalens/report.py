@@ -94,9 +94,10 @@ def canvas(rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0,
     import matplotlib
 
     matplotlib.use("Agg")
+    from cycler import cycler
     from matplotlib import pyplot
 
-    style = {
+    style: dict[Any, Any] = {
         "font.size": 9,
         "axes.spines.top": False,
         "axes.spines.right": False,
@@ -106,7 +107,7 @@ def canvas(rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0,
         "axes.titleweight": "bold",
         "figure.facecolor": "white",
         "image.cmap": "magma",
-        "axes.prop_cycle": pyplot.cycler(color=["#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#444"]),
+        "axes.prop_cycle": cycler(color=["#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#444"]),
     }
     with matplotlib.rc_context(style):
         return pyplot.subplots(rows, columns, figsize=size, layout="constrained", **options)
