@@ -108,7 +108,7 @@ def double_helix(x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, 
 def cubic(x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float) -> Array:
     """Hyperbolic phase plus :class:`Cubic`."""
     x, y = x_um / radius_um, y_um / radius_um
-    return hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)
+    return np.asarray(hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3))
 
 
 def read_map(shape: PhaseMap) -> Array:
@@ -132,7 +132,7 @@ def read_map(shape: PhaseMap) -> Array:
     if not np.isfinite(phase).all():
         row, column = (int(i) for i in np.argwhere(~np.isfinite(phase))[0])
         raise LensError(f"{path}: phase at row {row}, column {column} is {phase[row, column]}, need finite radians")
-    return phase.astype(float)
+    return np.asarray(phase, float)
 
 
 def interpolate(phase_rad: Array, pitch_um: float, x_um: Array, y_um: Array) -> Array:

@@ -1,0 +1,73 @@
+"""The direction of imports, lazy start-up, and what the repository may hold."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("metalens", "layout", "characterize", "codesign")
+MAY_IMPORT = {
+    "metalens": set(),
+    "layout": {"metalens"},
+    "characterize": {"metalens"},
+    "codesign": {"metalens", "characterize"},
+}
+
+
+def _imports(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_run_one_way(package):
+    found = {
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in (ROOT / package).rglob("*.py")
+        for name in _imports(path)
+        if name.split(".")[0] in PACKAGES and name.split(".")[0] != package
+    }
+    wrong = {(path, name) for path, name in found if name.split(".")[0] not in MAY_IMPORT[package]}
+    assert not wrong
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_shipped_code_never_imports_gdstk_or_klayout(package):
+    names = {name.split(".")[0] for path in (ROOT / package).rglob("*.py") for name in _imports(path)}
+    assert not names & {"gdstk", "klayout", "gdspy", "pickle"}
+
+
+def test_no_module_takes_the_name_of_a_standard_one():
+    names = {path.stem for package in PACKAGES for path in (ROOT / package).rglob("*.py")} - {"__init__"}
+    # `profiles`-like near misses are fine; an equal name would shadow the library when run as a script
+    assert not names & (sys.stdlib_module_names - {"test"}) - {"bench"}
+
+
+def _loaded(code):
+    script = f"{code}\nimport sys\nprint(' '.join(sys.modules))"
+    return set(
+        subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    )
+
+
+def test_layout_never_loads_torch_nor_the_solid_kernels():
+    assert not _loaded("import layout, metalens.lens") & {"torch", "build123d", "manifold3d", "matplotlib", "scipy"}
+
+
+def test_help_loads_neither_numpy_nor_torch():
+    code = (
+        "import contextlib, io\nfrom metalens.cli import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()):\n    main(['--help'])"
+    )
+    assert not _loaded(code) & {"numpy", "torch", "tyro", "matplotlib"}
+
+
+def test_test_files_have_unique_names():
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) == len(set(names))
