@@ -1,0 +1,169 @@
+"""From pupil centre and slippage to gaze: the spherical-eye solver, and what is left to learn for each person.
+
+Camera frame: origin at the lens, z towards the eye, x right and y down as on the (upright) sensor image.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from metalens.errors import SceneError, TrainingError
+
+
+@dataclass(frozen=True, slots=True)
+class EyeGeometry:
+    """Where the eye of a population mean sits before the camera, and how it is built.
+
+    centre_mm: rotation centre of the eye at zero slippage.
+    radius_mm: rotation centre to the pupil (13.1 mm from the corneal apex less 3.05 mm of anterior chamber,
+        Le Grand's eye; apex to rotation centre after Guestrin and Eizenman 2006).
+    sensor_distance_mm: lens to sensor: turns a place on the sensor into a ray.
+    """
+
+    centre_mm: tuple[float, float, float]
+    radius_mm: float = 10.05
+    sensor_distance_mm: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (self.radius_mm > 0 and self.sensor_distance_mm > 0):
+            raise SceneError(
+                f"radius_mm = {self.radius_mm}, sensor_distance_mm = {self.sensor_distance_mm}: need both above 0"
+            )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OpticalAxis:
+    """Result of the solver.
+
+    direction: (batch, 3) unit vector from the rotation centre through the pupil, towards the camera side.
+    hit: (batch,) whether the ray meets the sphere; where it does not, ``direction`` points to the place on the
+        sphere that is nearest to the ray.
+    """
+
+    direction: Tensor
+    hit: Tensor
+
+
+def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> OpticalAxis:
+    """Intersect the ray through the pupil's image with the sphere on which the pupil moves.
+
+    The slippage moves the camera, so the eye sits at centre - slip. With the unit ray u and centre C the near
+    intersection is at t = u·C - sqrt((u·C)² - |C|² + R²); values and gradients stay finite when the ray misses.
+
+    Args:
+        pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the lens axis.
+        slip_mm: (batch, 3) displacement of the camera.
+    """
+    x, y = pupil_mm[..., 0], pupil_mm[..., 1]
+    ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
+    ray = ray / ray.norm(dim=-1, keepdim=True)
+    centre = torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
+    along = (ray * centre).sum(-1)
+    beside = centre - along[..., None] * ray  # from the nearest point of the ray to the centre
+    inside = geometry.radius_mm**2 - (beside**2).sum(-1)
+    hit = inside > 0
+    depth = torch.sqrt(torch.where(hit, inside, torch.ones_like(inside))) * hit
+    offset = -beside - depth[..., None] * ray
+    return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-9), hit)
+
+
+def pupil_of(direction: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Tensor:
+    """(batch, 2) place on the sensor, mm, of the pupil of an eye that looks along ``direction``: the inverse.
+
+    Raises:
+        SceneError: the pupil lies behind the lens.
+    """
+    centre = torch.tensor(geometry.centre_mm, dtype=direction.dtype, device=direction.device) - slip_mm
+    point = centre + geometry.radius_mm * direction
+    if bool((point[..., 2] <= 0).any()):
+        raise SceneError("a pupil lies behind the lens: the slippage is larger than the distance to the eye")
+    return point[..., :2] / point[..., 2:] * geometry.sensor_distance_mm
+
+
+def angle_rad(one: Tensor, other: Tensor) -> Tensor:
+    """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|)."""
+    a, b = one / one.norm(dim=-1, keepdim=True), other / other.norm(dim=-1, keepdim=True)
+    gap = ((a - b) ** 2).sum(-1)
+    near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
+    return 2 * torch.atan2(near, (a + b).norm(dim=-1))
+
+
+class ResidualRegressor(nn.Module):
+    """Offset from optical to visual axis, R(g_opt, slip): two angles from one hidden layer, zero at the start."""
+
+    def __init__(self, hidden: int = 10) -> None:
+        super().__init__()
+        self.inside = nn.Linear(6, hidden)
+        self.outside = nn.Linear(hidden, 2)
+        nn.init.zeros_(self.outside.weight)
+        nn.init.zeros_(self.outside.bias)
+
+    def forward(self, axis: Tensor, slip_mm: Tensor) -> Tensor:
+        """(batch, 3) unit visual axis: the optical axis turned by the learned yaw and pitch."""
+        yaw, pitch = self.outside(torch.tanh(self.inside(torch.cat([axis, slip_mm / 3], -1)))).unbind(-1)
+        return turn(axis, yaw, pitch)
+
+
+def turn(axis: Tensor, yaw_rad: Tensor, pitch_rad: Tensor) -> Tensor:
+    """Directions turned about the vertical (yaw) and then about the horizontal axis (pitch)."""
+    x, y, z = axis.unbind(-1)
+    c, s = torch.cos(yaw_rad), torch.sin(yaw_rad)
+    x, z = c * x + s * z, c * z - s * x
+    c, s = torch.cos(pitch_rad), torch.sin(pitch_rad)
+    return torch.stack([x, c * y - s * z, c * z + s * y], -1)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PersonalCalibration:
+    """Ridge regression from features of one person's samples to the angles of gaze.
+
+    weights: (features, 2). scale: (5, 2) mean and spread of the raw features.
+    """
+
+    weights: Tensor
+    scale: Tensor
+
+    def __call__(self, axis: Tensor, slip_mm: Tensor) -> Tensor:
+        """(batch, 2) gaze yaw and pitch in rad."""
+        return _features(axis, slip_mm, self.scale) @ self.weights
+
+
+def calibrate(axis: Tensor, slip_mm: Tensor, gaze_rad: Tensor, *, ridge: float = 1e-3) -> PersonalCalibration:
+    """Personal calibration from a few points: quadratic in optical axis and slippage, with a ridge.
+
+    Args:
+        axis: (points, 3) optical axes; slip_mm: (points, 3); gaze_rad: (points, 2) true yaw and pitch.
+        ridge: penalty on the weights; the mean is free.
+
+    Raises:
+        TrainingError: fewer than 3 points.
+    """
+    if len(axis) < 3:
+        raise TrainingError(f"personal calibration from {len(axis)} points, need 3 or more")
+    raw = _raw(axis, slip_mm)
+    scale = torch.stack([raw.mean(0), raw.std(0).clamp_min(1e-6)], -1)
+    features = _features(axis, slip_mm, scale)
+    penalty = ridge * len(axis) * torch.eye(features.shape[1], dtype=features.dtype)
+    penalty[0, 0] = 1e-12
+    weights = torch.linalg.solve(features.T @ features + penalty, features.T @ gaze_rad.to(features.dtype))
+    return PersonalCalibration(weights, scale)
+
+
+def yaw_pitch(direction: Tensor) -> Tensor:
+    """(batch, 2) angles of directions that point back to the camera (-z): yaw to +x, pitch to +y."""
+    x, y, z = direction.unbind(-1)
+    return torch.stack([torch.atan2(x, -z), torch.asin(y.clamp(-1, 1))], -1)
+
+
+def _raw(axis: Tensor, slip_mm: Tensor) -> Tensor:
+    return torch.cat([yaw_pitch(axis), slip_mm], -1)
+
+
+def _features(axis: Tensor, slip_mm: Tensor, scale: Tensor) -> Tensor:
+    """1, the angles, the slips, and all products of two."""
+    unit = (_raw(axis, slip_mm) - scale[:, 0]) / scale[:, 1] / math.sqrt(2)
+    count = unit.shape[-1]
+    i, j = torch.triu_indices(count, count)
+    return torch.cat([torch.ones_like(unit[..., :1]), unit, unit[..., i] * unit[..., j]], -1)

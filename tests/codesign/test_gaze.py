@@ -1,0 +1,89 @@
+"""Spherical-eye solver: inverse of the projection, safe when the ray misses, exact gradients."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from codesign import gaze
+from metalens.errors import SceneError, TrainingError
+
+GEOMETRY = gaze.EyeGeometry(centre_mm=(1.0, -14.0, 27.0))
+angle = st.floats(-0.5, 0.5)
+slip = st.floats(-3.0, 3.0)
+
+
+def _direction(yaw, pitch):
+    return torch.tensor(
+        [[math.sin(yaw) * math.cos(pitch), math.sin(pitch), -math.cos(yaw) * math.cos(pitch)]], dtype=torch.float64
+    )
+
+
+@given(angle, angle, slip, slip, slip)
+def test_solver_inverts_the_projection(yaw, pitch, dx, dy, dz):
+    direction, moved = _direction(yaw, pitch), torch.tensor([[dx, dy, dz]], dtype=torch.float64)
+    pupil = gaze.pupil_of(direction, moved, GEOMETRY)
+    found = gaze.optical_axis(pupil, moved, GEOMETRY)
+    # the near intersection is the pupil wherever the pupil faces the camera
+    centre = torch.tensor(GEOMETRY.centre_mm, dtype=torch.float64) - moved
+    facing = (direction * (centre + GEOMETRY.radius_mm * direction)).sum() < 0
+    if facing:
+        assert bool(found.hit)
+        assert float(gaze.angle_rad(found.direction, direction)) < 1e-6
+
+
+def test_a_ray_that_misses_gives_the_nearest_place_and_a_finite_gradient():
+    pupil = torch.tensor([[50.0, 0.0], [0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    found = gaze.optical_axis(pupil, torch.zeros(2, 3, dtype=torch.float64), GEOMETRY)
+    assert not bool(found.hit[0])
+    found.direction.sum().backward()
+    assert torch.isfinite(pupil.grad).all()
+    assert torch.allclose(found.direction.norm(dim=-1), torch.ones(2, dtype=torch.float64))
+
+
+def test_gradients_agree_with_finite_differences():
+    pupil = torch.tensor([[0.1, -1.2], [0.3, -0.9]], dtype=torch.float64, requires_grad=True)
+    moved = torch.tensor([[0.5, -0.2, 1.0], [0.0, 0.3, -1.0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p, s: gaze.optical_axis(p, s, GEOMETRY).direction, (pupil, moved))
+
+
+def test_angle_is_exact_and_differentiable_at_zero():
+    a = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    b = torch.tensor([[math.sin(1e-9), 0.0, -math.cos(1e-9)]], dtype=torch.float64)
+    assert float(gaze.angle_rad(a.detach(), b)) == pytest.approx(1e-9, rel=1e-6)
+    gaze.angle_rad(a, a.detach()).sum().backward()
+    assert torch.isfinite(a.grad).all()
+
+
+def test_turn_by_yaw_moves_the_gaze_by_that_angle():
+    axis = _direction(0.1, 0.0)
+    turned = gaze.turn(axis, torch.tensor([-0.2], dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    assert float(gaze.yaw_pitch(turned)[0, 0]) == pytest.approx(0.3, abs=1e-12)
+
+
+def test_the_residual_regressor_starts_as_the_optical_axis():
+    axis = _direction(0.1, -0.2).float()
+    assert torch.allclose(gaze.ResidualRegressor()(axis, torch.zeros(1, 3)), axis, atol=1e-7)
+
+
+def test_personal_calibration_removes_angle_kappa():
+    generator = torch.Generator().manual_seed(0)
+    angles = (torch.rand(60, 2, generator=generator, dtype=torch.float64) - 0.5) * 0.6
+    axis = torch.cat([_direction(float(y), float(p)) for y, p in angles])
+    kappa = torch.tensor([math.radians(5.0), math.radians(1.5)], dtype=torch.float64)
+    moved = torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    person = gaze.calibrate(axis[:30], moved[:30], angles[:30] + kappa, ridge=1e-5)
+    error = (person(axis[30:], moved[30:]) - angles[30:] - kappa).norm(dim=-1)
+    # the truth lies in the span of the features: what is left is the ridge, far below the 5 degrees of kappa
+    assert float(error.max()) < math.radians(0.5)
+
+
+def test_too_few_points_and_impossible_geometry_are_refused():
+    with pytest.raises(TrainingError, match="2 points"):
+        gaze.calibrate(torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 2))
+    with pytest.raises(SceneError, match="radius_mm"):
+        gaze.EyeGeometry((0, 0, 30), radius_mm=0)
+    with pytest.raises(SceneError, match="behind the lens"):
+        gaze.pupil_of(_direction(0, 0), torch.tensor([[0.0, 0.0, 50.0]], dtype=torch.float64), GEOMETRY)
