@@ -1,0 +1,178 @@
+"""Regularised evolution over architectures under a compute budget, with ageing (Real et al. 2019), and Pareto sets."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from codesign.architecture import Architecture, Space, active, check, largest, mutate, sample, smallest
+from metalens.errors import TrainingError, nearest
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """An evaluated architecture: ``error`` is to be small, ``macs`` within the budget."""
+
+    architecture: Architecture
+    error: float
+    macs: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Settings of the search.
+
+    population: members alive; the oldest dies with every birth.
+    tournament: members that compete to be the parent.
+    rounds: evaluations in all, the first population included.
+    mutation: chance that one entry changes.
+    """
+
+    population: int = 16
+    tournament: int = 4
+    rounds: int = 64
+    mutation: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not (self.population >= 2 and 1 <= self.tournament <= self.population <= self.rounds):
+            raise TrainingError(
+                f"population {self.population}, tournament {self.tournament}, rounds {self.rounds}: need "
+                "2 <= population, 1 <= tournament <= population <= rounds"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """State of a search: everything that is needed to go on after a stop.
+
+    history: every candidate in order of birth; the last ``population`` are alive.
+    generator: state of the random generator.
+    """
+
+    history: tuple[Candidate, ...] = ()
+    generator: dict[str, Any] = field(default_factory=dict)
+
+    def alive(self, plan: Plan) -> tuple[Candidate, ...]:
+        """The members that may become parents."""
+        return self.history[-plan.population :]
+
+
+Evaluate = Callable[[Architecture], float]
+Count = Callable[[Architecture], float]
+
+
+def evolve(
+    space: Space, plan: Plan, evaluate: Evaluate, count: Count, *, budget: float, seed: int, start: Search | None = None
+) -> Iterator[Search]:
+    """Search state after every birth; give the last one as ``start`` to go on exactly where it stopped.
+
+    Args:
+        evaluate: error of an architecture; each different network is evaluated once.
+        count: its multiply-accumulates; only candidates within ``budget`` are evaluated.
+
+    Raises:
+        TrainingError: the smallest network of the space is beyond the budget.
+    """
+    least = count(smallest(space))
+    if least > budget:
+        raise TrainingError(
+            f"budget of {budget / 1e6:.1f} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
+            "raise the budget or the pixel pitch"
+        )
+    state = start or Search(generator=dict(np.random.default_rng(seed).bit_generator.state))
+    known = {active(space, c.architecture): c.error for c in state.history}
+    while len(state.history) < plan.rounds:
+        generator = np.random.default_rng()
+        generator.bit_generator.state = state.generator
+        chosen = _next(space, plan, state, count, budget, generator)
+        key = active(space, chosen)
+        if key not in known:
+            known[key] = float(evaluate(chosen))
+        born = Candidate(chosen, known[key], float(count(chosen)))
+        state = Search((*state.history, born), dict(generator.bit_generator.state))
+        yield state
+
+
+def _next(
+    space: Space, plan: Plan, state: Search, count: Count, budget: float, generator: np.random.Generator
+) -> Architecture:
+    """A random member while the first population grows, then a child of the best of a tournament."""
+    if len(state.history) < plan.population:
+        return _within(lambda: sample(space, generator), count, budget) or smallest(space)
+    alive = state.alive(plan)
+    rivals = generator.choice(len(alive), plan.tournament, replace=False)
+    parent = min((alive[i] for i in rivals), key=lambda c: (_rank(c.error), c.macs)).architecture
+    return _within(lambda: mutate(space, parent, generator, rate=plan.mutation), count, budget) or parent
+
+
+def _within(draw: Callable[[], Architecture], count: Count, budget: float, *, tries: int = 200) -> Architecture | None:
+    for _ in range(tries):
+        drawn = draw()
+        if count(drawn) <= budget:
+            return drawn
+    return None
+
+
+def _rank(error: float) -> float:
+    """A non-finite error ranks last."""
+    return error if np.isfinite(error) else np.inf
+
+
+def best(candidates: Sequence[Candidate]) -> Candidate:
+    """The candidate of least error; of equals, the cheapest."""
+    return min(candidates, key=lambda c: (_rank(c.error), c.macs))
+
+
+def pareto(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Candidates that no other beats in both error and cost, cheapest first."""
+    front: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda c: (c.macs, _rank(c.error))):
+        if np.isfinite(candidate.error) and (not front or candidate.error < front[-1].error):
+            front.append(candidate)
+    return tuple(front)
+
+
+def within(space: Space, count: Count, budget: float) -> Architecture:
+    """The largest uniform network inside the budget: width, then depth, then the rest is reduced."""
+    top, bottom = largest(space), smallest(space)
+    for width in sorted(space.widths, reverse=True):
+        for part in (top, dataclasses.replace(top, depths=bottom.depths), dataclasses.replace(bottom, resolution=1.0)):
+            candidate = dataclasses.replace(part, width=width)
+            if count(candidate) <= budget:
+                return candidate
+    return bottom
+
+
+def dumps(search: Search) -> str:
+    """The state as JSON text."""
+    history = [{**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs} for c in search.history]
+    return json.dumps({"history": history, "generator": search.generator})
+
+
+def loads(text: str, space: Space) -> Search:
+    """State from JSON text.
+
+    Raises:
+        TrainingError: not the state of a search, or of another space.
+    """
+    try:
+        raw = json.loads(text)
+        history = tuple(_candidate(entry, space) for entry in raw["history"])
+        return Search(history, raw["generator"])
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise TrainingError(f"not the state of an architecture search: {error!r}") from error
+
+
+def _candidate(entry: dict[str, Any], space: Space) -> Candidate:
+    values = dict(entry)
+    error, macs = values.pop("error"), values.pop("macs")
+    fields = {f.name for f in dataclasses.fields(Architecture)}
+    for name in values:
+        if name not in fields:
+            raise TrainingError(f"unknown entry {name!r} of an architecture{nearest(name, fields)}")
+    fixed: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    made = Architecture(**fixed)
+    return Candidate(check(space, made), float(error), float(macs))

@@ -1,0 +1,110 @@
+"""Regularised evolution: finds the optimum of a known landscape, keeps the budget, goes on exactly after a stop."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from codesign import architecture as arch
+from codesign import cost, evolution
+from codesign.evolution import Candidate, Plan
+from metalens.errors import TrainingError
+
+SPACE = arch.Space()
+TARGET = arch.sample(SPACE, np.random.default_rng(42))
+PLAN = Plan(population=12, tournament=4, rounds=200)
+
+
+def _distance(architecture):
+    """Entries that differ from a hidden target, over the slots that the target uses: zero only at the target."""
+    used = [j < d for d in TARGET.depths for j in range(max(SPACE.depths))]
+    pairs = zip(architecture.kernels, TARGET.kernels, used, strict=True)
+    return float(
+        sum(a != b for a, b in zip(architecture.depths, TARGET.depths, strict=True))
+        + sum(a != b for a, b, u in pairs if u)
+        + (architecture.width != TARGET.width)
+    )
+
+
+def _count(architecture):
+    return float(cost.network(SPACE, architecture).at(128))
+
+
+def _run(plan=PLAN, budget=1e12, start=None, evaluate=_distance):
+    return list(evolution.evolve(SPACE, plan, evaluate, _count, budget=budget, seed=1, start=start))
+
+
+def test_evolution_descends_a_known_landscape_below_random_search():
+    generator = np.random.default_rng(7)
+    drawn = min(_distance(arch.sample(SPACE, generator)) for _ in range(PLAN.rounds))
+    found = evolution.best(_run()[-1].history).error
+    assert found < 0.7 * drawn
+
+
+def test_no_candidate_is_beyond_the_budget():
+    budget = 3 * _count(arch.smallest(SPACE))
+    assert max(c.macs for c in _run(budget=budget, plan=Plan(8, 2, 40))[-1].history) <= budget
+
+
+def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
+    states = _run(plan=Plan(8, 3, 30))
+    middle = evolution.loads(evolution.dumps(states[12]), SPACE)
+    assert _run(plan=Plan(8, 3, 30), start=middle)[-1] == states[-1]
+
+
+def test_equal_networks_are_evaluated_once():
+    seen = []
+
+    def count_calls(architecture):
+        seen.append(arch.active(SPACE, architecture))
+        return _distance(architecture)
+
+    _run(plan=Plan(8, 3, 60), evaluate=count_calls)
+    assert len(seen) == len(set(seen))
+
+
+def test_the_oldest_die_even_when_they_are_the_best():
+    plan = Plan(8, 3, 40)
+    state = _run(plan=plan)[-1]
+    assert state.alive(plan) == state.history[-8:]
+
+
+def test_a_network_that_diverged_is_never_the_best():
+    bad = Candidate(arch.smallest(SPACE), float("nan"), 1.0)
+    good = Candidate(arch.largest(SPACE), 5.0, 2.0)
+    assert evolution.best([bad, good]) == good
+    assert evolution.pareto([bad, good]) == (good,)
+
+
+def test_budget_below_the_smallest_network_is_refused():
+    with pytest.raises(TrainingError, match="below the smallest network"):
+        _run(budget=1e5)
+
+
+@given(st.lists(st.tuples(st.floats(0, 10), st.floats(1, 10)), min_size=1, max_size=30))
+def test_pareto_set_is_what_no_other_beats(points):
+    candidates = [Candidate(arch.smallest(SPACE), e, m) for e, m in points]
+    front = evolution.pareto(candidates)
+    for member in front:
+        assert not any(
+            (c.error < member.error and c.macs <= member.macs) or (c.error <= member.error and c.macs < member.macs)
+            for c in candidates
+        )
+    for c in candidates:
+        assert any(m.error <= c.error and m.macs <= c.macs for m in front)
+
+
+def test_foreign_state_is_refused():
+    with pytest.raises(TrainingError, match="not the state"):
+        evolution.loads("{}", SPACE)
+    text = evolution.dumps(_run(plan=Plan(2, 1, 2))[-1]).replace('"width"', '"widht"')
+    with pytest.raises(TrainingError, match="did you mean 'width'"):
+        evolution.loads(text, SPACE)
+
+
+def test_the_uniform_network_fits_its_budget():
+    for budget in (1e7, 5e7, 2e8):
+        assert _count(evolution.within(SPACE, _count, budget)) <= budget
+    assert dataclasses.replace(evolution.within(SPACE, _count, 1e12), width=1.0) == arch.largest(SPACE)
