@@ -1,0 +1,83 @@
+"""Chunked polynomials against numpy's own, their slopes against the complex step, their bounds against samples."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial import chebyshev
+
+from metalens import polynomial, polynomial_torch
+from metalens.errors import DomainError
+
+LOW, HIGH = 0.08, 0.21
+COEFFICIENTS = np.array([3.0, 2.5, 0.8, -0.2, 0.05, 0.02, -0.01, 0.003, 0.001])
+
+
+def reference(diameter, power):
+    """The Chebyshev sum by numpy; also for complex diameters."""
+    x = (2 * diameter**power - LOW**power - HIGH**power) / (HIGH**power - LOW**power)
+    return sum(c * np.polynomial.chebyshev.chebval(x, np.eye(9)[k]) for k, c in enumerate(COEFFICIENTS))
+
+
+@pytest.mark.parametrize("power", [1, 2, 3])
+@pytest.mark.parametrize("shape", [(), (7, 5), (3, polynomial.CHUNK // 2)])
+def test_value_and_slope(power, shape):
+    d = np.random.default_rng(0).uniform(LOW, HIGH, shape)
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), power)
+    assert np.abs(polynomial.value(p, d) - reference(d, power)).max() < 1e-12  # monomials up to 40: 40 eps
+    step = np.imag(reference(d + 1e-30j, power)) / 1e-30
+    assert np.abs(polynomial.slope(p, d) / step - 1).max() < 1e-10
+
+
+def test_single_precision_stays_single():
+    d = np.random.default_rng(1).uniform(LOW, HIGH, 1000)
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 3)
+    got = polynomial.value(p, d.astype(np.float32))
+    assert got.dtype == np.float32
+    assert np.abs(got - reference(d, 3)).max() < 3e-5  # 6e-8 of D times slope 100 rad/um, and of 6 rad
+
+
+@given(st.lists(st.floats(-1, 1), min_size=1, max_size=24), st.integers(1, 3))
+def test_bounds_hold_everywhere_and_are_tight(terms, rows):
+    c = np.resize(np.array(terms), (rows, max(1, len(terms) // rows)))
+    x, y = np.linspace(-1, 1, 301), np.linspace(-1, 1, 41)
+    sampled = chebyshev.chebgrid2d(y, x, c)
+    low, high = polynomial.bounds(c)
+    assert low <= sampled.min() + 1e-12
+    assert high >= sampled.max() - 1e-12
+    span = np.abs(c).sum()
+    assert low >= sampled.min() - 0.02 * span  # 301 samples of degree 23 miss up to (pi 23/301)²/8 of the range
+    assert high <= sampled.max() + 0.02 * span
+
+
+@pytest.mark.parametrize("bad", [0.0799, 0.2101, np.nan, np.inf, -1.0])
+def test_outside_the_domain_is_refused(bad):
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 2)
+    for verb, values in (
+        (polynomial.value, np.array([0.1, bad])),
+        (polynomial.slope, np.array([0.1, bad])),
+        (polynomial_torch.value, torch.tensor([0.1, bad], dtype=torch.float64)),
+    ):
+        with pytest.raises(DomainError, match=r"the proxy holds from 0\.08 to 0\.21"):
+            verb(p, values)
+
+
+def test_torch_derivatives_of_all_kinds():
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 3)
+    d = torch.linspace(0.09, 0.2, 6, dtype=torch.float64, requires_grad=True)
+
+    def f(x):
+        return polynomial_torch.value(p, x)
+
+    assert torch.autograd.gradcheck(f, d, check_forward_ad=True, eps=1e-7)
+    assert torch.autograd.gradgradcheck(f, d, eps=1e-7)
+    step = torch.from_numpy(np.imag(reference(d.detach().numpy() + 1e-30j, 3)) / 1e-30)
+    for got in (torch.func.vmap(torch.func.grad(f))(d), torch.func.jvp(f, (d,), (torch.ones(6).double(),))[1]):
+        assert torch.allclose(got, step, rtol=1e-11)
+
+
+def test_ceiling_takes_off_rounding_alone():
+    p = polynomial.curve(np.array([1.0 + 1e-9]), (LOW, HIGH), 1, 1.0)
+    assert polynomial.value(p, np.array([0.1])) == 1.0
+    assert polynomial_torch.value(p, torch.tensor([0.1])) == 1.0
