@@ -98,8 +98,8 @@ class Lens:
 
 
 def save(path: str | Path, lens: Lens) -> None:
-    """Write a lens file (kind ``lens``); diameters as float64."""
-    arrays: dict[str, Array] = {"diameter_um": np.asarray(lens.diameters.diameter_um, float)}
+    """Write a lens file (kind ``lens``); diameters keep their dtype."""
+    arrays: dict[str, Array] = {"diameter_um": lens.diameters.diameter_um}
     arrays |= {f"proxy/{name}": array for name, array in lens.proxy.to_arrays().items()}
     attributes: dict[str, Any] = {
         "pitch_um": lens.diameters.pitch_um,
