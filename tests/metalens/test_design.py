@@ -143,7 +143,7 @@ def test_empty_aperture_and_unprintable_cells_are_refused(proxy):
     with pytest.raises(LensError, match="no printable pillar"):
         _make(proxy, limits=Limits(min_diameter_nm=295))
     with pytest.raises(LensError, match="of a turn"):
-        _make(proxy, limits=Limits(min_diameter_nm=210))
+        _make(proxy, limits=Limits(min_diameter_nm=230))
 
 
 def test_one_pillar_is_a_lens(proxy):
