@@ -1,0 +1,7 @@
+"""``python -m metalens``: the command line."""
+
+import sys
+
+from metalens.cli import main
+
+sys.exit(main())
