@@ -1,0 +1,134 @@
+"""What is propagated: pillars, one direction of light at several depths, and the window on the sensor.
+
+Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor at z = +d. Time factor exp(-iωt).
+A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray meets the sensor at (d·tx, d·ty).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens.errors import PropagationError
+from metalens.store import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Geometry of one propagation; hashable, so that plans can be kept.
+
+    shape: (y, x) pillars; pitch_um: their lattice constant.
+    wavelength_um: in the medium on both sides of the lens.
+    sensor_distance_um: lens plane to sensor plane.
+    tangents: (x, y) tangents of the field angle.
+    inverse_depths_per_um: 1/z of every source, 0 for a source at infinity.
+    centre_um: (x, y) of the window on the sensor; step_um: its sampling; samples: (y, x) points of the window.
+
+    Raises:
+        PropagationError: a length that is not positive and finite, no depth, no sample.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    wavelength_um: float
+    sensor_distance_um: float
+    tangents: tuple[float, float]
+    inverse_depths_per_um: tuple[float, ...]
+    centre_um: tuple[float, float]
+    step_um: float
+    samples: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        for name in ("pitch_um", "wavelength_um", "sensor_distance_um", "step_um"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise PropagationError(f"{name} is {value}, need a positive length in um")
+        if min(self.shape) < 1 or min(self.samples) < 1:
+            raise PropagationError(f"{self.shape} pillars and {self.samples} samples, need at least one of each")
+        inverse = np.array(self.inverse_depths_per_um)
+        if inverse.size == 0 or not (np.isfinite(inverse) & (inverse >= 0)).all():
+            raise PropagationError("depths_um must hold at least one source depth above 0 (inf for a far source)")
+        if not np.isfinite([*self.tangents, *self.centre_um]).all():
+            raise PropagationError(f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}")
+
+    @property
+    def wavenumber(self) -> float:
+        """k = 2π/λ in rad/um."""
+        return 2 * np.pi / self.wavelength_um
+
+    @property
+    def half_size_um(self) -> tuple[float, float]:
+        """(y, x) distance from the axis to the outermost pillar centre, at least half a pitch."""
+        ny, nx = self.shape
+        return max(ny - 1, 1) / 2 * self.pitch_um, max(nx - 1, 1) / 2 * self.pitch_um
+
+    @property
+    def half_window_um(self) -> tuple[float, float]:
+        """(y, x) distance from the window centre to its outermost sample, at least a hundredth of a step."""
+        my, mx = self.samples
+        return max(my - 1, 0.02) / 2 * self.step_um, max(mx - 1, 0.02) / 2 * self.step_um
+
+    @property
+    def pillars_um(self) -> tuple[Array, Array]:
+        """(y,), (x,) positions of the pillar rows and columns."""
+        return axis(self.shape[0], self.pitch_um), axis(self.shape[1], self.pitch_um)
+
+    @property
+    def window_um(self) -> tuple[Array, Array]:
+        """(y,), (x,) positions of the window samples from the window centre."""
+        return axis(self.samples[0], self.step_um), axis(self.samples[1], self.step_um)
+
+
+def axis(count: int, step: float) -> Array:
+    """(count,) positions about the centre of the row."""
+    return (np.arange(count) - (count - 1) / 2) * step
+
+
+def source_path(x: Any, y: Any, tangents: Any, inverse_depth: Any) -> Any:
+    """Path from a point source to (x, y), less its path to the lens centre, um; exact for a source at infinity.
+
+    r - r0 = (ρ²/z + 2(x·tx + y·ty)) / (√(ρ²/z² + 2(x·tx + y·ty)/z + s²) + s) with s² = 1 + tx² + ty².
+    Any mix of numpy and torch operands that broadcast; no cancellation and no division by the depth.
+    """
+    tx, ty = tangents
+    s = (1 + tx * tx + ty * ty) ** 0.5
+    tilt = 2 * (x * tx + y * ty)
+    numerator = (x * x + y * y) * inverse_depth + tilt
+    return numerator / ((numerator * inverse_depth + s * s) ** 0.5 + s)
+
+
+def sensor_path(x: Any, y: Any, centre: Any, distance: Any) -> Any:
+    """Path from a pillar at (x, y) to a point of the sensor, less the path from the lens centre, um."""
+    cx, cy = centre
+    r0 = (cx * cx + cy * cy + distance * distance) ** 0.5
+    q = x * x + y * y - 2 * (x * cx + y * cy)
+    return q / ((q + r0 * r0) ** 0.5 + r0)
+
+
+def chief_path(case: Case) -> float:
+    """Distance from the lens centre to the window centre, um: the phase that all methods share."""
+    return float(np.sqrt(case.centre_um[0] ** 2 + case.centre_um[1] ** 2 + case.sensor_distance_um**2))
+
+
+def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:
+    """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or infinity.
+
+    Args:
+        phase_rad, transmission: (y, x) numpy arrays of float.
+
+    Raises:
+        PropagationError: naming row and column.
+    """
+    for name, array in (("phase_rad", phase_rad), ("transmission", transmission)):
+        if array.shape != case.shape:
+            raise PropagationError(f"{name} has shape {array.shape}, need {case.shape} (y, x)")
+    empty = True
+    for start in range(0, case.shape[0], 512):
+        rows = slice(start, start + 512)
+        bad = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
+        if bad.any():
+            row, column = (int(i) for i in np.argwhere(bad)[0])
+            raise PropagationError(f"phase or transmission at row {start + row}, column {column} is not finite")
+        empty = empty and not transmission[rows].any()
+    if empty:
+        raise PropagationError("empty aperture: transmission is 0 everywhere; check the aperture and the lens")

@@ -1,0 +1,291 @@
+"""How many nodes, directions, depth basis fields and correction terms a propagation needs, and the operators.
+
+The kernel from a pillar to a window sample, carrier removed, is
+K = d/(2πr²)(1/r - ik) exp(ik(r - r_w)) exp(ik(s_z - s_ref)).
+It is smooth in everything, so each of its dependencies is sampled just finely enough: every count below is the least
+whose Legendre tail on probing lines is under the tolerance.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens import legendre
+from metalens.errors import PropagationError
+from metalens.propagate_case import Case, chief_path, source_path
+from metalens.store import Array
+
+MOST_NODES = 1500
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Counts chosen for a case and tolerance.
+
+    nodes: (y, x) Legendre nodes over the lens; directions: direction cosines p along x.
+    window: (y, x), lens: (row, direction) grids on which the correction is sampled.
+    """
+
+    nodes: tuple[int, int]
+    directions: int
+    window: tuple[int, int]
+    lens: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Operators:
+    """Arrays of a plan, complex128 and float64; e = lens row nodes, x = lens column nodes, p = directions.
+
+    basis: (b, e, x) depth basis; coefficients: (depth, b).
+    to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
+    lens_terms: (r, p, e), window_terms: (r, Y, X) of the correction.
+    """
+
+    sizes: Sizes
+    reference: float
+    basis: Array
+    coefficients: Array
+    to_directions: Array
+    along_y: Array
+    along_x: Array
+    lens_terms: Array
+    window_terms: Array
+
+
+def reference_depth(case: Case) -> float:
+    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the range."""
+    inverse = case.inverse_depths_per_um
+    return (min(inverse) + max(inverse)) / 2
+
+
+@functools.lru_cache(maxsize=32)
+def sizes(case: Case, tolerance: float) -> Sizes:
+    """The counts that a case needs.
+
+    Raises:
+        PropagationError: more than 1500 nodes would be needed; the window is too large for this method.
+    """
+    share = tolerance / 4
+    high_y, high_x = case.half_size_um
+    nodes_x = _count(lambda t: _over_lens(case, t * high_x, None), share, "lens columns")
+    nodes_y = _count(lambda t: _over_lens(case, None, t * high_y), share, "lens rows")
+    low, high = direction_range(case, legendre.mapped(nodes_y, -high_y, high_y))
+    middle, reach = (low + high) / 2, (high - low) / 2
+    directions = _count(lambda t: _over_directions(case, middle + reach * t), share, "directions")
+    wy, wx = case.half_window_um
+    window_x = _count(lambda t: _over_window(case, (low, high), X=t * wx), share, "window columns")
+    window_y = _count(lambda t: _over_window(case, (low, high), Y=t * wy), share, "window rows")
+    lens_p = _count(lambda t: _over_window(case, (low, high), p=middle + reach * t), share, "correction directions")
+    lens_e = _count(lambda t: _over_window(case, (low, high), e=t * high_y), share, "correction rows")
+    return Sizes((nodes_y, nodes_x), directions, (window_y, window_x), (lens_e, lens_p))
+
+
+def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
+    count = 32
+    while count <= 2 * MOST_NODES:
+        found = legendre.needed(lines(legendre.nodes(count)[0]), tolerance)
+        if found <= count:
+            return max(found, 2)
+        count *= 2
+    raise PropagationError(
+        f"windowed propagation needs more than {MOST_NODES} nodes ({what}); "
+        "make the window smaller, or use propagate.exact"
+    )
+
+
+def direction_range(case: Case, rows_um: Array) -> tuple[float, float]:
+    """(least, largest) direction cosine p over the lens, for the row nodes given; never of zero width."""
+    high_x = case.half_size_um[1]
+    edge = np.array([-high_x, high_x]) - case.centre_um[0]
+    far = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
+    near = np.abs(far).min()
+    p = edge / np.sqrt(edge**2 + np.array([[near**2], [np.abs(far).max() ** 2]]) + case.sensor_distance_um**2)
+    low, high = float(p.min()), float(p.max())
+    spare = max(1e-9, 1e-6 * (high - low))
+    return max(low - spare, -1 + 1e-15), min(high + spare, 1 - 1e-15)
+
+
+def _probe() -> Array:
+    return np.array([-1.0, 0.0, 1.0])
+
+
+def kernel(case: Case, x: Any, y: Any, X: Any, Y: Any, inverse: Any) -> Array:
+    """K of the module's heading, without the pillar's area, at lens (x, y) and window offset (X, Y)."""
+    k, d = case.wavenumber, case.sensor_distance_um
+    dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
+    r_w = np.sqrt(dx * dx + dy * dy + d * d)
+    q = X * X + Y * Y + 2 * (X * dx + Y * dy)
+    r = np.sqrt(r_w * r_w + q)
+    path = q / (r + r_w) + source_path(x, y, case.tangents, inverse)
+    path = path - source_path(x, y, case.tangents, reference_depth(case))
+    return np.asarray(d / (2 * np.pi * r * r) * (1 / r - 1j * k) * np.exp(1j * k * path))
+
+
+def _over_lens(case: Case, x: Array | None, y: Array | None) -> Array:
+    """(line, node) of the kernel along lens columns (x given) or rows (y given)."""
+    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    inverse = np.array([min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)])
+    other = np.array([-0.9, 0.0, 0.9])
+    grid = np.meshgrid(other, _probe() * wx, _probe() * wy, inverse, indexing="ij")
+    o, X, Y, v = (g.reshape(-1, 1) for g in grid)
+    return kernel(case, o * hx if x is None else x, o * hy if y is None else y, X, Y, v)
+
+
+def _over_directions(case: Case, p: Array) -> Array:
+    """(line, direction) of the window kernel along p at fixed lens rows."""
+    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    grid = np.meshgrid(np.array([-0.9, 0.0, 0.9]) * hy, _probe() * wx, _probe() * wy, indexing="ij")
+    e, X, Y = (g.reshape(-1, 1) for g in grid)
+    residual = correction(case, p, e, X, Y)
+    q = _cosine_y(case, p, e)
+    return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
+
+
+def _over_window(case: Case, span: tuple[float, float], **line: Array) -> Array:
+    """(line, node) of the correction along one of X, Y, p, e, the others on a few probes."""
+    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    low, high = span
+    middle, reach = (low + high) / 2, (high - low) / 2
+    probes = {"X": _probe() * wx, "Y": _probe() * wy, "p": middle + reach * _probe(), "e": _probe() * hy}
+    names = [n for n in probes if n not in line]
+    grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
+    at: dict[str, Any] = {n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)} | line
+    return correction(case, at["p"], at["e"], at["X"], at["Y"])
+
+
+def _cosine_y(case: Case, p: Any, e: Any) -> Any:
+    """Direction cosine q along y of the ray from lens row e with cosine p to the window centre."""
+    far = e - case.centre_um[1]
+    return far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
+
+
+def correction(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
+    """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w + pX + qY))."""
+    k, d = case.wavenumber, case.sensor_distance_um
+    r, path = _residual(case, p, e, X, Y)
+    return np.asarray(d / (2 * np.pi * r * r) * (1 / r - 1j * k) * np.exp(1j * k * path))
+
+
+def _residual(case: Case, p: Any, e: Any, X: Any, Y: Any) -> tuple[Any, Any]:
+    """(r, r - r_w + pX + qY) without cancellation."""
+    far = e - case.centre_um[1]
+    r_w = np.sqrt((far * far + case.sensor_distance_um**2) / (1 - p * p))
+    g = p * X + _cosine_y(case, p, e) * Y
+    q = X * X + Y * Y - 2 * r_w * g
+    r = np.sqrt(r_w * r_w + q)
+    return r, (X * X + Y * Y + g * q / (r + r_w)) / (r + r_w)
+
+
+def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
+    """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x and y, at fixed pillar."""
+    k, d = case.wavenumber, case.sensor_distance_um
+    r, _ = _residual(case, p, e, X, Y)
+    far = e - case.centre_um[1]
+    r_w = np.sqrt((far * far + d * d) / (1 - p * p))
+    radial = 1j * k - 2 / r - 1 / (r * r) / (1 / r - 1j * k)
+    along = np.stack(np.broadcast_arrays(d / r, (X - r_w * p) / r, (Y - far) / r))
+    out = np.asarray(radial * along)
+    out[0] += 1 / d
+    return out
+
+
+def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None) -> Operators:
+    """All arrays of a plan; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y instead."""
+    (ny, nx), m = chosen.nodes, chosen.directions
+    high_y, high_x = case.half_size_um
+    e, x = legendre.mapped(ny, -high_y, high_y), legendre.mapped(nx, -high_x, high_x)
+    low, high = direction_range(case, e)
+    p = legendre.mapped(m, low, high)
+    far = (e - case.centre_um[1])[:, None]
+    across = x - case.centre_um[0]
+    cosines = across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
+    to_directions = legendre.interpolation(m, (2 * cosines - low - high) / (high - low))
+    y_um, x_um = case.window_um
+    k = case.wavenumber
+    q = _cosine_y(case, p[:, None], e[None, :])
+    lens_terms, window_terms = _low_rank(case, chosen, tolerance / 4, (low, high), slope)
+    basis, coefficients = depth_basis(case, (e, x), tolerance / 4)
+    return Operators(
+        sizes=chosen,
+        reference=reference_depth(case),
+        basis=basis,
+        coefficients=coefficients * np.exp(1j * k * chief_path(case)),
+        to_directions=to_directions,
+        along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
+        along_x=np.exp(-1j * k * x_um[:, None] * p),
+        lens_terms=lens_terms,
+        window_terms=window_terms,
+    )
+
+
+def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> Any:
+    """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands."""
+    reference = source_path(x, e, case.tangents, reference_depth(case))
+    return case.wavenumber * (source_path(x, e, tangents, inverse) - reference)
+
+
+def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float) -> tuple[Array, Array]:
+    """Few fields that span the curvatures of all depths, and their derivatives' range: (b, e, x), (depth, b).
+
+    Orthonormal under the quadrature of the nodes; truncated at ``tolerance`` root mean square.
+    """
+    e, x = nodes_um[0][:, None], nodes_um[1]
+    weight = np.sqrt(np.outer(legendre.nodes(len(e))[1], legendre.nodes(len(x))[1]))
+    inverse = np.array(case.inverse_depths_per_um)
+    training = inverse
+    if len(inverse) > 48:
+        training = np.clip(legendre.mapped(48, inverse.min(), inverse.max()), 0, None)
+    fields = np.exp(1j * depth_factors(case, e, x, case.tangents, training[:, None, None])) * weight
+    _, size, v = np.linalg.svd(fields.reshape(len(training), -1), full_matrices=False)
+    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+    rank = int(max(1, (tail > tolerance).sum()))
+    basis = v[:rank].reshape(rank, len(e), len(x))
+    coefficients = np.empty((len(inverse), rank), complex)
+    for start in range(0, len(inverse), 16):
+        part = inverse[start : start + 16, None, None]
+        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
+        coefficients[start : start + 16] = fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
+    return np.asarray(basis / weight), coefficients
+
+
+def _low_rank(
+    case: Case, chosen: Sizes, tolerance: float, span: tuple[float, float], slope: int | None
+) -> tuple[Array, Array]:
+    """Correction as Σ_r lens_terms[r, p, e] window_terms[r, Y, X], pillar area included."""
+    (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
+    (my, mx), (me, mp) = chosen.window, chosen.lens
+    Y, X = legendre.mapped(my, -wy, wy), legendre.mapped(mx, -wx, wx)
+    e, p = legendre.mapped(me, -hy, hy), legendre.mapped(mp, *span)
+    at = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
+    table = correction(case, *at)
+    if slope is not None:
+        table = table * slopes(case, *at)[slope]
+    left, right = _factors(table.reshape(my * mx, mp * me) * case.pitch_um**2, tolerance)
+    y_um, x_um = case.window_um
+    Iy, Ix = legendre.interpolation(my, y_um / wy), legendre.interpolation(mx, x_um / wx)
+    window_terms = np.einsum("Yj,jir,Xi->rYX", Iy, left.reshape(my, mx, -1), Ix, optimize=True)
+    e_um = legendre.nodes(chosen.nodes[0])[0]
+    p_um = legendre.nodes(chosen.directions)[0]
+    Ie, Ip = legendre.interpolation(me, e_um), legendre.interpolation(mp, p_um)
+    lens_terms = np.einsum("Pp,rpe,Ee->rPE", Ip, right.reshape(-1, mp, me), Ie, optimize=True)
+    return lens_terms, window_terms
+
+
+def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
+    """table ≈ left (row, r) @ right (r, column) within ``tolerance`` in the Frobenius norm; randomised range finder."""
+    random = np.random.default_rng(0)
+    total = np.linalg.norm(table)
+    rank = min(16, *table.shape)
+    while True:
+        left = np.linalg.qr(table @ random.standard_normal((table.shape[1], rank)))[0]
+        right = left.conj().T @ table
+        if rank == min(table.shape) or np.linalg.norm(table - left @ right) <= tolerance / 2 * total:
+            break
+        rank = min(2 * rank, *table.shape)
+    u, size, v = np.linalg.svd(right, full_matrices=False)
+    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1]) / total
+    keep = int(max(1, (tail > tolerance / 2).sum()))
+    return left @ u[:, :keep] * size[:keep], v[:keep]

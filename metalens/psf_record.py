@@ -1,0 +1,53 @@
+"""The PSF stack as a record and as a file."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from metalens.propagate_case import axis
+from metalens.store import Array, Provenance
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PsfStack:
+    """PSFs over depth (and field angle, and lens), each of sum 1, with their energy beside them.
+
+    intensity: (…, depth, y, x), sum over (y, x) is 1 (paper: normalised PSF); numpy or torch, as the lens came in.
+        With several field angles the axis before depth is the angle; axes before that are a batch of lenses.
+    energy_um2: (…, depth) light in the window for unit incident irradiance: Σ|U|²·step².
+    depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are; wavelengths are summed with the weights.
+    step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a row per angle.
+    sensor_distance_um: lens to sensor. tolerance: that was asked for.
+    """
+
+    intensity: Any
+    energy_um2: Any
+    depths_um: Array
+    angles_rad: Array
+    wavelengths_um: Array
+    weights: Array
+    step_um: float
+    centres_um: Array
+    sensor_distance_um: float
+    tolerance: float
+    provenance: Provenance = field(default_factory=Provenance)
+
+    @property
+    def x_um(self) -> Array:
+        """(x,) positions from the window centre."""
+        return axis(self.intensity.shape[-1], self.step_um)
+
+    @property
+    def y_um(self) -> Array:
+        """(y,) positions from the window centre."""
+        return axis(self.intensity.shape[-2], self.step_um)
+
+    def numpy(self) -> "PsfStack":
+        """The same record with numpy arrays, detached from any graph."""
+        return dataclasses.replace(self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2))
+
+
+def _array(value: Any) -> Array:
+    return value if isinstance(value, np.ndarray) else np.asarray(value.detach().cpu().numpy())
