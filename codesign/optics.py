@@ -1,0 +1,226 @@
+"""The optics that training moves: a focus and a few dozen orthonormal polynomials of phase, and their PSFs.
+
+A smooth phase is enough to shape a PSF, keeps its gradients of one size, and leaves no pillar noise to overfit;
+:func:`phase_of` gives the same phase at every pillar of the full lens.
+"""
+
+import functools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from metalens import profiles
+from metalens.design import PhaseOf
+from metalens.errors import ConfigError, TrainingError
+from metalens.profiles import Focus
+from metalens.pupil import Pupil, coordinates, psf, radius
+from metalens.scene import Imager, PsfBasis, basis, imager
+from metalens.store import Array
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsConfig:
+    """The lens in front of the sensor, and how finely training sees it.
+
+    aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
+    focus_mm: source distance that the hyperbolic part images onto the sensor.
+    polynomials: orthonormal radial-angular terms of order 2 and above that training moves; 0 for a fixed lens.
+    zones: rings of a double helix added to the hyperbolic phase; 0 for none.
+    depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at equal steps of 1/z.
+    sample_um: of the PSFs; the image is formed on this grid before the pixels integrate it.
+    window_samples: of the PSFs.
+    tolerance: of the low-rank PSF basis.
+    """
+
+    aperture_mm: float = 1.0
+    sensor_distance_mm: float = 2.0
+    wavelength_nm: float = 850.0
+    focus_mm: float = 20.0
+    polynomials: int = 35
+    zones: int = 0
+    depths_mm: tuple[float, float] = (12.0, 50.0)
+    depth_count: int = 24
+    sample_um: float = 9.0
+    window_samples: int = 33
+    tolerance: float = 3e-3
+
+    def __post_init__(self) -> None:
+        low, high = self.depths_mm
+        if not (0 < low < high and self.depth_count >= 2):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, depth_count = {self.depth_count}: need 0 < least < largest"
+            )
+        if min(self.aperture_mm, self.sensor_distance_mm, self.wavelength_nm, self.focus_mm, self.sample_um) <= 0:
+            raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")
+        if self.window_samples < 3 or self.window_samples % 2 == 0:
+            raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
+
+    @property
+    def fine(self) -> int:
+        """Samples of the intensity to one of ``sample_um``: at most lambda / (4 NA) apart, an odd number."""
+        pupil = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
+        need = math.ceil(self.sample_um / (pupil.field_step_um / 2))
+        return need + 1 - need % 2
+
+    @property
+    def pupil(self) -> Pupil:
+        """The aperture with as many nodes as the window of the PSFs needs."""
+        rough = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
+        width = self.window_samples * self.sample_um * 1.05
+        nodes = max(64, math.ceil(width * 2 * rough.edge / rough.wavelength_um / 2) * 2)
+        return Pupil(rough.radius_um, rough.sensor_distance_um, rough.wavelength_um, nodes)
+
+    @property
+    def depths_um(self) -> Tensor:
+        """(depths,) ascending, at equal steps of 1/z, float64."""
+        low, high = self.depths_mm
+        return 1e3 / torch.linspace(1 / low, 1 / high, self.depth_count, dtype=torch.float64)
+
+    @property
+    def focus(self) -> Focus:
+        """What the hyperbolic part images onto the sensor."""
+        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.focus_mm * 1e3)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Spread:
+    """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
+
+    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
+    astigmatism_waves: of stress and stage errors, waves at the rim.
+    """
+
+    focus_um: float = 0.0
+    tilt_waves: float = 0.0
+    astigmatism_waves: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stack:
+    """PSFs over depth on the grid of the image.
+
+    intensity: (depths, h, w) share of the light. depths_um: (depths,).
+    """
+
+    intensity: Tensor
+    depths_um: Tensor = field(repr=False)
+
+    def basis(self, tolerance: float) -> PsfBasis:
+        """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1)."""
+        total = self.intensity.sum((-2, -1), keepdim=True)
+        return basis(self.intensity / total, self.depths_um, tolerance=tolerance)
+
+
+def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: Tensor | None = None) -> Stack:
+    """PSFs of the lens whose polynomial coefficients are these; differentiable.
+
+    Args:
+        coefficients_rad: (polynomials,) in rad of root-mean-square phase over the aperture.
+        error: (3,) focus_um, tilt_waves, astigmatism_waves of one draw of :class:`Spread`.
+
+    Raises:
+        TrainingError: a coefficient is not finite.
+    """
+    if not bool(torch.isfinite(coefficients_rad).all()):
+        raise TrainingError("the optics left the finite numbers: lower the learning rate of the optics")
+    pupil = settings.pupil
+    phase = added_phase(settings, coefficients_rad)
+    if error is not None:
+        phase = phase + _error_phase(settings, error)
+    fine = settings.fine
+    intensity = psf(
+        phase,
+        pupil,
+        depths_um=settings.depths_um,
+        focus_um=settings.focus_mm * 1e3,
+        sample_um=settings.sample_um / fine,
+        samples=settings.window_samples * fine,
+    )
+    size = settings.window_samples
+    pixels = intensity.reshape(-1, size, fine, size, fine).sum((2, 4))
+    return Stack(pixels, settings.depths_um)
+
+
+def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
+    """(nodes, nodes) phase on top of the hyperbolic focus: vortices of the double helix, and the polynomials."""
+    phase = _vortices(settings)
+    if settings.polynomials:
+        terms, _ = _polynomials(settings.pupil, settings.polynomials)
+        phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), terms)
+    return phase
+
+
+def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
+    """The trained phase as a function of pillar positions, for :func:`metalens.design.make`."""
+    mix = _polynomials(settings.pupil, settings.polynomials)[1] if settings.polynomials else torch.zeros(0, 0)
+    weights = (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).numpy() if len(mix) else np.zeros(0)
+    rim = settings.aperture_mm * 500
+
+    def phase(x_um: Array, y_um: Array) -> Array:
+        x, y = x_um, y_um[:, None]
+        if settings.zones:
+            shape = profiles.DoubleHelix(settings.zones)
+            total = profiles.double_helix(x, y, settings.focus, shape, radius_um=rim)
+        else:
+            total = profiles.hyperbolic(x, y, settings.focus)
+        for weight, term in zip(weights, _terms(x / rim, y / rim, len(weights)), strict=True):
+            total = total + weight * term
+        return total
+
+    return phase
+
+
+def prepared(settings: OpticsConfig, made: Stack, frame: int, *, margin: int) -> Imager:
+    """Transfer functions for square frames of ``frame`` samples rendered with ``margin`` to spare."""
+    return imager(made.basis(settings.tolerance), (frame, frame), margin=margin)
+
+
+def _terms(x: Array, y: Array, count: int) -> list[Array]:
+    """rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n: the first ``count``."""
+    rho, theta = np.hypot(x, y), np.arctan2(y, x)
+    terms: list[Array] = []
+    order = 2
+    while len(terms) < count:
+        for m in range(-order, order + 1, 2):
+            terms.append(rho**order * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta)))
+        order += 1
+    return terms[:count]
+
+
+@functools.lru_cache(maxsize=8)
+def _polynomials(pupil: Pupil, count: int) -> tuple[Tensor, Tensor]:
+    """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of :func:`_terms`."""
+    x, y = (c.numpy() / pupil.radius_um for c in coordinates(pupil))
+    raw = torch.from_numpy(np.stack(_terms(x, y, count)))
+    inside = radius(pupil) <= pupil.radius_um
+    samples = raw[:, inside]
+    _, upper = torch.linalg.qr(samples.T)
+    mix = torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
+    return torch.einsum("nm,myx->nyx", mix, raw) * inside, mix
+
+
+@functools.lru_cache(maxsize=8)
+def _vortex_phase(pupil: Pupil, zones: int) -> Tensor:
+    x, y = coordinates(pupil)
+    fraction = torch.hypot(x, y) / pupil.radius_um
+    ring = torch.ceil(zones * fraction**2).clamp(1, zones)
+    return (2 * ring - 1) * torch.atan2(y, x)
+
+
+def _vortices(settings: OpticsConfig) -> Tensor:
+    pupil = settings.pupil
+    return _vortex_phase(pupil, settings.zones) if settings.zones else torch.zeros_like(radius(pupil))
+
+
+def _error_phase(settings: OpticsConfig, error: Tensor) -> Tensor:
+    pupil = settings.pupil
+    x, y = (c / pupil.radius_um for c in coordinates(pupil))
+    rho2 = x**2 + y**2
+    focus_um, tilt, astigmatism = error.double().unbind()
+    k = 2 * math.pi / pupil.wavelength_um
+    defocus = -k * focus_um * (pupil.radius_um / pupil.sensor_distance_um) ** 2 / 2 * rho2
+    return defocus + 2 * math.pi * (tilt * rho2 * x + astigmatism * (x**2 - y**2))
