@@ -1,0 +1,153 @@
+"""Matrices of the quarter cell with every wall natural: what a geometry costs once, for all wavelengths.
+
+With edge-element functions N_i and scalar functions z_i of the quarter cell (lengths in half pitches):
+
+    mass_ij = ∫ N_i·N_j,   curl_ij = ∫ rot N_i rot N_j,   scalar_ij = ∫ z_i z_j,   grad z_j = sum_i gradient_ij N_i
+
+over the whole cell and over the disc alone. Heights, wavelengths, indices, angles and polarisations come later.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from metalens.errors import CellError
+from metalens.modal.mesh import Mesh, MeshPlan, Patch, build
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Part:
+    """Mass, curl-curl and scalar mass matrices of a part of the cell."""
+
+    mass: np.ndarray
+    curl: np.ndarray
+    scalar: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Geometry:
+    """One disc in its cell, assembled: reused for every wavelength, height, index, angle and polarisation.
+
+    rho: diameter over pitch. cell, disc: matrices of the whole quarter cell and of its part inside the disc, in
+    half pitches. gradient: (vectors, scalars).
+    """
+
+    rho: float
+    mesh: Mesh
+    cell: Part
+    disc: Part
+    gradient: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Metric:
+    """Products of the Jacobian at the points of a patch: contravariant metric times area, 1 / area, area."""
+
+    xi_xi: np.ndarray
+    eta_eta: np.ndarray
+    xi_eta: np.ndarray
+    inverse_area: np.ndarray
+    area: np.ndarray
+
+
+def metric(patch: Patch, rho: float) -> Metric:
+    """(elements, points) each; N_i·N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j) + eta_eta b_i b_j."""
+    xi = rho * patch.rho_xi + patch.rest_xi
+    eta = rho * patch.rho_eta + patch.rest_eta
+    g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
+    area = np.abs(xi[..., 0] * eta[..., 1] - xi[..., 1] * eta[..., 0])
+    inverse = 1 / area
+    return Metric(g22 * inverse, g11 * inverse, -g12 * inverse, inverse, area)
+
+
+def metric_rate(patch: Patch, rho: float) -> Metric:
+    """Derivative of ``metric`` in rho."""
+    xi, eta = rho * patch.rho_xi + patch.rest_xi, rho * patch.rho_eta + patch.rest_eta
+    d_xi, d_eta = patch.rho_xi, patch.rho_eta
+    g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
+    d11, d22 = 2 * (xi * d_xi).sum(-1), 2 * (eta * d_eta).sum(-1)
+    d12 = (d_xi * eta + xi * d_eta).sum(-1)
+    area = xi[..., 0] * eta[..., 1] - xi[..., 1] * eta[..., 0]
+    d_area = d_xi[..., 0] * eta[..., 1] + xi[..., 0] * d_eta[..., 1]
+    d_area = d_area - d_xi[..., 1] * eta[..., 0] - xi[..., 1] * d_eta[..., 0]
+    d_area, area = d_area * np.sign(area), np.abs(area)
+    inverse = 1 / area
+    d_inverse = -d_area * inverse**2
+    return Metric(
+        d22 * inverse + g22 * d_inverse,
+        d11 * inverse + g11 * d_inverse,
+        -(d12 * inverse + g12 * d_inverse),
+        d_inverse,
+        d_area,
+    )
+
+
+def element_matrices(patch: Patch, m: Metric) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass, curl-curl and scalar mass of each element of a patch: (elements, functions, functions)."""
+    b = patch.basis
+    w = b.weight
+
+    def gram(left: np.ndarray, field: np.ndarray, right: np.ndarray) -> np.ndarray:
+        product: np.ndarray = (left * (field * w)[:, None, :]) @ right.T
+        return product
+
+    cross = gram(b.along_xi, m.xi_eta, b.along_eta)
+    mass = np.concatenate(
+        [
+            np.concatenate([gram(b.along_xi, m.xi_xi, b.along_xi), cross], 2),
+            np.concatenate([cross.transpose(0, 2, 1), gram(b.along_eta, m.eta_eta, b.along_eta)], 2),
+        ],
+        1,
+    )
+    curl = b.curl.T @ gram(b.turn, m.inverse_area, b.turn) @ b.curl
+    return mass, curl, gram(b.scalar, m.area, b.scalar)
+
+
+def scatter(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
+    """Sum element blocks into an (n, n) matrix; numbers is (copies, elements, functions), blocks shared by copies."""
+    index = (numbers[..., :, None] * n + numbers[..., None, :]).ravel()
+    weights = np.broadcast_to(blocks, (len(numbers), *blocks.shape)).ravel()
+    return np.bincount(index, weights, n * n).reshape(n, n)
+
+
+@lru_cache(maxsize=32)
+def gradient(plan: MeshPlan) -> np.ndarray:
+    """Coefficients of the gradients of the scalar functions: topology alone."""
+    mesh = build(plan)
+    out = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
+    for patch in mesh.patches:
+        rows, columns = np.nonzero(patch.basis.gradient)
+        out[patch.vector[..., rows], patch.scalar[..., columns]] = patch.basis.gradient[rows, columns]
+    return out
+
+
+def integrate(mesh: Mesh, rho: float, *, rate: bool = False) -> tuple[Part, Part]:
+    """Matrices of the cell and of the disc, or (``rate``) their derivatives in rho."""
+    nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
+    sums = {inside: [np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns))] for inside in (True, False)}
+    for patch in mesh.patches:
+        mass, curl, scalar = element_matrices(patch, (metric_rate if rate else metric)(patch, rho))
+        total = sums[patch.inside]
+        total[0] += scatter(patch.vector, mass, nv)
+        total[1] += scatter(patch.vector, curl, nv)
+        total[2] += scatter(patch.scalar, scalar, ns)
+    disc = Part(*sums[True])
+    rest = sums[False]
+    return Part(disc.mass + rest[0], disc.curl + rest[1], disc.scalar + rest[2]), disc
+
+
+def assemble(rho: float, plan: MeshPlan) -> Geometry:
+    """Integrate the matrices of a disc of radius ``rho`` half pitches.
+
+    Raises:
+        CellError: the disc is not strictly inside the cell: elements between it and the wall would vanish.
+    """
+    if not (math.isfinite(rho) and 0 < rho < 1):
+        raise CellError(
+            f"diameter = {rho:.6g} pitches: the elements that follow the disc need one above 0 and below 1; "
+            "touching pillars are solved by metalens.rcwa"
+        )
+    mesh = build(plan)
+    return Geometry(rho, mesh, *integrate(mesh, rho), gradient(plan))

@@ -1,0 +1,221 @@
+"""The public solve: one pillar cell, one wavelength, one angle, with an error estimate."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from metalens.cell import Cell
+from metalens.errors import CellError
+from metalens.materials import index
+from metalens.modal.assembly import Geometry, assemble
+from metalens.modal.homogeneous import Basis, modes
+from metalens.modal.ladder import Rung, first_rung, rungs
+from metalens.modal.layer import Medium, electric_modes, magnetic_modes
+from metalens.modal.match import half_space, scattering, zero_order
+from metalens.modal.mesh import MeshPlan
+from metalens.modal.spaces import space
+from metalens.response import Response
+
+NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
+CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
+POLARIZATIONS = ("x", "y", "s", "p")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One problem in half pitches: what the linear algebra needs.
+
+    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above: permittivities of the
+    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the electric field.
+    """
+
+    rho: float
+    k0: float
+    height: float
+    below: float
+    above: float
+    disc: complex
+    around: complex
+    bloch: float
+    p: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solution:
+    """One rung's answer: zero-order scattering matrix (2, 2), its error estimate, energy, unknowns of both forms."""
+
+    matrix: np.ndarray
+    error: float
+    energy: float
+    unknowns: int
+
+
+@lru_cache(maxsize=6)
+def geometry(rho: float, plan: MeshPlan) -> Geometry:
+    return assemble(rho, plan)
+
+
+@lru_cache(maxsize=8)
+def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float) -> Basis:
+    """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change."""
+    symmetry_class = space(geometry(rho, plan), electric=electric, half_phase_rad=bloch or None)
+    return modes(symmetry_class, careful=0 < bloch < CAREFUL_RAD)
+
+
+def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """first (first⁻¹ second)^(1/2) of two nearby 2 x 2 matrices: unitary and symmetric where both are.
+
+    Falls back on the arithmetic mean where the ratio has no principal root nearby or ``first`` is singular.
+    """
+    size = np.linalg.norm(first, 2) ** 2
+    if abs(np.linalg.det(first)) < 1e-3 * size or np.linalg.norm(first - second, 2) > 0.3 * np.sqrt(size):
+        arithmetic: np.ndarray = (first + second) / 2
+        return arithmetic
+    ratio = np.linalg.solve(first, second)
+    root = np.sqrt(np.linalg.det(ratio) + 0j)
+    mean: np.ndarray = first @ ((ratio + root * np.eye(2)) / np.sqrt(np.trace(ratio) + 2 * root))
+    return mean
+
+
+def evaluate(case: Case, plan: MeshPlan) -> Solution:
+    """Both forms on one mesh."""
+    medium = Medium(case.k0, case.disc, case.around)
+    matrices, powers, unknowns = [], [], 0
+    for magnetic in (False, True):
+        # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
+        electric_walls = case.p == magnetic if case.bloch else False
+        b = basis(case.rho, plan, electric_walls, case.bloch)
+        layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
+        below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
+        full = scattering(layer, case.height, below, above)
+        te = case.p == magnetic if case.bloch else True
+        foot = zero_order(b, below, case.bloch, te=te)
+        top = len(below.ports) + zero_order(b, above, case.bloch, te=te)
+        powers.append(float((np.abs(full[:, foot]) ** 2).sum()))
+        sign = -1.0 if magnetic else 1.0
+        matrices.append(full[np.ix_((foot, top), (foot, top))] * np.array([[sign, 1.0], [1.0, sign]]))
+        unknowns += b.size
+    mean = geometric_mean(*matrices)
+    others = np.mean([p - (np.abs(m[:, 0]) ** 2).sum() for p, m in zip(powers, matrices, strict=True)])
+    energy = float((np.abs(mean[:, 0]) ** 2).sum() + others)
+    return Solution(mean, float(np.abs(matrices[0] - matrices[1]).max()) / 2, energy, unknowns)
+
+
+def climb(case: Case, tolerance: float) -> tuple[Solution, float, bool, str]:
+    """The cheapest rung of the ladder that meets the tolerance, by its own estimate."""
+    best: tuple[float, Solution, Rung] | None = None
+    for rung in rungs()[first_rung(tolerance) :]:
+        solution = evaluate(case, rung.plan)
+        error = rung.error(solution.error)
+        if best is None or error < best[0]:
+            best = (error, solution, rung)
+        if error <= tolerance:
+            return solution, error, True, f"both forms agree within the tolerance on mesh {rung.name}"
+    if best is None:
+        raise CellError(f"tolerance = {tolerance}: need a number above 0")
+    return best[1], best[0], False, f"the finest mesh ({best[2].name}) leaves an estimated error of {best[0]:.1e}"
+
+
+def film(case: Case) -> np.ndarray:
+    """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
+    kz1, kz2 = (math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above))
+    y1, y2 = (case.below / kz1, case.above / kz2) if case.p else (kz1, kz2)
+    r, t = (y1 - y2) / (y1 + y2), 2 * math.sqrt(y1 * y2) / (y1 + y2)
+    return np.array([[r, t], [t, -r]], complex)
+
+
+def case_of(
+    cell: Cell, diameter_um: float, wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str
+) -> Case:
+    """Check a case, and put it into half pitches.
+
+    Raises:
+        CellError: films or a tilted sidewall (use metalens.rcwa), a plane of incidence off the lattice axes, an
+            absorbing half-space, an unknown polarisation, or a number out of range.
+    """
+    check_shape(cell, diameter_um)
+    if not (math.isfinite(wavelength_um) and wavelength_um > 0):
+        raise CellError(f"wavelength_um = {wavelength_um}: need a finite length above 0")
+    if not abs(angle_rad) < math.pi / 2:
+        raise CellError(f"angle_rad = {angle_rad}: need an angle within +-pi/2")
+    if polarization not in POLARIZATIONS:
+        raise CellError(f"polarization = {polarization!r}: need one of {', '.join(POLARIZATIONS)}")
+    quarter = azimuth_rad / (math.pi / 2)
+    if angle_rad and abs(quarter - round(quarter)) > 1e-12:
+        raise CellError(
+            f"azimuth_rad = {azimuth_rad}: the modal engine takes planes of incidence along the lattice axes "
+            "(multiples of pi/2); use metalens.rcwa for others"
+        )
+    along = "x" if round(quarter) % 2 == 0 else "y"
+    below, above, disc, around = (
+        index(m, wavelength_um) for m in (cell.substrate, cell.cover, cell.pillar, cell.between)
+    )
+    for name, n in (("substrate", below), ("cover", above)):
+        if n.imag:
+            raise CellError(f"{name} absorbs (index {n}): the orders of a half-space need a real index")
+    k0 = 2 * math.pi / wavelength_um
+    sine = abs(math.sin(angle_rad))
+    if sine >= min(below.real, above.real):
+        raise CellError(
+            f"angle_rad = {angle_rad}: no zero order in a half-space of index {min(below.real, above.real)}"
+        )
+    half = cell.pitch_um / 2
+    bloch = k0 * sine * half
+    return Case(
+        rho=diameter_um / cell.pitch_um,
+        k0=k0 * half,
+        height=cell.height_um / half,
+        below=below.real**2,
+        above=above.real**2,
+        disc=disc**2,
+        around=around**2,
+        bloch=bloch if bloch > NORMAL_RAD else 0.0,
+        p=polarization in ("p", along),
+    )
+
+
+def check_shape(cell: Cell, diameter_um: float) -> None:
+    """Refuse what the elements cannot follow."""
+    if cell.under or cell.over or cell.sidewall_rad:
+        raise CellError("the modal engine takes an upright pillar without films; use metalens.rcwa for this cell")
+    if not (math.isfinite(diameter_um) and 0 < diameter_um < cell.pitch_um):
+        raise CellError(
+            f"diameter_um = {diameter_um} on a pitch of {cell.pitch_um} um: the elements that follow the disc need "
+            "one above 0 and below the pitch; touching pillars are solved by metalens.rcwa"
+        )
+
+
+def solve(
+    cell: Cell,
+    diameter_um: float,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    polarization: str = "x",
+    tolerance: float = 1e-3,
+) -> Response:
+    """Zero-order response of a round pillar by the modal method, exact along z.
+
+    diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in
+    every layer by Snell's law. azimuth_rad: of the plane of incidence, a multiple of pi/2. polarization: "s" or
+    "p", or "x" or "y" for the field along that axis of the plane of incidence.
+    tolerance: of t and r; the mesh is chosen from it and refined until the estimate meets it.
+
+    Accuracy: ``t_error`` holds for r as well; it comes from the difference of the electric and magnetic forms.
+
+    Raises:
+        CellError, MaterialError: see ``case_of``.
+    """
+    case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
+    if not (tolerance > 0 and math.isfinite(tolerance)):
+        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    if case.height == 0:
+        matrix = film(case)
+        energy = float((np.abs(matrix[:, 0]) ** 2).sum())
+        return Response(complex(matrix[1, 0]), complex(matrix[0, 0]), 1e-15, 1, energy, "film", True, "closed form")
+    solution, error, converged, reason = climb(case, tolerance)
+    t, r = complex(solution.matrix[1, 0]), complex(solution.matrix[0, 0])
+    return Response(t, r, error, solution.unknowns, solution.energy, "modal", converged, reason)

@@ -1,0 +1,78 @@
+"""Modes of a homogeneous layer in the element space: the basis of everything else.
+
+The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu = kx² + ky²) and the rest
+(TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as exp(i kz z) with
+kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from metalens.modal.spaces import Space
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Basis:
+    """Mass-orthonormal modes of the empty cell, lengths in half pitches.
+
+    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise.
+    vector: (unknowns, a + b) fields, TE first. scalar: (scalars, b) longitudinal fields of the TM modes.
+    disc_mass: (a + b, a + b) mass inside the disc; disc_curl: (a, a); disc_scalar: (b, b).
+    """
+
+    te: np.ndarray
+    tm: np.ndarray
+    vector: np.ndarray
+    scalar: np.ndarray
+    disc_mass: np.ndarray
+    disc_curl: np.ndarray
+    disc_scalar: np.ndarray
+
+    @property
+    def size(self) -> int:
+        return len(self.te) + len(self.tm)
+
+
+def gradients(space: Space, lower: np.ndarray, *, careful: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transverse wavenumbers squared and scalar fields of the gradients, and a full orthogonal basis, gradients first.
+
+    The basis is in coordinates ``lower.T @ field``, in which the mass matrix is the identity. ``careful`` takes
+    singular values instead of eigenvalues of the squared problem: nearly uniform gradients (grazing the normal)
+    keep all digits, at twice the cost.
+    """
+    g = space.gradient
+    if careful:
+        scalar_lower = np.linalg.cholesky(space.cell.scalar)
+        factor = sl.solve_triangular(scalar_lower, (lower.T @ g).T, lower=True, check_finite=False).T
+        left, value, right = np.linalg.svd(factor, full_matrices=True)
+        order = np.argsort(value)
+        left[:, : len(value)] = left[:, order]
+        scalar = sl.solve_triangular(scalar_lower, right[order].T, trans="T", lower=True, check_finite=False)
+        return value[order] ** 2, scalar, left
+    tm, scalar = sl.eigh(g.T @ space.cell.mass @ g, space.cell.scalar, check_finite=False)
+    normal = lower.T @ ((g @ scalar) / np.sqrt(tm))
+    q = sl.qr(normal, check_finite=False)[0]
+    q[:, : len(tm)] = normal
+    return tm, scalar, q
+
+
+def modes(space: Space, *, careful: bool = False) -> Basis:
+    """TM modes from the gradients, TE modes from their complement; ``careful`` as in ``gradients``."""
+    lower = np.linalg.cholesky(space.cell.mass)
+    tm, scalar, orthogonal = gradients(space, lower, careful=careful)
+    vector = sl.solve_triangular(lower, orthogonal, trans="T", lower=True, check_finite=False)
+    rest = vector[:, len(tm) :]
+    te, mix = np.linalg.eigh(rest.T @ space.cell.curl @ rest)
+    rest = rest @ mix
+    vector = np.concatenate([rest, vector[:, : len(tm)]], 1)
+    return Basis(
+        te=np.maximum(te, 0.0),
+        tm=tm,
+        vector=vector,
+        scalar=scalar,
+        disc_mass=vector.T @ space.disc.mass @ vector,
+        disc_curl=rest.T @ space.disc.curl @ rest,
+        disc_scalar=scalar.T @ space.disc.scalar @ scalar,
+    )

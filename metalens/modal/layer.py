@@ -1,0 +1,98 @@
+"""Modes of the patterned layer, in the basis of the homogeneous modes.
+
+Curl-curl equation in the layer, longitudinal field eliminated (u transverse field, p its continuous partner):
+
+    growth u'' = stiffness u,    p = growth u',    u = w exp(i q z):  -q² growth w = stiffness w
+
+``electric`` form, u = E_t: stiffness = curl - k0² mass_eps, 1/growth = 1/mass - grad (k0² scalar_eps)⁻¹ gradᵀ.
+``magnetic`` form, u = H_t: stiffness = curl_(1/eps) - k0² mass, 1/growth = 1/mass_(1/eps) - grad (k0² scalar)⁻¹ gradᵀ.
+Both are Galerkin forms of the same Maxwell problem with errors of opposite tendency: their mean is better than
+either, their difference measures the error. All matrices are symmetric, and real without absorption.
+
+TM unknowns are scaled by k0 / sqrt(tm), the size of their growth, which keeps rim-graded bases accurate.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.modal.homogeneous import Basis
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Medium:
+    """Numbers of one case in half pitches: k0 and the permittivities of disc and surroundings."""
+
+    k0: float
+    disc: complex
+    around: complex
+
+    def permittivities(self) -> tuple[complex, complex]:
+        """Both, as real numbers where neither absorbs: the arithmetic stays real."""
+        if self.disc.imag == 0 and self.around.imag == 0:
+            return self.disc.real, self.around.real
+        return self.disc, self.around
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LayerModes:
+    """Fields and partners of the layer modes, columns scaled alike.
+
+    q: (n,) axial wavenumbers, decaying or going up. field: (n, n) w. partner: (n, n) growth w.
+    """
+
+    q: np.ndarray
+    field: np.ndarray
+    partner: np.ndarray
+
+
+def axial(square: np.ndarray) -> np.ndarray:
+    """The root of q² that decays upwards, or goes up where it does neither."""
+    q = np.sqrt(square + 0j)
+    flip = (q.imag < 0) | ((np.abs(q.imag) <= 1e-9 * np.abs(q)) & (q.real < 0))
+    return np.where(flip, -q, q)
+
+
+def electric_modes(basis: Basis, medium: Medium) -> LayerModes:
+    """Layer modes for u = E_t."""
+    disc, around = medium.permittivities()
+    n, a, k0 = basis.size, len(basis.te), medium.k0
+    scale = k0 / np.sqrt(basis.tm)
+    both = np.concatenate([np.ones(a), scale])
+    stiffness = -(k0**2) * (disc - around) * basis.disc_mass
+    diagonal = np.arange(n)
+    stiffness[diagonal, diagonal] -= k0**2 * around
+    stiffness[diagonal[:a], diagonal[:a]] += basis.te
+    level = 1 / np.concatenate([np.sqrt(basis.te + k0**2), np.full(n - a, k0)])
+    inverse = np.linalg.inv(level[:, None] * stiffness * level)
+    longitudinal = (disc - around) * basis.disc_scalar + around * np.eye(n - a)
+    shrink = np.linalg.solve(np.eye(n - a) - longitudinal * scale**2, longitudinal)
+    shrink = (shrink + shrink.T) / 2
+    level = level * both
+    problem = level[:, None] * inverse * level
+    problem[:, a:] = -problem[:, a:] @ shrink
+    value, vectors = np.linalg.eig(problem)
+    partner = vectors.copy()
+    partner[a:] = -shrink @ vectors[a:]
+    return LayerModes(axial(-1 / value), vectors / both[:, None], partner * both[:, None])
+
+
+def magnetic_modes(basis: Basis, medium: Medium) -> LayerModes:
+    """Layer modes for u = H_t."""
+    disc, around = (1 / e for e in medium.permittivities())
+    n, a, k0 = basis.size, len(basis.te), medium.k0
+    scale = k0 / np.sqrt(basis.tm)
+    both = np.concatenate([np.ones(a), scale])
+    weighted = (disc - around) * basis.disc_mass + around * np.eye(n)
+    inverse = both[:, None] * np.linalg.inv(weighted) * both
+    tail = np.arange(a, n)
+    inverse[tail, tail] -= 1
+    growth = np.linalg.inv(inverse)
+    growth = (growth + growth.T) / 2
+    stiffness = (disc - around) * basis.disc_curl + np.diag(around * basis.te - k0**2)
+    level = 1 / np.sqrt(basis.te + k0**2)
+    problem = np.empty_like(growth)
+    problem[:a] = level[:, None] * np.linalg.solve(level[:, None] * stiffness * level, level[:, None] * growth[:a])
+    problem[a:] = -((scale / k0) ** 2)[:, None] * growth[a:]
+    value, vectors = np.linalg.eig(problem)
+    return LayerModes(axial(-1 / value), vectors / both[:, None], both[:, None] * (growth @ vectors))
