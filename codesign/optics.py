@@ -23,6 +23,19 @@ Tensor = torch.Tensor
 
 
 @dataclass(frozen=True, slots=True)
+class Spread:
+    """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
+
+    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
+    astigmatism_waves: of stress and stage errors, waves at the rim.
+    """
+
+    focus_um: float = 0.0
+    tilt_waves: float = 0.0
+    astigmatism_waves: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class OpticsConfig:
     """The lens in front of the sensor, and how finely training sees it.
 
@@ -34,6 +47,7 @@ class OpticsConfig:
     sample_um: of the PSFs; the image is formed on this grid before the pixels integrate it.
     window_samples: of the PSFs.
     tolerance: of the low-rank PSF basis.
+    spread: of the lenses that are made.
     """
 
     aperture_mm: float = 1.0
@@ -47,6 +61,7 @@ class OpticsConfig:
     sample_um: float = 9.0
     window_samples: int = 33
     tolerance: float = 3e-3
+    spread: Spread = field(default_factory=Spread)
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -84,19 +99,6 @@ class OpticsConfig:
     def focus(self) -> Focus:
         """What the hyperbolic part images onto the sensor."""
         return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.focus_mm * 1e3)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Spread:
-    """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
-
-    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
-    astigmatism_waves: of stress and stage errors, waves at the rim.
-    """
-
-    focus_um: float = 0.0
-    tilt_waves: float = 0.0
-    astigmatism_waves: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)

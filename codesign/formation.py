@@ -1,0 +1,55 @@
+"""From light on the image grid to what the network sees and what it costs, and the depth that a PSF stack tells."""
+
+import torch
+from torch import Tensor
+
+from codesign import cost
+from codesign.architecture import Architecture
+from codesign.optics import OpticsConfig, Stack
+from codesign.supernet import Supernet
+from metalens import sensor as camera
+from metalens.fisher import encircled_energy, texture_information
+from metalens.sensor import Sensor
+
+
+def read_out(
+    irradiance: Tensor, sample_um: float, pitch_um: Tensor, sensor: Sensor, *, generator: torch.Generator | None
+) -> Tensor:
+    """(batch, 1, rows, columns) standardised frames as the network sees them: pixels, noise, quantisation."""
+    mean = camera.mean_electrons(irradiance, sample_um, sensor=sensor, pitch_um=pitch_um)
+    frames = camera.digitise(camera.expose(mean, sensor=sensor, generator=generator), sensor=sensor)
+    centred = frames - frames.mean((-2, -1), keepdim=True)
+    return (centred / centred.std((-2, -1), keepdim=True).clamp_min(1e-6))[:, None].to(torch.float32)
+
+
+def network_macs(net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
+    """Multiply-accumulates of one member at this pitch, differentiable."""
+    return cost.macs(net.space, architecture, window_um / pitch_um * architecture.resolution)
+
+
+def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:
+    """-log of the information on depth in blurred texture, and a hinge on the encircled energy (paper Eq. 6).
+
+    A texture's blur is what the network reads; the information of the PSF alone ranks lenses wrongly.
+    """
+    psfs = made.intensity
+    size = psfs.shape[-1]
+    spectrum = _texture(size).to(psfs)
+    step = (made.depths_um[1:] - made.depths_um[:-1])[:, None, None].to(psfs)
+    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
+    told = torch.stack(
+        [
+            texture_information(pair, step_um=float(gap), spectrum=spectrum, noise=1e-3)[0]
+            for pair, gap in zip(pairs, step.flatten(), strict=True)
+        ]
+    )
+    share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
+    return -torch.log(told + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+
+
+def _texture(size: int) -> Tensor:
+    """Power of a 1/f texture on the grid of rfft2, of mean 1."""
+    fy, fx = torch.fft.fftfreq(size), torch.fft.rfftfreq(size)
+    power = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
+    scaled: Tensor = power / power.mean()
+    return scaled

@@ -1,0 +1,299 @@
+"""The inner loop: lens, pixel pitch and network weights move together against one loss (paper Eqs. 8 and 10).
+
+Every step draws its frames, architectures, noise and lens errors from the seed and the step's number alone, so a run
+that is stopped anywhere goes on bit for bit. Optics, pitch and weights have their own rates, clips and schedules: the
+gradients of phase coefficients are a hundred times smaller than those of weights, and one shared clip never acts.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from codesign import losses
+from codesign import optics as lens
+from codesign.architecture import Architecture, largest, sample, smallest
+from codesign.formation import depth_loss, network_macs, read_out
+from codesign.optics import OpticsConfig
+from codesign.supernet import Supernet
+from metalens.errors import ConfigError, TrainingError
+from metalens.scene import Frames, Imager, image
+from metalens.sensor import Sensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Batch:
+    """Rendered frames with what is true of them.
+
+    frames: sheets on the image grid, ``margin`` samples wider on every side.
+    mask: (batch, y, x) pupil coverage without the margin. slip_mm: (batch, 3).
+    """
+
+    frames: Frames
+    mask: Tensor
+    slip_mm: Tensor
+
+
+class Scenes(Protocol):
+    """Where frames come from: the same step gives the same frames."""
+
+    margin: int
+
+    def batch(self, step: int, size: int) -> Batch:
+        """``size`` frames of training step ``step``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own clip.
+
+    rate: largest learning rate; 0 keeps the group fixed.
+    start, end: part of the run in which it moves.
+    clip: largest norm of its gradient.
+    """
+
+    rate: float
+    start: float = 0.0
+    end: float = 1.0
+    clip: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.rate >= 0 and 0 <= self.start < self.end <= 1 and self.clip > 0):
+            raise ConfigError(f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0")
+
+    def at(self, progress: float) -> float:
+        """Learning rate at this part of the run."""
+        if not self.start <= progress < self.end:
+            return 0.0
+        inside = (progress - self.start) / (self.end - self.start)
+        return self.rate * min(1.0, inside / 0.1 + 0.01) * (0.5 + 0.5 * math.cos(math.pi * inside))
+
+
+@dataclass(frozen=True, slots=True)
+class InnerConfig:
+    """Settings of the inner loop.
+
+    steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest (sandwich rule); with
+        ``architecture`` fixed, that one alone is trained.
+    weights, optics, pitch: schedules of the three groups.
+    slip_weight, optics_weight, budget_weight: of Eq. 10. energy: encircled share that the optics loss keeps.
+    budget_mmacs: C_budget; 0 for none.
+    slip_scale_mm: spread of the slippage, the unit of the network's answer.
+    patience: steps without a finite gradient, one after the other, that end the run.
+    """
+
+    steps: int = 1000
+    batch: int = 32
+    seed: int = 0
+    subnets: int = 1
+    weights: Schedule = field(default_factory=lambda: Schedule(4e-3, clip=2.0))
+    optics: Schedule = field(default_factory=lambda: Schedule(0.02, 0.1, 0.8, clip=1.0))
+    pitch: Schedule = field(default_factory=lambda: Schedule(0.0, 0.1, 0.8, clip=1.0))
+    slip_weight: float = 2.0
+    optics_weight: float = 0.05
+    budget_weight: float = 1.0
+    energy: float = 0.4
+    budget_mmacs: float = 0.0
+    slip_scale_mm: tuple[float, float, float] = (1.4, 1.2, 2.3)
+    patience: int = 20
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.batch, self.patience) < 1 or self.subnets < 0:
+            raise ConfigError(f"steps {self.steps}, batch {self.batch}, patience {self.patience}: need 1 or more")
+
+
+@dataclass(eq=False)
+class Model:
+    """What training moves.
+
+    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um.
+    """
+
+    net: Supernet
+    coefficients_rad: nn.Parameter
+    log_pitch: nn.Parameter
+
+    @property
+    def pitch_um(self) -> Tensor:
+        """Pixel pitch, always above 0."""
+        return self.log_pitch.exp()
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One line of the log.
+
+    skipped: steps so far whose gradient was not finite.
+    """
+
+    step: int
+    loss: float
+    task: float
+    optics: float
+    pitch_um: float
+    mmacs: float
+    skipped: int
+
+
+def model(settings: OpticsConfig, *, pitch_um: float, seed: int) -> Model:
+    """A fresh model: network weights from the seed, a lens without added phase."""
+    torch.manual_seed(seed)
+    return Model(
+        Supernet(),
+        nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
+        nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
+    )
+
+
+class Trainer:
+    """The loop with its optimisers; ``state`` and ``restore`` keep everything that a resume needs."""
+
+    def __init__(
+        self,
+        inner: InnerConfig,
+        optics: OpticsConfig,
+        sensor: Sensor,
+        scenes: Scenes,
+        made: Model,
+        *,
+        architecture: Architecture | None = None,
+    ) -> None:
+        self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
+        self.architecture = architecture
+        self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
+            "weights": (inner.weights, list(made.net.parameters())),
+            "optics": (inner.optics, [made.coefficients_rad] if made.coefficients_rad.numel() else []),
+            "pitch": (inner.pitch, [made.log_pitch]),
+        }
+        self.optimisers = {
+            name: torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0)
+            for name, (_, parameters) in self.groups.items()
+            if parameters
+        }
+        self.step, self.skipped, self.bad_run = 0, 0, 0
+        self._imager: Imager | None = None
+
+    def run(self, *, until: int | None = None) -> Iterator[Record]:
+        """Train to ``until`` (the end of the run without it), yielding a record a step.
+
+        Raises:
+            TrainingError: no finite gradient for ``patience`` steps, with the cause.
+        """
+        self.model.net.train()
+        while self.step < min(until or self.inner.steps, self.inner.steps):
+            yield self._advance()
+
+    def state(self) -> dict[str, object]:
+        """Everything that the next step depends on."""
+        return {
+            "net": self.model.net.state_dict(),
+            "coefficients_rad": self.model.coefficients_rad.detach(),
+            "log_pitch": self.model.log_pitch.detach(),
+            "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
+            "counters": [self.step, self.skipped, self.bad_run],
+        }
+
+    def restore(self, state: dict[str, object]) -> None:
+        """Go on from what :meth:`state` gave."""
+        self.model.net.load_state_dict(state["net"])  # type: ignore[arg-type]
+        with torch.no_grad():
+            self.model.coefficients_rad.copy_(state["coefficients_rad"])  # type: ignore[arg-type]
+            self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
+        for name, optimiser in self.optimisers.items():
+            optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
+        self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
+        self._imager = None
+
+    def _advance(self) -> Record:
+        progress = self.step / self.inner.steps
+        rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
+        for optimiser in self.optimisers.values():
+            optimiser.zero_grad(set_to_none=True)
+        task, optics_loss, macs = self._losses(live=rates["optics"] > 0, pitch_moves=rates["pitch"] > 0)
+        total = task + self.inner.optics_weight * optics_loss
+        if self.inner.budget_mmacs:
+            total = total + self.inner.budget_weight * losses.over_budget(macs, self.inner.budget_mmacs * 1e6)
+        total.backward()  # type: ignore[no-untyped-call]
+        self._apply(rates, finite=bool(torch.isfinite(total)) and self._finite())
+        self.step += 1
+        loss, task_loss, optics_value, pitch_um, mmacs = (
+            float(v.detach()) for v in (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
+        )
+        return Record(self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped)
+
+    def _losses(self, *, live: bool, pitch_moves: bool) -> tuple[Tensor, Tensor, Tensor]:
+        batch = self.scenes.batch(self.step, self.inner.batch)
+        with torch.set_grad_enabled(live):
+            optics, optics_loss = self._light(batch.frames, live)
+            irradiance = image(batch.frames, optics, margin=self.scenes.margin)
+        pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
+        frames = read_out(irradiance, self.optics.sample_um, pitch, self.sensor, generator=self._generator(1))
+        scale = torch.tensor(self.inner.slip_scale_mm)
+        members = self._members()
+        parts = [
+            losses.task(self.model.net(frames, a), batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight)
+            for a in members
+        ]
+        size = irradiance.shape[-1] * self.optics.sample_um
+        macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members]).mean()
+        return torch.stack(parts).mean(), optics_loss, macs
+
+    def _light(self, frames: Frames, live: bool) -> tuple[Imager, Tensor]:
+        """Imager of this step, and the optics loss; kept from step to step while the optics are fixed."""
+        spread = self._lens_error()
+        if not live and spread is None and self._imager is not None:
+            return self._imager, torch.zeros(())
+        made = lens.stack(self.optics, self.model.coefficients_rad, error=spread)
+        prepared = lens.prepared(self.optics, made, frames.radiance.shape[-1], margin=self.scenes.margin)
+        self._imager = None if live or spread is not None else prepared
+        return prepared, depth_loss(made, self.optics, energy=self.inner.energy)
+
+    def _lens_error(self) -> Tensor | None:
+        spread = self.optics.spread
+        deviations = torch.tensor([spread.focus_um, spread.tilt_waves, spread.astigmatism_waves])
+        return deviations * torch.randn(3, generator=self._generator(2)) if bool(deviations.any()) else None
+
+    def _members(self) -> Sequence[Architecture]:
+        if self.architecture is not None:
+            return [self.architecture]
+        space = self.model.net.space
+        generator = np.random.default_rng([self.inner.seed, self.step, 3])
+        return [largest(space), smallest(space), *(sample(space, generator) for _ in range(self.inner.subnets))]
+
+    def _generator(self, stream: int) -> torch.Generator:
+        seed = int(np.random.SeedSequence([self.inner.seed, self.step, stream]).generate_state(1, np.uint64)[0])
+        return torch.Generator().manual_seed(seed >> 1)
+
+    def _finite(self) -> bool:
+        grads = [p.grad for _, ps in self.groups.values() for p in ps if p.grad is not None]
+        return all(bool(torch.isfinite(g).all()) for g in grads)
+
+    def _apply(self, rates: dict[str, float], *, finite: bool) -> None:
+        if not finite:
+            self.skipped, self.bad_run = self.skipped + 1, self.bad_run + 1
+            if self.bad_run >= self.inner.patience:
+                raise TrainingError(
+                    f"no finite gradient in {self.bad_run} steps up to step {self.step}; {self._culprits()}; "
+                    "lower the learning rates or resume from an earlier checkpoint"
+                )
+            return
+        self.bad_run = 0
+        for name, optimiser in self.optimisers.items():
+            schedule, parameters = self.groups[name]
+            if rates[name] > 0:
+                nn.utils.clip_grad_norm_(parameters, schedule.clip)
+                for group in optimiser.param_groups:
+                    group["lr"] = rates[name]
+                optimiser.step()
+
+    def _culprits(self) -> str:
+        bad = [
+            name
+            for name, (_, parameters) in self.groups.items()
+            if any(p.grad is not None and not bool(torch.isfinite(p.grad).all()) for p in parameters)
+        ]
+        return "not finite: " + (" and ".join(bad) if bad else "the loss itself")

@@ -1,0 +1,151 @@
+"""The inner loop: bit-identical from a seed and after a stop, moves only what is scheduled, survives bad gradients."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from codesign import inner
+from codesign.architecture import Space, smallest
+from codesign.inner import Batch, InnerConfig, Schedule, Trainer
+from codesign.optics import OpticsConfig, Spread
+from metalens.errors import ConfigError, TrainingError
+from metalens.scene import Frames
+from metalens.sensor import Sensor
+
+OPTICS = OpticsConfig(
+    aperture_mm=0.3, sensor_distance_mm=1.0, polynomials=6, depth_count=4, window_samples=9, depths_mm=(14.0, 30.0)
+)
+SENSOR = Sensor(pitch_um=9.0)
+SIZE = 48
+
+
+class Discs:
+    """A dark pupil on a rough iris at a depth that the slip changes: the smallest scene with all labels."""
+
+    margin = 4
+
+    def batch(self, step, size):
+        generator = torch.Generator().manual_seed(step + 1)
+        full = SIZE + 2 * self.margin
+        texture = torch.rand(size, full, full, generator=generator) * 0.5 + 0.4
+        slip = torch.randn(size, 3, generator=generator)
+        x = torch.arange(full, dtype=torch.float32) - (full - 1) / 2
+        pupil = (torch.hypot(x - 4 * slip[:, :1, None], (x - 4 * slip[:, 1:2]).unsqueeze(-1)) < 8).float()
+        light = texture * (1 - 0.9 * pupil)
+        radiance = torch.stack([torch.zeros_like(light), light], 1)
+        coverage = torch.stack([torch.zeros_like(light), torch.ones_like(light)], 1)
+        depth = (20_000 + 2000 * slip[:, 2]).clamp(14_500, 29_000)[:, None, None, None].expand_as(radiance)
+        inside = slice(self.margin, -self.margin)
+        return Batch(Frames(radiance, coverage, depth.contiguous()), pupil[:, inside, inside], slip)
+
+
+def _trainer(config=None, *, optics=OPTICS, architecture=None):
+    config = config or InnerConfig(steps=6, batch=2, subnets=0)
+    made = inner.model(optics, pitch_um=9.0, seed=config.seed)
+    return Trainer(config, optics, SENSOR, Discs(), made, architecture=architecture)
+
+
+def _weights(trainer):
+    state = trainer.model
+    return [*state.net.state_dict().values(), state.coefficients_rad.detach(), state.log_pitch.detach()]
+
+
+def _equal(a, b):
+    return all(torch.equal(x, y) for x, y in zip(_weights(a), _weights(b), strict=True))
+
+
+MOVING = InnerConfig(
+    steps=6,
+    batch=2,
+    subnets=1,
+    optics=Schedule(0.02, 0.0, 0.7),
+    pitch=Schedule(0.02, 0.0, 0.7),
+    budget_mmacs=1.0,
+)
+
+
+def test_two_runs_from_one_seed_are_bit_identical():
+    one, two = _trainer(MOVING), _trainer(MOVING)
+    assert list(one.run()) == list(two.run())
+    assert _equal(one, two)
+
+
+@pytest.mark.parametrize("stop", [1, 4])
+def test_a_stopped_run_goes_on_bit_for_bit(stop, tmp_path):
+    from codesign import checkpoint
+
+    whole = _trainer(MOVING)
+    lines = list(whole.run())
+    first = _trainer(MOVING)
+    list(first.run(until=stop))
+    checkpoint.save(tmp_path / "c", first.state(), settings=MOVING)
+    second = _trainer(MOVING)
+    second.restore(checkpoint.load(tmp_path / "c", settings=MOVING))
+    assert list(second.run()) == lines[stop:]
+    assert _equal(whole, second)
+
+
+def test_optics_and_pitch_move_only_inside_their_schedules():
+    trainer = _trainer(MOVING)
+    list(trainer.run(until=5))
+    lens, pitch = trainer.model.coefficients_rad.detach().clone(), float(trainer.model.log_pitch.detach())
+    assert float(lens.abs().max()) > 0
+    assert pitch != math.log(9.0)
+    list(trainer.run())
+    torch.testing.assert_close(trainer.model.coefficients_rad.detach(), lens, rtol=0, atol=0)
+    assert float(trainer.model.log_pitch.detach()) == pitch
+
+
+def test_a_budget_drives_the_pitch_up():
+    trainer = _trainer(replace(MOVING, budget_weight=100.0), architecture=smallest(Space()))
+    list(trainer.run())
+    assert float(trainer.model.pitch_um) > 9.0
+
+
+def test_a_bad_gradient_is_skipped_and_counted():
+    trainer = _trainer(architecture=smallest(Space()))
+    before = [w.clone() for w in _weights(trainer)]
+    hook = trainer.model.net.stem.weight.register_hook(lambda g: g * float("nan"))
+    record = next(trainer.run())
+    assert record.skipped == 1
+    assert all(torch.equal(a, b) for a, b in zip(before, _weights(trainer), strict=True))
+    hook.remove()
+    assert list(trainer.run())[-1].skipped == 1
+
+
+def test_only_bad_gradients_end_the_run_with_the_cause():
+    trainer = _trainer(InnerConfig(steps=6, batch=2, patience=3), architecture=smallest(Space()))
+    trainer.model.net.stem.weight.register_hook(lambda g: g * float("inf"))
+    with pytest.raises(TrainingError, match=r"no finite gradient in 3 steps up to step 2; not finite: weights"):
+        list(trainer.run())
+
+
+def test_lens_errors_are_drawn_anew_each_step_and_belong_to_the_step():
+    optics = replace(OPTICS, spread=Spread(focus_um=5.0, tilt_waves=0.1, astigmatism_waves=0.1))
+    trainer = _trainer(optics=optics)
+    first = trainer._lens_error()
+    assert torch.equal(first, trainer._lens_error())
+    trainer.step = 1
+    assert not torch.equal(first, trainer._lens_error())
+
+
+def test_the_optics_loss_falls_along_its_own_gradient():
+    from codesign import formation
+    from codesign import optics as lens
+
+    coefficients = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    start = formation.depth_loss(lens.stack(OPTICS, coefficients), OPTICS, energy=0.4)
+    (slope,) = torch.autograd.grad(start, coefficients)
+    assert float(slope.norm()) > 0
+    step = (0.05 / float(slope.norm())) * slope
+    after = formation.depth_loss(lens.stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4)
+    assert float(after) < float(start)
+
+
+def test_impossible_schedules_are_refused():
+    with pytest.raises(ConfigError, match="0 <= start < end"):
+        Schedule(0.1, 0.8, 0.2)
+    with pytest.raises(ConfigError, match="need 1 or more"):
+        InnerConfig(steps=0)
