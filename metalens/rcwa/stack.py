@@ -1,0 +1,155 @@
+"""Fields of a whole stack: half-spaces, films and pillar layers, matched without growing exponentials.
+
+A plane's upward-radiating fields form a pair (U, V): every field that only light from above can not reach is u = U a,
+w = V a. Since P and Q are symmetric, two solutions keep u1^T w2 - w1^T u2 from plane to plane, so "radiates upwards"
+reads V^T u - U^T w = 0, and a pair passes from the top of a layer to its foot by one linear solve with decaying
+factors only.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens.rcwa.layer import Layer
+from metalens.rcwa.waves import Waves, half_space, normal_component
+
+Array = np.ndarray[Any, np.dtype[Any]]
+Pair = tuple[Array, Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Media:
+    """Refractive indices and thicknesses at one wavelength (exp(-iwt)); lengths in units of 1/k0.
+
+    under, over: (index, thickness) of the films, in the order that the light meets them.
+    heights: of the pillar layers, foot first.
+    """
+
+    substrate: complex
+    cover: complex
+    under: tuple[tuple[complex, float], ...] = ()
+    over: tuple[tuple[complex, float], ...] = ()
+    heights: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Amplitudes:
+    """Power-normalised amplitudes of every order for unit incident power in the zero order: (*batch, n).
+
+    t, r: of the outgoing waves in cover and substrate, 0 where a wave carries no power.
+    """
+
+    t: Array
+    r: Array
+
+
+def respond(ways: Waves, media: Media, layers: list[Layer], zero: int) -> Amplitudes:
+    """Response to the zero order (place ``zero``) from the substrate; no layers: a stack of films."""
+    top, lift = _through(ways, half_space(ways, media.cover), tuple(reversed(media.over)))
+    foot, drop = _through(ways, half_space(ways, media.substrate), media.under)
+    source = np.zeros(len(ways.kappa), complex)
+    below = half_space(ways, media.substrate)
+    source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
+    u, w, u_top, w_top = _match(layers, media.heights, top, foot, source)
+    up = (np.conj(top[0]) * u_top + np.conj(top[1]) * w_top) / (np.abs(top[0]) ** 2 + np.abs(top[1]) ** 2)
+    incident = _flux(below)[zero]
+    t = up * lift * np.sqrt(_flux(half_space(ways, media.cover)) / incident)
+    return Amplitudes(t, _reflected(ways, media, u, w, zero) * np.sqrt(_flux(below) / incident))
+
+
+def _match(
+    layers: list[Layer], heights: tuple[float, ...], top: Pair, foot: Pair, source: Array
+) -> tuple[Array, Array, Array, Array]:
+    """u and w at the foot of the lowest layer and at the top of the highest one."""
+    if not layers:
+        a = source / (foot[1] * top[0] + foot[0] * top[1])
+        return top[0] * a, top[1] * a, top[0] * a, top[1] * a
+    pair, returns = top, []
+    for part, height in zip(reversed(layers), reversed(heights), strict=True):
+        back, kept, fade = _reflection(part, height, pair)
+        returns.append((back, kept, fade))
+        pair = _foot_pair(part, back, kept, fade)
+    a = _solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
+    u, w = _times(pair[0], a), _times(pair[1], a)
+    u_top, w_top = u, w
+    for i, (part, (back, kept, fade)) in enumerate(zip(layers, reversed(returns), strict=True)):
+        if i:
+            a = (_solve(part.W, u_top) + _solve(part.V, w_top)) / 2
+        down = _times(back, a[..., :kept])
+        up = np.concatenate([fade * a[..., :kept], np.zeros_like(a[..., kept:])], axis=-1)
+        u_top, w_top = _times(part.W, up + down), _times(part.V, up - down)
+    return u, w, u_top, w_top
+
+
+def _reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Array]:
+    """Downward amplitudes at the top for each upward one at the foot, for the modes that reach the top at all."""
+    exponent = part.q * height
+    kept = int(np.count_nonzero(exponent.imag < _FADED, axis=-1).max())
+    fade = np.exp(1j * exponent[..., :kept])
+    wv, vw = _across(pair[0], part.V), _across(pair[1], part.W)
+    return np.linalg.solve(wv + vw, (wv - vw)[..., :kept] * fade[..., None, :]), kept, fade
+
+
+_FADED = 41.0  # exp(-41) = 1.6e-18
+
+
+def _foot_pair(part: Layer, back: Array, kept: int, fade: Array) -> Pair:
+    U, V = part.W.astype(complex), part.V.astype(complex)
+    trip = fade[..., :, None] * back[..., :kept, :]
+    U[..., :kept] += part.W[..., :kept] @ trip
+    V[..., :kept] -= part.V[..., :kept] @ trip
+    return U, V
+
+
+def _through(ways: Waves, pair: Pair, films: tuple[tuple[complex, float], ...]) -> tuple[Pair, Array]:
+    """An outgoing pair seen through films, nearest to its half-space first, and the decay of its waves on the way."""
+    u, w = pair
+    fade = np.ones(len(ways.kappa), complex)
+    is_p = np.arange(len(ways.kappa)) < ways.p_count
+    for index, thickness in films:
+        kz = normal_component(ways.kappa, index)
+        once = np.exp(1j * kz * thickness)
+        cosine = (1 + once**2) / 2
+        sine = np.where(kz == 0, thickness, np.expm1(2j * kz * thickness) / (2j * np.where(kz == 0, 1, kz)))
+        alpha, beta = np.where(is_p, index**2, kz**2), np.where(is_p, kz**2 / index**2, 1.0)
+        u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
+        fade = fade * once
+    return (u, w), fade
+
+
+def _reflected(ways: Waves, media: Media, u: Array, w: Array, zero: int) -> Array:
+    """Reflected amplitudes in the substrate from the fields above the films under the pillar."""
+    U, V = half_space(ways, media.substrate)
+    live = _flux((U, V)) > 0
+    u, w = np.where(live, u, 0), np.where(live, w, 0)
+    is_p = np.arange(len(U)) < ways.p_count
+    for index, thickness in reversed(media.under):
+        kz = normal_component(np.where(live, ways.kappa, 0), index)
+        cosine = np.cos(kz * thickness)
+        sine = np.where(kz == 0, thickness, np.sin(kz * thickness) / np.where(kz == 0, 1, kz))
+        alpha, beta = np.where(is_p, index**2, kz**2), np.where(is_p, kz**2 / index**2, 1.0)
+        u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
+    unit = np.zeros(len(U))
+    unit[zero] = 1
+    back = np.conj(U) * (u - U * unit) - np.conj(V) * (w - V * unit)
+    return np.asarray(np.where(live, back / (np.abs(U) ** 2 + np.abs(V) ** 2), 0))
+
+
+def _flux(pair: Pair) -> Array:
+    """Power along z of outgoing waves of unit amplitude, Re(u w*); 0 for waves that decay."""
+    flux = (pair[0] * np.conj(pair[1])).real
+    return np.where(flux > 1e-12 * np.abs(pair[0] * pair[1]), flux, 0.0)
+
+
+def _across(left: Array, matrix: Array) -> Array:
+    return left[:, None] * matrix if left.ndim == 1 else np.swapaxes(left, -1, -2) @ matrix
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    right = np.broadcast_to(right, matrix.shape[:-1])
+    return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0])
