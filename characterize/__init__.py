@@ -4,12 +4,21 @@ Names load when first used: ``import characterize; characterize.fit(capture, len
 """
 
 import importlib
-from types import ModuleType
+from typing import Any
+
+_VERBS = {
+    "Capture": "capture",
+    "load": "capture",
+    "fit_pupil": "pupilfit",
+    "PupilSpec": "pupil",
+}
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
+    if name in _VERBS:
+        return getattr(importlib.import_module(f"{__name__}.{_VERBS[name]}"), name)
     try:
         return importlib.import_module(f"{__name__}.{name}")
     except ModuleNotFoundError as error:

@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "lens.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
     "layout": ("layout.command", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
+    "fit": ("characterize.command_fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
 }
