@@ -115,7 +115,7 @@ def make(
         wanted = phase(axis, axis[rows])[inside]
         made = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within)
         diameter[rows][inside] = made
-        sums.add(wanted, made, proxy, focus.wavelength_um)
+        sums.add(wanted, diameter[rows][inside].astype(float), proxy, focus.wavelength_um)
     lens = Lens(
         diameters=DiameterMap(diameter, cell.pitch_um),
         cell=cell,

@@ -1,0 +1,203 @@
+"""The chain as far as it stands, on a real lens: every stage is run as its command, and one report shows it all."""
+
+import contextlib
+import io
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from metalens import report
+from metalens.cli import main as run_verb
+from metalens.commands import Common
+from metalens.errors import ConfigError, MetalensError
+
+CELL = """# Amorphous-silicon pillars on fused silica; see docs/cell_study for how the pitch was chosen.
+[cell]
+pitch_um = 0.30
+height_um = 0.7
+pillar = {n = 3.6}
+substrate = "SiO2"
+
+[sweep]
+wavelengths_um = [0.85]
+tolerance = 1e-3
+"""
+DESIGN = """# The eye at 20 mm onto a sensor 2 mm behind a 1 mm lens (NA 0.24).
+profile = "hyperbolic"
+aperture_mm = {aperture_mm}
+wavelength_nm = 850.0
+sensor_distance_mm = 2.0
+source_distance_mm = 20.0
+library = "library.h5"
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One verb of the chain.
+
+    words: of the command line, relative to the demo's folder. pictures: files that the verb leaves, with captions.
+    """
+
+    title: str
+    text: str
+    words: tuple[str, ...]
+    pictures: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a verb did: its exit status, its --json result, and its wall time."""
+
+    stage: Stage
+    status: int
+    values: dict[str, Any]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens demo``.
+
+    Attributes:
+        output: folder for everything that is made; report.html is the page to open.
+        aperture_mm: diameter of the lens.
+    """
+
+    output: tyro.conf.Positional[Path]
+    aperture_mm: float = 1.0
+
+
+def stages() -> tuple[Stage, ...]:
+    """The chain, in order."""
+    return (
+        Stage(
+            "Pillar library",
+            "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
+            "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
+            ("library", "cell.toml", "-o", "library.h5"),
+            (
+                (
+                    "library.png",
+                    "Phase and transmission of the pillars with their error bars, and the proxy's residual.",
+                ),
+            ),
+        ),
+        Stage(
+            "Lens",
+            "Every site takes the printable diameter whose phase is the wanted one. A direct Rayleigh-Sommerfeld sum "
+            "over all pillars then shows where the light really meets.",
+            ("design", "design.toml", "-o", "lens.h5"),
+            (("lens.png", "Phase and diameter of the pillars across the lens, and a zoom to single pillars."),),
+        ),
+        Stage(
+            "Point spread functions",
+            "Images of point sources from 16 to 26 mm, computed on the sensor window only, to a stated error.",
+            ("psf", "lens.h5", "-o", "psf.h5"),
+            (
+                ("psf_xz.png", "Slice through the PSF along depth."),
+                ("psf_montage.png", "PSFs over depth and field angle."),
+                ("psf_information.png", "Axial information of Eq. 11; the normalisation decides the ranking."),
+                ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
+            ),
+        ),
+        Stage(
+            "Mask",
+            "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
+            "witness cells; checked against the design rules, written, read back and compared.",
+            ("layout", "lens.h5", "--process", "process.toml", "-o", "mask", "--oasis", "--gds"),
+            (
+                ("mask/die.png", "The whole die."),
+                ("mask/zoom.png", "Single pillars as polygons of the mask."),
+                ("mask/histogram.png", "How many pillars of each diameter."),
+                ("mask/margins.png", "Distance to the design rules."),
+            ),
+        ),
+    )
+
+
+def run(options: Options) -> int:
+    """Run the chain; exit 0 when every stage passed its own check, else the status of the first that did not."""
+    folder = options.output
+    if folder.exists() and any(folder.iterdir()) and not options.force:
+        raise ConfigError(f"{folder} is not empty; give --force to write into it")
+    if not 0.02 <= options.aperture_mm <= 10:
+        raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cell.toml").write_text(CELL, encoding="utf-8")
+    (folder / "design.toml").write_text(DESIGN.format(aperture_mm=options.aperture_mm), encoding="utf-8")
+    (folder / "process.toml").write_text(_default_process(), encoding="utf-8")
+    outcomes: list[Outcome] = []
+    for outcome in _chain(folder):
+        outcomes.append(outcome)
+        words = " ".join(outcome.stage.words)
+        options.console.say(f"{outcome.seconds:6.1f} s  metalens {words}  {'ok' if outcome.status == 0 else 'FAILED'}")
+    _write(folder, outcomes)
+    page = folder / "report.html"
+    values = {o.stage.words[0]: {"status": o.status, "seconds": o.seconds, **o.values} for o in outcomes}
+    options.console.result({"report": str(page), **values}, f"open {page}")
+    return next((o.status for o in outcomes if o.status), 0)
+
+
+def _chain(folder: Path) -> Iterator[Outcome]:
+    """Run the verbs in the demo's folder until one refuses its input."""
+    with contextlib.chdir(folder):
+        for stage in stages():
+            start, shown = time.perf_counter(), io.StringIO()
+            with contextlib.redirect_stdout(shown):
+                status = run_verb([*stage.words, "--json", "--force"])
+            values = json.loads(shown.getvalue()) if shown.getvalue().strip() else {}
+            yield Outcome(stage, status, values, time.perf_counter() - start)
+            if status == 2:
+                raise MetalensError(f"the demo stopped: `metalens {' '.join(stage.words)}` refused its input")
+
+
+def _write(folder: Path, outcomes: list[Outcome]) -> None:
+    total = sum(o.seconds for o in outcomes)
+    flat = {name: value for o in outcomes for name, value in o.values.items() if isinstance(value, int | float)}
+    keys = [
+        report.KeyFigure("pillars", f"{int(flat.get('pillars', 0)):,}"),
+        report.KeyFigure("numerical aperture", f"{flat.get('numerical_aperture', 0):.3f}"),
+        report.KeyFigure("focusing efficiency", f"{flat.get('efficiency', 0):.1%}"),
+        report.KeyFigure("every stage passed its check", _verdict(outcomes), good=not any(o.status for o in outcomes)),
+        report.KeyFigure("from cell to checked mask", f"{total:.0f} s"),
+    ]
+    rows = [(o.stage.title, "metalens " + " ".join(o.stage.words), o.seconds, _verdict([o])) for o in outcomes]
+    timing = report.Table(("stage", "command", "seconds", "check"), rows, "Run any of these yourself in this folder.")
+    sections = [_section(folder, outcome) for outcome in outcomes]
+    report.write(
+        folder / "report.html",
+        "From pillar cell to verified mask",
+        [report.Section("The chain", "Every stage is a command; every artefact is a file.", (timing,)), *sections],
+        lead="A metalens for an eye tracker, from the physics of one silicon pillar to the file that is written.",
+        key_figures=keys,
+    )
+
+
+def _section(folder: Path, outcome: Outcome) -> report.Section:
+    stage = outcome.stage
+    pictures = [
+        report.Figure((folder / name).read_bytes(), caption, wide=True)
+        for name, caption in stage.pictures
+        if (folder / name).is_file()
+    ]
+    rows = [
+        (name.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else value)
+        for name, value in outcome.values.items()
+        if isinstance(value, bool | int | float | str)
+    ]
+    table = report.Table(("result", "value"), rows, f"metalens {' '.join(stage.words)}: {outcome.seconds:.1f} s")
+    return report.Section(stage.title, stage.text, (*pictures, table))
+
+
+def _verdict(outcomes: list[Outcome]) -> str:
+    return "yes" if not any(o.status for o in outcomes) else "no"
+
+
+def _default_process() -> str:
+    return "# All defaults of the process description; see the mask page of the documentation.\n"

@@ -1,0 +1,150 @@
+"""DESIGN.toml to lens.h5: a hyperbolic, double-helix, cubic, Fisher or own phase made of printable pillars."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from metalens import config, design, lens, lens_plot, library, store
+from metalens.cell import Cell
+from metalens.commands import Common, Output
+from metalens.console import Console
+from metalens.design import Limits, Quality
+from metalens.errors import ConfigError
+from metalens.focus_check import FocusCheck, check_focus
+from metalens.profiles import Cubic, DoubleHelix, Focus, PhaseMap
+from metalens.proxy import Proxy
+from metalens.store import write_bytes
+
+Profile = Literal["hyperbolic", "double-helix", "cubic", "map"]
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """The content of DESIGN.toml.
+
+    profile: which phase.
+    aperture_mm: diameter of the round aperture, up to 10.
+    wavelength_nm: of the design.
+    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a collimated beam).
+    library: library.h5 of the pillar cell, relative to the config; without it ``cell`` is swept first.
+    cell: the pillar cell, where no library is given.
+    limits: what the process prints.
+    double_helix, cubic, map: of the profile of that name.
+    """
+
+    profile: Profile = "hyperbolic"
+    aperture_mm: float = 1.0
+    wavelength_nm: float = 850.0
+    sensor_distance_mm: float = 2.0
+    source_distance_mm: float = 20.0
+    library: Path | None = None
+    cell: Cell | None = None
+    limits: Limits = field(default_factory=Limits)
+    double_helix: DoubleHelix = field(default_factory=DoubleHelix)
+    cubic: Cubic = field(default_factory=Cubic)
+    map: PhaseMap | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.aperture_mm <= 10:
+            raise ConfigError(f"aperture_mm = {self.aperture_mm}: need a diameter above 0 and up to 10 mm")
+        if self.profile == "map" and self.map is None:
+            raise ConfigError("profile 'map' needs a table [map] with file and pitch_um")
+        if self.library is not None and self.cell is not None:
+            raise ConfigError("library and cell are both given; a library holds its cell: give one of them")
+
+    @property
+    def focus(self) -> Focus:
+        """What is imaged onto what, in um."""
+        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens design``.
+
+    Attributes:
+        config: DESIGN.toml.
+        output: the lens file to write.
+        skip_focus_check: leave out the exact diffraction sum around the focus.
+    """
+
+    config: tyro.conf.Positional[Path]
+    output: Output = Path("lens.h5")
+    skip_focus_check: bool = False
+
+
+def run(options: Options) -> int:
+    """Design the lens, check its focus, write it; exit 1 where the light does not focus where it should."""
+    wanted = config.load(options.config, Design)
+    target = options.claim(options.output)
+    cell, proxy, inputs = _pillars(wanted, options.config, options.console)
+    inputs[options.config.name] = store.sha256(options.config)
+    shape = {"double-helix": wanted.double_helix, "cubic": wanted.cubic, "map": _located(wanted, options.config)}
+    radius_um = wanted.aperture_mm * 500
+    phase = design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um)
+    made, quality = design.make(
+        phase,
+        wanted.focus,
+        aperture_um=2 * radius_um,
+        cell=cell,
+        proxy=proxy,
+        limits=wanted.limits,
+        profile=wanted.profile,
+        provenance=store.Provenance(config=config.dumps(wanted), inputs=inputs),
+    )
+    check = None if options.skip_focus_check or wanted.profile != "hyperbolic" else check_focus(made)
+    lens.save(target, made)
+    write_bytes(target.with_suffix(".png"), lens_plot.picture(made))
+    options.console.result(_values(quality, check), _text(target, wanted, quality, check))
+    return 0 if check is None or check.passed else 1
+
+
+def _pillars(wanted: Design, where: Path, console: Console) -> tuple[Cell, Proxy, dict[str, str]]:
+    """The pillar cell with its proxy, and the hash of the library file if there is one."""
+    if wanted.library is not None:
+        path = where.parent / wanted.library
+        made = library.load(path)
+        return made.cell, library.proxy_of(made), {path.name: store.sha256(path)}
+    cell = wanted.cell or library.DEFAULT_CELL
+    made = library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console)
+    return cell, library.proxy_of(made), {}
+
+
+def _located(wanted: Design, where: Path) -> PhaseMap | None:
+    """The phase map with its file relative to the config."""
+    if wanted.map is None:
+        return None
+    return PhaseMap(where.parent / wanted.map.file, wanted.map.pitch_um, wanted.map.add_focus)
+
+
+def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
+    values: dict[str, object] = {
+        "pillars": quality.pillars,
+        "numerical_aperture": quality.numerical_aperture,
+        "field_of_view_deg": math.degrees(quality.field_of_view_rad),
+        "efficiency": quality.efficiency,
+        "transmission": quality.transmission,
+        "strehl": quality.strehl,
+        "max_phase_error_rad": quality.max_phase_error_rad,
+    }
+    if check is not None:
+        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": check.z_um}
+        values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
+    return values
+
+
+def _text(target: Path, wanted: Design, quality: Quality, check: FocusCheck | None) -> str:
+    lines = [
+        f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
+        f"{wanted.wavelength_nm:g} nm",
+        f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
+        f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)",
+        f"  focusing efficiency {quality.efficiency:.3f}, mean |T|² {quality.transmission:.3f}, "
+        f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
+    ]
+    if check is not None:
+        lines.append(f"  exact diffraction sum: {check.text}")
+    return "\n".join(lines)
