@@ -1,0 +1,136 @@
+"""GDSII: one structure for each pillar class, one reference for each pillar, written in blocks of rows.
+
+Bytes are the same for the same plan: the time stamps are zero. Memory is one block, whatever the lens.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from layout import gdsii_bytes as gds
+from layout.jit import compiled
+from layout.mask import Figure, Lattice, MaskPlan, PillarClass
+from metalens import store
+from metalens.errors import ProcessError
+from metalens.store import Array
+
+_BLOCK = 1 << 18  # bytes of references made before they are written: within the processor's cache
+MOST_LAYERS = 32767  # layer numbers are signed 16-bit
+
+
+def write(plan: MaskPlan, path: str | Path) -> None:
+    """Write ``plan`` as GDSII; the file appears whole or not at all.
+
+    Raises:
+        ProcessError: a layer number beyond 32 767 or a polygon beyond 8190 points.
+        OSError: the target cannot be written, or the disk is full; what was there before stays.
+    """
+    with store.replacing(path) as part, open(part, "wb", buffering=0) as file:
+        for piece in _pieces(plan):
+            _write_all(file, piece)
+
+
+def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
+    """Raw files may take less than they are given."""
+    view = memoryview(piece)
+    while len(view):
+        view = view[file.write(view) :]
+
+
+def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
+    yield gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *[0] * 12) + gds.text(gds.LIBNAME, plan.name)
+    yield gds.record(gds.UNITS, gds.real(plan.unit_nm * 1e-3) + gds.real(plan.unit_nm * 1e-9))
+    yield b"".join(_class_structure(made) for made in plan.classes)
+    for figure in plan.figures:
+        yield _figure_structure(figure)
+    for lattice in plan.lattices:
+        yield _begin(lattice.name)
+        yield from _references(plan, lattice)
+        yield gds.record(gds.ENDSTR)
+    yield _begin(plan.name)
+    yield b"".join(_reference(part.name) for part in (*plan.figures, *plan.lattices))
+    yield gds.record(gds.ENDSTR) + gds.record(gds.ENDLIB)
+
+
+def _begin(name: str) -> bytes:
+    return gds.shorts(gds.BGNSTR, *[0] * 12) + gds.text(gds.STRNAME, name)
+
+
+def _class_structure(made: PillarClass) -> bytes:
+    shapes = b"".join(_boundary(made.layer, polygon) for polygon in made.polygons)
+    return _begin(made.name) + shapes + gds.record(gds.ENDSTR)
+
+
+def _figure_structure(figure: Figure) -> bytes:
+    shapes = [_boundary(layer, polygon) for layer, polygons in figure.polygons.items() for polygon in polygons]
+    return _begin(figure.name) + b"".join(shapes) + gds.record(gds.ENDSTR)
+
+
+def _boundary(layer: tuple[int, int], polygon: Array) -> bytes:
+    if len(polygon) + 1 > gds.MOST_POINTS:
+        raise ProcessError(
+            f"polygon of {len(polygon)} vertices on layer {layer}: GDSII holds {gds.MOST_POINTS - 1}; split it"
+        )
+    if max(layer) > MOST_LAYERS:
+        raise ProcessError(f"layer {layer[0]}/{layer[1]}: GDSII holds numbers to {MOST_LAYERS}; change the layer map")
+    head = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, layer[0]) + gds.shorts(gds.DATATYPE, layer[1])
+    return head + gds.points(np.concatenate([polygon, polygon[:1]])) + gds.record(gds.ENDEL)
+
+
+def _reference(name: str, x: int = 0, y: int = 0) -> bytes:
+    return gds.record(gds.SREF) + gds.text(gds.SNAME, name) + gds.points(np.array([[x, y]])) + gds.record(gds.ENDEL)
+
+
+def _references(plan: MaskPlan, lattice: Lattice) -> Iterator[memoryview]:
+    """The references of a lattice, in one buffer that is filled again and again."""
+    templates = _templates(plan)
+    word = templates.dtype.itemsize
+    buffer = np.empty((_BLOCK // (templates.shape[1] * word), templates.shape[1]), templates.dtype)
+    xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), templates.dtype)
+    for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
+        ys = _words(lattice.y0 - lattice.pitch * np.arange(first, first + len(block)), templates.dtype)
+        row, column = 0, 0
+        while row < len(block):
+            row, column, used = _fill(buffer, block, row, column, templates, xs, ys)
+            yield memoryview(buffer[:used]).cast("B")
+
+
+def _templates(plan: MaskPlan) -> Array:
+    """(classes, words) a reference to each class at (0, 0), in words of 4 or 2 bytes; x, y and the end come last."""
+    made = [_reference(kind.name) for kind in plan.classes]
+    longest = max(map(len, made))
+    if any(len(m) != longest for m in made):
+        raise ProcessError("cell names of the pillar classes differ in length; give them as many digits")
+    return np.frombuffer(b"".join(made), np.uint16 if longest % 4 else np.uint32).reshape(len(made), -1)
+
+
+def _words(values: Array, dtype: np.dtype[Any]) -> Array:
+    """(n, words) big-endian 32-bit numbers as they lie in the file."""
+    return np.ascontiguousarray(values.astype(">i4")).view(dtype).reshape(len(values), -1)
+
+
+@compiled
+def _fill(
+    buffer: Array, block: Array, row: int, column: int, templates: Array, xs: Array, ys: Array
+) -> tuple[int, int, int]:
+    """References of the sites from (row, column) on, until the buffer is full; (next row, column, references)."""
+    size, wide = templates.shape[1], xs.shape[1]
+    head, used = size - 3 * wide, 0
+    while row < block.shape[0]:
+        while column < block.shape[1]:
+            kind = block[row, column]
+            if kind:
+                if used == buffer.shape[0]:
+                    return row, column, used
+                for i in range(head):
+                    buffer[used, i] = templates[kind - 1, i]
+                for i in range(wide):
+                    buffer[used, head + i] = xs[column, i]
+                    buffer[used, head + wide + i] = ys[row, i]
+                    buffer[used, head + 2 * wide + i] = templates[kind - 1, head + 2 * wide + i]
+                used += 1
+            column += 1
+        row, column = row + 1, 0
+    return row, column, used

@@ -1,0 +1,68 @@
+"""Bytes of the OASIS format (SEMI P39): integers, reals, strings, compressed blocks, start and end."""
+
+import struct
+import zlib
+
+MAGIC = b"%SEMI-OASIS\r\n"
+PAD, START, END, CELLNAME, CELLNAME_REF, TEXTSTRING, TEXTSTRING_REF, PROPNAME, PROPNAME_REF = range(9)
+PROPSTRING, PROPSTRING_REF, LAYERNAME, LAYERNAME_TEXT, CELL_REF, CELL, XYABSOLUTE, XYRELATIVE = range(9, 17)
+PLACEMENT, PLACEMENT_ANY, TEXT, RECTANGLE, POLYGON, PATH, TRAPEZOID, TRAPEZOID_A, TRAPEZOID_B = range(17, 26)
+CTRAPEZOID, CIRCLE, PROPERTY, PROPERTY_REPEAT, XNAME, XNAME_REF, XELEMENT, XGEOMETRY, CBLOCK = range(26, 35)
+
+END_SIZE = 256
+
+
+def unsigned(value: int) -> bytes:
+    """7 bits a byte, least significant first; the top bit says that more follow."""
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def signed(value: int) -> bytes:
+    """Magnitude shifted left by the sign bit."""
+    return unsigned(abs(value) << 1 | (value < 0))
+
+
+def string(text: str) -> bytes:
+    """Length and characters."""
+    data = text.encode("ascii")
+    return unsigned(len(data)) + data
+
+
+def real(value: float) -> bytes:
+    """Whole numbers as such, their reciprocals as such, all others as IEEE double."""
+    if value > 0 and value == round(value):
+        return b"\0" + unsigned(round(value))
+    if value > 0 and 1 / round(1 / value) == value:
+        return b"\x02" + unsigned(round(1 / value))
+    return b"\x07" + struct.pack("<d", value)
+
+
+def compressed(raw: bytes | memoryview, level: int) -> bytes:
+    """A CBLOCK record, or the bytes themselves where compression gains nothing."""
+    packer = zlib.compressobj(level, zlib.DEFLATED, -15)
+    packed = packer.compress(raw) + packer.flush()
+    block = bytes([CBLOCK, 0]) + unsigned(len(raw)) + unsigned(len(packed)) + packed
+    return block if len(block) < len(raw) else bytes(raw)
+
+
+def start(unit_nm: float) -> bytes:
+    """Magic and START: version 1.0, grid steps in a micrometre, table offsets in the END record."""
+    return MAGIC + bytes([START]) + string("1.0") + real(1e3 / unit_nm) + unsigned(1)
+
+
+def end(offsets: tuple[int, int, int, int, int, int], checksum: int) -> bytes:
+    """The 256 bytes of END: strict name tables (0 where there is none), padding, CRC-32 of all before the CRC.
+
+    offsets: of the tables of cell names, text strings, property names, property strings, layer names, XNAMEs.
+    checksum: CRC-32 of the file so far.
+    """
+    head = bytes([END]) + b"".join(unsigned(1) + unsigned(offset) for offset in offsets)
+    fill = END_SIZE - len(head) - 5
+    length = unsigned(fill - 2) if fill - 2 > 127 else b"\x80" + bytes([fill - 1])
+    body = head + length + bytes(fill - len(length)) + b"\x01"
+    return body + struct.pack("<I", zlib.crc32(body, checksum))
