@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -10,6 +10,10 @@ from numpy.polynomial import chebyshev
 from metalens import polynomial
 from metalens.errors import DomainError
 from metalens.store import Array
+
+if TYPE_CHECKING:
+    from metalens.library import PillarLibrary
+    from metalens.proxy_fit import Wanted
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
@@ -174,6 +178,14 @@ class Proxy:
             int(arrays["power"]),
             float(arrays["max_angle_rad"]),
         )
+
+
+def fit(library: "PillarLibrary", wanted: "Wanted | None" = None) -> Proxy:
+    """The proxy of a library; :func:`metalens.proxy_fit.fit` gives its table of error against coefficients too."""
+    from metalens import proxy_fit
+
+    made: Proxy = proxy_fit.fit(library, wanted).proxy
+    return made
 
 
 def _is_torch(values: object) -> bool:

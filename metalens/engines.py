@@ -1,0 +1,110 @@
+"""Which solver takes a pillar cell, and one whose error changes smoothly with the diameter."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from metalens.cell import Cell
+from metalens.errors import CellError
+from metalens.materials import index
+from metalens.response import Response
+
+Engine = Literal["auto", "rcwa", "modal"]
+Polarization = Literal["x", "y", "s", "p"]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """One plane wave: vacuum wavelength, angle of incidence in air, and polarisation (x at normal incidence, s, p)."""
+
+    wavelength_um: float
+    angle_rad: float = 0.0
+    polarization: Polarization = "x"
+
+
+def choose(cell: Cell, engine: Engine = "auto") -> str:
+    """``modal`` for upright pillars without films (faster and more precise), ``rcwa`` for everything else."""
+    upright = not (cell.under or cell.over or cell.sidewall_rad)
+    if engine == "modal" and not upright:
+        raise CellError("the modal engine takes upright pillars without films; use engine 'rcwa' or 'auto'")
+    if engine == "auto":
+        return "modal" if upright else "rcwa"
+    return engine
+
+
+def lossless(cell: Cell, wavelength_um: float) -> bool:
+    """Whether no material of the cell absorbs, so that |t|² + |r|² = 1."""
+    films = [film.material for film in (*cell.under, *cell.over)]
+    return all(index(m, wavelength_um).imag == 0 for m in (cell.pillar, cell.between, cell.substrate, *films))
+
+
+def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Callable[[float], Response]:
+    """Response at a diameter, refined until its own error estimate meets the tolerance."""
+    if engine == "modal":
+        return functools.partial(_modal, cell, light, tolerance)
+    return functools.partial(_rcwa, cell, light, tolerance, None)
+
+
+def smooth(
+    cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str
+) -> Callable[[float], Response]:
+    """As :func:`precise`, on one discretisation for all diameters of ``span_um``.
+
+    It is the least that meets the tolerance at three probes. Elsewhere the error may exceed the tolerance (it is
+    reported), but it has no jumps that a rational fit would take for resonances.
+    """
+    levels = _modal_levels(cell, light, tolerance) if engine == "modal" else _rcwa_levels(cell, light, tolerance)
+    probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 0.97)]
+    for at in levels[:-1]:
+        if all(at(d).converged for d in probes):
+            return at
+    return levels[-1]
+
+
+def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
+    from metalens.modal.engine import case_of, evaluate
+    from metalens.modal.ladder import Rung, first_rung, rungs
+
+    def level(rung: Rung) -> Callable[[float], Response]:
+        def at(diameter_um: float) -> Response:
+            case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
+            made = evaluate(case, rung.plan)
+            error = rung.error(made.error)
+            t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
+            return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
+
+        return at
+
+    return [level(rung) for rung in rungs()[max(0, first_rung(tolerance) - 1) :]]
+
+
+def _rcwa_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
+    return [functools.partial(_rcwa, cell, light, tolerance, reach) for reach in (6, 8, 10, 12, 14)]
+
+
+def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Response:
+    from metalens import modal
+
+    return modal.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+    )
+
+
+def _rcwa(cell: Cell, light: Light, tolerance: float, harmonics: int | None, diameter_um: float) -> Response:
+    from metalens import rcwa
+
+    return rcwa.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+        harmonics=harmonics,
+    )

@@ -1,0 +1,184 @@
+"""Run a library sweep: one rational curve t(D) for every wavelength, angle and polarisation, on all cores."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+
+from metalens import __version__, config, engines, reduced, workers
+from metalens.cell import Cell
+from metalens.console import Console
+from metalens.engines import Light
+from metalens.library import PillarLibrary, Sweep
+from metalens.reduced import Curve, Nodes
+from metalens.store import Array, Provenance
+from metalens.workers import Result, Task
+
+AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where diameters are added
+FINEST_UM = 1e-4  # resonances narrower than this cannot be printed: sampled no finer
+MOST_ADDED = 400
+POINTS = 8  # entries a task when solved one by one
+
+
+def run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path | None) -> PillarLibrary:
+    """See :func:`metalens.library.sweep`."""
+    console = console or Console(quiet=True)
+    engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
+    lights = _lights(sweep)
+    span = sweep.span_um(cell)
+    journal = _Journal(checkpoint, cell, sweep)
+    tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
+    results = journal.run(tasks, console, "curves")
+    curves = [
+        reduced.curve(
+            _nodes(result),
+            tolerance=workers.FIT_SHARE * sweep.tolerance,
+            lossless=engines.lossless(cell, light.wavelength_um),
+        )
+        for result, light in zip(results, lights, strict=True)
+    ]
+    diameters = _diameters(span, sweep.samples, curves)
+    table = np.stack([_evaluate(c, diameters) for c in curves])  # (light, 3, diameter): t, r, error
+    extra = _points(cell, sweep, engine, lights, diameters, table[:, 2].real)
+    for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
+        _replace(table[lights.index(Light(*task["light"]))], diameters, result)
+    solves = sum(len(result["diameter_um"]) for result in results) + sum(len(t["diameters_um"]) for t in extra)
+    made = _library(
+        cell, sweep, engine, solves, diameters, dict(zip(lights, zip(curves, table, strict=True), strict=True))
+    )
+    journal.finish()
+    return made
+
+
+def _lights(sweep: Sweep) -> list[Light]:
+    """Every distinct plane wave: at normal incidence s and p are the same."""
+    return [
+        Light(w, math.radians(a), p)
+        for a in sweep.angles_deg
+        for p in (sweep.polarizations if a else ("x",))
+        for w in sweep.wavelengths_um
+    ]
+
+
+def _nodes(result: Result) -> Nodes:
+    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
+    error, energy = np.array(result["error"]), np.array(result["energy"])
+    return Nodes(
+        np.array(result["diameter_um"]), np.stack([t, r], 1), error, energy, result["converged"], result["reason"]
+    )
+
+
+def _evaluate(curve: Curve, diameters: Array) -> Array:
+    value, error = curve(diameters)
+    return np.stack([value[:, 0], value[:, 1], error + 0j])
+
+
+def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> Array:
+    """Even samples, and more where t turns fast: around every resonance, on its own scale."""
+    low, high = span
+    even = np.linspace(low, high, samples)
+    sharp = np.concatenate([curve.resonances() for curve in curves])
+    sharp = sharp[sharp[:, 1] < 3 * (even[1] - even[0])]  # wider ones are well sampled already
+    added = (sharp[:, :1] + np.array(AROUND) * np.maximum(sharp[:, 1:], FINEST_UM)).ravel()
+    added = np.unique(np.round(added[(added > low) & (added < high)], 6))
+    return np.unique(np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]]))
+
+
+def _points(cell: Cell, sweep: Sweep, engine: str, lights: list[Light], diameters: Array, error: Array) -> list[Task]:
+    """Tasks for the entries whose error bar on the curve is above the tolerance."""
+    tasks = []
+    for light, row in zip(lights, error, strict=True):
+        bad = diameters[row > sweep.tolerance].tolist()
+        for start in range(0, len(bad), POINTS):
+            some = bad[start : start + POINTS]
+            tasks.append(workers.points_task(cell, light, some, tolerance=sweep.tolerance, engine=engine))
+    return tasks
+
+
+def _replace(row: Array, diameters: Array, result: Result) -> None:
+    """Put single solves in place of the curve's values where their error is less."""
+    places: list[int] = np.searchsorted(diameters, np.array(result["diameter_um"])).tolist()
+    for place, t, r, error in zip(places, result["t"], result["r"], result["error"], strict=True):
+        if error < row[2, place].real:
+            row[:, place] = complex(*t), complex(*r), error
+
+
+def _library(
+    cell: Cell,
+    sweep: Sweep,
+    engine: str,
+    solves: int,
+    diameters: Array,
+    found: dict[Light, tuple[Curve, Array]],
+) -> PillarLibrary:
+    shape = (len(sweep.polarizations), len(sweep.angles_deg), len(sweep.wavelengths_um), len(diameters))
+    t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
+    resonances = []
+    for i, j, k in np.ndindex(*shape[:3]):
+        angle, wavelength = math.radians(sweep.angles_deg[j]), sweep.wavelengths_um[k]
+        curve, table = found[Light(wavelength, angle, sweep.polarizations[i] if angle else "x")]
+        t[i, j, k], r[i, j, k], error[i, j, k] = table[0], table[1], table[2].real
+        resonances += [(i, angle, wavelength, *pole) for pole in curve.resonances()]
+    return PillarLibrary(
+        cell,
+        sweep,
+        sweep.polarizations,
+        np.radians(sweep.angles_deg),
+        np.array(sweep.wavelengths_um),
+        diameters,
+        t,
+        r,
+        error,
+        np.abs(t) ** 2 + np.abs(r) ** 2,
+        np.array(resonances, float).reshape(-1, 5),
+        engine,
+        solves,
+        provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
+    )
+
+
+class _Journal:
+    """Finished tasks as JSON lines beside the output, so that an interrupted sweep goes on where it stopped.
+
+    The first line names the sweep; a file of another sweep is started afresh, a line cut short is dropped.
+    """
+
+    def __init__(self, path: Path | None, cell: Cell, sweep: Sweep) -> None:
+        self._path = path
+        self._title = json.dumps([__version__, config.dumps(cell), config.dumps(sweep)])
+        self._known: dict[str, Result] = {}
+        if path is None:
+            return
+        lines = path.read_text(encoding="utf-8").split("\n") if path.exists() else []
+        if lines and lines[0] == self._title:
+            for line in lines[1:-1]:
+                task, result = json.loads(line)
+                self._known[task] = result
+        else:
+            path.write_text(self._title + "\n", encoding="utf-8")
+
+    def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
+        """Results of the tasks in order; those in the journal are not computed again."""
+        keys = [json.dumps(task, sort_keys=True) for task in tasks]
+        left = [i for i, key in enumerate(keys) if key not in self._known]
+        if left and len(left) < len(tasks):
+            console.say(f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before")
+        stream = workers.run([tasks[i] for i in left])
+        for i, result in console.track(stream, total=len(left), label=label):
+            self._keep(keys[left[i]], result)
+        return [self._known[key] for key in keys]
+
+    def _keep(self, key: str, result: Result) -> None:
+        self._known[key] = result
+        if self._path is not None:
+            with open(self._path, "a", encoding="utf-8") as file:
+                file.write(json.dumps([key, result]) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+
+    def finish(self) -> None:
+        """The sweep is complete: its journal is no longer needed."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
