@@ -7,7 +7,6 @@ from typing import Literal
 
 from metalens.cell import Cell
 from metalens.errors import CellError
-from metalens.materials import index
 from metalens.response import Response
 
 Engine = Literal["auto", "rcwa", "modal"]
@@ -31,12 +30,6 @@ def choose(cell: Cell, engine: Engine = "auto") -> str:
     if engine == "auto":
         return "modal" if upright else "rcwa"
     return engine
-
-
-def lossless(cell: Cell, wavelength_um: float) -> bool:
-    """Whether no material of the cell absorbs, so that |t|² + |r|² = 1."""
-    films = [film.material for film in (*cell.under, *cell.over)]
-    return all(index(m, wavelength_um).imag == 0 for m in (cell.pillar, cell.between, cell.substrate, *films))
 
 
 def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Callable[[float], Response]:

@@ -18,6 +18,7 @@ from metalens.store import Array
 
 Solver = Callable[[float], Response]
 FIT_SHARE = 0.2  # of the tolerance: residual of the rational fit
+FLOOR_SHARE = 0.1  # of the tolerance: added to every estimate, for what no rival shows
 DOUBT_SHARE = 0.5  # of the tolerance: disagreement of the fits at which the search ends
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
 SCAN = 1200  # places where the fits are compared
@@ -46,20 +47,18 @@ class Curve:
     nodes: the exact solves.
     best: the rational fit of all nodes; rivals: fits of fewer nodes or fewer poles.
     tolerance: that the nodes were chosen for.
-    lossless: |t|² + |r|² = 1 holds, and its defect is one more error estimate.
     """
 
     nodes: Nodes
     best: Rational
     rivals: tuple[Rational, ...]
     tolerance: float
-    lossless: bool
 
     def __call__(self, diameter_um: Array) -> tuple[Array, Array]:
         """(..., 2) t and r, and (...) error estimate of t, not below the true error.
 
-        The estimate adds the largest disagreement with a rival fit (or the energy defect where lossless), the
-        residual of the fit, and the solver's error at the neighbouring nodes. At a node it is the solver's own.
+        The estimate adds the largest disagreement with a rival fit, the residual of the fit, a tenth of the
+        tolerance, and the solver's error at the neighbouring nodes. At a node it is the solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -81,9 +80,7 @@ class Curve:
     def _doubt(self, d: Array) -> Array:
         value = self.best(d)
         doubt = np.max([np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0)
-        if self.lossless:
-            doubt = np.maximum(doubt, np.abs((np.abs(value) ** 2).sum(-1) - 1))
-        return np.asarray(doubt + self.best.residual + FIT_SHARE * self.tolerance)
+        return np.asarray(doubt + self.best.residual + FLOOR_SHARE * self.tolerance)
 
     def resonances(self, half_width_um: float = 0.02) -> Array:
         """(k, 2) diameter and half-width of the poles nearer to the real axis than ``half_width_um``, um.
@@ -121,7 +118,8 @@ def explore(
     while calm < CALM and len(x) < most:
         fit, simpler = _fits(np.array(x), _responses(made), tolerance)
         where, doubt = _suspect(fit, [simpler, *past[-2:]], np.array(x))
-        still = doubt < DOUBT_SHARE * tolerance
+        enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(simpler.support)
+        still = enough and doubt < DOUBT_SHARE * tolerance
         where = _widest_gap(x) if still and calm == 0 else where
         response = solve(where)
         missed = np.abs(fit(np.array([where]))[0] - (response.t, response.r)).max()
@@ -138,18 +136,18 @@ def explore(
     return Nodes(np.array(x), _responses(made), errors, energies, calm == CALM, reason)
 
 
-def curve(nodes: Nodes, *, tolerance: float, lossless: bool) -> Curve:
+def curve(nodes: Nodes, *, tolerance: float) -> Curve:
     """The rational curve through exact solves, and the rivals that judge it."""
     x, y = nodes.diameter_um, nodes.response
     best, simpler = _fits(x, y, tolerance)
     shorter = tuple(rational.fit(x[:-k], y[:-k], tolerance=FIT_SHARE * tolerance) for k in (1, 2))
-    return Curve(nodes, best, (simpler, *shorter), tolerance, lossless)
+    return Curve(nodes, best, (simpler, *shorter), tolerance)
 
 
 def _fits(x: Array, y: Array, tolerance: float) -> tuple[Rational, Rational]:
-    """The fit of all data, and one with a pole less."""
-    best = rational.fit(x, y, tolerance=FIT_SHARE * tolerance)
-    simpler = rational.fit(x, y, tolerance=0.0, terms=max(1, len(best.support) - 1), start=best.support[:-1])
+    """A fit with a pole more than the data ask for, and the fit of least degree that meets them."""
+    simpler = rational.fit(x, y, tolerance=FIT_SHARE * tolerance)
+    best = rational.fit(x, y, tolerance=0.0, terms=len(simpler.support) + 1, start=simpler.support)
     return best, simpler
 
 
@@ -159,12 +157,18 @@ def _suspect(fit: Rational, rivals: list[Rational], x: Array) -> tuple[float, fl
     poles = fit.poles()
     poles = poles[(poles.real > low) & (poles.real < high) & (np.abs(poles.imag) < 0.1 * (high - low))]
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
-    places = np.unique(np.clip(np.concatenate([np.linspace(low, high, SCAN + 1), *around]), low, high))
-    places = places[np.abs(places[:, None] - x).min(1) > 1e-9]
-    value = fit(places)
-    doubt = np.max([np.abs(rival(places) - value).max(1) for rival in rivals], axis=0)
+    even, near = np.linspace(low, high, SCAN + 1), np.concatenate(around)
+    even = even[_distance(even, x) > (high - low) / (5 * len(x))]
+    near = near[(near > low) & (near < high) & (_distance(near, x) > 1e-9)]
+    places = np.concatenate([even, near])
+    value = fit(places)[:, 0]
+    doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)
     worst = int(np.argmax(doubt))
     return float(places[worst]), float(doubt[worst])
+
+
+def _distance(places: Array, x: Array) -> Array:
+    return np.asarray(np.abs(places[:, None] - x).min(axis=1, initial=np.inf))
 
 
 def _widest_gap(x: list[float]) -> float:

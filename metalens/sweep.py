@@ -31,14 +31,7 @@ def run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path |
     journal = _Journal(checkpoint, cell, sweep)
     tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
     results = journal.run(tasks, console, "curves")
-    curves = [
-        reduced.curve(
-            _nodes(result),
-            tolerance=workers.FIT_SHARE * sweep.tolerance,
-            lossless=engines.lossless(cell, light.wavelength_um),
-        )
-        for result, light in zip(results, lights, strict=True)
-    ]
+    curves = [reduced.curve(_nodes(result), tolerance=workers.FIT_SHARE * sweep.tolerance) for result in results]
     diameters = _diameters(span, sweep.samples, curves)
     table = np.stack([_evaluate(c, diameters) for c in curves])  # (light, 3, diameter): t, r, error
     extra = _points(cell, sweep, engine, lights, diameters, table[:, 2].real)
