@@ -65,18 +65,20 @@ def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float) -> Basis:
 
 
 def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """first (first⁻¹ second)^(1/2) of two nearby 2 x 2 matrices: unitary and symmetric where both are.
+    """first (first⁻¹ second)^(1/2) of two 2 x 2 matrices: unitary and symmetric where both are.
 
-    Falls back on the arithmetic mean where the ratio has no principal root nearby or ``first`` is singular.
+    The arithmetic mean, from which it differs in second order, where ``first`` is nearly singular (a black layer)
+    or the ratio has no principal root.
     """
-    size = np.linalg.norm(first, 2) ** 2
-    if abs(np.linalg.det(first)) < 1e-3 * size or np.linalg.norm(first - second, 2) > 0.3 * np.sqrt(size):
-        arithmetic: np.ndarray = (first + second) / 2
-        return arithmetic
-    ratio = np.linalg.solve(first, second)
-    root = np.sqrt(np.linalg.det(ratio) + 0j)
-    mean: np.ndarray = first @ ((ratio + root * np.eye(2)) / np.sqrt(np.trace(ratio) + 2 * root))
-    return mean
+    if abs(np.linalg.det(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
+        ratio = np.linalg.solve(first, second)
+        root = np.sqrt(np.linalg.det(ratio) + 0j)
+        trace = np.sqrt(np.trace(ratio) + 2 * root)
+        if abs(trace) > 0.1:
+            mean: np.ndarray = first @ ((ratio + root * np.eye(2)) / trace)
+            return mean
+    arithmetic: np.ndarray = (first + second) / 2
+    return arithmetic
 
 
 def evaluate(case: Case, plan: MeshPlan) -> Solution:
@@ -89,7 +91,7 @@ def evaluate(case: Case, plan: MeshPlan) -> Solution:
         b = basis(case.rho, plan, electric_walls, case.bloch)
         layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
         below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
-        full = scattering(layer, case.height, below, above)
+        full = scattering(layer, case.height, below, above).matrix
         te = case.p == magnetic if case.bloch else True
         foot = zero_order(b, below, case.bloch, te=te)
         top = len(below.ports) + zero_order(b, above, case.bloch, te=te)
@@ -98,9 +100,8 @@ def evaluate(case: Case, plan: MeshPlan) -> Solution:
         matrices.append(full[np.ix_((foot, top), (foot, top))] * np.array([[sign, 1.0], [1.0, sign]]))
         unknowns += b.size
     mean = geometric_mean(*matrices)
-    others = np.mean([p - (np.abs(m[:, 0]) ** 2).sum() for p, m in zip(powers, matrices, strict=True)])
-    energy = float((np.abs(mean[:, 0]) ** 2).sum() + others)
-    return Solution(mean, float(np.abs(matrices[0] - matrices[1]).max()) / 2, energy, unknowns)
+    half_difference = float(np.abs(matrices[0] - matrices[1]).max()) / 2
+    return Solution(mean, half_difference, float(np.mean(powers)), unknowns)
 
 
 def climb(case: Case, tolerance: float) -> tuple[Solution, float, bool, str]:

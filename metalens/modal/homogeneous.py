@@ -2,9 +2,11 @@
 
 The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu = kx² + ky²) and the rest
 (TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as exp(i kz z) with
-kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction.
+kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction. In the half-spaces the zero order
+is given its exact wavenumber, so that it propagates up to grazing incidence.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +19,16 @@ from metalens.modal.spaces import Space
 class Basis:
     """Mass-orthonormal modes of the empty cell, lengths in half pitches.
 
-    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise.
+    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise. te_exact, tm_exact: the same with that of the
+    zero order exact.
     vector: (unknowns, a + b) fields, TE first. scalar: (scalars, b) longitudinal fields of the TM modes.
     disc_mass: (a + b, a + b) mass inside the disc; disc_curl: (a, a); disc_scalar: (b, b).
     """
 
     te: np.ndarray
     tm: np.ndarray
+    te_exact: np.ndarray
+    tm_exact: np.ndarray
     vector: np.ndarray
     scalar: np.ndarray
     disc_mass: np.ndarray
@@ -33,6 +38,15 @@ class Basis:
     @property
     def size(self) -> int:
         return len(self.te) + len(self.tm)
+
+
+def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
+    """Discrete wavenumbers squared with the zero order's, where this family has it, set to its exact value."""
+    exact = (half_phase_rad or 0.0) ** 2
+    out = np.maximum(discrete, 0.0)
+    if abs(out[0] - exact) <= 0.05 * exact + 1e-9:
+        out[0] = exact
+    return out
 
 
 def gradients(space: Space, lower: np.ndarray, *, careful: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,6 +84,8 @@ def modes(space: Space, *, careful: bool = False) -> Basis:
     return Basis(
         te=np.maximum(te, 0.0),
         tm=tm,
+        te_exact=corrected(te, space.half_phase_rad),
+        tm_exact=corrected(tm, space.half_phase_rad),
         vector=vector,
         scalar=scalar,
         disc_mass=vector.T @ space.disc.mass @ vector,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.modal.homogeneous import Basis
-from metalens.modal.layer import LayerModes, Medium, axial
+from metalens.modal.layer import LayerModes, axial
 
 CARRY = 1e-13  # modes that decay below this over the height cannot change a result of double precision
 
@@ -29,7 +29,7 @@ def half_space(basis: Basis, k0: float, permittivity: float, *, magnetic: bool) 
 
     A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance stays finite.
     """
-    kz = axial(np.concatenate([k0**2 * permittivity - basis.te, k0**2 * permittivity - basis.tm]))
+    kz = axial(np.concatenate([k0**2 * permittivity - basis.te_exact, k0**2 * permittivity - basis.tm_exact]))
     kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
     a = len(basis.te)
     te, tm = (1 / permittivity, 1.0) if magnetic else (1.0, permittivity)
@@ -42,70 +42,99 @@ class Interface:
     """One end of the layer, seen by its carrying modes and by the propagating orders (power-normalised).
 
     reflect: (carry, carry) of layer modes; enter: (carry, ports); leave: (ports, carry); back: (ports, ports).
+    inward: (n, carry + ports) amplitudes of all layer modes going in, per carrying mode that arrives (its own
+    incoming amplitude left out) and per order that arrives.
     """
 
     reflect: np.ndarray
     enter: np.ndarray
     leave: np.ndarray
     back: np.ndarray
+    inward: np.ndarray
 
 
 def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interface:
-    """Reflect, enter and leave blocks at a half-space, from G applied to carrying partners and ports."""
+    """Blocks at a half-space, from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports."""
     admittance, ports = half.admittance, half.ports
-    rate = 1j * layer.q
-    norm = layer.partner[:, carry].T @ layer.field[:, carry]
+    rate, c, m = 1j * layer.q, len(carry), len(carry) + len(ports)
     columns = np.concatenate([layer.partner[:, carry], np.eye(len(admittance))[:, ports]], 1)
-    c = len(carry)
-    base_rate, base_admittance = rate, admittance
-    lossless = np.isrealobj(layer.field)
-    if lossless:
-        base_rate, base_admittance = -np.abs(rate), np.where(admittance.real == 0, -np.abs(admittance), admittance.real)
-        columns = columns.real
-    operator = layer.partner * base_rate + base_admittance[:, None] * layer.field
-    green = columns.T @ (layer.field @ np.linalg.solve(operator, columns))
-    if lossless:
-        correction = np.zeros((len(green), len(green)), complex)
-        correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rate[carry] - base_rate[carry]).T).T
-        correction[c:, c:] = np.diag(admittance[ports] - base_admittance[ports])
-        green = np.linalg.solve(np.eye(len(green)) + green @ correction, green)
+    norm = columns[:, :c].T @ layer.field[:, carry]
+    real = np.isrealobj(layer.field)
+    near_rate = -np.abs(rate) if real else rate
+    near = np.where(admittance.real == 0, -np.abs(admittance), admittance.real) if real else admittance
+    operator = layer.partner * near_rate + near[:, None] * layer.field
+    inward = np.linalg.solve(operator, columns)
+    green = columns.T @ (layer.field @ inward)
+    if real:
+        correction = np.zeros((m, m), complex)
+        correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rate[carry] - near_rate[carry])).T
+        correction[c:, c:] = np.diag(admittance[ports] - near[ports])
+        mend = np.linalg.inv(np.eye(m) + correction @ green)
+        green, inward = green @ mend, inward @ mend
     root = np.sqrt(admittance[ports])
-    inward = np.linalg.solve(norm, green[:c])
+    weight = 2 * np.concatenate([rate[carry], root])
+    arrive = np.linalg.solve(norm, green[:c]) * weight
     return Interface(
-        reflect=2 * inward[:, :c] * rate[carry] - np.eye(c),
-        enter=2 * inward[:, c:] * root,
-        leave=2 * root[:, None] * green[c:, :c] * rate[carry],
-        back=2 * root[:, None] * green[c:, c:] * root - np.eye(len(ports)),
+        reflect=arrive[:, :c] - np.eye(c),
+        enter=arrive[:, c:],
+        leave=root[:, None] * green[c:, :c] * weight[:c],
+        back=root[:, None] * green[c:, c:] * weight[c:] - np.eye(len(ports)),
+        inward=inward * weight,
     )
 
 
-def scattering(layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace) -> np.ndarray:
-    """Scattering matrix over the ports of both sides, below first, power-normalised: unitary where lossless."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Match:
+    """Scattering matrix over the ports of both sides, below first, and what it was made from.
+
+    carry: the modes that travel; round_trip: (2 carry, 2 carry) system of their amplitudes, waves up at the foot
+    first, then waves down at the top; amplitude: (2 carry, ports) its solution for unit power into each port.
+    """
+
+    matrix: np.ndarray
+    carry: np.ndarray
+    foot: Interface
+    top: Interface
+    round_trip: np.ndarray
+    amplitude: np.ndarray
+
+    def height_rate(self, layer: LayerModes, height: float) -> np.ndarray:
+        """Derivative of the scattering matrix in the height."""
+        q = layer.q[self.carry]
+        x = np.exp(1j * q * height)
+        moved = swap(self.foot.reflect, self.top.reflect, 1j * q * x) @ self.amplitude
+        out = swap(self.foot.leave, self.top.leave, 1j * q * x) @ self.amplitude
+        rate: np.ndarray = out + swap(self.foot.leave, self.top.leave, x) @ np.linalg.solve(self.round_trip, moved)
+        return rate
+
+
+def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """[[0, foot x], [top x, 0]]: waves that crossed the layer meet the other end."""
+    c = len(x)
+    out = np.zeros((len(foot) + len(top), 2 * c), complex)
+    out[: len(foot), c:], out[len(foot) :, :c] = foot * x, top * x
+    return out
+
+
+def scattering(layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace) -> Match:
+    """Match both ends: the matrix is symmetric, and unitary where lossless."""
     travel = np.exp(1j * layer.q * height)
     carry = np.flatnonzero(np.abs(travel) > CARRY)
     foot, top = interface(layer, carry, below), interface(layer, carry, above)
-    x, c = travel[carry], len(carry)
-    round_trip = np.eye(2 * c, dtype=complex)
-    round_trip[:c, c:] = -foot.reflect * x
-    round_trip[c:, :c] = -top.reflect * x
-    n_below, n_above = len(below.ports), len(above.ports)
-    source = np.zeros((2 * c, n_below + n_above), complex)
-    source[:c, :n_below], source[c:, n_below:] = foot.enter, top.enter
-    up_down = np.linalg.solve(round_trip, source)
-    out = np.zeros((n_below + n_above,) * 2, complex)
-    out[:n_below, :n_below], out[n_below:, n_below:] = foot.back, top.back
-    out[:n_below] += (foot.leave * x) @ up_down[c:]
-    out[n_below:] += (top.leave * x) @ up_down[:c]
-    return out
+    x, c, n = travel[carry], len(carry), len(below.ports)
+    round_trip = np.eye(2 * c) - swap(foot.reflect, top.reflect, x)
+    source = np.zeros((2 * c, n + len(above.ports)), complex)
+    source[:c, :n], source[c:, n:] = foot.enter, top.enter
+    amplitude = np.linalg.solve(round_trip, source)
+    matrix = swap(foot.leave, top.leave, x) @ amplitude
+    matrix[:n, :n] += foot.back
+    matrix[n:, n:] += top.back
+    return Match(matrix, carry, foot, top, round_trip, amplitude)
 
 
 def zero_order(basis: Basis, half: HalfSpace, wavenumber: float, *, te: bool) -> int:
     """Position among the ports of the order with the given transverse wavenumber."""
     a = len(basis.te)
-    family = basis.te if te else basis.tm
+    family = basis.te_exact if te else basis.tm_exact
     mode = int(np.argmin(np.abs(family - wavenumber**2))) + (0 if te else a)
     return int(np.flatnonzero(half.ports == mode)[0])
-
-
-def medium_of(k0: float, disc: complex, around: complex) -> Medium:
-    return Medium(k0, complex(disc), complex(around))

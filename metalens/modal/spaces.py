@@ -70,11 +70,13 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndar
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Space:
-    """Matrices of one symmetry class, in half pitches."""
+    """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch."""
 
     cell: Part
     disc: Part
     gradient: np.ndarray
+    electric: bool
+    half_phase_rad: float | None
 
 
 def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> Space:
@@ -88,4 +90,5 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
             restrict(p.mass, vectors, vectors), restrict(p.curl, vectors, vectors), restrict(p.scalar, scalars, scalars)
         )
 
-    return Space(part(geometry.cell), part(geometry.disc), restrict(geometry.gradient, vectors, scalars))
+    gradient = restrict(geometry.gradient, vectors, scalars)
+    return Space(part(geometry.cell), part(geometry.disc), gradient, electric, half_phase_rad)

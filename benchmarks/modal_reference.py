@@ -1,0 +1,111 @@
+"""Reference values of hard pillars: ``python -m benchmarks.modal_reference [FILE]`` (an hour on one core).
+
+Each value is the mean of both forms on the finer of two unrelated meshes, its uncertainty the distance to the mean
+on the other. Entries already in the file are kept, so an interrupted run goes on where it stopped.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import metalens
+from metalens.cell import Cell, Index
+from metalens.modal.engine import case_of, evaluate
+from metalens.modal.mesh import MeshPlan
+
+FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
+FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
+FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
+OTHER = MeshPlan(5, 6, 6, (0.7,), (0.8, 0.97, 1.0), (0.04, 0.25, 1.0))
+TOUCH = MeshPlan(5, 7, 5, (0.7,), (0.85, 1.0), (0.2, 1.0), (0.15, 0.4, 1.0))
+TOUCH_OTHER = MeshPlan(6, 6, 6, (0.7,), (0.8, 1.0), (0.3, 1.0), (0.1, 0.3, 0.6, 1.0))
+NORMAL, OBLIQUE, GAP = (FINEST, FINE), (FINE, OTHER), (TOUCH_OTHER, TOUCH)
+PAPER = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
+NIR = Cell(0.40, 0.7, Index(3.6), Index(1.4513), Index(1.0), Index(1.0))
+DISPUTED = Cell(0.418, 0.7, Index(3.698, 0.0086), Index(1.4513), Index(1.0), Index(1.0))
+Wanted = tuple[str, Cell, float, float, float, str, tuple[MeshPlan, MeshPlan]]
+
+
+def absorbing(k: float) -> Cell:
+    return Cell(0.40, 0.7, Index(3.6, k), Index(1.4525), Index(1.0), Index(1.0))
+
+
+def wanted() -> list[Wanted]:
+    """Name, cell, diameter, wavelength, angle in degrees, polarisation, the two meshes."""
+    out: list[Wanted] = []
+    for d, name in ((0.08, "thin"), (0.128, "128"), (0.2, "200"), (0.1937, "dip"), (0.272, "272"), (0.302, "flank")):
+        out.append((name, PAPER, d, 0.85, 0.0, "x", NORMAL))
+    out.append(("wide", PAPER, 0.32, 0.85, 0.0, "x", NORMAL))
+    out.append(("needle", PAPER, 0.01, 0.85, 0.0, "x", NORMAL))
+    for d in (0.15, 0.2, 0.25):
+        out.append(("940", NIR, d, 0.94, 0.0, "x", NORMAL))
+        out.append(("disputed", DISPUTED, d, 0.94, 0.0, "x", NORMAL))
+    for k in (0.1, 3.0):
+        out.append((f"absorbing {k:g}", absorbing(k), 0.2, 0.85, 0.0, "x", NORMAL))
+    out.append(("nearly touching", PAPER, 0.39, 0.85, 0.0, "x", GAP))
+    for angle in (5.0, 10.0, 20.0):
+        for d in (0.2, 0.272, 0.128):
+            for polarization in "ps":
+                name = "dark mode" if (angle, d, polarization) == (5.0, 0.272, "p") else "oblique"
+                out.append((name, PAPER, d, 0.85, angle, polarization, OBLIQUE))
+    return out
+
+
+def entry(name: str, cell: Cell, d: float, wavelength: float, angle: float, p: str, plans: Any) -> dict[str, Any]:
+    """Solve one case on both meshes."""
+    case = case_of(cell, d, wavelength, float(np.deg2rad(angle)), 0.0, p)
+    finer, other = (evaluate(case, plan) for plan in plans)
+    t, r = finer.matrix[1, 0], finer.matrix[0, 0]
+    return {
+        "name": name,
+        "cell": {
+            "pitch_um": cell.pitch_um,
+            "height_um": cell.height_um,
+            **{
+                part: [getattr(cell, part).n, getattr(cell, part).k]
+                for part in ("pillar", "substrate", "cover", "between")
+            },
+        },
+        "diameter_um": d,
+        "wavelength_um": wavelength,
+        "angle_deg": angle,
+        "polarization": p,
+        "t": [t.real, t.imag],
+        "r": [r.real, r.imag],
+        "uncertainty": float(np.abs(finer.matrix - other.matrix).max()),
+        "unknowns": [finer.unknowns // 2, other.unknowns // 2],
+        "half_difference": [finer.error, other.error],
+    }
+
+
+def identity(item: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(item[key] for key in ("name", "diameter_um", "wavelength_um", "angle_deg", "polarization"))
+
+
+def main(file: Path) -> None:
+    document: dict[str, Any] = {
+        "about": "Zero-order t and r of round pillars, power-normalised, exp(-iwt), phases from foot to top, light "
+        "from the substrate; angles in vacuum. Mean of the electric and magnetic forms of metalens.modal on the finer "
+        "of two meshes; uncertainty: largest distance of the scattering matrices of the two meshes.",
+        "made_by": "python -m benchmarks.modal_reference",
+        "entries": [],
+    }
+    if file.exists():
+        document["entries"] = json.loads(file.read_text(encoding="utf-8"))["entries"]
+    done = {identity(item) for item in document["entries"]}
+    for name, cell, d, wavelength, angle, p, plans in wanted():
+        if (name, d, wavelength, angle, p) in done:
+            continue
+        start = time.perf_counter()
+        item = entry(name, cell, d, wavelength, angle, p, plans)
+        document["entries"].append(item)
+        file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        print(f"{name:16s} {d:.4f} {angle:4.1f} {p}  +-{item['uncertainty']:.1e}  {time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FILE)
