@@ -152,7 +152,7 @@ class CalibrationHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         reduced = F.hardswish(self.reduce(features, SLIP_CHANNELS))
-        grid = _to_grid(reduced)
+        grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
         slip: Tensor = self.slip(F.hardswish(self.hidden(grid.flatten(1))))
         return slip
 
@@ -180,7 +180,7 @@ class Supernet(nn.Module):
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(zip(self.stages, blocks(self.space, architecture), strict=True)):
-            for module, block in zip(_modules(stage), row, strict=False):
+            for module, block in zip(modules_of(stage), row, strict=False):
                 x = module(x, block)
             if i in kept:
                 features.append(x)
@@ -192,10 +192,18 @@ class Supernet(nn.Module):
 
 
 def scaled(frames: Tensor, resolution: float) -> Tensor:
-    """Frames resized by area averaging to ``resolution`` of their size (to the nearest pixel)."""
-    before = [int(s) for s in frames.shape[-2:]]
-    size = [max(1, round(s * resolution)) for s in before]
-    return frames if size == before else F.interpolate(frames, size=size, mode="area")
+    """Frames resized to ``resolution`` of their size (to the nearest pixel)."""
+    height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
+    return resampled(frames, (height, width))
+
+
+def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """(batch, channels, *size): averaged by whole factors, then interpolated where the size is no divisor."""
+    factor = [max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)]
+    pooled = F.avg_pool2d(x, factor) if max(factor) > 1 else x
+    if tuple(int(s) for s in pooled.shape[-2:]) == size:
+        return pooled
+    return F.interpolate(pooled, size=size, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Tensor) -> Tensor:
@@ -239,72 +247,6 @@ def recalibrate(net: Supernet, architecture: Architecture, batches: Iterable[Ten
     net.eval()
 
 
-class Subnet(nn.Module):
-    """One architecture cut out of a supernet, for export: ``forward(frames) -> (mask_logits, centre, slip)``.
-
-    It holds only the weights that it uses; outputs equal those of the recalibrated supernet.
-    """
-
-    def __init__(self, net: Supernet, architecture: Architecture) -> None:
-        super().__init__()
-        self.architecture = architecture
-        self.net = Supernet(net.space)
-        self.net.load_state_dict(net.state_dict())
-        _trim(self.net, architecture)
-        self.net.eval()
-
-    def forward(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        found = self.net(frames, self.architecture)
-        return found.mask_logits, found.centre, found.slip
-
-
-def _trim(net: Supernet, architecture: Architecture) -> None:
-    """Drop the weights that ``architecture`` does not use."""
-    rows = blocks(net.space, architecture)
-    stem = stem_channels(net.space, architecture)
-    _trim_conv(net.stem, 1, stem, 3)
-    for stage, row in zip(net.stages, rows, strict=True):
-        modules = list(_modules(stage))
-        for module, block in zip(modules, row, strict=False):
-            _trim_block(module, block)
-        del stage[len(row) :]  # type: ignore[operator]
-    kept = [rows[stage][-1].outputs for stage, _ in lateral_strides(net.space)]
-    for lateral, channels in zip(net.perception.laterals, kept, strict=True):
-        _trim_conv(lateral, channels, MASK_CHANNELS, 1)
-    _trim_conv(net.calibration.reduce, rows[-1][-1].outputs, SLIP_CHANNELS, 1)
-
-
-def _trim_block(module: ElasticBlock, block: Block) -> None:
-    _trim_conv(module.expand, block.inputs, block.hidden, 1)
-    _trim_conv(module.depthwise, 1, block.hidden, block.kernel)
-    _trim_conv(module.project, block.hidden, block.outputs, 1)
-    if module.squeeze is not None:
-        down, up = module.squeeze.down, module.squeeze.up
-        _keep(down, weight=down.weight[: block.squeeze, : block.hidden], bias=down.bias[: block.squeeze])
-        _keep(up, weight=up.weight[: block.hidden, : block.squeeze], bias=up.bias[: block.hidden])
-
-
-def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
-    trim = (conv.weight.shape[-1] - kernel) // 2
-    inside = slice(trim, trim + kernel)
-    _keep(conv, weight=conv.weight[:outputs, :inputs, inside, inside])
-    norm = conv.norm
-    _keep(norm, weight=norm.weight[:outputs], bias=norm.bias[:outputs])
-    norm.mean, norm.variance = norm.mean[:outputs].clone(), norm.variance[:outputs].clone()
-
-
-def _keep(module: nn.Module, **tensors: Tensor) -> None:
-    for name, tensor in tensors.items():
-        setattr(module, name, nn.Parameter(tensor.detach().clone()))
-
-
-def _modules(stage: nn.Module) -> Iterator[Any]:
+def modules_of(stage: nn.Module) -> Iterator[Any]:
+    """The blocks of a stage, in order."""
     return iter(stage.children())
-
-
-def _to_grid(features: Tensor) -> Tensor:
-    """(batch, channels, 8, 8) by averaging or, for smaller maps, by repeating."""
-    height, width = features.shape[-2:]
-    if height % SLIP_GRID == 0 and width % SLIP_GRID == 0:
-        return F.avg_pool2d(features, (height // SLIP_GRID, width // SLIP_GRID))
-    return F.interpolate(features, size=(SLIP_GRID, SLIP_GRID), mode="bilinear", align_corners=False, antialias=True)
