@@ -2,11 +2,10 @@
 
 The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu = kx² + ky²) and the rest
 (TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as exp(i kz z) with
-kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction. In the half-spaces the zero order
-is given its exact wavenumber, so that it propagates up to grazing incidence.
+kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction.
+In the half-spaces the zero order is given its exact wavenumber, so that it propagates up to grazing incidence.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +42,7 @@ class Basis:
 def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
     """Discrete wavenumbers squared with the zero order's, where this family has it, set to its exact value."""
     exact = (half_phase_rad or 0.0) ** 2
-    out = np.maximum(discrete, 0.0)
+    out: np.ndarray = np.maximum(discrete, 0.0)
     if abs(out[0] - exact) <= 0.05 * exact + 1e-9:
         out[0] = exact
     return out
