@@ -12,11 +12,12 @@ import numpy as np
 
 from metalens.errors import PropagationError
 from metalens.propagate_case import Case
+from metalens.propagate_choose import Choice, choose
 from metalens.propagate_exact import field_at, field_exact
 from metalens.propagate_spectrum import angular_spectrum as _angular_spectrum
 from metalens.store import Array
 
-__all__ = ["Case", "angular_spectrum", "case", "exact", "field_at", "field_exact", "windowed"]
+__all__ = ["Case", "Choice", "angular_spectrum", "case", "choose", "exact", "field_at", "field_exact", "windowed"]
 
 
 def case(
@@ -137,5 +138,5 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
     made = plan(case(phase.shape, **geometry), tolerance, phase.dtype, phase.device)
-    field = field_windowed(phase, level, made)
+    field, _ = field_windowed(phase, level, made)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

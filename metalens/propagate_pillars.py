@@ -8,30 +8,29 @@ P̂_n(-x) = (-1)ⁿ P̂_n(x).
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 
 from metalens import legendre
-from metalens.propagate_case import Case, sensor_path, source_path
-from metalens.propagate_sincos import turns32, turns64
-from metalens.store import Array
+from metalens.propagate_case import Case
+from metalens.propagate_kernels import Carrier, carrier, carrier_turns, fill, outermost, pull
 from metalens.threads import split
 
 ROWS = 64
+KEEP_BYTES = 16e6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moments:
     """How pillars are reduced.
 
-    case: geometry; reference: inverse depth, 1/um, of the source whose phase is taken off.
+    carrier: the phase that is taken off; table: its polynomials, where they are small enough to be kept.
     rows: (y, m) polynomials at the pillar rows.
     folds: even and odd polynomials at the columns x >= 0, (half, n_even) and (half, n_odd).
     """
 
-    case: Case
-    reference: float
+    carrier: Carrier
+    table: torch.Tensor | None
     rows: torch.Tensor
     folds: tuple[torch.Tensor, torch.Tensor]
 
@@ -47,7 +46,10 @@ def moments(case: Case, reference: float, counts: tuple[int, int], dtype: torch.
     rows = legendre.values(counts[0], y / high_y)
     half = legendre.values(counts[1], x[case.shape[1] // 2 :] / high_x)
     folds = tuple(torch.tensor(np.ascontiguousarray(half[:, p::2]), dtype=dtype) for p in (0, 1))
-    return Moments(case, reference, torch.tensor(rows, dtype=dtype), (folds[0], folds[1]))
+    wave = carrier(case, reference, folds[0].element_size())
+    size = case.shape[0] * -(-case.shape[1] // wave.width) * wave.order * 8
+    table = torch.tensor(wave.table(0, case.shape[0])) if size <= KEEP_BYTES else None
+    return Moments(wave, table, torch.tensor(rows, dtype=dtype), (folds[0], folds[1]))
 
 
 def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> torch.Tensor:
@@ -109,17 +111,15 @@ def _blocks(phase: torch.Tensor, level: torch.Tensor, plan: Moments, everything:
 
 def _reach(level: torch.Tensor, half: int) -> int:
     """Folded columns up to the outermost open pillar of a block."""
-    open_ = torch.nonzero((level != 0).any(0))[:, 0]
-    if open_.numel() == 0:
-        return 0
-    nx = level.shape[1]
-    return half - min(int(open_[0]), nx - 1 - int(open_[-1]))
+    if level.device.type != "cpu":
+        return half
+    measure: Any = outermost
+    return half - int(measure(level.detach().numpy(), half))
 
 
-def _numbers(plan: Moments) -> Array:
-    case = plan.case
-    turns = 1 / case.wavelength_um
-    return np.array([*case.tangents, plan.reference, *case.centre_um, case.sensor_distance_um, turns])
+def _table(plan: Moments, start: int, stop: int) -> Any:
+    """Carrier polynomials of rows start to stop."""
+    return plan.carrier.table(start, stop) if plan.table is None else plan.table.numpy()[start:stop]
 
 
 def _phasors(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int, buffer: torch.Tensor) -> None:
@@ -128,13 +128,12 @@ def _phasors(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int
         light = _light(phase, level, plan, start)
         _fold(light, buffer)
         return
-    y, x = plan.case.pillars_um
-    kernel = _fill32 if buffer.dtype == torch.float32 else _fill64
-    arrays = phase.detach().numpy(), level.detach().numpy(), buffer.numpy()
-    numbers = _numbers(plan)
+    kernel: Any = fill
+    u = plan.carrier.positions
+    phases, levels, out = phase.detach().numpy(), level.detach().numpy(), buffer.numpy()
 
     def work(a: int, b: int) -> None:
-        kernel(arrays[0][a:b], arrays[1][a:b], y[start + a : start + b], x, numbers, arrays[2][:, a:b])
+        kernel(phases[a:b], levels[a:b], _table(plan, start + a, start + b), u, out[:, a:b])
 
     split(phase.shape[0], work)
 
@@ -149,26 +148,24 @@ def _pull(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int, b
         if out[1] is not None:
             out[1].copy_(grad[:, 0] * turn.real + grad[:, 1] * turn.imag)
         return
-    y, x = plan.case.pillars_um
-    kernel = _pull32 if buffer.dtype == torch.float32 else _pull64
+    kernel: Any = pull
+    u = plan.carrier.positions
     none = np.empty((0, 0), phase.detach().numpy().dtype)
     arrays = [phase.detach().numpy(), level.detach().numpy(), *(none if t is None else t.numpy() for t in out)]
-    pulled, numbers = buffer.numpy(), _numbers(plan)
+    pulled = buffer.numpy()
 
     def work(a: int, b: int) -> None:
-        kernel(*(v[a:b] for v in arrays), y[start + a : start + b], x, numbers, pulled[:, a:b])
+        kernel(*(v[a:b] for v in arrays), _table(plan, start + a, start + b), u, pulled[:, a:b])
 
     split(phase.shape[0], work)
 
 
 def _light(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
     """(y, x) complex phasors of a block, for devices without compiled loops."""
-    case = plan.case
+    case = plan.carrier.case
     y, x = (torch.tensor(v, device=phase.device) for v in case.pillars_um)
     y = y[start : start + phase.shape[0], None]
-    path = source_path(x, y, case.tangents, plan.reference)
-    path = path + sensor_path(x, y, case.centre_um, case.sensor_distance_um)
-    turns = phase.double() / (2 * torch.pi) + path / case.wavelength_um
+    turns = phase.double() / (2 * torch.pi) + carrier_turns(case, plan.carrier.reference, x, y)
     angle = ((turns - turns.round()) * 2 * torch.pi).to(plan.rows.dtype)
     return torch.complex(level * torch.cos(angle), level * torch.sin(angle))
 
@@ -195,72 +192,3 @@ def _unfold(buffer: torch.Tensor, nx: int) -> torch.Tensor:
     if nx % 2:
         out[:, :, nx // 2] = buffer[0, :, :, 0]
     return out
-
-
-@numba.njit(inline="always")
-def _turns(phase, x, across, numbers):  # type: ignore[no-untyped-def]
-    """Phase plus carrier in turns, within [-1/2, 1/2], float64; ``across`` holds the terms of the row."""
-    tilt = 2 * x * numbers[0] + across[0]
-    rho2 = x * x + across[1]
-    numerator = rho2 * numbers[2] + tilt
-    source = numerator / (np.sqrt(numerator * numbers[2] + across[2]) + across[3])
-    q = rho2 - 2 * x * numbers[3] + across[4]
-    sensor = q / (np.sqrt(q + across[5]) + across[6])
-    t = np.float64(phase) * (1 / (2 * np.pi)) + (source + sensor) * numbers[6]
-    return t - np.rint(t)
-
-
-@numba.njit(inline="always")
-def _across(y, numbers):  # type: ignore[no-untyped-def]
-    s2 = 1 + numbers[0] ** 2 + numbers[1] ** 2
-    r2 = numbers[3] ** 2 + numbers[4] ** 2 + numbers[5] ** 2
-    return (2 * y * numbers[1], y * y, s2, np.sqrt(s2), -2 * y * numbers[4], r2, np.sqrt(r2))
-
-
-def _make_fill(turns: Any) -> Any:
-    @numba.njit(fastmath=True, nogil=True, error_model="numpy")
-    def fill(phase, level, y, x, numbers, out):  # type: ignore[no-untyped-def]
-        rows, nx = phase.shape
-        middle, reach = nx // 2, out.shape[3]
-        for i in range(rows):
-            across = _across(y[i], numbers)
-            for j in range(reach):
-                right, left = middle + j, nx - 1 - middle - j
-                c, s = turns(_turns(phase[i, right], x[right], across, numbers))
-                d, t = turns(_turns(phase[i, left], x[left], across, numbers))
-                a, b = level[i, right], level[i, left]
-                out[0, i, 0, j], out[0, i, 1, j] = a * c + b * d, a * s + b * t
-                out[1, i, 0, j], out[1, i, 1, j] = a * c - b * d, a * s - b * t
-            if nx % 2:
-                out[0, i, 0, 0] *= 0.5
-                out[0, i, 1, 0] *= 0.5
-
-    return fill
-
-
-def _make_pull(turns: Any) -> Any:
-    @numba.njit(fastmath=True, nogil=True, error_model="numpy")
-    def pull(phase, level, out_phase, out_level, y, x, numbers, grad):  # type: ignore[no-untyped-def]
-        rows, nx = phase.shape
-        middle, reach = nx // 2, grad.shape[3]
-        for i in range(rows):
-            across = _across(y[i], numbers)
-            for side in range(2):
-                sign = grad.dtype.type(1 - 2 * side)
-                first = middle if side == 0 else nx - 1 - middle
-                step = 1 - 2 * side
-                for j in range(reach):
-                    at = first + step * j
-                    c, s = turns(_turns(phase[i, at], x[at], across, numbers))
-                    re = grad[0, i, 0, j] + sign * grad[1, i, 0, j]
-                    im = grad[0, i, 1, j] + sign * grad[1, i, 1, j]
-                    if out_phase.size:
-                        out_phase[i, at] = level[i, at] * (im * c - re * s)
-                    if out_level.size:
-                        out_level[i, at] = re * c + im * s
-
-    return pull
-
-
-_fill32, _fill64 = _make_fill(turns32), _make_fill(turns64)
-_pull32, _pull64 = _make_pull(turns32), _make_pull(turns64)

@@ -19,6 +19,7 @@ from metalens.propagate_case import Case, chief_path, source_path
 from metalens.store import Array
 
 MOST_NODES = 1500
+MOST_USEFUL_NODES = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +35,18 @@ class Sizes:
     window: tuple[int, int]
     lens: tuple[int, int]
 
+    @property
+    def practical(self) -> bool:
+        """Whether the operators stay within some 100 MB."""
+        table = self.window[0] * self.window[1] * self.lens[0] * self.lens[1]
+        return max(self.nodes) <= MOST_USEFUL_NODES and table <= 4e6
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Operators:
     """Arrays of a plan, complex128 and float64; e = lens row nodes, x = lens column nodes, p = directions.
 
-    basis: (b, e, x) depth basis; coefficients: (depth, b).
+    basis: (b, e, x) depth basis; coefficients: (depth, b); pairs: (2, n) which (r, b) products are kept.
     to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
     lens_terms: (r, p, e), window_terms: (r, Y, X) of the correction.
     """
@@ -48,6 +55,7 @@ class Operators:
     reference: float
     basis: Array
     coefficients: Array
+    pairs: Array
     to_directions: Array
     along_y: Array
     along_x: Array
@@ -68,7 +76,7 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     Raises:
         PropagationError: more than 1500 nodes would be needed; the window is too large for this method.
     """
-    share = tolerance / 4
+    share = tolerance / 2
     high_y, high_x = case.half_size_um
     nodes_x = _count(lambda t: _over_lens(case, t * high_x, None), share, "lens columns")
     nodes_y = _count(lambda t: _over_lens(case, None, t * high_y), share, "lens rows")
@@ -192,8 +200,11 @@ def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
     return out
 
 
-def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None) -> Operators:
-    """All arrays of a plan; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y instead."""
+def operators(
+    case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None, moving: bool = False
+) -> Operators:
+    """All arrays of a plan; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y
+    instead; ``moving``: the depth basis also spans the derivatives in source position."""
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um
     e, x = legendre.mapped(ny, -high_y, high_y), legendre.mapped(nx, -high_x, high_x)
@@ -206,13 +217,14 @@ def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None 
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = _cosine_y(case, p[:, None], e[None, :])
-    lens_terms, window_terms = _low_rank(case, chosen, tolerance / 4, (low, high), slope)
-    basis, coefficients = depth_basis(case, (e, x), tolerance / 4)
+    lens_terms, window_terms, strength = _low_rank(case, chosen, tolerance / 2, (low, high), slope)
+    basis, coefficients, size = depth_basis(case, (e, x), tolerance / 2, moving=moving)
     return Operators(
         sizes=chosen,
         reference=reference_depth(case),
         basis=basis,
         coefficients=coefficients * np.exp(1j * k * chief_path(case)),
+        pairs=_pairs(strength, size, tolerance / 2),
         to_directions=to_directions,
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
         along_x=np.exp(-1j * k * x_um[:, None] * p),
@@ -227,10 +239,13 @@ def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> An
     return case.wavenumber * (source_path(x, e, tangents, inverse) - reference)
 
 
-def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float) -> tuple[Array, Array]:
-    """Few fields that span the curvatures of all depths, and their derivatives' range: (b, e, x), (depth, b).
+def depth_basis(
+    case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False
+) -> tuple[Array, Array, Array]:
+    """Few fields that span the curvatures of all depths: (b, e, x), (depth, b), and their strengths (b,).
 
-    Orthonormal under the quadrature of the nodes; truncated at ``tolerance`` root mean square.
+    With ``moving`` they also span the derivatives in inverse depth and tangents. Orthonormal under the quadrature of
+    the nodes; truncated at ``tolerance`` root mean square.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(np.outer(legendre.nodes(len(e))[1], legendre.nodes(len(x))[1]))
@@ -239,7 +254,9 @@ def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float) -> 
     if len(inverse) > 48:
         training = np.clip(legendre.mapped(48, inverse.min(), inverse.max()), 0, None)
     fields = np.exp(1j * depth_factors(case, e, x, case.tangents, training[:, None, None])) * weight
-    _, size, v = np.linalg.svd(fields.reshape(len(training), -1), full_matrices=False)
+    if moving:
+        fields = np.concatenate([fields, *_tangents(case, e, x, training[:, None, None], fields)])
+    _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
     tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
     rank = int(max(1, (tail > tolerance).sum()))
     basis = v[:rank].reshape(rank, len(e), len(x))
@@ -248,13 +265,36 @@ def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float) -> 
         part = inverse[start : start + 16, None, None]
         fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
         coefficients[start : start + 16] = fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
-    return np.asarray(basis / weight), coefficients
+    return np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
+
+
+def _tangents(case: Case, e: Array, x: Array, inverse: Array, fields: Array) -> list[Array]:
+    """Derivatives of the depth fields in inverse depth and the tangents, each of the fields' own norm; complex step."""
+    out = []
+    h = 1e-30
+    for step in ((0, 0, 1j * h), (1j * h, 0, 0), (0, 1j * h, 0)):
+        tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
+        slope = case.wavenumber * source_path(x, e, tangents, inverse + step[2]).imag / h
+        slope = np.broadcast_to(slope, fields.shape)
+        scale = np.sqrt((np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum())
+        if scale > 0:
+            out.append(1j * slope / scale * fields)
+    return out
+
+
+def _pairs(strength: Array, size: Array, tolerance: float) -> Array:
+    """(2, n) pairs (correction term, depth field) whose joint strength matters; the rest sums below tolerance."""
+    joint = (np.outer(strength, size) ** 2).ravel()
+    order = np.argsort(joint)
+    least = np.cumsum(joint[order]) <= tolerance**2 * joint.sum()
+    kept = np.sort(order[~least])
+    return np.stack(np.unravel_index(kept, (len(strength), len(size))))
 
 
 def _low_rank(
     case: Case, chosen: Sizes, tolerance: float, span: tuple[float, float], slope: int | None
-) -> tuple[Array, Array]:
-    """Correction as Σ_r lens_terms[r, p, e] window_terms[r, Y, X], pillar area included."""
+) -> tuple[Array, Array, Array]:
+    """Correction as Σ_r lens_terms[r, p, e] window_terms[r, Y, X], pillar area included; and strengths (r,)."""
     (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
     (my, mx), (me, mp) = chosen.window, chosen.lens
     Y, X = legendre.mapped(my, -wy, wy), legendre.mapped(mx, -wx, wx)
@@ -271,7 +311,7 @@ def _low_rank(
     p_um = legendre.nodes(chosen.directions)[0]
     Ie, Ip = legendre.interpolation(me, e_um), legendre.interpolation(mp, p_um)
     lens_terms = np.einsum("Pp,rpe,Ee->rPE", Ip, right.reshape(-1, mp, me), Ie, optimize=True)
-    return lens_terms, window_terms
+    return lens_terms, window_terms, np.linalg.norm(left, axis=0)
 
 
 def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
@@ -282,10 +322,10 @@ def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
     while True:
         left = np.linalg.qr(table @ random.standard_normal((table.shape[1], rank)))[0]
         right = left.conj().T @ table
-        if rank == min(table.shape) or np.linalg.norm(table - left @ right) <= tolerance / 2 * total:
+        if rank == min(table.shape) or np.linalg.norm(table - left @ right) <= tolerance * total / 4:
             break
         rank = min(2 * rank, *table.shape)
     u, size, v = np.linalg.svd(right, full_matrices=False)
     tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1]) / total
-    keep = int(max(1, (tail > tolerance / 2).sum()))
+    keep = int(max(1, (tail > tolerance).sum()))
     return left @ u[:, :keep] * size[:keep], v[:keep]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.extending import overload
 from numpy.polynomial import Chebyshev, Polynomial
 
 from metalens.store import Array
@@ -33,6 +34,17 @@ _S8, _C8 = tuple(float(v) for v in SINE[8]), tuple(float(v) for v in COSINE[8])
 
 
 @numba.njit(inline="always")
+def turns64(t):  # type: ignore[no-untyped-def]
+    """(cos 2πt, sin 2πt) in float64 for t in [-1/2, 1/2]."""
+    u = t * t
+    s = _S8[5] + u * (_S8[6] + u * (_S8[7] + u * (_S8[8] + u * (_S8[9] + u * _S8[10]))))
+    s = t * (_S8[0] + u * (_S8[1] + u * (_S8[2] + u * (_S8[3] + u * (_S8[4] + u * s)))))
+    c = _C8[6] + u * (_C8[7] + u * (_C8[8] + u * (_C8[9] + u * (_C8[10] + u * _C8[11]))))
+    c = _C8[0] + u * (_C8[1] + u * (_C8[2] + u * (_C8[3] + u * (_C8[4] + u * (_C8[5] + u * c)))))
+    return c * c - s * s, 2.0 * s * c
+
+
+@numba.njit(inline="always")
 def turns32(t):  # type: ignore[no-untyped-def]
     """(cos 2πt, sin 2πt) in float32 for float64 t in [-1/2, 1/2]."""
     x = np.float32(t)
@@ -42,12 +54,13 @@ def turns32(t):  # type: ignore[no-untyped-def]
     return c * c - s * s, np.float32(2) * s * c
 
 
-@numba.njit(inline="always")
-def turns64(t):  # type: ignore[no-untyped-def]
-    """(cos 2πt, sin 2πt) in float64 for t in [-1/2, 1/2]."""
-    u = t * t
-    s = _S8[5] + u * (_S8[6] + u * (_S8[7] + u * (_S8[8] + u * (_S8[9] + u * _S8[10]))))
-    s = t * (_S8[0] + u * (_S8[1] + u * (_S8[2] + u * (_S8[3] + u * (_S8[4] + u * s)))))
-    c = _C8[6] + u * (_C8[7] + u * (_C8[8] + u * (_C8[9] + u * (_C8[10] + u * _C8[11]))))
-    c = _C8[0] + u * (_C8[1] + u * (_C8[2] + u * (_C8[3] + u * (_C8[4] + u * (_C8[5] + u * c)))))
-    return c * c - s * s, 2.0 * s * c
+def turns(t: Any, like: Any) -> Any:
+    """(cos 2πt, sin 2πt) in the precision of the array ``like``; for compiled code only."""
+    raise NotImplementedError("turns is compiled code")
+
+
+@overload(turns, inline="always")
+def _turns(t, like):  # type: ignore[no-untyped-def]
+    if like.dtype == numba.float32:
+        return lambda t, like: turns32(t)
+    return lambda t, like: turns64(t)

@@ -20,6 +20,7 @@ class PsfStack:
     depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are; wavelengths are summed with the weights.
     step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a row per angle.
     sensor_distance_um: lens to sensor. tolerance: that was asked for.
+    error: estimated relative L2 error of the intensity, the worst over angles and lenses; reason: method, and why.
     """
 
     intensity: Any
@@ -32,6 +33,8 @@ class PsfStack:
     centres_um: Array
     sensor_distance_um: float
     tolerance: float
+    error: float
+    reason: str
     provenance: Provenance = field(default_factory=Provenance)
 
     @property

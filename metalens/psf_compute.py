@@ -1,0 +1,116 @@
+"""Intensity of one lens in one direction, by the cheapest method, checked and repeated until the tolerance is met."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from metalens.errors import PropagationError
+from metalens.propagate_case import Case, chief_path
+from metalens.propagate_choose import choose
+from metalens.propagate_estimate import Sample, relative_error
+from metalens.propagate_exact import field_exact
+from metalens.propagate_window import Moving, field_windowed, plan
+
+ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of one pillar's phasor, standard deviation
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Result:
+    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped."""
+
+    intensity: torch.Tensor
+    error: float
+    reason: str
+
+
+def intensity(
+    phase: torch.Tensor,
+    level: torch.Tensor,
+    cases: list[Case],
+    weights: list[float],
+    *,
+    tolerance: float,
+    moving: Any = None,
+) -> Result:
+    """|U|² on the window, wavelengths added with their weights.
+
+    Args:
+        phase, level: (wavelength, y, x).
+        cases: one a wavelength, alike in everything else.
+        moving: :class:`Moving` or None.
+
+    The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
+    tolerance; the result of the last try is returned with its estimate in any case.
+    """
+    needs_grad = phase.requires_grad or level.requires_grad or moving is not None
+    choices = [choose(case, tolerance, differentiable=needs_grad) for case in cases]
+    if all(choice.method == "exact" for choice in choices) and phase.device.type == "cpu":
+        return _exact(phase, level, cases, weights, choices[0].reason)
+    first = phase.dtype if tolerance >= 4e-7 else torch.float64
+    tries = [(tolerance, first), (tolerance / 10, first), (tolerance / 10, torch.float64)]
+    for setting, dtype in tries:
+        result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, setting, moving)
+        if result.error <= tolerance:
+            break
+    return replace(result, intensity=result.intensity.to(phase.dtype))
+
+
+def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights: list[float], reason: str) -> Result:
+    arrays = [np.abs(field_exact(p.numpy(), t.numpy(), c)) ** 2 for p, t, c in zip(phase, level, cases, strict=True)]
+    total = sum(w * a for w, a in zip(weights, arrays, strict=True))
+    error = 1e-12 if phase.dtype == torch.float64 else 1e-7
+    return Result(torch.as_tensor(total).to(phase.dtype), error, reason)
+
+
+def _windowed(
+    maps: tuple[torch.Tensor, torch.Tensor], cases: list[Case], weights: list[float], tolerance: float, moving: Any
+) -> Result:
+    """One try: every wavelength and tile, then the estimate from all of them."""
+    phase, level = maps
+    choice = choose(cases[0], tolerance, differentiable=True)
+    samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
+    total: Any = 0
+    for p, t, case, weight in zip(phase, level, cases, weights, strict=True):
+        noise = ROUNDING[p.dtype] * _incoherent(t.detach(), case)
+        tiles = choice.tiles if case is cases[0] else choose(case, tolerance, differentiable=True).tiles
+        if [len(row) for row in tiles] != [len(row) for row in choice.tiles]:
+            tiles = tuple(tuple(_like(tile, case) for tile in row) for row in choice.tiles)
+        rows, index = [], 0
+        for row in tiles:
+            parts = []
+            for tile in row:
+                made = plan(tile, tolerance, p.dtype, p.device, moving is not None)
+                field, gathered = field_windowed(p, t, made, _shifted(moving, case, tile))
+                parts.append(field)
+                values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
+                samples[index].append(Sample(tile, weight, *values, noise))
+                index += 1
+            rows.append(torch.cat(parts, -1))
+        field = torch.cat(rows, -2)
+        total = total + weight * (field.real**2 + field.imag**2)
+    if not bool((total.detach().sum((-1, -2)) > 0).all()):
+        raise PropagationError("no light reaches the window at some depth; move or widen the window")
+    return Result(total, relative_error(samples), choice.reason)
+
+
+def _like(tile: Case, case: Case) -> Case:
+    """The tile at another wavelength."""
+    return replace(tile, wavelength_um=case.wavelength_um)
+
+
+def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
+    """Moving geometry seen from a tile of the window."""
+    if moving is None or tile.centre_um == case.centre_um:
+        return moving
+    shift = [a - b for a, b in zip(tile.centre_um, case.centre_um, strict=True)]
+    return replace(moving, centre=moving.centre + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device))
+
+
+def _incoherent(level: torch.Tensor, case: Case) -> float:
+    """Magnitude of the field at the window centre if all pillars added with random phases."""
+    flat = level.reshape(-1)
+    total = math.sqrt(float(torch.dot(flat, flat)))
+    return total * case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
