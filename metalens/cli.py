@@ -20,6 +20,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "metalens.commands.library",
         "CELL.toml -> library.h5: pillar sweep with an error bar on every entry",
     ),
+    "study": ("metalens.commands.study", "which pitch and height cover a full turn: table, JSON and figure"),
     "design": (
         "metalens.commands.design",
         "DESIGN.toml -> lens.h5: hyperbolic, double helix, cubic, Fisher, own map",

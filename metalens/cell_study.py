@@ -1,0 +1,244 @@
+"""Which pillar cell to take: over pitch, height and wavelength, how much phase do printable pillars cover smoothly?"""
+
+import itertools
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from metalens import engines, reduced, store, workers
+from metalens.cell import Cell, Material
+from metalens.console import Console
+from metalens.engines import Light
+from metalens.errors import ConfigError
+from metalens.library import PLAIN
+from metalens.materials import index
+from metalens.reduced import Curve, Nodes
+from metalens.store import Array
+
+TURN = 2 * math.pi
+SAMPLES = 600
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What is compared.
+
+    pitches_um, heights_um, wavelengths_um: every combination.
+    pillar: material of the pillars; substrate and cover are those of :class:`metalens.cell.Cell`.
+    min_diameter_um, min_gap_um: what can be printed.
+    least_transmission: |t| below this ends a smooth stretch.
+    least_half_width_um: so does a resonance narrower than this.
+    tolerance: error of t.
+    """
+
+    pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
+    heights_um: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    wavelengths_um: tuple[float, ...] = (0.85, 0.94)
+    pillar: Material = PLAIN
+    min_diameter_um: float = 0.08
+    min_gap_um: float = 0.06
+    least_transmission: float = 0.8
+    least_half_width_um: float = 0.005
+    tolerance: float = 1e-2
+
+    def __post_init__(self) -> None:
+        if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
+            raise ConfigError(
+                f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
+                f"{self.min_gap_um} um"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One cell at one wavelength.
+
+    turns: of phase that the longest smooth stretch covers; from_um, to_um: its diameters.
+    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
+    ends: what bounds it above.
+    max_angle_deg: of incidence in air up to which no diffraction order propagates.
+    error: largest error estimate of t on the stretch.
+    """
+
+    pitch_um: float
+    height_um: float
+    wavelength_um: float
+    turns: float
+    from_um: float
+    to_um: float
+    least_transmission: float
+    mean_power: float
+    ends: str
+    max_angle_deg: float
+    error: float
+
+
+def run(study: Study, console: Console | None = None) -> list[Verdict]:
+    """Verdicts on every combination, wavelength by wavelength; one rational curve t(D) each, on all cores."""
+    cases = list(itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um))
+    tasks = []
+    for wavelength, height, pitch in cases:
+        cell = Cell(pitch, height, study.pillar)
+        span = (study.min_diameter_um, pitch - study.min_gap_um)
+        about = {"tolerance": study.tolerance, "engine": engines.choose(cell)}
+        tasks.append(workers.curve_task(cell, Light(wavelength), span, **about))  # type: ignore[arg-type]
+    console = console or Console(quiet=True)
+    found = dict(console.track(workers.run(tasks), total=len(tasks), label="cells"))
+    return [
+        judge(study, Cell(pitch, height, study.pillar), wavelength, curve_of(found[i], study.tolerance))
+        for i, (wavelength, height, pitch) in enumerate(cases)
+    ]
+
+
+def curve_of(result: workers.Result, tolerance: float) -> Curve:
+    """The rational curve behind a worker's answer."""
+    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
+    error, energy = np.array(result["error"]), np.array(result["energy"])
+    diameter = np.array(result["diameter_um"])
+    nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, result["converged"], result["reason"])
+    return reduced.curve(nodes, tolerance=workers.FIT_SHARE * tolerance)
+
+
+def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdict:
+    """The smooth stretch that covers most phase on one curve."""
+    d = np.linspace(curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES)
+    value, error = curve(d)
+    level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0]))
+    faults = {"|t| falls": level < study.least_transmission, "the phase falls": np.diff(phase, append=np.inf) < 0}
+    sharp = np.zeros(SAMPLES, bool)
+    for centre, width in curve.resonances(study.least_half_width_um):
+        sharp |= np.abs(d - centre) <= max(4 * width, d[1] - d[0])
+    faults["a narrow resonance"] = sharp
+    start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
+    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or ["the printable range"]
+    run = slice(start, stop)
+    return Verdict(
+        cell.pitch_um,
+        cell.height_um,
+        wavelength_um,
+        float(phase[stop - 1] - phase[start]) / TURN if stop > start else 0.0,
+        float(d[start]),
+        float(d[max(start, stop - 1)]),
+        float(level[run].min(initial=1.0)),
+        _mean_over_phase(phase[run], level[run] ** 2),
+        " and ".join(why),
+        max_angle_deg(cell, wavelength_um),
+        float(error[run].max(initial=0.0)),
+    )
+
+
+def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
+    """Angle of incidence in air up to which no order propagates: sin = wavelength / pitch - n of the substrate."""
+    sine = wavelength_um / cell.pitch_um - index(cell.substrate, wavelength_um).real
+    return math.degrees(math.asin(min(1.0, max(0.0, sine))))
+
+
+def _most_phase(phase: Array, good: Array) -> tuple[int, int]:
+    """(start, stop) of the run of good samples that covers most phase; (0, 0) where there is none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2).tolist()
+    return max(((a, b) for a, b in edges), key=lambda run: phase[run[1] - 1] - phase[run[0]], default=(0, 0))
+
+
+def _mean_over_phase(phase: Array, power: Array) -> float:
+    if len(phase) < 2:
+        return 0.0
+    return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
+
+
+def write(folder: Path, study: Study, verdicts: list[Verdict], *, command: str) -> None:
+    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist."""
+    from metalens.cell_plots import study_figure
+
+    values = {"study": asdict(study), "verdicts": [asdict(v) for v in verdicts]}
+    store.write_text(folder / "cell_study.json", json.dumps(_rounded(values), indent=1) + "\n")
+    store.write_text(folder / "README.md", markdown(study, verdicts, command=command))
+    study_figure(folder / "cell_study.png", study, verdicts)
+
+
+def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
+    """The study as a page with one table a wavelength: turns covered (least |t|), pitch across, height down."""
+    n = study.pillar if isinstance(study.pillar, str) else f"n = {study.pillar.n:g} + {study.pillar.k:g}i"
+    lines = [
+        "# Cell study",
+        "",
+        f"Round pillars of {n} on fused silica in air. Printable: diameter from {1e3 * study.min_diameter_um:g} nm to "
+        f"the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, in turns, that the longest stretch of "
+        f"diameters covers on which the phase rises, |t| >= {study.least_transmission:g} and no resonance has a "
+        f"half-width below {1e3 * study.least_half_width_um:g} nm; in brackets the mean |t|² over it. "
+        "**Bold**: a full turn.",
+        "",
+        f"Made by `{command}`; numbers with diameters and reasons in `cell_study.json`.",
+        "",
+        "![coverage](cell_study.png)",
+    ]
+    for wavelength in study.wavelengths_um:
+        lines += [
+            "",
+            f"## {1e3 * wavelength:g} nm",
+            "",
+            *_table(study, [v for v in verdicts if v.wavelength_um == wavelength]),
+        ]
+    return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
+
+
+def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
+    found = {(v.height_um, v.pitch_um): v for v in verdicts}
+    head = "| height \\ pitch (nm) | " + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um) + " |"
+    lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
+    for height in study.heights_um:
+        cells = [found[height, pitch] for pitch in study.pitches_um]
+        texts = [
+            f"**{v.turns:.2f}** ({v.mean_power:.2f})" if v.turns >= 1 else f"{v.turns:.2f} ({v.mean_power:.2f})"
+            for v in cells
+        ]
+        lines.append(f"| {1e3 * height:g} | " + " | ".join(texts) + " |")
+    return lines
+
+
+def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
+    """(pitch, height) in um that covers a full turn at every wavelength with most turns at the worst of them, at the
+    least height; None where no cell does."""
+    by_cell: dict[tuple[float, float], list[float]] = {}
+    for v in verdicts:
+        by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
+    good = {cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1}
+    if not good:
+        return None
+    height = min(cell[0] for cell in good)
+    best = max((cell for cell in good if cell[0] == height), key=lambda cell: good[cell])
+    return best[1], best[0]
+
+
+def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
+    waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
+    best = choice(study, verdicts)
+    if best is None:
+        return [f"No cell covers a full turn at {waves} nm."]
+    found = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
+    lines = [
+        "## Choice",
+        "",
+        f"The lowest pillars that cover a full turn at {waves} nm with one cell are {1e3 * best[1]:g} nm high; among "
+        f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
+        "",
+    ]
+    for v in found:
+        lines.append(
+            f"- {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to {1e3 * v.to_um:.0f} nm "
+            f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
+            f"order up to {v.max_angle_deg:.0f} deg"
+        )
+    return lines
+
+
+def _rounded(value: object) -> object:
+    """Six significant digits: what the tolerance carries, and the same text on any machine."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,152 @@
+"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy, and a figure beside it."""
+
+import dataclasses
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from metalens import config, library, proxy_fit, store
+from metalens.cell import Cell
+from metalens.commands import Common, Output
+from metalens.errors import DomainError
+from metalens.library import DEFAULT_CELL, PillarLibrary, Sweep
+from metalens.proxy_fit import ProxyFit, Wanted
+
+
+@dataclass(frozen=True, slots=True)
+class CellFile:
+    """The content of CELL.toml.
+
+    cell: the pillar cell. sweep: what the library holds. proxy: what its polynomial must meet.
+    """
+
+    cell: Cell = DEFAULT_CELL
+    sweep: Sweep = field(default_factory=Sweep)
+    proxy: Wanted = field(default_factory=Wanted)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens library``.
+
+    Attributes:
+        config: CELL.toml.
+        output: the library file to write; NAME.resume beside it keeps finished curves until it is complete.
+    """
+
+    config: tyro.conf.Positional[Path]
+    output: Output = Path("library.h5")
+
+
+def run(options: Options) -> int:
+    """Sweep, fit, write; exit 1 where an error bar misses the tolerance or no full turn is covered."""
+    wanted = config.load(options.config, CellFile)
+    library.check(wanted.cell, wanted.sweep)
+    target = options.claim(options.output)
+    start = time.perf_counter()
+    journal = target.with_name(target.name + ".resume")
+    made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)
+    seconds = time.perf_counter() - start
+    fitted, refusal = _fit(made, wanted.proxy)
+    notes = fitted.notes if fitted else (refusal,)
+    about = store.Provenance(config.dumps(wanted), {options.config.name: store.sha256(options.config)})
+    made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
+    library.save(target, made)
+    _draw(target, made, fitted)
+    failures = _failures(made, fitted, refusal)
+    options.console.result(_values(made, fitted, seconds, failures), _text(target, made, fitted, seconds, failures))
+    return 1 if failures else 0
+
+
+def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:
+    try:
+        return proxy_fit.fit(made, wanted), ""
+    except DomainError as refused:
+        return None, str(refused)
+
+
+def _draw(target: Path, made: PillarLibrary, fitted: ProxyFit | None) -> None:
+    from metalens.cell_plots import library_figure
+
+    library_figure(target.with_suffix(".png"), made, fitted)
+
+
+def _failures(made: PillarLibrary, fitted: ProxyFit | None, refusal: str) -> list[str]:
+    failures = []
+    if not made.converged:
+        missed = made.t_error > made.sweep.tolerance
+        failures.append(
+            f"{int(missed.sum())} of {missed.size} error bars are above the tolerance {made.sweep.tolerance:g} "
+            f"(largest {made.t_error.max():.2g}): allow a larger tolerance or leave the resonances out of diameters_um"
+        )
+    if fitted is None:
+        failures.append(f"no proxy: {refusal}")
+    elif fitted.turns < 1:
+        failures.append(
+            f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: take a smaller pitch, taller pillars or "
+            "a material of higher index (metalens study compares cells)"
+        )
+    return failures
+
+
+def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failures: list[str]) -> dict[str, Any]:
+    values: dict[str, Any] = {
+        "engine": made.engine,
+        "entries": made.t.size,
+        "solves": made.solves,
+        "seconds": seconds,
+        "max_error": float(made.t_error.max()),
+        "median_error": float(np.median(made.t_error)),
+        "failures": failures,
+    }
+    if fitted is not None:
+        proxy = fitted.proxy
+        values |= {
+            "domain_um": list(proxy.domain_um),
+            "turns": fitted.turns,
+            "coefficients": proxy.phase_coefficients.size + proxy.transmission_coefficients.size,
+            "max_phase_error_rad": proxy.max_phase_error_rad,
+            "max_transmission_error": proxy.max_transmission_error,
+            "polarization_spread": fitted.polarization_spread,
+            "notes": list(fitted.notes),
+            "error_against_coefficients": [dataclasses.asdict(trial) for trial in fitted.table],
+        }
+    return values
+
+
+def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failures: list[str]) -> str:
+    each = 1e3 * seconds / max(1, made.solves)
+    lines = [
+        f"{target}: {made.t.size} entries, {len(made.resonances)} poles near the real diameters",
+        "",
+        "  what     effort                          time        error",
+        f"  sweep    {made.solves:4d} solves ({made.engine}, {each:.0f} ms each)   {seconds:6.1f} s    "
+        f"t within {made.t_error.max():.1e} (median {np.median(made.t_error):.1e})",
+    ]
+    if fitted is not None:
+        lines += [
+            *(
+                f"  proxy    {trial.coefficients:4d} coefficients                            "
+                f"phase {trial.phase_error_rad:.1e} rad, |T| {trial.transmission_error:.1e}"
+                for trial in fitted.table
+            ),
+            "",
+            *_proxy_lines(fitted),
+        ]
+    return "\n".join(lines + [f"  FAILED: {failure}" for failure in failures])
+
+
+def _proxy_lines(fitted: ProxyFit) -> list[str]:
+    proxy = fitted.proxy
+    low, high = (1e3 * d for d in proxy.domain_um)
+    lines = [
+        f"  proxy in diameter^{proxy.power} from {low:.1f} to {high:.1f} nm, {fitted.turns:.2f} turns: phase within "
+        f"{proxy.max_phase_error_rad:.1e} rad, |T| within {proxy.max_transmission_error:.1e} (half of them unseen)"
+    ]
+    if fitted.polarization_spread > 0:
+        lines.append(f"  s and p differ by up to {2 * fitted.polarization_spread:.1e}; the proxy holds their mean")
+    return lines + [f"  {note}" for note in fitted.notes]

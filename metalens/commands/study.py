@@ -1,0 +1,44 @@
+"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from metalens import cell_study, config
+from metalens.cell_study import Study
+from metalens.commands import Common, Output
+from metalens.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens study``.
+
+    Attributes:
+        config: STUDY.toml with pitches, heights, wavelengths, material and limits; the project's own without it.
+        output: folder for README.md, cell_study.json and cell_study.png.
+    """
+
+    config: tyro.conf.Positional[Path | None] = None
+    output: Output = Path("cell_study")
+
+
+def run(options: Options) -> int:
+    """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
+    study = Study() if options.config is None else config.load(options.config, Study)
+    if (options.output / "cell_study.json").exists() and not options.force:
+        raise ConfigError(f"{options.output} holds a study; give --force to overwrite it")
+    if not options.output.parent.is_dir():
+        raise ConfigError(f"{options.output}: folder {options.output.parent} does not exist")
+    verdicts = cell_study.run(study, options.console)
+    options.output.mkdir(exist_ok=True)
+    given = "" if options.config is None else f" {options.config.name}"
+    cell_study.write(options.output, study, verdicts, command=f"metalens study{given} -o {options.output.name}")
+    best = cell_study.choice(study, verdicts)
+    values = {"pitch_um": best and best[0], "height_um": best and best[1], "cells": len(verdicts)}
+    text = "no cell covers a full turn at all wavelengths"
+    if best is not None:
+        text = f"{len(verdicts)} cells; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
+    options.console.result(values, f"{options.output}: {text}")
+    return 0 if best else 1
