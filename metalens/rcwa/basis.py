@@ -158,14 +158,35 @@ def normals(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, A
     (Half the worst truncation error of n n^T, whose centre is singular.)
     """
     radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
-    x = np.sqrt(space.shells) * radius
-    small = np.abs(x) < 0.05
-    y = np.where(small, 1.0, x)
+    x, y, small = _argument(space, radius)
+    j0, j2 = _bessel(0, y), _bessel(2, y)
     share = radius**2 / (4 * np.pi)
-    j0, j1, j2 = (_bessel(order, y) for order in range(3))
-    flat = np.where(small, 0.25 - x**2 / 48, 2 * j2 / y**2)
-    fourfold = np.where(small, x**2 / 96, (2 - 2 * j0 - y * j1) / y**2 - (4 * j2 / y - j1) / y)
-    a, b = share * flat, -share * fourfold
+    a = share * np.where(small, 0.25 - x**2 / 48, 2 * j2 / y**2)
+    b = -share * np.where(small, x**2 / 96, (2 - 2 * j0 - 4 * j2) / y**2)
+    xx, yy, xy = (whole - part for whole, part in zip(space.normal, _directed(space, a, b), strict=True))
+    return xx, yy, xy
+
+
+def normals_rate(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, Array, Array]:
+    """Derivative of :func:`normals` with respect to diameter_um."""
+    radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
+    x, y, small = _argument(space, radius)
+    j1, j2 = _bessel(1, y), _bessel(2, y)
+    scale = radius / (4 * pitch_um)  # d(radius)/d(diameter) is pi / pitch
+    a = scale * np.where(small, 0.5 - x**2 / 12, 2 * (j1 - 2 * j2 / y) / y)
+    b = -scale * np.where(small, x**2 / 24, (8 * j2 / y - 2 * j1) / y)
+    xx, yy, xy = (-part for part in _directed(space, a, b))
+    return xx, yy, xy
+
+
+def _argument(space: Basis, radius: Array) -> tuple[Array, Array, Array]:
+    x = np.sqrt(space.shells) * radius
+    small = np.abs(x) < 0.01
+    return x, np.where(small, 1.0, x), small
+
+
+def _directed(space: Basis, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Matrices of the functions with coefficients a + b cos 2f, a - b cos 2f and b sin 2f: (xx, yy, xy)."""
     taken = []
     for link, sign in ((EX, 1), (EY, -1)):
         pair = space.links[link]
@@ -173,9 +194,7 @@ def normals(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, A
         directed = np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.cos2)
         taken.append(isotropic + sign * directed)
     pair = space.links[MIXED]
-    taken.append(np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.sin2))
-    xx, yy, xy = (whole - part for whole, part in zip(space.normal, taken, strict=True))
-    return xx, yy, xy
+    return taken[0], taken[1], np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.sin2)
 
 
 def _normal(ex: Orders, ey: Orders, reach: int) -> tuple[Array, Array, Array]:

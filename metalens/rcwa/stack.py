@@ -44,27 +44,45 @@ class Amplitudes:
     r: Array
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Fields:
+    """Tangential fields of one incident wave.
+
+    u, w: (*batch, n) at the foot of the lowest layer; u_top, w_top: at the top of the highest one.
+    up, down: for each layer, (*batch, n) amplitudes of its upward modes at its foot and downward modes at its top.
+    """
+
+    u: Array
+    w: Array
+    u_top: Array
+    w_top: Array
+    up: list[Array]
+    down: list[Array]
+
+
 def respond(ways: Waves, media: Media, layers: list[Layer], zero: int) -> Amplitudes:
     """Response to the zero order (place ``zero``) from the substrate; no layers: a stack of films."""
-    top, lift = _through(ways, half_space(ways, media.cover), tuple(reversed(media.over)))
-    foot, drop = _through(ways, half_space(ways, media.substrate), media.under)
+    below, above = half_space(ways, media.substrate), half_space(ways, media.cover)
+    top, lift = _through(ways, above, tuple(reversed(media.over)))
+    foot, drop = _through(ways, below, media.under)
     source = np.zeros(len(ways.kappa), complex)
-    below = half_space(ways, media.substrate)
     source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
-    u, w, u_top, w_top = _match(layers, media.heights, top, foot, source)
-    up = (np.conj(top[0]) * u_top + np.conj(top[1]) * w_top) / (np.abs(top[0]) ** 2 + np.abs(top[1]) ** 2)
+    found = match(layers, media.heights, top, foot, source)
     incident = _flux(below)[zero]
-    t = up * lift * np.sqrt(_flux(half_space(ways, media.cover)) / incident)
-    return Amplitudes(t, _reflected(ways, media, u, w, zero) * np.sqrt(_flux(below) / incident))
+    t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(_flux(above) / incident)
+    return Amplitudes(t, _reflected(ways, media, found.u, found.w, zero) * np.sqrt(_flux(below) / incident))
 
 
-def _match(
-    layers: list[Layer], heights: tuple[float, ...], top: Pair, foot: Pair, source: Array
-) -> tuple[Array, Array, Array, Array]:
-    """u and w at the foot of the lowest layer and at the top of the highest one."""
+def outgoing(pair: Pair, u: Array, w: Array) -> Array:
+    """Amplitudes a of the diagonal pair with u = U a, w = V a, from whichever of the two is large."""
+    return np.asarray((np.conj(pair[0]) * u + np.conj(pair[1]) * w) / (np.abs(pair[0]) ** 2 + np.abs(pair[1]) ** 2))
+
+
+def match(layers: list[Layer], heights: tuple[float, ...], top: Pair, foot: Pair, source: Array) -> Fields:
+    """Fields that radiate into ``top`` above the layers, and whose incident part gives foot V u + U w = source."""
     if not layers:
         a = source / (foot[1] * top[0] + foot[0] * top[1])
-        return top[0] * a, top[1] * a, top[0] * a, top[1] * a
+        return Fields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
     pair, returns = top, []
     for part, height in zip(reversed(layers), reversed(heights), strict=True):
         back, kept, fade = _reflection(part, height, pair)
@@ -72,14 +90,16 @@ def _match(
         pair = _foot_pair(part, back, kept, fade)
     a = _solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
     u, w = _times(pair[0], a), _times(pair[1], a)
-    u_top, w_top = u, w
+    u_top, w_top, ups, downs = u, w, [], []
     for i, (part, (back, kept, fade)) in enumerate(zip(layers, reversed(returns), strict=True)):
         if i:
             a = (_solve(part.W, u_top) + _solve(part.V, w_top)) / 2
         down = _times(back, a[..., :kept])
         up = np.concatenate([fade * a[..., :kept], np.zeros_like(a[..., kept:])], axis=-1)
         u_top, w_top = _times(part.W, up + down), _times(part.V, up - down)
-    return u, w, u_top, w_top
+        ups.append(a)
+        downs.append(down)
+    return Fields(u, w, u_top, w_top, ups, downs)
 
 
 def _reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Array]:
@@ -132,8 +152,7 @@ def _reflected(ways: Waves, media: Media, u: Array, w: Array, zero: int) -> Arra
         u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
     unit = np.zeros(len(U))
     unit[zero] = 1
-    back = np.conj(U) * (u - U * unit) - np.conj(V) * (w - V * unit)
-    return np.asarray(np.where(live, back / (np.abs(U) ** 2 + np.abs(V) ** 2), 0))
+    return np.where(live, outgoing((U, V), u - U * unit, -(w - V * unit)), 0)
 
 
 def _flux(pair: Pair) -> Array:

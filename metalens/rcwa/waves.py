@@ -24,7 +24,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 class Waves:
     """The waves of a basis at one wavelength and direction: all p waves, then all s waves.
 
-    kappa: (n,) |k| / k0.
+    m, n: (n,) orders; kappa: (n,) |k| / k0; along: (2, n) direction of k.
     p_count: number of p waves.
     bare: number of leading p waves that have no Ez at all (the zero order at normal incidence, E along x).
     fold: (ex + ey, n) orthogonal matrix from the waves to Ex and Ey.
@@ -32,7 +32,10 @@ class Waves:
     """
 
     space: Basis
+    m: Array
+    n: Array
     kappa: Array
+    along: Array
     p_count: int
     bare: int
     fold: Array
@@ -50,11 +53,12 @@ def waves(space: Basis, *, pitch_um: float, wavelength_um: float, kx: float, ky:
     k = np.stack([kx + step * m, ky + step * n])
     kappa = np.hypot(*k)
     straight = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)])[:, None]
-    e = np.where(kappa > 0, k / np.where(kappa > 0, kappa, 1.0), straight)
+    along = np.where(kappa > 0, k / np.where(kappa > 0, kappa, 1.0), straight)
     p_count = bare + len(ez.m)
-    e = np.where(np.arange(len(m)) < p_count, e, np.stack([-e[1], e[0]]))
+    e = np.where(np.arange(len(m)) < p_count, along, np.stack([-along[1], along[0]]))
     fold = np.concatenate([_place(ex, m, n) * e[0], _place(ey, m, n) * e[1]])
-    return Waves(space, kappa, p_count, bare, fold, _zero(m, n, 0, p_count), _zero(m, n, p_count, len(m)))
+    zero_p, zero_s = _zero(m, n, 0, p_count), _zero(m, n, p_count, len(m))
+    return Waves(space, m, n, kappa, along, p_count, bare, fold, zero_p, zero_s)
 
 
 def normal_component(kappa: Array, index: complex) -> Array:

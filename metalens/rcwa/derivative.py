@@ -1,0 +1,263 @@
+"""Exact derivatives of the transmission, from the fields of the light and of its reverse.
+
+With tilde the fields of unit power incident from the cover, a change dP, dQ of the operators anywhere changes the
+power-normalised transmission by (Lagrange's identity of u' = i P w, w' = i Q u; P and Q symmetric)
+
+    dt = i/2 ∫ (u^T dQ u~ - w^T dP w~) dz,      layer stretched by dh:  dt = i/2 (u^T Q u~ - w^T P w~) dh.
+
+No mode is differentiated, so equal propagation constants need no care: only divided differences of exponentials
+appear. In the half-spaces outgoing waves are integrated in closed form; there the incident wave adds nothing, since
+its power is fixed.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens import materials
+from metalens.cell import Material
+from metalens.errors import CellError
+from metalens.rcwa import changes
+from metalens.rcwa.case import Case, case_waves
+from metalens.rcwa.changes import Change
+from metalens.rcwa.layer import Layer, layer
+from metalens.rcwa.stack import Fields, match, outgoing
+from metalens.rcwa.waves import Waves, half_space, normal_component
+
+Array = np.ndarray[Any, np.dtype[Any]]
+_GRAZING = 1e-8  # |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh anomaly
+
+
+@dataclass(frozen=True, slots=True)
+class Derivatives:
+    """The transmission of a pillar at a fixed truncation, and its derivatives.
+
+    wavelength_um: dispersion of all materials included. n, k: of the pillar.
+    """
+
+    t: complex
+    diameter_um: complex
+    height_um: complex
+    n: complex
+    k: complex
+    wavelength_um: complex
+    angle_rad: complex
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Region:
+    """A layer between the half-spaces: its modes, reduced height, and the index of its film, or its diameter."""
+
+    part: Layer
+    height: float
+    film: Material | None
+    diameter_um: float
+    lift: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Problem:
+    this: Case
+    ways: Waves
+    regions: list[_Region]
+    light: Fields
+    reverse: Fields
+    ends: tuple[tuple[complex, Array, Array], tuple[complex, Array, Array]]
+    t: complex
+
+
+def differentiate(this: Case, diameter_um: float, *, harmonics: int, slices: int, angle_rad: float) -> Derivatives:
+    """Derivatives at one truncation.
+
+    Raises:
+        CellError: an absorbing half-space, or a zero order that does not propagate in the cover.
+    """
+    problem = _solve(this, diameter_um, harmonics, slices)
+    by_index = _by_index(problem)
+    return Derivatives(
+        problem.t,
+        _by_diameter(problem, [1.0] * len(problem.regions)),
+        _by_height(problem),
+        by_index,
+        1j * by_index,
+        _by_wavelength(problem),
+        _by_angle(problem, angle_rad),
+    )
+
+
+def _solve(this: Case, diameter_um: float, harmonics: int, slices: int) -> _Problem:
+    ways, zero = case_waves(this, harmonics)
+    media = this.media
+    if media.substrate.imag or media.cover.imag:
+        raise CellError("derivatives need a substrate and a cover that do not absorb")
+    if media.cover.real <= ways.kappa[zero]:
+        raise CellError("derivatives need a zero order that propagates in the cover; here it is totally reflected")
+    regions = _regions(this, ways, diameter_um, slices)
+    layers, heights = [region.part for region in regions], tuple(region.height for region in regions)
+    below, above = half_space(ways, media.substrate), half_space(ways, media.cover)
+    light = match(layers, heights, above, below, _source(below, zero))
+    reverse = match(layers[::-1], heights[::-1], below, above, _source(above, zero))
+    unit = np.zeros(len(ways.kappa))
+    unit[zero] = 1
+    transmitted = outgoing(above, light.u_top, light.w_top)
+    reflected = _returned(below, light, unit)
+    ends = (
+        (media.substrate, reflected, outgoing(below, reverse.u_top, reverse.w_top)),
+        (media.cover, transmitted, _returned(above, reverse, unit)),
+    )
+    t = complex(transmitted[zero] * np.sqrt(above[0][zero] * above[1][zero]))
+    return _Problem(this, ways, regions, light, reverse, ends, t)
+
+
+def _source(pair: tuple[Array, Array], zero: int) -> Array:
+    source = np.zeros(len(pair[0]), complex)
+    source[zero] = 2 * np.sqrt(pair[0][zero] * pair[1][zero])
+    return source
+
+
+def _returned(pair: tuple[Array, Array], fields: Fields, unit: Array) -> Array:
+    incident = unit / np.sqrt(pair[0] * pair[1] + (1 - unit))
+    return outgoing(pair, fields.u - pair[0] * incident, pair[1] * incident - fields.w)
+
+
+def _regions(this: Case, ways: Waves, diameter_um: float, slices: int) -> list[_Region]:
+    def films(stack: tuple[Any, ...], indices: tuple[tuple[complex, float], ...]) -> list[_Region]:
+        pairs = zip(stack, indices, strict=True)
+        return [_Region(_film(ways, index), height, film.material, 0.0, 0.0) for film, (index, height) in pairs]
+
+    cell = this.cell
+    tilt = math.tan(cell.sidewall_rad)
+    pillar = []
+    for i in range(slices):
+        lift = (i + 0.5) / slices - 0.5
+        diameter = diameter_um - 2 * tilt * cell.height_um * lift
+        part = layer(ways, np.array(diameter), pitch_um=cell.pitch_um, pillar=this.pillar, between=this.between)
+        pillar.append(_Region(part, cell.height_um * this.k0 / slices, None, diameter, lift))
+    return films(cell.under, this.media.under) + pillar + films(cell.over, this.media.over)
+
+
+def _film(ways: Waves, index: complex) -> Layer:
+    kz = normal_component(ways.kappa, index)
+    kz = np.where(np.abs(kz) < _GRAZING, _GRAZING, kz)
+    is_p = np.arange(len(kz)) < ways.p_count
+    P, Q = np.where(is_p, kz**2 / index**2, 1.0), np.where(is_p, index**2, kz**2)
+    return Layer(np.diag(P), np.diag(Q), kz, np.eye(len(kz)), np.diag(Q / kz))
+
+
+def _by_diameter(problem: _Problem, share: list[float]) -> complex:
+    """Slope for diameters that change by ``share`` in each region."""
+    total = 0j
+    for i, (region, weight) in enumerate(zip(problem.regions, share, strict=True)):
+        if region.film is None:
+            change = changes.rim(problem.this, problem.ways, np.array(region.diameter_um))
+            total += weight * _inside(problem, i, change)
+    return total
+
+
+def _by_index(problem: _Problem) -> complex:
+    total = 0j
+    for i, region in enumerate(problem.regions):
+        if region.film is None:
+            change = changes.indices(problem.this, problem.ways, np.array(region.diameter_um), 1.0, 0.0)
+            total += _inside(problem, i, change)
+    return total
+
+
+def _by_height(problem: _Problem) -> complex:
+    tilt, slices = math.tan(problem.this.cell.sidewall_rad), sum(r.film is None for r in problem.regions)
+    total = 0j
+    for i, region in enumerate(problem.regions):
+        if region.film is None:
+            total += problem.this.k0 / slices * _stretch(problem, i)
+    if tilt:
+        total += _by_diameter(problem, [-2 * tilt * region.lift for region in problem.regions])
+    return total
+
+
+def _by_wavelength(problem: _Problem) -> complex:
+    this, ways = problem.this, problem.ways
+    wavelength, cell = this.wavelength_um, this.cell
+
+    def slope(material: Material) -> complex:
+        return materials.slope(material, wavelength)
+
+    turn = changes.turning(ways, np.stack([ways.m, ways.n]) / cell.pitch_um)
+    total = 0j
+    for i, region in enumerate(problem.regions):
+        total -= region.height / wavelength * _stretch(problem, i)
+        if region.film is None:
+            bulk = changes.indices(this, ways, np.array(region.diameter_um), slope(cell.pillar), slope(cell.between))
+            change = changes.add(changes.turned_pattern(this, ways, np.array(region.diameter_um), turn), bulk)
+        else:
+            index = materials.index(region.film, wavelength)
+            change = changes.medium(ways, index, 2 * index * slope(region.film), turn)
+        total += _inside(problem, i, change)
+    for (index, out, back), material in zip(problem.ends, (cell.substrate, cell.cover), strict=True):
+        total += _outside(ways, index, out, back, changes.medium(ways, index, 2 * index * slope(material), turn))
+    return total
+
+
+def _by_angle(problem: _Problem, angle_rad: float) -> complex:
+    this, ways = problem.this, problem.ways
+    if angle_rad == 0:
+        return 0j  # the response is even in the angle
+    tilt = math.cos(angle_rad) / math.sin(angle_rad) * np.array([[this.kx], [this.ky]])
+    turn = changes.turning(ways, np.broadcast_to(tilt, (2, len(ways.kappa))))
+    total = 0j
+    for i, region in enumerate(problem.regions):
+        if region.film is None:
+            change = changes.turned_pattern(this, ways, np.array(region.diameter_um), turn)
+        else:
+            change = changes.medium(ways, materials.index(region.film, this.wavelength_um), 0j, turn)
+        total += _inside(problem, i, change)
+    for index, out, back in problem.ends:
+        total += _outside(ways, index, out, back, changes.medium(ways, index, 0j, turn))
+    return total
+
+
+def _inside(problem: _Problem, i: int, change: Change) -> complex:
+    """i/2 of the integral over a layer."""
+    region, (a, b), (c, d) = problem.regions[i], *_amplitudes(problem, i)
+    part, h = region.part, region.height
+    q, fade = part.q, np.exp(1j * part.q * h)
+    total, apart = q[:, None] + q, q[:, None] - q
+    same = np.expm1(1j * total * h) / (1j * total)
+    near = np.abs(apart) * h < 0.5
+    x = np.where(near, apart, 0) * h / 2
+    middle = np.exp(1j * np.where(near, total, 0) * h / 2) * h * np.sinc(x / np.pi)
+    opposite = np.where(near, middle, (fade[:, None] - fade) / np.where(near, 1, 1j * apart))
+    even = same * (np.outer(a, c) + np.outer(b, d))
+    odd = opposite * (np.outer(a, d) + np.outer(b, c))
+    from_q = (part.W.T @ change[1] @ part.W) * (even + odd)
+    from_p = (part.V.T @ change[0] @ part.V) * (even - odd)
+    return complex(0.5j * (from_q.sum() - from_p.sum()))
+
+
+def _stretch(problem: _Problem, i: int) -> complex:
+    """i/2 (u^T Q u~ - w^T P w~), the same at every height of a layer; taken at its foot."""
+    region, (a, b), (c, d) = problem.regions[i], *_amplitudes(problem, i)
+    part = region.part
+    fade = np.exp(1j * part.q * region.height)
+    u, w = part.W @ (a + fade * b), part.V @ (a - fade * b)
+    u_back, w_back = part.W @ (c + fade * d), part.V @ (c - fade * d)
+    return complex(0.5j * (u @ part.Q @ u_back - w @ part.P @ w_back))
+
+
+def _amplitudes(problem: _Problem, i: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """(up, down) of the light and of the reverse in a layer, both as seen from below."""
+    j = len(problem.regions) - 1 - i
+    light, reverse = problem.light, problem.reverse
+    return (light.up[i], light.down[i]), (reverse.down[j], reverse.up[j])
+
+
+def _outside(ways: Waves, index: complex, out: Array, back: Array, change: Change) -> complex:
+    """i/2 of the integral over a half-space, of its outgoing waves."""
+    U, V = half_space(ways, index)
+    kz = normal_component(ways.kappa, index)
+    total = kz[:, None] + kz
+    total = np.where(np.abs(total) < _GRAZING, _GRAZING, total)
+    u, w, u_back, w_back = U * out, V * out, U * back, V * back
+    kernel = change[1] * np.outer(u, u_back) - change[0] * np.outer(w, w_back)
+    return complex(0.5j * (1j / total * kernel).sum())
