@@ -47,6 +47,8 @@ def smooth(
     It is the least that meets the tolerance at three probes. Elsewhere the error may exceed the tolerance (it is
     reported), but it has no jumps that a rational fit would take for resonances.
     """
+    if cell.height_um == 0:
+        return precise(cell, light, tolerance=tolerance, engine=engine)
     levels = _modal_levels(cell, light, tolerance) if engine == "modal" else _rcwa_levels(cell, light, tolerance)
     probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 0.97)]
     for at in levels[:-1]:
@@ -57,7 +59,7 @@ def smooth(
 
 def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
     from metalens.modal.engine import case_of, evaluate
-    from metalens.modal.ladder import Rung, first_rung, rungs
+    from metalens.modal.ladder import RUNGS, Rung, first_rung
 
     def level(rung: Rung) -> Callable[[float], Response]:
         def at(diameter_um: float) -> Response:
@@ -69,7 +71,7 @@ def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[
 
         return at
 
-    return [level(rung) for rung in rungs()[max(0, first_rung(tolerance) - 1) :]]
+    return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
 
 
 def _rcwa_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
