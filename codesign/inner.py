@@ -213,7 +213,9 @@ class Trainer:
         rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        task, optics_loss, macs = self._losses(live=rates["optics"] > 0, pitch_moves=rates["pitch"] > 0)
+        task, optics_loss, macs = self._losses(
+            live=rates["optics"] > 0 and "optics" in self.optimisers, pitch_moves=rates["pitch"] > 0
+        )
         total = task + self.inner.optics_weight * optics_loss
         if self.inner.budget_mmacs:
             total = total + self.inner.budget_weight * losses.over_budget(macs, self.inner.budget_mmacs * 1e6)
