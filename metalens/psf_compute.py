@@ -50,7 +50,7 @@ def intensity(
     if all(choice.method == "exact" for choice in choices) and phase.device.type == "cpu":
         return _exact(phase, level, cases, weights, choices[0].reason)
     first = phase.dtype if tolerance >= 4e-7 else torch.float64
-    tries = [(tolerance, first), (tolerance / 10, first), (tolerance / 10, torch.float64)]
+    tries = [(tolerance, first), (tolerance / 10, first), (tolerance / 100, torch.float64)]
     for setting, dtype in tries:
         result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, setting, moving)
         if result.error <= tolerance:

@@ -2,10 +2,12 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from metalens import store
 from metalens.propagate_case import axis
 from metalens.store import Array, Provenance
 
@@ -47,6 +49,11 @@ class PsfStack:
         """(y,) positions from the window centre."""
         return axis(self.intensity.shape[-2], self.step_um)
 
+    @property
+    def converged(self) -> bool:
+        """Whether the error estimate is within the tolerance."""
+        return self.error <= self.tolerance
+
     def numpy(self) -> "PsfStack":
         """The same record with numpy arrays, detached from any graph."""
         return dataclasses.replace(self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2))
@@ -54,3 +61,26 @@ class PsfStack:
 
 def _array(value: Any) -> Array:
     return value if isinstance(value, np.ndarray) else np.asarray(value.detach().cpu().numpy())
+
+
+_AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
+_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
+
+
+def save(path: str | Path, stack: PsfStack) -> None:
+    """Write a PSF file (kind ``psf``)."""
+    plain = stack.numpy()
+    arrays = {name: np.asarray(getattr(plain, name)) for name in ("intensity", "energy_um2", *_AXES)}
+    about = {name: getattr(plain, name) for name in _NUMBERS}
+    store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
+
+
+def load(path: str | Path) -> PsfStack:
+    """Read a PSF file.
+
+    Raises:
+        StoreError: missing, truncated, or not a PSF file.
+    """
+    stored = store.load(path, "psf")
+    fields: dict[str, Any] = {name: stored.attributes[name] for name in _NUMBERS} | stored.arrays
+    return PsfStack(**fields, provenance=stored.provenance)
