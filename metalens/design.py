@@ -50,7 +50,7 @@ class Limits:
     """
 
     min_diameter_nm: float = 80.0
-    min_gap_nm: float = 60.0
+    min_gap_nm: float = 70.0
 
     def __post_init__(self) -> None:
         if not (self.min_diameter_nm > 0 and self.min_gap_nm > 0):
