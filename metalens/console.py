@@ -62,11 +62,13 @@ def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.speed:.3g}/s"),
+        TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, transient=True) as bar:
-        task = bar.add_task(label, total=total)
-        for item in items:
+        task = bar.add_task(label, total=total, rate="")
+        start = time.monotonic()
+        for done, item in enumerate(items, 1):
             yield item
-            bar.advance(task)
+            rate = done / max(time.monotonic() - start, 1e-9)
+            bar.update(task, advance=1, rate=f"{rate:.3g}/s")
