@@ -50,7 +50,7 @@ def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
         yield from _references(plan, lattice)
         yield gds.record(gds.ENDSTR)
     yield _begin(plan.name)
-    yield b"".join(_reference(part.name) for part in (*plan.figures, *plan.lattices))
+    yield b"".join(_reference(name) for name in plan.placed_names)
     yield gds.record(gds.ENDSTR) + gds.record(gds.ENDLIB)
 
 
@@ -94,7 +94,7 @@ def _references(plan: MaskPlan, lattice: Lattice) -> Iterator[memoryview]:
         row, column = 0, 0
         while row < len(block):
             row, column, used = _fill(buffer, block, row, column, templates, xs, ys)
-            yield memoryview(buffer[:used]).cast("B")
+            yield buffer[:used].data.cast("B")
 
 
 def _templates(plan: MaskPlan) -> Array:

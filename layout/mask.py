@@ -133,8 +133,12 @@ class MaskPlan:
     @property
     def cell_names(self) -> list[str]:
         """Pillar classes, figures, lattices, top: in the order of the file."""
-        parts = (*self.classes, *self.figures, *self.lattices)
-        return [*(part.name for part in parts), self.name]
+        return [*(made.name for made in self.classes), *self.placed_names, self.name]
+
+    @property
+    def placed_names(self) -> list[str]:
+        """Cells that the top cell places: figures and lattices."""
+        return [*(figure.name for figure in self.figures), *(lattice.name for lattice in self.lattices)]
 
     @property
     def class_dtype(self) -> type[np.unsignedinteger]:

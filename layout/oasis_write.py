@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -100,7 +101,7 @@ def _cells(plan: MaskPlan, placed: list[list[Piece]], number: dict[str, int], se
         else:
             yield _cell(number[lattice.name])
             yield from _sites(lattice, settings, len(plan.classes))
-    top = b"".join(_placement(number[part.name]) for part in (*plan.figures, *plan.lattices))
+    top = b"".join(_placement(number[name]) for name in plan.placed_names)
     yield _cell(number[plan.name]) + top
 
 
@@ -150,7 +151,7 @@ def _tiles(lattice: Lattice, level: int) -> Iterator[bytes]:
             y = lattice.y0 - first * lattice.pitch
             for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
                 tile, x = block[:, left : left + tiles.TILE_COLUMNS], lattice.x0 + left * lattice.pitch
-                yield lambda tile=tile, x=x, y=y: _tile(tile, lattice.pitch, x, y, level)
+                yield partial(_tile, tile, lattice.pitch, x, y, level)
 
     yield from _in_order(jobs())
 
@@ -158,7 +159,7 @@ def _tiles(lattice: Lattice, level: int) -> Iterator[bytes]:
 def _tile(tile: Array, pitch: int, x0: int, y0: int, level: int) -> bytes:
     out = np.empty(tile.size * tiles.LARGEST_RECORD, np.uint8)
     used = tiles.encode_tile(tile, pitch, x0, y0, out)
-    return oasis.compressed(memoryview(out)[:used], level) if used else b""
+    return oasis.compressed(out[:used].data, level) if used else b""
 
 
 def _repetitions(lattice: Lattice, level: int, classes: int) -> Iterator[bytes]:
@@ -184,7 +185,7 @@ def _repetitions(lattice: Lattice, level: int, classes: int) -> Iterator[bytes]:
         return oasis.compressed(head + out[begins[kind] : ends[kind]].tobytes(), level)
 
     used = np.flatnonzero(counts[1:]) + 1
-    yield from _in_order(lambda k=int(k): one(k) for k in used)
+    yield from _in_order(partial(one, int(k)) for k in used)
 
 
 def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[bytes]:

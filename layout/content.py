@@ -1,0 +1,130 @@
+"""What a mask file holds, as it was read: cells, their polygons, circles and placements."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from layout.process import LayerNumber
+from metalens.errors import MaskFileError
+from metalens.store import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Placed:
+    """Placements in one cell.
+
+    children: names. child: (n,) index into them. x, y: (n,) int32 database units.
+    turn: (n,) uint8: quarter turns counter-clockwise (bits 0-1) after a mirror at the x axis (bit 2).
+    """
+
+    children: tuple[str, ...]
+    child: Array
+    x: Array
+    y: Array
+    turn: Array
+
+
+_DEEPEST = 64
+NOTHING = Placed((), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CellContent:
+    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n, 3) of x, y, radius}."""
+
+    name: str
+    polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
+    circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
+    placed: Placed = NOTHING
+    texts: int = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MaskContent:
+    """All of a mask file.
+
+    kind: ``GDSII`` or ``OASIS``. unit_nm: database unit. cells: by name, in the order of the file.
+    """
+
+    kind: str
+    unit_nm: float
+    cells: dict[str, CellContent]
+    layer_names: dict[LayerNumber, str] = field(default_factory=dict)
+
+    @property
+    def tops(self) -> list[str]:
+        """Cells that no other cell places."""
+        used = {name for cell in self.cells.values() for name in cell.placed.children}
+        return [name for name in self.cells if name not in used]
+
+    def leaves(self, top: str) -> Iterator[Placed]:
+        """All placements below ``top`` of cells that place nothing themselves, at their final places.
+
+        Raises:
+            MaskFileError: a cell that places itself, or one that is placed and not there.
+        """
+        yield from self._walk(top, 0, 0, 0, ())
+
+    def sites(self, top: str) -> dict[str, tuple[Array, Array]]:
+        """{leaf cell: (x, y) of all its placements below ``top``}, the hierarchy taken apart."""
+        found: dict[str, list[tuple[Array, Array]]] = {}
+        for placed in self.leaves(top):
+            order = np.argsort(placed.child, kind="stable")
+            edges = np.searchsorted(placed.child[order], np.arange(len(placed.children) + 1))
+            for k, child in enumerate(placed.children):
+                chosen = order[edges[k] : edges[k + 1]]
+                if len(chosen):
+                    found.setdefault(child, []).append((placed.x[chosen], placed.y[chosen]))
+        return {
+            name: (np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts]))
+            for name, parts in found.items()
+        }
+
+    def counts(self, top: str) -> dict[str, int]:
+        """{leaf cell: number of placements below ``top``}."""
+        found: dict[str, int] = {}
+        for placed in self.leaves(top):
+            for k, count in enumerate(np.bincount(placed.child, minlength=len(placed.children)).tolist()):
+                if count:
+                    found[placed.children[k]] = found.get(placed.children[k], 0) + count
+        return found
+
+    def _walk(self, name: str, x: int, y: int, turn: int, above: tuple[str, ...]) -> Iterator[Placed]:
+        if name in above or len(above) > _DEEPEST:
+            raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
+        placed = self._cell(name).placed
+        if not len(placed.child):
+            return
+        deep = np.array([bool(len(self._cell(child).placed.child)) for child in placed.children], bool)
+        px, py = _turned(placed.x, placed.y, turn)
+        px, py = px + np.int32(x), py + np.int32(y)
+        if not deep.any():
+            yield Placed(placed.children, placed.child, px, py, placed.turn)
+            return
+        inner = deep[placed.child]
+        for i in np.flatnonzero(inner):
+            down = _compose(turn, int(placed.turn[i]))
+            yield from self._walk(placed.children[placed.child[i]], int(px[i]), int(py[i]), down, (*above, name))
+        if not inner.all():
+            yield Placed(placed.children, placed.child[~inner], px[~inner], py[~inner], placed.turn[~inner])
+
+    def _cell(self, name: str) -> CellContent:
+        if name not in self.cells:
+            raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
+        return self.cells[name]
+
+
+def _turned(x: Array, y: Array, turn: int) -> tuple[Array, Array]:
+    """Points mirrored at the x axis (bit 2), then turned by quarter turns (bits 0-1)."""
+    if turn & 4:
+        y = -y
+    for _ in range(turn & 3):
+        x, y = -y, x
+    return x, y
+
+
+def _compose(outer: int, inner: int) -> int:
+    """The turn that equals ``inner`` followed by ``outer``."""
+    quarter = (outer & 3) + (-(inner & 3) if outer & 4 else inner & 3)
+    return quarter & 3 | (outer ^ inner) & 4
