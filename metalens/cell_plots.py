@@ -23,7 +23,7 @@ def study_figure(path: Path, study: "Study", verdicts: "list[Verdict]") -> None:
     pitch, height = NM * np.array(study.pitches_um), NM * np.array(study.heights_um)
     for panel, wavelength in zip(panels, study.wavelengths_um, strict=True):
         found = [v.turns for v in verdicts if v.wavelength_um == wavelength]
-        turns = np.array(found).reshape(len(height), len(pitch))
+        turns = np.array(found[: len(height) * len(pitch)]).reshape(len(height), len(pitch))
         image = panel.imshow(turns, origin="lower", aspect="auto", vmin=0, vmax=2, cmap="RdYlBu")
         for i, j in np.ndindex(*turns.shape):
             weight = "bold" if turns[i, j] >= 1 else "normal"

@@ -17,6 +17,7 @@ from metalens.errors import ConfigError
 from metalens.library import PLAIN
 from metalens.materials import index
 from metalens.reduced import Curve, Nodes
+from metalens.smooth import REACH
 from metalens.store import Array
 
 TURN = 2 * math.pi
@@ -33,6 +34,7 @@ class Study:
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t.
+    others: materials that the chosen cell is tried with as well.
     """
 
     pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
@@ -43,7 +45,8 @@ class Study:
     min_gap_um: float = 0.06
     least_transmission: float = 0.8
     least_half_width_um: float = 0.005
-    tolerance: float = 1e-2
+    tolerance: float = 3e-3
+    others: tuple[str, ...] = ("a-Si",)
 
     def __post_init__(self) -> None:
         if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
@@ -62,6 +65,7 @@ class Verdict:
     ends: what bounds it above.
     max_angle_deg: of incidence in air up to which no diffraction order propagates.
     error: largest error estimate of t on the stretch.
+    pillar: name of the material, or n + ik.
     """
 
     pitch_um: float
@@ -75,23 +79,30 @@ class Verdict:
     ends: str
     max_angle_deg: float
     error: float
+    pillar: str
 
 
 def run(study: Study, console: Console | None = None) -> list[Verdict]:
-    """Verdicts on every combination, wavelength by wavelength; one rational curve t(D) each, on all cores."""
-    cases = list(itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um))
+    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell with other materials."""
+    shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
+    cases = [(Cell(pitch, height, study.pillar), wavelength) for wavelength, height, pitch in shapes]
+    verdicts = _judged(study, cases, console or Console(quiet=True))
+    best = choice(study, verdicts)
+    if best is None:
+        return verdicts
+    cells = [Cell(*best, other) for other in study.others]
+    return verdicts + _judged(study, [(c, w) for c in cells for w in study.wavelengths_um], Console(quiet=True))
+
+
+def _judged(study: Study, cases: list[tuple[Cell, float]], console: Console) -> list[Verdict]:
+    """One rational curve t(D) a case, on all cores."""
     tasks = []
-    for wavelength, height, pitch in cases:
-        cell = Cell(pitch, height, study.pillar)
-        span = (study.min_diameter_um, pitch - study.min_gap_um)
-        about = {"tolerance": study.tolerance, "engine": engines.choose(cell)}
-        tasks.append(workers.curve_task(cell, Light(wavelength), span, **about))  # type: ignore[arg-type]
-    console = console or Console(quiet=True)
+    for cell, wavelength in cases:
+        span = (study.min_diameter_um, cell.pitch_um - study.min_gap_um)
+        engine = engines.choose(cell)
+        tasks.append(workers.curve_task(cell, Light(wavelength), span, tolerance=study.tolerance, engine=engine))
     found = dict(console.track(workers.run(tasks), total=len(tasks), label="cells"))
-    return [
-        judge(study, Cell(pitch, height, study.pillar), wavelength, curve_of(found[i], study.tolerance))
-        for i, (wavelength, height, pitch) in enumerate(cases)
-    ]
+    return [judge(study, *case, curve_of(found[i], study.tolerance)) for i, case in enumerate(cases)]
 
 
 def curve_of(result: workers.Result, tolerance: float) -> Curve:
@@ -111,7 +122,7 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
     faults = {"|t| falls": level < study.least_transmission, "the phase falls": np.diff(phase, append=np.inf) < 0}
     sharp = np.zeros(SAMPLES, bool)
     for centre, width in curve.resonances(study.least_half_width_um):
-        sharp |= np.abs(d - centre) <= max(4 * width, d[1] - d[0])
+        sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
     faults["a narrow resonance"] = sharp
     start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
     why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or ["the printable range"]
@@ -128,6 +139,7 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
         " and ".join(why),
         max_angle_deg(cell, wavelength_um),
         float(error[run].max(initial=0.0)),
+        named(cell.pillar),
     )
 
 
@@ -161,15 +173,14 @@ def write(folder: Path, study: Study, verdicts: list[Verdict], *, command: str) 
 
 def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
     """The study as a page with one table a wavelength: turns covered (least |t|), pitch across, height down."""
-    n = study.pillar if isinstance(study.pillar, str) else f"n = {study.pillar.n:g} + {study.pillar.k:g}i"
     lines = [
         "# Cell study",
         "",
-        f"Round pillars of {n} on fused silica in air. Printable: diameter from {1e3 * study.min_diameter_um:g} nm to "
-        f"the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, in turns, that the longest stretch of "
-        f"diameters covers on which the phase rises, |t| >= {study.least_transmission:g} and no resonance has a "
-        f"half-width below {1e3 * study.least_half_width_um:g} nm; in brackets the mean |t|² over it. "
-        "**Bold**: a full turn.",
+        f"Round pillars of {named(study.pillar)} on fused silica in air. Printable: diameter from "
+        f"{1e3 * study.min_diameter_um:g} nm to the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, "
+        "in turns, that the longest stretch of diameters covers on which the phase rises, |t| >= "
+        f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
+        "in brackets the mean |t|² over it. **Bold**: a full turn.",
         "",
         f"Made by `{command}`; numbers with diameters and reasons in `cell_study.json`.",
         "",
@@ -180,9 +191,18 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
             "",
             f"## {1e3 * wavelength:g} nm",
             "",
-            *_table(study, [v for v in verdicts if v.wavelength_um == wavelength]),
+            *_table(study, [v for v in _own(study, verdicts) if v.wavelength_um == wavelength]),
         ]
     return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
+
+
+def named(material: Material) -> str:
+    """A material in words."""
+    return material if isinstance(material, str) else f"n = {material.n:g} + {material.k:g}i"
+
+
+def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
+    return [v for v in verdicts if v.pillar == named(study.pillar)]
 
 
 def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
@@ -203,7 +223,7 @@ def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
     """(pitch, height) in um that covers a full turn at every wavelength with most turns at the worst of them, at the
     least height; None where no cell does."""
     by_cell: dict[tuple[float, float], list[float]] = {}
-    for v in verdicts:
+    for v in _own(study, verdicts):
         by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
     good = {cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1}
     if not good:
@@ -228,7 +248,8 @@ def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
     ]
     for v in found:
         lines.append(
-            f"- {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to {1e3 * v.to_um:.0f} nm "
+            f"- {v.pillar}, {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
+            f"{1e3 * v.to_um:.0f} nm "
             f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
             f"order up to {v.max_angle_deg:.0f} deg"
         )

@@ -22,6 +22,7 @@ FLOOR_SHARE = 0.1  # of the tolerance: added to every estimate, for what no riva
 DOUBT_SHARE = 0.5  # of the tolerance: disagreement of the fits at which the search ends
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
 SCAN = 1200  # places where the fits are compared
+FINEST_UM = 2e-5  # no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles no better
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,7 +59,8 @@ class Curve:
         """(..., 2) t and r, and (...) error estimate of t, not below the true error.
 
         The estimate adds the largest disagreement with a rival fit, the residual of the fit, a tenth of the
-        tolerance, and the solver's error at the neighbouring nodes. At a node it is the solver's own.
+        tolerance, and the solver's error: mostly a small shift of the diameter, it is carried from the neighbouring
+        nodes in proportion to the slope of t. At a node the estimate is the solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -68,10 +70,11 @@ class Curve:
         x = self.nodes.diameter_um[order]
         if d.size and not (d.min() >= x[0] - 1e-12 and d.max() <= x[-1] + 1e-12):
             raise DomainError(f"diameters {d.min():.6g} to {d.max():.6g} um, the curve holds {x[0]:.6g} to {x[-1]:.6g}")
-        value, error = self.best(d), self._doubt(d)
         right = np.clip(np.searchsorted(x, d), 1, len(x) - 1)
         solver = self.nodes.error[order]
-        error = error + np.maximum(solver[right - 1], solver[right])
+        shift = solver / self._steepness(x)
+        value = self.best(d)
+        error = self._doubt(d) + np.maximum(shift[right - 1], shift[right]) * self._steepness(d)
         for side in (right - 1, right):
             hit = x[side] == d
             value[hit], error[hit] = self.nodes.response[order[side[hit]]], solver[side[hit]]
@@ -81,6 +84,13 @@ class Curve:
         value = self.best(d)
         doubt = np.max([np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0)
         return np.asarray(doubt + self.best.residual + FLOOR_SHARE * self.tolerance)
+
+    def _steepness(self, d: Array) -> Array:
+        """|dt/dD| and what a curve without features would have, 1/um."""
+        low, high = self.nodes.diameter_um.min(), self.nodes.diameter_um.max()
+        step = FINEST_UM / 100
+        rise = np.abs(self.best(d + step)[..., 0] - self.best(d - step)[..., 0]) / (2 * step)
+        return np.asarray(rise + 2 / (high - low))
 
     def resonances(self, half_width_um: float = 0.02) -> Array:
         """(k, 2) diameter and half-width of the poles nearer to the real axis than ``half_width_um``, um.
@@ -159,7 +169,7 @@ def _suspect(fit: Rational, rivals: list[Rational], x: Array) -> tuple[float, fl
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
     even, near = np.linspace(low, high, SCAN + 1), np.concatenate(around)
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
-    near = near[(near > low) & (near < high) & (_distance(near, x) > 1e-9)]
+    near = near[(near > low) & (near < high) & (_distance(near, x) > FINEST_UM)]
     places = np.concatenate([even, near])
     value = fit(places)[:, 0]
     doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)

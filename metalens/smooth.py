@@ -9,7 +9,7 @@ from metalens.library import PillarLibrary
 from metalens.store import Array
 
 LEAST_ENTRIES = 12
-REACH = 4.0  # half-widths from a narrow resonance that are cut with it
+REACH = 2.0  # half-widths from a narrow resonance that are cut with it
 
 
 @dataclass(frozen=True, eq=False, slots=True)

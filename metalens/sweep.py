@@ -17,7 +17,7 @@ from metalens.store import Array, Provenance
 from metalens.workers import Result, Task
 
 AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where diameters are added
-FINEST_UM = 1e-4  # resonances narrower than this cannot be printed: sampled no finer
+FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
 MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
 
@@ -73,8 +73,9 @@ def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> 
     low, high = span
     even = np.linspace(low, high, samples)
     sharp = np.concatenate([curve.resonances() for curve in curves])
-    sharp = sharp[sharp[:, 1] < 3 * (even[1] - even[0])]  # wider ones are well sampled already
-    added = (sharp[:, :1] + np.array(AROUND) * np.maximum(sharp[:, 1:], FINEST_UM)).ravel()
+    wide = 3 * (even[1] - even[0])  # well sampled already
+    sharp = sharp[(sharp[:, 1] > FINEST_UM) & (sharp[:, 1] < wide)]
+    added = (sharp[:, :1] + np.array(AROUND) * sharp[:, 1:]).ravel()
     added = np.unique(np.round(added[(added > low) & (added < high)], 6))
     return np.unique(np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]]))
 

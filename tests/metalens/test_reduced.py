@@ -88,4 +88,8 @@ def test_the_solvers_error_enters_the_estimate():
         return Response(made.t, made.r, 0.02, made.orders, made.energy, made.engine, True, "")
 
     curve = reduced.curve(reduced.explore(coarse, *SPAN, tolerance=1e-3), tolerance=1e-3)
-    assert curve(np.linspace(*SPAN, 50))[1].min() >= 0.02
+    d = np.linspace(*SPAN, 400)
+    estimate = curve(d)[1]
+    assert estimate.min() > 0.01
+    slope = np.abs(np.gradient(curve(d)[0][:, 0], d))
+    assert estimate[np.argmax(slope)] > 2 * np.median(estimate)  # an error of the diameter costs most on a flank
