@@ -11,7 +11,7 @@ from metalens.errors import CellError
 from metalens.materials import index
 from metalens.modal.assembly import Geometry, assemble
 from metalens.modal.homogeneous import Basis, modes
-from metalens.modal.ladder import Rung, first_rung, rungs
+from metalens.modal.ladder import RUNGS, Rung, first_rung
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import half_space, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
@@ -104,19 +104,38 @@ def evaluate(case: Case, plan: MeshPlan) -> Solution:
     return Solution(mean, half_difference, float(np.mean(powers)), unknowns)
 
 
-def climb(case: Case, tolerance: float) -> tuple[Solution, float, bool, str]:
+@dataclass(frozen=True, eq=False, slots=True)
+class Climb:
+    """Where the ladder was left: the solution, its rung and error estimate, and why."""
+
+    solution: Solution
+    rung: Rung
+    error: float
+    converged: bool
+    reason: str
+
+
+def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate."""
-    best: tuple[float, Solution, Rung] | None = None
-    for rung in rungs()[first_rung(tolerance) :]:
+    best: Climb | None = None
+    for rung in RUNGS[first_rung(tolerance) :]:
         solution = evaluate(case, rung.plan)
         error = rung.error(solution.error)
-        if best is None or error < best[0]:
-            best = (error, solution, rung)
         if error <= tolerance:
-            return solution, error, True, f"both forms agree within the tolerance on mesh {rung.name}"
+            reason = f"the {rung.name} mesh meets the tolerance"
+            return Climb(solution, rung, error, True, reason)
+        if best is None or error < best.error:
+            reason = f"the {rung.name} mesh leaves an estimated error of {error:.1e}, the least of all meshes"
+            best = Climb(solution, rung, error, False, reason)
     if best is None:
-        raise CellError(f"tolerance = {tolerance}: need a number above 0")
-    return best[1], best[0], False, f"the finest mesh ({best[2].name}) leaves an estimated error of {best[0]:.1e}"
+        raise CellError(f"tolerance = {tolerance}: no mesh to try")
+    return best
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse what is not a finite number above 0."""
+    if not (math.isfinite(tolerance) and tolerance > 0):
+        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
 
 
 def film(case: Case) -> np.ndarray:
@@ -211,12 +230,12 @@ def solve(
         CellError, MaterialError: see ``case_of``.
     """
     case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
-    if not (tolerance > 0 and math.isfinite(tolerance)):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    check_tolerance(tolerance)
     if case.height == 0:
         matrix = film(case)
         energy = float((np.abs(matrix[:, 0]) ** 2).sum())
         return Response(complex(matrix[1, 0]), complex(matrix[0, 0]), 1e-15, 1, energy, "film", True, "closed form")
-    solution, error, converged, reason = climb(case, tolerance)
-    t, r = complex(solution.matrix[1, 0]), complex(solution.matrix[0, 0])
-    return Response(t, r, error, solution.unknowns, solution.energy, "modal", converged, reason)
+    end = climb(case, tolerance)
+    t, r = complex(end.solution.matrix[1, 0]), complex(end.solution.matrix[0, 0])
+    unknowns, energy = end.solution.unknowns, end.solution.energy
+    return Response(t, r, end.error, unknowns, energy, "modal", end.converged, end.reason)

@@ -37,11 +37,6 @@ RUNGS = (
 )
 
 
-def rungs() -> tuple[Rung, ...]:
-    """All meshes, coarsest first."""
-    return RUNGS
-
-
 def first_rung(tolerance: float) -> int:
     """Index of the coarsest mesh that usually meets the tolerance."""
     return next((i for i, rung in enumerate(RUNGS) if rung.usual <= tolerance), len(RUNGS) - 1)

@@ -8,11 +8,11 @@ of twice the size, also with absorption. At kx = 0 the two parts decouple; the i
 which is the case of light polarised along x at normal incidence.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from metalens.modal.assembly import Geometry, Part
+from metalens.modal.assembly import Geometry, Part, integrate
 from metalens.modal.mesh import X0, X1, Y0, Y1
 
 
@@ -68,6 +68,22 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndar
     return out
 
 
+def restrict_rate(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndarray:
+    """Derivative of ``restrict`` in the half phase, which enters by the weights along x = pitch / 2."""
+    moving_rows, moving_columns = weight_rate(rows), weight_rate(columns)
+    rate: np.ndarray = restrict(matrix, moving_rows, columns) + restrict(matrix, rows, moving_columns)
+    return rate
+
+
+def weight_rate(selection: Selection) -> Selection:
+    """The selection with its weights replaced by their derivatives in the half phase."""
+    real, imaginary = np.zeros_like(selection.real_weight), np.zeros_like(selection.imaginary_weight)
+    shared = len(set(selection.real_at.tolist()) & set(selection.imaginary_at.tolist()))
+    if shared:
+        real[-shared:], imaginary[-shared:] = -selection.imaginary_weight[-shared:], selection.real_weight[-shared:]
+    return replace(selection, real_weight=real, imaginary_weight=imaginary)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Space:
     """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch."""
@@ -92,3 +108,30 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
 
     gradient = restrict(geometry.gradient, vectors, scalars)
     return Space(part(geometry.cell), part(geometry.disc), gradient, electric, half_phase_rad)
+
+
+def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> tuple[Space, Space]:
+    """Derivatives of ``space`` in the radius rho and in the half phase (zero without one)."""
+    mesh = geometry.mesh
+    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
+    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
+
+    def by_radius(p: Part) -> Part:
+        return Part(
+            restrict(p.mass, vectors, vectors), restrict(p.curl, vectors, vectors), restrict(p.scalar, scalars, scalars)
+        )
+
+    def by_phase(p: Part) -> Part:
+        return Part(
+            restrict_rate(p.mass, vectors, vectors),
+            restrict_rate(p.curl, vectors, vectors),
+            restrict_rate(p.scalar, scalars, scalars),
+        )
+
+    cell, disc = integrate(mesh, geometry.rho, rate=True)
+    still = np.zeros((vectors.size, scalars.size))
+    turned = restrict_rate(geometry.gradient, vectors, scalars)
+    return (
+        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad),
+        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad),
+    )
