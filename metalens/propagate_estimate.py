@@ -55,21 +55,24 @@ def relative_error(tiles: list[list[Sample]]) -> float:
     energy = light.sum(1)
     depths = np.unique(np.linspace(0, len(light) - 1, min(len(light), DEPTHS)).round().astype(int))
     normalised = light[depths] / energy[depths, None]
-    points, chance = _draw(normalised, edges)
+    points, chance = draw(normalised, edges)
     difference = _difference(tiles, light, depths, points) / energy[depths, None]
+    noise = sum(2 * s.weight * s.noise**2 * (1 / energy[depths]).sum() for s in tiles[0])
+    total = square_error(normalised, points, chance, difference) + float(noise)
+    return float(SAFETY * np.sqrt(total / (normalised**2).sum()))
+
+
+def square_error(normalised: Array, points: Array, chance: Array, difference: Array) -> float:
+    """Unbiased estimate of Σ (δ/S - (I/S)·Σδ/S)² from samples of ``difference`` = δ/S (depth, n) at drawn pixels."""
     value = np.take_along_axis(normalised, points, 1)
     a, b, d = difference**2 / chance, value * difference / chance, difference / chance
     n, power = points.shape[1], (normalised**2).sum(1)
-    if n == light.shape[1]:
-        square = a.sum(1) - 2 * b.sum(1) * d.sum(1) + d.sum(1) ** 2 * power
-    else:
-        pairs = n * (n - 1)
-        cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
-        common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
-        square = a.mean(1) - 2 * cross + common * power
-    noise = sum(2 * s.weight * s.noise**2 * (1 / energy[depths]).sum() for s in tiles[0])
-    total = max(float(square.sum()), 0.1 * float(a.mean(1).sum())) + float(noise)
-    return float(SAFETY * np.sqrt(total / power.sum()))
+    if n == normalised.shape[1]:
+        return float((a.sum(1) - 2 * b.sum(1) * d.sum(1) + d.sum(1) ** 2 * power).sum())
+    pairs = n * (n - 1)
+    cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
+    common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
+    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.1 * float(a.mean(1).sum()))
 
 
 def _intensity(samples: list[Sample]) -> Array:
@@ -85,7 +88,7 @@ def _edges(shape: tuple[int, ...]) -> Array:
     return np.asarray(1 + 9 * np.maximum(np.abs(x), np.abs(y)[:, None]) ** 8).ravel()
 
 
-def _draw(normalised: Array, edges: Array) -> tuple[Array, Array]:
+def draw(normalised: Array, edges: Array) -> tuple[Array, Array]:
     """(depth, n) pixel indices and their chances: a systematic sample, or every pixel where there are few."""
     depths, pixels = normalised.shape
     n = max(8, POINTS // depths)
