@@ -70,7 +70,8 @@ def respond(ways: Waves, media: Media, layers: list[Layer], zero: int) -> Amplit
     found = match(layers, media.heights, top, foot, source)
     incident = _flux(below)[zero]
     t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(_flux(above) / incident)
-    return Amplitudes(t, _reflected(ways, media, found.u, found.w, zero) * np.sqrt(_flux(below) / incident))
+    r = _reflected(ways, media, foot, drop, found, zero) * np.sqrt(_flux(below) / incident)
+    return Amplitudes(t, r)
 
 
 def outgoing(pair: Pair, u: Array, w: Array) -> Array:
@@ -138,21 +139,20 @@ def _through(ways: Waves, pair: Pair, films: tuple[tuple[complex, float], ...]) 
     return (u, w), fade
 
 
-def _reflected(ways: Waves, media: Media, u: Array, w: Array, zero: int) -> Array:
-    """Reflected amplitudes in the substrate from the fields above the films under the pillar."""
+def _reflected(ways: Waves, media: Media, foot: Pair, drop: Array, fields: Fields, zero: int) -> Array:
+    """Reflected amplitudes in the substrate, from the fields above the films under the pillar.
+
+    Without the pillar the films would pass the incident wave on into a medium like the substrate; what the fields
+    differ from that comes from above, and radiates downwards.
+    """
     U, V = half_space(ways, media.substrate)
-    live = _flux((U, V)) > 0
-    u, w = np.where(live, u, 0), np.where(live, w, 0)
-    is_p = np.arange(len(U)) < ways.p_count
-    for index, thickness in reversed(media.under):
-        kz = normal_component(np.where(live, ways.kappa, 0), index)
-        cosine = np.cos(kz * thickness)
-        sine = np.where(kz == 0, thickness, np.sin(kz * thickness) / np.where(kz == 0, 1, kz))
-        alpha, beta = np.where(is_p, index**2, kz**2), np.where(is_p, kz**2 / index**2, 1.0)
-        u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
-    unit = np.zeros(len(U))
-    unit[zero] = 1
-    return np.where(live, outgoing((U, V), u - U * unit, -(w - V * unit)), 0)
+    (u, w), fade = _through(ways, (U, V), tuple(reversed(media.under)))
+    whole = V[zero] * u[zero] + U[zero] * w[zero]
+    passed = np.zeros(len(U), complex)
+    passed[zero] = fade[zero] * 2 * U[zero] * V[zero] / whole
+    back = drop * outgoing(foot, fields.u - U * passed, V * passed - fields.w)
+    back[..., zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / whole
+    return np.asarray(back)
 
 
 def _flux(pair: Pair) -> Array:
