@@ -9,6 +9,8 @@ from typing import Any
 _VERBS = {
     "Capture": "capture",
     "load": "capture",
+    "fit": "estimate",
+    "AsBuilt": "asbuilt",
     "fit_pupil": "pupilfit",
     "PupilSpec": "pupil",
 }

@@ -203,6 +203,9 @@ def _gain(capture: Capture, notes: list[str]) -> Gain:
 
 
 def _dark_level(capture: Capture, notes: list[str]) -> Array | float:
+    if capture.dark is None and "offset" in capture.about:
+        notes.append(f"offset of {capture.about['offset']} counts subtracted as stated")
+        return float(capture.about["offset"])
     if capture.dark is None:
         notes.append("no dark frame: the offset is left to the fit's background")
         return 0.0

@@ -13,7 +13,7 @@ from metalens.store import Array
 class Grid:
     """Fine samples under the pixels of a window, with a margin that keeps blur from wrapping around.
 
-    rows, columns: pixels of the window. oversample: fine samples per pixel side, odd so that one sits at the centre.
+    rows, columns: pixels of the window. oversample: fine samples per pixel side.
     margin: pixels on each side.
     """
 
@@ -44,16 +44,22 @@ class Grid:
 
     def sample(self, intensity: Array, transfer: Array) -> Array:
         """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
-        blurred = fft.irfft2(fft.rfft2(intensity) * transfer, s=intensity.shape[-2:])
+        blurred = fft.irfft2(fft.rfft2(intensity) * (transfer * self._half_step()), s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
         return np.asarray(blurred[..., y, x])
 
+    def _half_step(self) -> Array | float:
+        """Transfer that moves the light by half a fine sample, where no fine sample sits at a pixel's centre."""
+        if self.oversample % 2:
+            return 1.0
+        fy, fx = self.frequencies()
+        return np.asarray(np.exp(-1j * np.pi * (fy + fx) * self.fine_um))
+
 
 def fine_enough(pixel_um: float, highest: float) -> int:
-    """Least odd oversampling at which intensity of up to ``highest`` cycles/um is sampled above twice that."""
-    need = math.ceil(2 * highest * pixel_um * (1 + 1e-9))
-    return need + (need + 1) % 2 if need > 1 else 1
+    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled above twice that."""
+    return max(1, math.ceil(2 * highest * pixel_um * (1 + 1e-9)))
 
 
 def pixel(fy: Array, fx: Array, pixel_um: float) -> Array:

@@ -1,0 +1,320 @@
+"""Bench captures and a design to the lens that was made: maximum likelihood from several starts, checked, explained."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize import knowable, leastsquares
+from characterize.arrange import Arrangement, arrange, rearranged
+from characterize.asbuilt import AsBuilt
+from characterize.capture import Capture
+from characterize.clean import Frames, Gain, clean
+from characterize.forward import ForwardModel, Setting
+from characterize.leastsquares import Data, Prior, Settings, Solution
+from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
+from characterize.pillars import Sensitivity, sensitivity
+from metalens.errors import CaptureError, FitError
+from metalens.lens import Lens
+from metalens.store import Array
+
+MISFIT, LIKENESS = 1.15, 0.55
+MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to fit.
+
+    free: parameters to fit beyond the usual ones. known: metrology, as priors.
+    window: largest side in pixels of what is fitted. scan_um: half range of the stage-zero search.
+    insist: return a result that fails its checks (problems filled) instead of refusing it.
+    """
+
+    free: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
+    window: int = 48
+    scan_um: float | None = None
+    insist: bool = False
+
+
+def fit(
+    capture: Capture, lens: Lens, options: Options | None = None, *, response: Sensitivity | None = None
+) -> AsBuilt:
+    """The as-built lens behind a capture.
+
+    Args:
+        response: what height, index and sidewall do to the pillars; from rigorous solves of the cell without it.
+
+    Raises:
+        CaptureError: depths, pixel or wavelength missing, or frames unusable.
+        FitError: refused, with the cause: another lens, a model that cannot explain the frames, a parameter at its
+            bound, no convergence.
+    """
+    options = options or Options()
+    frames = clean(capture)
+    setting, window = _setting(capture, lens, options)
+    if response is None:
+        d = lens.diameters.diameter_um
+        response = sensitivity(lens.cell, lens.wavelength_um, (float(d[d > 0].min()), float(d.max())))
+    model = ForwardModel(lens, setting, response)
+    data = _data(frames, window)
+    known = {k.name: k for k in (*_stated(capture, lens), *options.known)}
+    start = vector({name: k.value for name, k in known.items()})
+    scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
+    found = arrange(model, data.electrons, data.usable, scan_um=scan, start=start)
+    _check_likeness(found, lens)
+    cautions = [*frames.corrections, *_arranged_words(found)]
+    data = _rearranged(data, found)
+    names, solution = _search(model, data, start, known, found, options)
+    if not _explained(solution) and not set(MORE) <= set(names):
+        more = dataclasses.replace(options, free=(*options.free, *MORE))
+        wider = _search(model, data, _full(names, solution, start), known, found, more, brief=True)
+        if wider[1].chi2_per_dof < 0.97 * solution.chi2_per_dof:
+            names, solution = wider
+            cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
+    result = _result(capture, lens, model, data, names, solution, start, known, cautions, frames.gain)
+    if result.problems and not options.insist:
+        raise FitError("fit refused: " + "; ".join(result.problems))
+    return result
+
+
+def _setting(capture: Capture, lens: Lens, options: Options) -> tuple[Setting, tuple[slice, slice]]:
+    if not np.isfinite(capture.position_um).all():
+        raise CaptureError("source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)")
+    if math.isnan(capture.pixel_um):
+        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+    if math.isnan(capture.wavelength_um):
+        raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
+    window = _window(capture, options.window)
+    exposure = capture.exposure_s / np.nanmax(capture.exposure_s) if np.isfinite(capture.exposure_s).all() else 1.0
+    n = len(capture.frames)
+    rows, columns = (s.stop - s.start for s in window)
+    return Setting(
+        np.asarray(capture.position_um, float),
+        np.asarray(capture.angle_rad, float),
+        np.broadcast_to(np.asarray(exposure, float), n).copy(),
+        capture.pixel_um,
+        rows,
+        columns,
+    ), window
+
+
+def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
+    """The whole frame if small, else a square about the light's centre."""
+    frames = np.asarray(capture.frames, float)
+    light = np.median(frames, axis=0) - np.median(frames)
+    light = np.maximum(light - 0.2 * np.percentile(light, 99.9), 0)
+    total = max(light.sum(), 1e-9)
+    slices = []
+    for axis, size in enumerate(light.shape):
+        side = min(size, largest)
+        place = (light.sum(1 - axis) * np.arange(size)).sum() / total
+        first = int(np.clip(round(place) - side // 2, 0, size - side))
+        slices.append(slice(first, first + side))
+    return slices[0], slices[1]
+
+
+def _data(frames: Frames, window: tuple[slice, slice]) -> Data:
+    shape = frames.electrons.shape
+    cut = (slice(None), *window)
+    floor, scale = (np.broadcast_to(a, shape)[cut] for a in (frames.variance_e2, frames.scale))
+    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale)
+
+
+def _stated(capture: Capture, lens: Lens) -> list[Known]:
+    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole."""
+    offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
+    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
+    if "pinhole_um" in capture.about:
+        size = float(capture.about["pinhole_um"])
+        known.append(Known("pinhole_um", size, 0.0))
+    return known
+
+
+def _check_likeness(found: Arrangement, lens: Lens) -> None:
+    if found.likeness < LIKENESS:
+        raise FitError(
+            f"fit refused: the frames look like no image of this lens (best correlation {found.likeness:.2f}); "
+            f"they are of another lens than this {lens.profile} one, far from the stated depths, or dark"
+        )
+
+
+def _arranged_words(found: Arrangement) -> list[str]:
+    words = []
+    if found.clearly:
+        words.append(f"frames fit the design only {found.words}: used so")
+    if found.reordered:
+        words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
+    if not found.order_seen:
+        words.append("images of neighbouring depths are alike: the order of the frames cannot be checked")
+    return words
+
+
+def _rearranged(data: Data, found: Arrangement) -> Data:
+    part = [rearranged(a, found) for a in (data.electrons, data.usable, data.saturated, data.variance_e2, data.scale)]
+    return Data(part[0], part[1], part[2], part[3], part[4])
+
+
+def _names(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
+    for name in free:
+        vector({name: 0.0})
+    wanted = {p.name for p in PARAMETERS if p.free} | set(free)
+    wanted |= {k.name for k in known.values() if k.sigma > 0}
+    wanted -= {k.name for k in known.values() if k.sigma == 0 and k.name not in free}
+    return tuple(name for name in NAMES if name in wanted)
+
+
+def prior_of(names: Sequence[str], known: dict[str, Known]) -> Prior:
+    """Priors of the fitted parameters: metrology where there is, else what is usual."""
+    table = [PARAMETERS[PLACE[name]] for name in names]
+    entries = [known.get(name) for name in names]
+    mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
+    sigma = [k.sigma if k and k.sigma > 0 else p.sigma for k, p in zip(entries, table, strict=True)]
+    return Prior(np.array(mean), np.array(sigma), np.array([p.low for p in table]), np.array([p.high for p in table]))
+
+
+def _search(
+    model: ForwardModel,
+    data: Data,
+    start: Array,
+    known: dict[str, Known],
+    found: Arrangement,
+    options: Options,
+    *,
+    brief: bool = False,
+) -> tuple[tuple[str, ...], Solution]:
+    """Short fits from each start, the best one to the end."""
+    names = _names(known, options.free)
+    prior, base = prior_of(names, known), start.copy()
+    place = [PLACE[name] for name in names]
+
+    def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
+        x = base.copy()
+        x[place] = values
+        return model.images(x, names if jacobian else None)
+
+    begins = [start] if brief else _starts(model, data, start, found)
+    if "pinhole_um" in names and base[PLACE["pinhole_um"]] == 0:
+        begins = [_with(x, {"pinhole_um": 5.0}) for x in begins]
+    if "bandwidth_nm" in names and base[PLACE["bandwidth_nm"]] == 0:
+        begins = [_with(x, {"bandwidth_nm": 0.5}) for x in begins]
+    short = Settings(iterations=3, step_tolerance=3.0)
+    tries = [leastsquares.fit(images, data, x[place], prior=prior, settings=short) for x in begins]
+    best = min(tries, key=lambda t: t.merit)
+    return names, leastsquares.fit(images, data, best.value, prior=prior, settings=Settings(iterations=30))
+
+
+def _with(x: Array, values: dict[str, float]) -> Array:
+    out = x.copy()
+    for name, value in values.items():
+        out[PLACE[name]] = value
+    return out
+
+
+def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -> list[Array]:
+    """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
+    pixel = model.setting.pixel_um
+    level = float(np.median(data.electrons[data.usable]))
+    base = _with(
+        start,
+        {
+            "stage_zero_um": found.stage_zero_um,
+            "decentre_x_um": float(np.clip(-found.shift_px[1] * pixel, -50, 50)),
+            "decentre_y_um": float(np.clip(-found.shift_px[0] * pixel, -50, 50)),
+            "background_e": level,
+        },
+    )
+    starts = []
+    for bias in (0.0, 8.0, -8.0):
+        x = _with(base, {"bias_nm": base[PLACE["bias_nm"]] + bias})
+        light = model.images(_with(x, {"background_e": 0.0}))[0]
+        keep = data.usable & ~data.saturated
+        gain = float((light * (data.electrons - level))[keep].sum() / (light[keep] ** 2).sum())
+        starts.append(_with(x, {"log_gain": math.log(max(gain, 1e-12))}))
+    return starts
+
+
+def _explained(solution: Solution) -> bool:
+    return solution.chi2_per_dof <= MISFIT
+
+
+def _full(names: tuple[str, ...], solution: Solution, start: Array) -> Array:
+    return _with(start, dict(zip(names, solution.value.tolist(), strict=True)))
+
+
+def _result(
+    capture: Capture,
+    lens: Lens,
+    model: ForwardModel,
+    data: Data,
+    names: tuple[str, ...],
+    solution: Solution,
+    start: Array,
+    known: dict[str, Known],
+    cautions: list[str],
+    gain: Gain,
+) -> AsBuilt:
+    prior = prior_of(names, known)
+    fitted = dict(zip(names, solution.value.tolist(), strict=True))
+    bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
+    held = {name: float(start[PLACE[name]]) for name in NAMES if name not in fitted}
+    return AsBuilt(
+        design=lens,
+        names=names,
+        value=solution.value,
+        covariance=_with_gain(names, solution, gain),
+        information=solution.information,
+        held=held,
+        depth_um=model.setting.depth_um,
+        angle_rad=model.setting.angle_rad,
+        pixel_um=capture.pixel_um,
+        measured=data.electrons,
+        predicted=solution.image,
+        nominal=model.images(_with(start, bench))[0],
+        residual_sigma=solution.residual_sigma,
+        chi2_per_dof=solution.chi2_per_dof,
+        converged=solution.converged,
+        reason=solution.reason,
+        identifiable=tuple(knowable.identifiable(names, solution.information, prior.sigma)),
+        degeneracies=tuple(knowable.degeneracies(names, solution.covariance, prior.sigma)),
+        cautions=tuple(cautions),
+        problems=tuple(_problems(names, solution, prior, gain.known)),
+    )
+
+
+def _with_gain(names: tuple[str, ...], solution: Solution, gain: Gain) -> Array:
+    """Covariance with the error of the sensor's gain, which scales everything that is counted in electrons."""
+    relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
+    by_gain = np.zeros(len(names))
+    for i, name in enumerate(names):
+        if name.startswith("background"):
+            by_gain[i] = solution.value[i] * relative
+        elif name == "log_gain":
+            by_gain[i] = relative
+    return np.asarray(solution.covariance + np.outer(by_gain, by_gain))
+
+
+def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain_known: bool) -> list[str]:
+    """Checks of a finished fit, each with the cause it points to."""
+    words = []
+    if not solution.converged:
+        words.append(f"not converged ({solution.reason})")
+    outliers = float((np.abs(solution.residual_sigma) > 6).mean())
+    if gain_known and not _explained(solution):
+        frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))
+        words.append(
+            f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, not 1: the model does not explain "
+            f"the frames (worst: frame {frame}); another lens, a shifted or repeated frame, a ghost, a wrong gain"
+        )
+    if gain_known and outliers > 0.02:
+        words.append(
+            f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
+        )
+    for name, value, low, high in zip(names, solution.value, prior.low, prior.high, strict=True):
+        at_zero = name in ("pinhole_um", "bandwidth_nm", "crosstalk_px") and value <= low
+        if not at_zero and (value <= low or value >= high):
+            words.append(f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread")
+    return words

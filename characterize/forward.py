@@ -1,0 +1,316 @@
+"""Expected frames of an as-built lens on its bench, with derivatives by every parameter, on coarse nodes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from characterize import detector
+from characterize.parameters import ABERRATIONS, BIAS, NAMES, PLACE, aberrations, bias_um
+from characterize.pillars import Pillars, Process, Range, Sensitivity
+from characterize.reduced import Bench, Operators, Reduced, sensor_path, source_path
+from metalens.errors import FitError
+from metalens.lens import Lens
+from metalens.store import Array
+
+GEOMETRY = (
+    "distance_um",
+    "wavelength_nm",
+    "decentre_x_um",
+    "decentre_y_um",
+    "tilt_x_deg",
+    "tilt_y_deg",
+    "source_x_um",
+    "source_y_um",
+    "stage_zero_um",
+    "stage_scale",
+)
+PROCESS = ("height_nm", "index", "sidewall_deg")
+_SLOPE_TOLERANCE = 3e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
+_STEP = {"distance_um": 0.05, "wavelength_nm": 0.005}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Setting:
+    """The frames that are to be predicted.
+
+    depth_um: (n,) stated source depths. angle_rad: (n, 2). exposure: (n,) relative.
+    pixel_um: of the sensor; rows, columns: of the window about the chief ray.
+    margin: pixels around it that blur may reach in from.
+    tolerance: relative error of the field allowed to the reduction.
+    """
+
+    depth_um: Array
+    angle_rad: Array
+    exposure: Array
+    pixel_um: float
+    rows: int
+    columns: int
+    margin: int = 4
+    tolerance: float = 5e-4
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.depth_um).all() and (self.depth_um > 0).all()):
+            raise FitError("source depths must be finite and above 0; give them in stage.csv (depth_um)")
+        if not (math.isfinite(self.pixel_um) and self.pixel_um > 0):
+            raise FitError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Group:
+    """Frames of one field angle."""
+
+    index: Array
+    reduced: Reduced
+    zernike: Array
+    bias: Array
+
+
+class ForwardModel:
+    """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
+
+    Accuracy: of the pillars ``pillars.error`` in t, of the geometry ``setting.tolerance`` in the field; a test and the
+    benchmark hold both against the sum over all pillars.
+    """
+
+    def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
+        self.lens, self.setting = lens, setting
+        self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
+        sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
+        over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
+        self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
+        self.pillars = Pillars(lens, response, span=span)
+        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
+        self.stage_centre_um = float(setting.depth_um.mean())
+        self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
+        self._edge_y = (np.arange(setting.rows) - setting.rows // 2)[:, None] / (setting.rows / 2)
+        self._edge_x = (np.arange(setting.columns) - setting.columns // 2)[None] / (setting.columns / 2)
+
+    def _group(self, angle_rad: Array) -> _Group:
+        setting = self.setting
+        index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
+        tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
+        bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
+        window = (max(setting.rows, setting.columns) + 2 * setting.margin) * setting.pixel_um + 20.0
+        depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
+        reduced = Reduced(
+            self.lens, self.pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance
+        )
+        _, maps = bias_um(np.zeros(len(NAMES)), reduced.u, reduced.v)
+        return _Group(index, reduced, aberrations(reduced.u, reduced.v), maps)
+
+    def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
+        """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
+        light, slopes = self._light(x, wanted)
+        scale = self._scale(x)
+        n, s = len(light), self.setting
+        sampled = scale[:, None, None] * light
+        image = sampled + x[PLACE["background_e"]]
+        image = image + x[PLACE["background_x_e"]] * self._edge_x + x[PLACE["background_y_e"]] * self._edge_y
+        if wanted is None:
+            return image, None
+        out = np.zeros((len(wanted), n, s.rows, s.columns))
+        plain: dict[str, Any] = {
+            "background_e": 1.0,
+            "background_x_e": self._edge_x,
+            "background_y_e": self._edge_y,
+            "log_gain": sampled,
+        }
+        for j, name in enumerate(wanted):
+            out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
+        if "stage_zero_um" in wanted or "stage_scale" in wanted:
+            depth = true_depth(x, self.setting, self.stage_centre_um)
+            rates: dict[str, Any] = {"stage_zero_um": 1.0, "stage_scale": self.setting.depth_um - self.stage_centre_um}
+            for name, rate in rates.items():
+                if name in wanted:  # light falls as the square of the depth
+                    out[list(wanted).index(name)] += (-2 * rate / depth)[:, None, None] * sampled
+        return image, out
+
+    def _scale(self, x: Array) -> Array:
+        """(n,) electrons in a pixel for unit |E|² density: gain, exposure, distance of the source, pixel area."""
+        depth = true_depth(x, self.setting, self.stage_centre_um)
+        share = self.setting.pixel_um**2 / self.area_um2
+        gain = np.exp(x[PLACE["log_gain"]])
+        return np.asarray(gain * self.setting.exposure * (self.reference_um / depth) ** 2 * share)
+
+    def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
+        """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
+        names = [] if wanted is None else list(wanted)
+        s = self.setting
+        light = np.zeros((len(s.depth_um), s.rows, s.columns))
+        slopes = {name: np.zeros_like(light) for name in names}
+        for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
+            for group in self.groups:
+                part, more = self._group_light(x, group, offset_nm, names)
+                light[group.index] += weight * part
+                for name in names:
+                    if name in more:
+                        slopes[name][group.index] += weight * more[name]
+        if "bandwidth_nm" in names:
+            up = x.copy()
+            up[PLACE["bandwidth_nm"]] += 0.02
+            slopes["bandwidth_nm"] = (self._light(up, None)[0] - light) / 0.02
+        return light, slopes
+
+    def _group_light(
+        self, x: Array, group: _Group, offset_nm: float, names: list[str]
+    ) -> tuple[Array, dict[str, Array]]:
+        x = x.copy()
+        x[PLACE["wavelength_nm"]] += offset_nm
+        phasor = np.exp(1j * self._phase(x, group))
+        pupil, by_bias, by_process = self._pupil(x, group, bool(names))
+        operators = self._operators(x, group)
+        field = operators.field(pupil * phasor)
+        intensity = field.real**2 + field.imag**2
+        transfer, blurs = self._transfer(x, group)
+        light = self.grid.sample(intensity, transfer)
+        out: dict[str, Array] = {}
+        growth = self._growth(x, group)
+        conjugate = field.conj()
+        lit = (pupil * phasor).astype(np.complex64)
+
+        def slope_field(change: Array) -> Array:
+            return operators.field(change.astype(np.complex64), tolerance=_SLOPE_TOLERANCE)
+
+        def sampled(change: Array) -> Array:
+            return self.grid.sample(2 * (conjugate * change).real, transfer)
+
+        for name in names:
+            if name in BIAS:
+                changed = by_bias * group.bias[BIAS.index(name)] * phasor
+                out[name] = sampled(slope_field(changed))
+            elif name in PROCESS:
+                changed = by_process[PROCESS.index(name)] * phasor
+                out[name] = sampled(slope_field(changed))
+            elif name.removesuffix("_rad") in ABERRATIONS:
+                z = group.zernike[ABERRATIONS.index(name.removesuffix("_rad"))]
+                out[name] = sampled(slope_field(1j * z * lit))
+            elif name in GEOMETRY:
+                turned = 1j * self._phase_slope(x, group, name)
+                change = slope_field(turned * lit)
+                if name in _STEP:
+                    change = change + self._by_operators(x, group, name, lit, field)
+                out[name] = sampled(change)
+                if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
+                    disc = blurs["pinhole_um"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+                    out[name] = out[name] + self.grid.sample(intensity, disc)
+            elif name in blurs:
+                out[name] = self.grid.sample(intensity, blurs[name])
+        return light, out
+
+    def _by_operators(self, x: Array, group: _Group, name: str, lit: Array, field: Array) -> Array:
+        """Derivative of the field through the window operators, and of the pillars where the wavelength changes."""
+        step = _STEP[name]
+        up = x.copy()
+        up[PLACE[name]] += step
+        phasor = np.exp(1j * self._phase(x, group))
+        pupil = self._pupil(up, group, False)[0] if name == "wavelength_nm" else self._pupil(x, group, False)[0]
+        return np.asarray((self._operators(up, group).field(pupil * phasor) - field) / step)
+
+    def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array]:
+        """(q, p) complex lens on the nodes, its derivative by the bias per um, and by height, index, sidewall units."""
+        bias, _ = bias_um(x, group.reduced.u, group.reduced.v)
+        reach = self.pillars.span.bias_um
+        weight, rate = self.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
+        change = process(x)
+        gathered = group.reduced.gathered
+        r, b, shape = len(gathered), len(weight), gathered.shape[1:]
+        values = self.pillars.coefficients(change)
+
+        def combine(w: Array, c: Array) -> Array:
+            return np.asarray(((c.T @ w.reshape(b, -1)).reshape(r, *shape) * gathered).sum(0))
+
+        pupil = combine(weight, values)
+        if not slopes:
+            return pupil, pupil, pupil
+        units = (1e-3, 1.0, math.pi / 180)
+        by_process = [combine(weight, c) * u for c, u in zip(self.pillars.slopes(change), units, strict=True)]
+        return pupil, combine(rate, values), np.stack(by_process)
+
+    def _phase(self, x: Array, group: _Group) -> Array:
+        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, plus aberrations."""
+        reduced, index = group.reduced, group.index
+        nominal = reduced.bench
+        k = 2 * math.pi / (nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
+        d = nominal.distance_um + x[PLACE["distance_um"]]
+        tilt = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
+        tx, ty = (t + extra for t, extra in zip(nominal.tangents, tilt, strict=True))
+        centre = d * tx + x[PLACE["decentre_x_um"]], d * ty + x[PLACE["decentre_y_um"]]
+        exit_path = sensor_path(reduced.x_um, reduced.y_um, centre, d)
+        known = reduced.k * reduced.path(reduced.x_um, reduced.y_um, nominal.distance_um, nominal)
+        depth = true_depth(x, self.setting, self.stage_centre_um)[index]
+        lateral = [x[PLACE[f"source_{a}_um"]] for a in "xy"]
+        out = np.empty((len(index), *reduced.x_um.shape))
+        for i, z in enumerate(depth):
+            tangents = tx - lateral[0] / z, ty - lateral[1] / z
+            out[i] = k * (source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path) - known
+        strengths = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
+        return out + np.tensordot(strengths, group.zernike, 1)
+
+    def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
+        """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""
+        step = {"stage_scale": 1e-5, "stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
+        up, down = x.copy(), x.copy()
+        up[PLACE[name]] += step
+        down[PLACE[name]] -= step
+        return (self._phase(up, group) - self._phase(down, group)) / (2 * step)
+
+    def _operators(self, x: Array, group: _Group) -> Operators:
+        nominal = group.reduced.bench
+        return group.reduced.operators(
+            wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+            distance_um=nominal.distance_um + x[PLACE["distance_um"]],
+            axes_um=self.grid.axes_um(),
+        )
+
+    def _growth(self, x: Array, group: _Group) -> dict[str, Array]:
+        """(frames,) relative growth of the source's image with the parameters that change its magnification."""
+        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        distance = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
+        from_centre = self.setting.depth_um[group.index] - self.stage_centre_um
+        return {
+            "distance_um": np.full(len(depth), 1 / distance),
+            "stage_zero_um": -1 / depth,
+            "stage_scale": -from_centre / depth,
+        }
+
+    def _transfer(self, x: Array, group: _Group) -> tuple[Array, dict[str, Array]]:
+        """(frames, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
+        fy, fx = self.grid.frequencies()
+        pixel = self.setting.pixel_um
+        blur, by_blur = detector.gauss(fy, fx, x[PLACE["crosstalk_px"]] * pixel)
+        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
+        square = detector.pixel(fy, fx, pixel)
+        discs = [detector.disc(fy, fx, x[PLACE["pinhole_um"]] * m) for m in shrink]
+        disc = np.stack([value for value, _ in discs])
+        by_disc = np.stack([slope * m for (_, slope), m in zip(discs, shrink, strict=True)])
+        shared = square * blur
+        return shared * disc, {"crosstalk_px": square * by_blur * pixel * disc, "pinhole_um": shared * by_disc}
+
+
+def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
+    """(n,) source depths after stage zero and scale; the scale acts about the middle of the stage."""
+    stated = setting.depth_um
+    depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - centre_um)
+    return np.asarray(np.maximum(depth, 0.2 * stated))
+
+
+def process(x: Array) -> Process:
+    """The pillars' change that the parameters mean."""
+    return Process(
+        x[PLACE["height_nm"]] * 1e-3,
+        x[PLACE["index"]],
+        math.radians(x[PLACE["sidewall_deg"]]),
+        x[PLACE["wavelength_nm"]] * 1e-3,
+    )
+
+
+def spectrum(bandwidth_nm: float) -> list[tuple[float, float]]:
+    """(offset in nm, weight) of a Gaussian line by 5-point Gauss-Hermite quadrature; one line for no width."""
+    if bandwidth_nm <= 0:
+        return [(0.0, 1.0)]
+    place, weight = np.polynomial.hermite_e.hermegauss(5)
+    return [(float(p) * bandwidth_nm, float(w)) for p, w in zip(place, weight / weight.sum(), strict=True)]

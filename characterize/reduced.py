@@ -1,0 +1,191 @@
+"""The lens gathered on coarse nodes, and the way from there to a sensor window.
+
+E(X, Y) = sum over nodes of G_pq f_pq K, where the nodes are direction cosines (p, q) seen from the window's centre,
+G is the lens without its known focusing phase, f is whatever acts smoothly over the aperture, and
+K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) = exp(-ik s(pX + qY)) times a smooth rest of low rank. The adjoint of
+Legendre interpolation gathers the pillars, so the result is that of the full sum for every smooth f.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.pillars import Pillars
+from metalens import legendre
+from metalens.errors import FitError
+from metalens.lens import Lens
+from metalens.store import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Where source, lens and sensor stand for one field angle.
+
+    tangents: (x, y) of the chief ray; the window sits where it meets the sensor.
+    reference_um: source depth whose phase is taken off before gathering.
+    """
+
+    distance_um: float
+    wavelength_um: float
+    reference_um: float
+    tangents: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Operators:
+    """From nodes to window for one wavelength and distance: along_y (Y, q), along_x (p, X), low-rank terms.
+
+    remainder: (rank,) relative size of what is left out before each term.
+    """
+
+    along_y: Array
+    along_x: Array
+    lens_terms: Array
+    window_terms: Array
+    remainder: Array
+
+    def field(self, light: Array, *, tolerance: float = 0.0) -> Array:
+        """(..., q, p) -> (..., Y, X) complex, in the precision of ``light``; fewer terms with a ``tolerance``."""
+        kind = light.dtype
+        out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), kind)
+        terms = max(1, int((self.remainder > tolerance).sum()))
+        for lens, window in zip(self.lens_terms[:terms], self.window_terms[:terms], strict=True):
+            part = self.along_y.astype(kind) @ (light * lens.astype(kind)) @ self.along_x.astype(kind)
+            out += part * window.astype(kind)
+        return out
+
+
+class Reduced:
+    """A lens on nodes for one field angle.
+
+    nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same over the lens radius.
+    gathered: (r, q, p) one field for each function of :class:`Pillars`.
+    """
+
+    def __init__(
+        self, lens: Lens, pillars: Pillars, bench: Bench, *, window_um: float, depths_um: Array, tolerance: float
+    ) -> None:
+        self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
+        self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
+        self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
+        self.k = 2 * math.pi / bench.wavelength_um
+        self._directions(depths_um)
+        self.gathered = self._gather(lens, pillars)
+        self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
+
+    def _directions(self, depths_um: Array) -> None:
+        d, (cx, cy) = self.bench.distance_um, self.center_um
+        hy, hx = self.half_um
+        edge = np.linspace(-1, 1, 41)
+        x, y = (g.ravel() for g in np.meshgrid(edge * hx - cx, edge * hy - cy))
+        r = np.sqrt(x**2 + y**2 + d**2)
+        self._p = float((x / r).min()), float((x / r).max())
+        self._q = float((y / r).min()), float((y / r).max())
+        swing = self.k * self.window_um / 2 * max(np.ptp(self._p), np.ptp(self._q)) / 2
+        inverse = np.abs(1 / np.asarray(depths_um) - 1 / self.bench.reference_um).max()
+        blur = self.k * inverse * self.radius_um**2 / 2
+        self.nodes = int(math.ceil(swing + blur + 14 + 2.5 * (swing + 1) ** (1 / 3)))
+        if self.nodes > 600:
+            raise FitError(f"window of {self.window_um:.0f} um needs {self.nodes} nodes a side; fit a smaller window")
+        p, q = legendre.mapped(self.nodes, *self._p), legendre.mapped(self.nodes, *self._q)
+        self.p, self.q = np.meshgrid(p, q)
+        if (self.p**2 + self.q**2).max() >= 0.98:
+            raise FitError("the aperture angle is too wide for the reduced model; need below 45 degrees across corners")
+        r_w = d / np.sqrt(1 - self.p**2 - self.q**2)
+        self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
+
+    @property
+    def center_um(self) -> tuple[float, float]:
+        """(x, y) of the window on the sensor at the nominal distance."""
+        tx, ty = self.bench.tangents
+        return self.bench.distance_um * tx, self.bench.distance_um * ty
+
+    def _gather(self, lens: Lens, pillars: Pillars) -> Array:
+        d = lens.diameters
+        x, y = d.x_um, d.y_um
+        hy, hx = self.half_um
+        n = self.nodes + 6
+        across, along = legendre.interpolation(n, x / hx), legendre.interpolation(n, y / hy)
+        fields = np.zeros((len(pillars.basis), n, n), complex)
+        block = max(1, 400_000 // len(x))
+        for start in range(0, len(y), block):
+            rows = slice(start, start + block)
+            carrier = np.exp(1j * self.k * self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench))
+            part = pillars.functions(d.diameter_um[rows]) * carrier
+            fields += along[rows].T @ (part @ across)
+        return self._to_directions(fields, n)
+
+    def _to_directions(self, fields: Array, n: int) -> Array:
+        """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
+        hy, hx = self.half_um
+        x, y = legendre.mapped(n, -hx, hx), legendre.mapped(n, -hy, hy)
+        (cx, cy), d, m = self.center_um, self.bench.distance_um, self.nodes
+        p = (x[None] - cx) / np.sqrt((x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2)
+        turned = np.stack([fields[:, j] @ _at(m, self._p, p[j]) for j in range(n)], 1)
+        q = (y - cy)[None] * np.sqrt(1 - self.p[0][:, None] ** 2) / np.sqrt((y - cy)[None] ** 2 + d**2)
+        out = np.stack([turned[:, :, a] @ _at(m, self._q, q[a]) for a in range(m)], 2)
+        return np.asarray(out)
+
+    def path(self, x: Array, y: Array, distance_um: float, bench: Bench) -> Array:
+        """Path from the reference source by (x, y) on the lens to the window's centre, um, less that by the axis."""
+        tx, ty = bench.tangents
+        return source_path(x, y, (tx, ty), 1 / bench.reference_um) + sensor_path(
+            x, y, (distance_um * tx, distance_um * ty), distance_um
+        )
+
+    def operators(self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
+        """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples."""
+        k, scale = 2 * math.pi / wavelength_um, self.bench.distance_um / distance_um
+        y, x = axes_um
+        wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
+        w = 11 + int(k * self.window_um**2 / self.bench.distance_um / 8)
+        m = 10 + int(16 * max(np.abs(self._p).max(), np.abs(self._q).max()))
+        Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
+        P, Q = np.meshgrid(legendre.mapped(m, *self._p), legendre.mapped(m, *self._q))
+        table = self._rest(P.ravel(), Q.ravel(), X[None, :, None], Y[:, None, None], (k, distance_um, scale))
+        table = table.reshape(w * w, m * m)
+        power, v = np.linalg.eigh(table.conj().T @ table)  # cheaper than an SVD, and 1e-8 is small enough
+        power, v = np.maximum(power[::-1], 0), v[:, ::-1].conj().T
+        remainder = np.sqrt(np.cumsum(power[::-1])[::-1] / power.sum())
+        rank = max(1, int((remainder > self.tolerance).sum()))
+        iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
+        window = np.einsum("Yj,jir,Xi->rYX", iy, (table @ v[:rank].conj().T).reshape(w, w, rank), ix, optimize=True)
+        to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
+        lens = np.einsum("bq,rqp,ap->rba", to_p, v[:rank].reshape(rank, m, m), to_p, optimize=True)
+        p, q = self.p[0], self.q[:, 0]
+        along_y, along_x = np.exp(-1j * k * scale * y[:, None] * q), np.exp(-1j * k * scale * p[:, None] * x)
+        return Operators(along_y, along_x, lens * self.pitch_um**2, window, remainder[:rank])
+
+    def _rest(self, p: Array, q: Array, X: Array, Y: Array, at: tuple[float, float, float]) -> Array:
+        """Kernel without exp(-ik s(pX + qY)) and without the path to the window's centre."""
+        k, d, scale = at
+        r_0 = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
+        (cx, cy), (tx, ty) = self.center_um, self.bench.tangents
+        dx, dy = d * tx - cx - r_0 * p, d * ty - cy - r_0 * q
+        r_w = np.sqrt(dx**2 + dy**2 + d**2)
+        more = X**2 + Y**2 + 2 * (X * dx + Y * dy)
+        r = np.sqrt(r_w**2 + more)
+        path = more / (r + r_w) + scale * (p * X + q * Y)
+        return np.asarray(d / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * path))
+
+
+def source_path(x: Array, y: Array, tangents: tuple[float, float], inverse_depth: Array | float) -> Array:
+    """Path from a point source to (x, y) less that to the axis, um; without cancellation, for any depth."""
+    tx, ty = tangents
+    s = math.sqrt(1 + tx * tx + ty * ty)
+    numerator = (x * x + y * y) * inverse_depth + 2 * (x * tx + y * ty)
+    return np.asarray(numerator / (np.sqrt(numerator * inverse_depth + s * s) + s))
+
+
+def sensor_path(x: Array, y: Array, center_um: tuple[float, float], distance_um: float) -> Array:
+    """Path from (x, y) on the lens to a point of the sensor less that from the axis, um."""
+    cx, cy = center_um
+    r_0 = math.sqrt(cx * cx + cy * cy + distance_um**2)
+    more = x * x + y * y - 2 * (x * cx + y * cy)
+    return np.asarray(more / (np.sqrt(more + r_0**2) + r_0))
+
+
+def _at(count: int, span: tuple[float, float], values: Array) -> Array:
+    low, high = span
+    return np.asarray(legendre.interpolation(count, (2 * values - low - high) / (high - low)))

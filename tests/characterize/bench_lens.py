@@ -1,0 +1,96 @@
+"""A small lens with a hand-made proxy, and captures of it on the virtual bench; shared by the tests beside it."""
+
+import functools
+import math
+
+import numpy as np
+
+from characterize import bench
+from characterize.bench import Camera, Truth
+from characterize.capture import Capture
+from characterize.parameters import Known
+from characterize.pillars import Sensitivity
+from metalens import design, profiles
+from metalens.cell import Cell
+from metalens.lens import Lens
+from metalens.proxy import Proxy
+
+DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)
+VALUES = {
+    "bias_nm": 4.0,
+    "bias_x_nm": 2.0,
+    "bias_y_nm": -1.5,
+    "bias_r_nm": 3.0,
+    "height_nm": -8.0,
+    "wavelength_nm": 0.4,
+    "distance_um": 2.0,
+    "decentre_x_um": 0.8,
+    "decentre_y_um": -0.4,
+    "stage_zero_um": 9.0,
+    "stage_scale": 0.004,
+    "coma_x_rad": 0.2,
+    "spherical_rad": 0.15,
+    "astigmatism_rad": 0.1,
+    "crosstalk_px": 0.25,
+    "background_e": 20.0,
+    "background_x_e": 3.0,
+}
+RESPONSE = Sensitivity(np.array([[-0.2 + 9j, 50j], [3j, 12j], [1.5j, 6j]]), 0.17)
+
+
+def proxy() -> Proxy:
+    """Phase from 0 to 8 rad over 90 to 260 nm, |T| about 0.9, between 830 and 870 nm."""
+    phase = np.zeros((2, 4))
+    phase[0, :3], phase[1, :2] = (4.0, 3.9, 0.4), (-0.2, -0.15)
+    level = np.zeros((2, 4))
+    level[0] = 0.88, -0.03, 0.02, 0.03
+    return Proxy(phase, level, (0.09, 0.26), (0.83, 0.87), 1e-3, 1e-3)
+
+
+@functools.lru_cache
+def lens(strength_rad: float = 0.0) -> Lens:
+    """A hyperbolic lens of 40 um, with a cubic term on top where ``strength_rad`` is not 0."""
+    focus = profiles.Focus(0.85, 110.0, 600.0)
+    shape = profiles.Cubic(strength_rad) if strength_rad else None
+    return design.make(
+        design.phase_of(shape, focus, radius_um=20.0), focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy()
+    )[0]
+
+
+def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> Truth:
+    """The hidden lens and its bench."""
+    known = tuple(Known(name, value) for name, value in (VALUES | more).items())
+    return Truth(DEPTHS, peak_e=peak_e, parameter=known, camera=Camera(pixel_um=1.5, pixels=16), seed=seed)
+
+
+@functools.lru_cache
+def light(strength_rad: float = 0.0, **more: float) -> np.ndarray:
+    """Noise-free light of the bench, in units of its own."""
+    return bench.irradiance(lens(strength_rad), truth(**more), RESPONSE)
+
+
+def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf) -> Capture:
+    """Noise on expected electrons, read out at 2 e a count with stated gain and offset."""
+    random = np.random.default_rng(seed)
+    seen = np.minimum(
+        random.poisson(np.maximum(electrons, 0)) + random.normal(0, read_noise_e, electrons.shape), full_well
+    )
+    counts = np.clip(np.round(seen / 2.0 + 64), 0, 4095).astype(np.uint16)
+    n = len(counts)
+    return Capture(
+        counts,
+        np.array(DEPTHS),
+        np.zeros((n, 2)),
+        np.full(n, np.nan),
+        tuple(f"frame {i}" for i in range(n)),
+        12,
+        pixel_um=1.5,
+        wavelength_um=0.85,
+        about={"gain_e": 2.0, "offset": 64, "read_noise_e": read_noise_e},
+    )
+
+
+def electrons(peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float) -> np.ndarray:
+    """Expected electrons of the hidden lens."""
+    bright = light(strength_rad, **more)
+    return bright * (peak_e / bright.max()) + bench._background(truth(**more).vector(), truth().camera)
