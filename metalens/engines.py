@@ -65,7 +65,7 @@ def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[
         def at(diameter_um: float) -> Response:
             case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
             made = evaluate(case, rung.plan)
-            error = rung.error(made.error)
+            error = rung.error(made.spread, made.drift, case.rho)
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
             return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
 

@@ -16,6 +16,7 @@ TURN = 2 * math.pi
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
+MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,7 @@ def fit_terms(data: _Data, power: int, terms: int) -> Proxy:
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
     level = _minimax(axes, data.level, terms)
-    high = polynomial.bounds(level)[1]
+    high = polynomial.bounds(level, points=64 if level.size > terms else 512)[1]
     if high > 1 - HEADROOM:
         level = level * ((1 - HEADROOM) / high)
     errors = [
@@ -174,36 +175,39 @@ def _unit(values: Array) -> Array:
     return np.asarray((2 * values - values[0] - values[-1]) / (values[-1] - values[0]))
 
 
-def _vander(axes: tuple[Array, Array, Array], terms: int) -> tuple[Array, Array, Array]:
-    """Chebyshev matrices: all that the angles and wavelengths can carry (5 at most), ``terms`` in the diameter."""
-    angle, wave, diameter = axes
-    counts = (min(len(angle), 5), min(len(wave), 5), terms)
-    a, w, d = (chebyshev.chebvander(x, n - 1) for x, n in zip((angle, wave, diameter), counts, strict=True))
-    return a, w, d
-
-
 def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
-    a, w, d = _vander(axes, coefficients.shape[2])
+    a, w, d = (chebyshev.chebvander(x, n - 1) for x, n in zip(axes, coefficients.shape, strict=True))
     return np.asarray(np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True))
 
 
-def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int, *, rounds: int = 40) -> Array:
-    """Coefficients of least largest deviation at every other diameter (Lawson 1961: weights times deviation)."""
-    a, w, d = _vander((axes[0], axes[1], axes[2][::2]), terms)
-    basis = np.einsum("ai,wj,dk->awdijk", a, w, d).reshape(len(a) * len(w) * len(d), -1)
-    shape = (a.shape[1], w.shape[1], d.shape[1])
-    target = values[:, :, ::2].reshape(-1)
-    weight = np.full(len(target), 1 / len(target))
-    best, least = np.zeros(basis.shape[1]), math.inf
+def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
+    """Tensor coefficients: every curve by itself in the diameter, then its coefficients in wavelength and angle.
+
+    Up to five wavelengths or angles are met exactly by polynomials of them, more by least squares.
+    """
+    curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
+    for axis in (0, 1):
+        basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), MOST_NODES) - 1)
+        curves = np.moveaxis(np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis)
+    return curves
+
+
+def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
+    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson 1961: weights times
+    deviation)."""
+    weight = np.full(values.shape, 1 / values.shape[-1])
+    best, least = np.zeros((*values.shape[:-1], basis.shape[1])), np.full(values.shape[:-1], np.inf)
     for _ in range(rounds):
-        root = np.sqrt(weight)
-        c = np.linalg.lstsq(basis * root[:, None], target * root, rcond=None)[0]
-        off = np.abs(basis @ c - target)
-        if off.max() < least:
-            best, least = c, float(off.max())
-        weight *= off / max(float(off.max()), 1e-300) + 1e-9
-        weight /= weight.sum()
-    return best.reshape(shape)
+        root = np.sqrt(weight)[..., None]
+        q, r = np.linalg.qr(basis * root)
+        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[..., 0]
+        off = np.abs(np.einsum("nk,...k->...n", basis, c) - values)
+        worst = off.max(axis=-1)
+        better = worst < least
+        best[better], least[better] = c[better], worst[better]
+        weight *= off / np.maximum(worst, 1e-300)[..., None] + 1e-9
+        weight /= weight.sum(axis=-1, keepdims=True)
+    return best
 
 
 def _trial(data: _Data, power: int, coefficients: int) -> Trial:
