@@ -1,0 +1,22 @@
+"""Solids of a lens and its module: STEP, STL, 3MF, glTF. Heavy kernels load inside the functions that need them."""
+
+from layout.module import Module, assemble, clearances, picture, write_module
+from layout.solid_mesh import write_3mf, write_gltf, write_stl
+from layout.solid_step import write_step
+from layout.solid_tile import LIMITS, Tile, check_count, tile
+
+__all__ = [
+    "LIMITS",
+    "Module",
+    "Tile",
+    "assemble",
+    "check_count",
+    "clearances",
+    "picture",
+    "tile",
+    "write_3mf",
+    "write_gltf",
+    "write_module",
+    "write_step",
+    "write_stl",
+]
