@@ -20,7 +20,7 @@ from metalens.store import Array
 from metalens.threads import split
 
 MORE = 8
-POINTS = 160
+POINTS = 256
 DEPTHS = 16
 SAFETY = 1.7
 
@@ -55,7 +55,7 @@ def relative_error(tiles: list[list[Sample]]) -> float:
     energy = light.sum(1)
     depths = np.unique(np.linspace(0, len(light) - 1, min(len(light), DEPTHS)).round().astype(int))
     normalised = light[depths] / energy[depths, None]
-    points, chance = draw(normalised, edges)
+    points, chance = draw(normalised, edges, POINTS * min(4, len(tiles)))
     difference = _difference(tiles, light, depths, points) / energy[depths, None]
     noise = sum(2 * s.weight * s.noise**2 * (1 / energy[depths]).sum() for s in tiles[0])
     total = square_error(normalised, points, chance, difference) + float(noise)
@@ -88,10 +88,10 @@ def _edges(shape: tuple[int, ...]) -> Array:
     return np.asarray(1 + 9 * np.maximum(np.abs(x), np.abs(y)[:, None]) ** 8).ravel()
 
 
-def draw(normalised: Array, edges: Array) -> tuple[Array, Array]:
+def draw(normalised: Array, edges: Array, count: int = POINTS) -> tuple[Array, Array]:
     """(depth, n) pixel indices and their chances: a systematic sample, or every pixel where there are few."""
     depths, pixels = normalised.shape
-    n = max(8, POINTS // depths)
+    n = max(8, count // depths)
     if pixels <= n:
         return np.tile(np.arange(pixels), (depths, 1)), np.ones((depths, pixels))
     root = np.sqrt(normalised) * edges
@@ -123,16 +123,22 @@ def _direct(sample: Sample, at: tuple[Array, Array, Array]) -> Array:
     light = legendre.to_nodes(m).T @ sample.moments @ legendre.to_nodes(n)
     (hy, hx), (wy, wx) = case.half_size_um, case.window_um
     e, x = legendre.mapped(m, -hy, hy), legendre.mapped(n, -hx, hx)
-    inverse = np.array(case.inverse_depths_per_um)[at[0]]
-    points = np.stack([wx[at[2]], wy[at[1]], inverse], -1)
+    points = np.stack([wx[at[2]], wy[at[1]]], -1)
     lengths = [*case.centre_um, case.sensor_distance_um, case.wavelength_um]
     numbers = np.array([*case.tangents, reference_depth(case), *lengths])
     out = np.zeros(len(points), complex)
+    turn: Any = _curved
     total: Any = _sum_nodes
-    parts = np.ascontiguousarray(light.real), np.ascontiguousarray(light.imag)
-    split(len(points), lambda a, b: total(*parts, e, x, points[a:b], numbers, out[a:b]))
-    turn = np.exp(1j * case.wavenumber * chief_path(case))
-    return np.asarray(out * turn * case.pitch_um**2)
+    used = np.unique(at[0])
+
+    def work(a: int, b: int) -> None:
+        for depth in used[a:b]:
+            mine = np.nonzero(at[0] == depth)[0]
+            parts = turn(light, e, x, numbers, case.inverse_depths_per_um[depth])
+            out[mine] = total(*parts, e, x, points[mine], numbers)
+
+    split(len(used), work)
+    return np.asarray(out * case.pitch_um**2 * np.exp(1j * case.wavenumber * chief_path(case)))
 
 
 @numba.njit(inline="always")
@@ -144,12 +150,27 @@ def _source(x, y, numbers, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _sum_nodes(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-def]
-    """Kernel of the plan module, summed over lens nodes for every point (X, Y, inverse depth)."""
+def _curved(light, e, x, numbers, inverse):  # type: ignore[no-untyped-def]
+    """Light on the nodes with the phase of a source depth less the reference's: (real, imaginary)."""
+    re, im = np.empty(light.shape), np.empty(light.shape)
+    for i in range(e.size):
+        for j in range(x.size):
+            path = _source(x[j], e[i], numbers, inverse) - _source(x[j], e[i], numbers, numbers[2])
+            t = path / numbers[6]
+            c, s = turns64(t - np.rint(t))
+            a, b = light[i, j].real, light[i, j].imag
+            re[i, j], im[i, j] = a * c - b * s, a * s + b * c
+    return re, im
+
+
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def _sum_nodes(re, im, e, x, points, numbers):  # type: ignore[no-untyped-def]
+    """(point,) kernel of the plan module summed over lens nodes, at window offsets (X, Y)."""
     distance, wavelength = numbers[5], numbers[6]
     k = 2 * np.pi / wavelength
+    out = np.zeros(points.shape[0], np.complex128)
     for p in range(points.shape[0]):
-        X, Y, inverse = points[p]
+        X, Y = points[p]
         total_re, total_im = 0.0, 0.0
         for i in range(e.size):
             dy = numbers[4] - e[i]
@@ -158,12 +179,12 @@ def _sum_nodes(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-d
                 w2 = dx * dx + dy * dy + distance * distance
                 q = X * X + Y * Y + 2 * (X * dx + Y * dy)
                 r = np.sqrt(w2 + q)
-                path = q / (r + np.sqrt(w2))
-                path += _source(x[j], e[i], numbers, inverse) - _source(x[j], e[i], numbers, numbers[2])
-                t = path / wavelength
+                t = q / ((r + np.sqrt(w2)) * wavelength)
                 c, s = turns64(t - np.rint(t))
-                scale = distance / (2 * np.pi * r * r)
-                h_re, h_im = scale * (c / r + k * s), scale * (s / r - k * c)
+                near = 1 / r
+                scale = distance / (2 * np.pi) * near * near
+                h_re, h_im = scale * (c * near + k * s), scale * (s * near - k * c)
                 total_re += re[i, j] * h_re - im[i, j] * h_im
                 total_im += re[i, j] * h_im + im[i, j] * h_re
         out[p] = complex(total_re, total_im)
+    return out

@@ -185,10 +185,7 @@ def _unfold(buffer: torch.Tensor, nx: int) -> torch.Tensor:
     """Adjoint of :func:`_fold`: (y, re/im, x)."""
     reach = buffer.shape[-1]
     out = buffer.new_zeros((buffer.shape[1], 2, nx))
-    right, left = out[:, :, nx // 2 :], out.flip(-1)[:, :, nx // 2 :]
-    right[:, :, :reach] = buffer[0] + buffer[1]
-    left[:, :, :reach] = buffer[0] - buffer[1]
-    out = torch.where(torch.arange(nx, device=buffer.device) < nx // 2, left.flip(-1), out)
-    if nx % 2:
-        out[:, :, nx // 2] = buffer[0, :, :, 0]
+    half = (nx + 1) // 2
+    out[:, :, half - reach : half] = (buffer[0] - buffer[1]).flip(-1)
+    out[:, :, nx // 2 : nx // 2 + reach] = buffer[0] + buffer[1]
     return out
