@@ -1,7 +1,9 @@
 """What a mask file holds, as it was read: cells, their polygons, circles and placements."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -128,3 +130,14 @@ def _compose(outer: int, inner: int) -> int:
     """The turn that equals ``inner`` followed by ``outer``."""
     quarter = (outer & 3) + (-(inner & 3) if outer & 4 else inner & 3)
     return quarter & 3 | (outer ^ inner) & 4
+
+
+def mapped(path: str | Path) -> Array:
+    """The bytes of a file as uint8, read when they are looked at.
+
+    Raises:
+        MaskFileError: an empty file. OSError: it cannot be opened.
+    """
+    if not os.stat(path).st_size:
+        raise MaskFileError(f"{path}: byte 0: empty file, need a mask")
+    return np.asarray(np.memmap(path, np.uint8, mode="r"))

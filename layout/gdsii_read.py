@@ -1,13 +1,12 @@
 """GDSII reader: every record is checked; what is wrong is named with its byte offset."""
 
-import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from layout import gdsii_bytes as gds
-from layout.content import CellContent, MaskContent, Placed
+from layout.content import CellContent, MaskContent, Placed, mapped
 from layout.read_loops import sref_run
 from metalens.errors import MaskFileError
 from metalens.store import Array
@@ -54,15 +53,7 @@ def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
         MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    with open(path, "rb") as file:
-        if not file.seek(0, 2):
-            raise MaskFileError(f"{path}: byte 0: empty file, need a GDSII stream")
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
-            data = np.frombuffer(view, np.uint8)
-            try:
-                return _Reader(str(path), data, limit).library()
-            finally:
-                del data
+    return _Reader(str(path), mapped(path), limit).library()
 
 
 class _Reader:

@@ -12,6 +12,7 @@ import numpy as np
 from layout import gdsii_bytes as gds
 from layout.jit import compiled
 from layout.mask import Figure, Lattice, MaskPlan, PillarClass
+from layout.oasis_tiles import count_classes
 from metalens import store
 from metalens.errors import ProcessError
 from metalens.store import Array
@@ -42,13 +43,14 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
 def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
     yield gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *[0] * 12) + gds.text(gds.LIBNAME, plan.name)
     yield gds.record(gds.UNITS, gds.real(plan.unit_nm * 1e-3) + gds.real(plan.unit_nm * 1e-9))
-    yield b"".join(_class_structure(made) for made in plan.classes)
     for figure in plan.figures:
         yield _figure_structure(figure)
+    counts = np.zeros(len(plan.classes) + 1, np.int64)
     for lattice in plan.lattices:
         yield _begin(lattice.name)
-        yield from _references(plan, lattice)
+        yield from _references(plan, lattice, counts)
         yield gds.record(gds.ENDSTR)
+    yield b"".join(_class_structure(made) for made, n in zip(plan.classes, counts[1:], strict=True) if n)
     yield _begin(plan.name)
     yield b"".join(_reference(name) for name in plan.placed_names)
     yield gds.record(gds.ENDSTR) + gds.record(gds.ENDLIB)
@@ -83,18 +85,20 @@ def _reference(name: str, x: int = 0, y: int = 0) -> bytes:
     return gds.record(gds.SREF) + gds.text(gds.SNAME, name) + gds.points(np.array([[x, y]])) + gds.record(gds.ENDEL)
 
 
-def _references(plan: MaskPlan, lattice: Lattice) -> Iterator[memoryview]:
-    """The references of a lattice, in one buffer that is filled again and again."""
+def _references(plan: MaskPlan, lattice: Lattice, counts: Array) -> Iterator[memoryview]:
+    """The references of a lattice, in one buffer that is filled again and again; ``counts`` adds up the classes."""
     templates = _templates(plan)
     word = templates.dtype.itemsize
     buffer = np.empty((_BLOCK // (templates.shape[1] * word), templates.shape[1]), templates.dtype)
     xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), templates.dtype)
     for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
         ys = _words(lattice.y0 - lattice.pitch * np.arange(first, first + len(block)), templates.dtype)
+        count_classes(block, counts)
         row, column = 0, 0
         while row < len(block):
             row, column, used = _fill(buffer, block, row, column, templates, xs, ys)
-            yield buffer[:used].data.cast("B")
+            if used:
+                yield buffer[:used].data.cast("B")
 
 
 def _templates(plan: MaskPlan) -> Array:

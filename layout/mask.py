@@ -145,6 +145,14 @@ class MaskPlan:
         """Narrowest type of the class numbers."""
         return np.uint8 if len(self.classes) <= 255 else np.uint16
 
+    def counts(self) -> Array:
+        """(classes + 1,) sites of each class number in all lattices."""
+        total = np.zeros(len(self.classes) + 1, np.int64)
+        for lattice in self.lattices:
+            for _, block in lattice.blocks(max(1, (1 << 20) // max(1, lattice.columns))):
+                total += np.bincount(block.ravel(), minlength=len(total))
+        return total
+
     def replace(self, **changes: object) -> "MaskPlan":
         """A copy with other values."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]

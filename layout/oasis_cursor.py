@@ -56,14 +56,16 @@ class Cursor:
         return self.data[self.at - count : self.at].tobytes()
 
     def unsigned(self) -> int:
-        """A variable-length integer, below 2^63."""
-        value = 0
-        for n in range(MOST_BYTES):
+        """A variable-length integer, below 2^63; some writers fill up space with zeros at its end."""
+        value = shift = 0
+        while True:
             byte = self.byte()
-            value |= (byte & 127) << 7 * n
+            if byte & 127 and shift >= 7 * MOST_BYTES:
+                raise self.fail(f"an integer of more than {MOST_BYTES} bytes")
+            value |= (byte & 127) << min(shift, 7 * MOST_BYTES)
             if byte < 128:
                 return value
-        raise self.fail(f"an integer of more than {MOST_BYTES} bytes")
+            shift += 7
 
     def signed(self) -> int:
         """An integer with its sign in the lowest bit."""

@@ -3,7 +3,6 @@
 Paths, trapezoids and extension records are no part of a pillar mask and are refused.
 """
 
-import mmap
 import struct
 import zlib
 from pathlib import Path
@@ -11,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from layout import oasis_bytes as oasis
-from layout.content import CellContent, MaskContent
+from layout.content import CellContent, MaskContent, mapped
 from layout.oasis_cells import CellReader, Child, OpenCell
 from layout.oasis_cursor import Cursor
-from metalens.errors import MaskFileError
 
 LIMIT = 2**29
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
@@ -31,15 +29,7 @@ def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
             pillars holds; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    with open(path, "rb") as file:
-        if not file.seek(0, 2):
-            raise MaskFileError(f"{path}: byte 0: empty file, need OASIS")
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
-            data = np.frombuffer(view, np.uint8)
-            try:
-                return _Reader(Cursor(str(path), data), limit).whole_file()
-            finally:
-                del data
+    return _Reader(Cursor(str(path), mapped(path)), limit).whole_file()
 
 
 class _Reader:

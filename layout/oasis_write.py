@@ -66,14 +66,21 @@ def _write_file(file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool)
     names.distinct(cell_names)
     number = {name: k for k, name in enumerate(cell_names)}
     head = oasis.start(plan.unit_nm)
-    cell_table = b"".join(bytes([oasis.CELLNAME]) + oasis.string(name) for name in cell_names)
     layer_table = b"".join(_layer_name(layer, name) for layer, name in sorted(plan.layer_names.items()))
-    checksum = 0
-    for piece in itertools.chain([head, cell_table, layer_table], _cells(plan, placed, number, settings)):
+    counts = np.zeros(len(plan.classes) + 1, np.int64)
+    written, checksum = 0, 0
+    for piece in itertools.chain([head, layer_table], _cells(plan, placed, number, settings, counts)):
         file.write(piece)
-        checksum = zlib.crc32(piece, checksum)
-    layers_at = len(head) + len(cell_table) if layer_table else 0
-    file.write(oasis.end((len(head), 0, 0, 0, layers_at, 0), checksum))
+        checksum, written = zlib.crc32(piece, checksum), written + len(piece)
+    unused = {made.name for made, n in zip(plan.classes, counts[1:], strict=True) if not n}
+    cell_table = b"".join(_cell_name(k, name) for name, k in number.items() if name not in unused)
+    file.write(cell_table)
+    layers_at = len(head) if layer_table else 0
+    file.write(oasis.end((written, 0, 0, 0, layers_at, 0), zlib.crc32(cell_table, checksum)))
+
+
+def _cell_name(number: int, name: str) -> bytes:
+    return bytes([oasis.CELLNAME_REF]) + oasis.string(name) + oasis.unsigned(number)
 
 
 def _piece_list(lattice: Lattice, fold: bool) -> list[Piece]:
@@ -86,8 +93,10 @@ def _layer_name(layer: tuple[int, int], name: str) -> bytes:
     return bytes([oasis.LAYERNAME]) + oasis.string(name) + numbers
 
 
-def _cells(plan: MaskPlan, placed: list[list[Piece]], number: dict[str, int], settings: _Settings) -> Iterator[bytes]:
-    yield b"".join(_cell(number[made.name]) + _pillar(made, settings.circles) for made in plan.classes)
+def _cells(
+    plan: MaskPlan, placed: list[list[Piece]], number: dict[str, int], settings: _Settings, counts: Array
+) -> Iterator[bytes]:
+    """All cells, those of the pillar classes that occur last; ``counts`` adds up the sites of each class."""
     for figure in plan.figures:
         shapes = [_polygon(layer, p) for layer, polygons in figure.polygons.items() for p in polygons]
         yield _cell(number[figure.name]) + b"".join(shapes)
@@ -95,12 +104,14 @@ def _cells(plan: MaskPlan, placed: list[list[Piece]], number: dict[str, int], se
         if len(parts) > 1:
             for part in parts:
                 yield _cell(number[part.lattice.name])
-                yield from _sites(part.lattice, settings, len(plan.classes))
+                yield from _sites(part.lattice, settings, counts)
             yield _cell(number[lattice.name])
             yield b"".join(_placement(number[p.lattice.name], turn) for p in parts for turn in p.placed)
         else:
             yield _cell(number[lattice.name])
-            yield from _sites(lattice, settings, len(plan.classes))
+            yield from _sites(lattice, settings, counts)
+    used = [made for made, n in zip(plan.classes, counts[1:], strict=True) if n]
+    yield b"".join(_cell(number[made.name]) + _pillar(made, settings.circles) for made in used)
     top = b"".join(_placement(number[name]) for name in plan.placed_names)
     yield _cell(number[plan.name]) + top
 
@@ -141,13 +152,15 @@ def _vector(dx: int, dy: int) -> bytes:
     return oasis.unsigned(abs(dx) << 2 | (dx < 0) << 1 | 1) + oasis.signed(dy)
 
 
-def _sites(lattice: Lattice, settings: _Settings, classes: int) -> Iterator[bytes]:
-    return _repetitions(lattice, settings.level, classes) if settings.reader else _tiles(lattice, settings.level)
+def _sites(lattice: Lattice, settings: _Settings, counts: Array) -> Iterator[bytes]:
+    form = _repetitions if settings.reader else _tiles
+    return form(lattice, settings.level, counts)
 
 
-def _tiles(lattice: Lattice, level: int) -> Iterator[bytes]:
+def _tiles(lattice: Lattice, level: int, counts: Array) -> Iterator[bytes]:
     def jobs() -> Iterator[Callable[[], bytes]]:
         for first, block in lattice.blocks(tiles.TILE_ROWS):
+            tiles.count_classes(block, counts)
             y = lattice.y0 - first * lattice.pitch
             for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
                 tile, x = block[:, left : left + tiles.TILE_COLUMNS], lattice.x0 + left * lattice.pitch
@@ -162,13 +175,13 @@ def _tile(tile: Array, pitch: int, x0: int, y0: int, level: int) -> bytes:
     return oasis.compressed(out[:used].data, level) if used else b""
 
 
-def _repetitions(lattice: Lattice, level: int, classes: int) -> Iterator[bytes]:
+def _repetitions(lattice: Lattice, level: int, total: Array) -> Iterator[bytes]:
     """One placement a class, at its first site, repeated at all others by a list of lattice steps."""
     sites = lattice.whole()
-    counts = np.zeros(classes + 1, np.int64)
+    counts, lengths = np.zeros_like(total), np.zeros_like(total)
     tiles.count_classes(sites, counts)
-    first, last = np.full((classes + 1, 2), -1), np.full((classes + 1, 2), -1)
-    lengths = np.zeros(classes + 1, np.int64)
+    total += counts
+    first, last = np.full((len(total), 2), -1), np.full((len(total), 2), -1)
     tiles.walk_classes(sites, _STRIP, first, last, lengths, np.empty(0, np.uint8), False)
     ends = np.cumsum(lengths)
     begins, out = ends - lengths, np.empty(int(ends[-1]), np.uint8)

@@ -39,7 +39,7 @@ def _lead(job: "Job") -> str:
     source = job.source
     return (
         f"A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, {2 * job.made.radius_um / 1e3:.4g} mm "
-        f"across, as {job.drc.pillars:,} pillars in {len(job.plan.classes)} cells, for the process “{job.process.name}”."
+        f"across, as {job.drc.pillars:,} pillars in {len(job.plan.classes)} cells; process “{job.process.name}”."
     )
 
 

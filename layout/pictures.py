@@ -10,7 +10,7 @@ from layout.mask import Lattice, MaskPlan
 from metalens import report
 from metalens.store import Array
 
-_FILLS = {"aperture": "none", "outline": "none", "fields": "none", "marks": "#355070", "label": "#355070"}
+_FILLED = ("marks", "label")
 
 
 def whole_die(plan: MaskPlan) -> bytes:
@@ -21,7 +21,12 @@ def whole_die(plan: MaskPlan) -> bytes:
     shown = None
     for lattice in plan.lattices:
         shown = axes.imshow(
-            _thumbnail(plan, lattice), extent=_extent(plan, lattice), vmin=low, vmax=high, interpolation="nearest"
+            _thumbnail(plan, lattice),
+            extent=_extent(plan, lattice),
+            vmin=low,
+            vmax=high,
+            cmap="viridis",
+            interpolation="nearest",
         )
     _draw_figures(axes, plan)
     reach = max((float(np.abs(p).max()) for p in _polygons(plan)), default=0.0) * plan.unit_nm * 1e-3
@@ -38,13 +43,16 @@ def pillars(plan: MaskPlan, windows: tuple[Window, ...]) -> bytes:
 
     figure, axes = report.canvas(1, len(windows), size=(4.0 * len(windows), 4.0), squeeze=False)
     scale = plan.unit_nm * 1e-3
+    low, high = (f(made.diameter_nm for made in plan.classes) for f in (min, max))
     for ax, window in zip(axes[0], windows, strict=True):
         shapes, sizes = [], []
         for k, x, y in (site for lattice in plan.lattices for site in sites_in(plan, lattice, window)):
             for polygon in plan.classes[k - 1].polygons:
                 shapes.append((polygon + np.array([x, y])) * scale)
                 sizes.append(plan.classes[k - 1].diameter_nm)
-        drawn = PolyCollection(shapes, array=np.array(sizes), cmap="magma", edgecolors="#222", linewidths=0.4)
+        drawn = PolyCollection(shapes, array=np.array(sizes), cmap="viridis", edgecolors="#222", linewidths=0.4)
+        drawn.set_clim(low, high)
+        ax.grid(False)
         ax.add_collection(drawn)
         half = window.size_um / 2
         ax.set(xlim=(window.x_um - half, window.x_um + half), ylim=(window.y_um - half, window.y_um + half))
@@ -128,8 +136,9 @@ def _draw_figures(axes: Any, plan: MaskPlan) -> None:
     for n, layer in enumerate(layers):
         shapes = [p * scale for figure in plan.figures for p in figure.polygons.get(layer, ())]
         name = plan.layer_names.get(layer, str(layer))
-        fill, colour = _FILLS.get(name, "none"), edges[n % len(edges)]
-        axes.add_collection(PolyCollection(shapes, facecolors=fill, edgecolors=colour, linewidths=0.8))
+        colour = edges[n % len(edges)]
+        fill, edge = (colour, "none") if name in _FILLED else ("none", colour)
+        axes.add_collection(PolyCollection(shapes, facecolors=fill, edgecolors=edge, linewidths=0.8))
         axes.plot([], [], color=colour, label=f"{name} {layer[0]}/{layer[1]}")
     if layers:
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09), ncols=5, frameon=False, fontsize=8)

@@ -100,7 +100,21 @@ def _round(diameter: float, vertices: int) -> Array:
     if vertices % 8:
         start[-1] = round(radius / math.sqrt(2))
     start[:, 1] = np.maximum(start[:, 1], 1)
-    return _refine(start, diameter)
+    return _refine(_without_dents(start), diameter)
+
+
+def _without_dents(eighth: Array) -> Array:
+    """The vertices without those that rounding has moved onto, or inside the line of, their neighbours."""
+    eighth = eighth[np.append(True, np.any(np.diff(eighth, axis=0) != 0, axis=1))]
+    while len(eighth) > 1:
+        on_diagonal = int(eighth[-1, 0] == eighth[-1, 1])
+        line = np.concatenate([eighth[:1] * (1, -1), eighth, eighth[-1 - on_diagonal :][:1, ::-1]])
+        step = np.diff(line, axis=0)
+        turn = step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0]
+        if turn.min() >= 0:
+            break
+        eighth = np.delete(eighth, int(turn.argmin()), axis=0)
+    return eighth
 
 
 def _refine(eighth: Array, diameter: float) -> Array:
@@ -141,10 +155,13 @@ def _cost(eighths: Array, diameter: float) -> Array:
     lean = 1 + 3.3 / (8 * x.shape[1]) ** 2  # vertices of an equal-area polygon stand outside the circle
     spread = ((np.hypot(x, y) - diameter / 2 * lean) ** 2).mean(1)
     cost = np.maximum(np.abs(area) / 5e-4 - 1, 0) ** 2 * 4 + np.abs(area) * 100 + spread
-    dx = np.diff(np.concatenate([x[:, :1], x, y[:, -1:]], axis=1), axis=1)
-    dy = np.diff(np.concatenate([-y[:, :1], y, x[:, -1:]], axis=1), axis=1)
+    on_diagonal = bool(x[0, -1] == y[0, -1])
+    after = slice(-2, -1) if on_diagonal and x.shape[1] > 1 else slice(-1, None)  # whose mirror image comes next
+    dx = np.diff(np.concatenate([x[:, :1], x, y[:, after]], axis=1), axis=1)
+    dy = np.diff(np.concatenate([-y[:, :1], y, x[:, after]], axis=1), axis=1)
     bent = (dx[:, :-1] * dy[:, 1:] - dx[:, 1:] * dy[:, :-1] < 0).any(1)
-    wrong = bent | (y[:, 0] < 1) | (y[:, -1] > x[:, -1]) | (dx > 0).any(1) | (dy < 0).any(1)
+    crossed = y[:, -1] > x[:, -1] if on_diagonal else y[:, -1] >= x[:, -1]
+    wrong = bent | crossed | ((dx == 0) & (dy == 0))[:, :-1].any(1) | (y[:, 0] < 1) | (dx > 0).any(1) | (dy < 0).any(1)
     return np.asarray(np.where(wrong, np.inf, cost))
 
 

@@ -34,10 +34,12 @@ def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
         found.append(f"database unit {content.unit_nm} nm, planned {plan.unit_nm}")
     if content.tops != [plan.name]:
         found.append(f"top cells {content.tops[:5]}, planned {plan.name!r} alone")
-    missing = [name for name in plan.cell_names if name not in content.cells]
+    used = [made for made, count in zip(plan.classes, plan.counts()[1:], strict=True) if count]
+    needed = [*(made.name for made in used), *plan.placed_names, plan.name]
+    missing = [name for name in needed if name not in content.cells]
     if missing:
         return Comparison(0, (*found, f"{len(missing)} cells are missing: {', '.join(missing[:5])}"))
-    for made in plan.classes:
+    for made in used:
         found += _compare_class(made, content.cells[made.name])
     for figure in plan.figures:
         for layer, polygons in figure.polygons.items():
