@@ -20,10 +20,11 @@ from metalens.modal.mesh import MeshPlan
 FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
 FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
 FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
-OTHER = MeshPlan(5, 6, 6, (0.7,), (0.8, 0.97, 1.0), (0.04, 0.25, 1.0))
-TOUCH = MeshPlan(5, 7, 5, (0.7,), (0.85, 1.0), (0.2, 1.0), (0.15, 0.4, 1.0))
-TOUCH_OTHER = MeshPlan(6, 6, 6, (0.7,), (0.8, 1.0), (0.3, 1.0), (0.1, 0.3, 0.6, 1.0))
-NORMAL, OBLIQUE, GAP = (FINEST, FINE), (FINE, OTHER), (TOUCH_OTHER, TOUCH)
+BOTH = MeshPlan(5, 6, 5, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0))
+OTHER = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
+GAP_FINE = MeshPlan(6, 6, 6, (0.7, 1.3), (1.0,), (1.0,), (0.3, 1.0))
+GAP_OTHER = MeshPlan(5, 5, 5, (0.7,), (1.0,), (0.25, 1.0), (0.25, 1.0))
+NORMAL, OBLIQUE, GAP = (FINEST, FINE), (BOTH, OTHER), (GAP_FINE, GAP_OTHER)
 PAPER = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
 NIR = Cell(0.40, 0.7, Index(3.6), Index(1.4513), Index(1.0), Index(1.0))
 DISPUTED = Cell(0.418, 0.7, Index(3.698, 0.0086), Index(1.4513), Index(1.0), Index(1.0))
@@ -78,7 +79,7 @@ def entry(name: str, cell: Cell, d: float, wavelength: float, angle: float, p: s
         "r": [r.real, r.imag],
         "uncertainty": float(np.abs(finer.matrix - other.matrix).max()),
         "unknowns": [finer.unknowns // 2, other.unknowns // 2],
-        "half_difference": [finer.error, other.error],
+        "half_difference": [finer.spread, other.spread],
     }
 
 

@@ -87,7 +87,7 @@ def form_rates(case: Case, plan: MeshPlan, *, magnetic: bool) -> tuple[np.ndarra
     foot, top = zero_order(b, below, case.bloch, te=te), zero_order(b, above, case.bloch, te=te)
     pick = np.ix_((foot, len(below.ports) + top), (foot, len(below.ports) + top))
     sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic else np.ones((2, 2))
-    rates = {"height": match.height_rate(layer, case.height)[pick] * sign}
+    rates = {"height": match.rate(1j * layer.q[match.carry] * match.travel)[pick] * sign}
     w = waves(match, layer, case.height, foot, top)
     zero = int(below.ports[foot])
     for name, change in changes(case, plan, b, electric_walls).items():

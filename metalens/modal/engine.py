@@ -20,6 +20,8 @@ from metalens.response import Response
 
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
+SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
+MOST = 8  # and of the others at most so many, the least decaying
 POLARIZATIONS = ("x", "y", "s", "p")
 
 
@@ -44,10 +46,16 @@ class Case:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solution:
-    """One rung's answer: zero-order scattering matrix (2, 2), its error estimate, energy, unknowns of both forms."""
+    """One rung's answer.
+
+    matrix: (2, 2) zero-order scattering matrix, mean of both forms. spread: how far the forms are apart, half the
+    difference. drift: change of the matrix per relative error of the transverse wavenumbers squared of the layer
+    modes, which both forms share. energy: mean of both forms. unknowns: of both forms.
+    """
 
     matrix: np.ndarray
-    error: float
+    spread: float
+    drift: float
     energy: float
     unknowns: int
 
@@ -81,27 +89,62 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return arithmetic
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Form:
+    """What one form gives: zero-order matrix (2, 2), power out per unit power in, size; and of the layer modes that
+    travel, by falling axial wavenumber, q (m,) and the derivative of the matrix in each (m, 2, 2)."""
+
+    matrix: np.ndarray
+    energy: float
+    unknowns: int
+    q: np.ndarray
+    by_q: np.ndarray
+
+
+def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool) -> Form:
+    """One form on one mesh."""
+    # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
+    b = basis(case.rho, plan, case.p == magnetic if case.bloch else False, case.bloch)
+    te = case.p == magnetic if case.bloch else True
+    layer = (magnetic_modes if magnetic else electric_modes)(b, Medium(case.k0, case.disc, case.around))
+    below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
+    match = scattering(layer, case.height, below, above)
+    foot = zero_order(b, below, case.bloch, te=te)
+    pair = (foot, len(below.ports) + zero_order(b, above, case.bloch, te=te))
+    q = layer.q[match.carry]
+    travelling = np.flatnonzero(np.abs(match.travel) > SEEN)
+    travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
+    moved = np.zeros((len(travelling), len(q)), complex)
+    moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
+    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic else np.ones((2, 2))
+    return Form(
+        matrix=match.matrix[np.ix_(pair, pair)] * sign,
+        energy=float((np.abs(match.matrix[:, foot]) ** 2).sum()),
+        unknowns=b.size,
+        q=q[travelling],
+        by_q=np.array([match.rate(row)[np.ix_(pair, pair)] * sign for row in moved]).reshape(-1, 2, 2),
+    )
+
+
 def evaluate(case: Case, plan: MeshPlan) -> Solution:
-    """Both forms on one mesh."""
-    medium = Medium(case.k0, case.disc, case.around)
-    matrices, powers, unknowns = [], [], 0
-    for magnetic in (False, True):
-        # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
-        electric_walls = case.p == magnetic if case.bloch else False
-        b = basis(case.rho, plan, electric_walls, case.bloch)
-        layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
-        below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
-        full = scattering(layer, case.height, below, above).matrix
-        te = case.p == magnetic if case.bloch else True
-        foot = zero_order(b, below, case.bloch, te=te)
-        top = len(below.ports) + zero_order(b, above, case.bloch, te=te)
-        powers.append(float((np.abs(full[:, foot]) ** 2).sum()))
-        sign = -1.0 if magnetic else 1.0
-        matrices.append(full[np.ix_((foot, top), (foot, top))] * np.array([[sign, 1.0], [1.0, sign]]))
-        unknowns += b.size
-    mean = geometric_mean(*matrices)
-    half_difference = float(np.abs(matrices[0] - matrices[1]).max()) / 2
-    return Solution(mean, half_difference, float(np.mean(powers)), unknowns)
+    """Both forms on one mesh.
+
+    Their difference is split into what the axial wavenumbers explain and the rest, so that the two cannot cancel.
+    """
+    first, second = (solve_form(case, plan, magnetic=magnetic) for magnetic in (False, True))
+    m = min(len(first.q), len(second.q))
+    explained = first.by_q[:m] * (first.q[:m] - second.q[:m])[:, None, None]
+    rest = first.matrix - second.matrix - explained.sum(0)
+    spread = np.abs(explained).sum(0).max() + np.abs(rest).max()
+    dense = case.k0**2 * max(case.disc, case.around, key=lambda e: e.real)
+    slack = np.abs(dense - first.q**2) / (2 * np.abs(first.q))
+    return Solution(
+        matrix=geometric_mean(first.matrix, second.matrix),
+        spread=float(spread) / 2,
+        drift=float((np.abs(first.by_q) * slack[:, None, None]).sum(0).max(initial=0.0)),
+        energy=(first.energy + second.energy) / 2,
+        unknowns=first.unknowns + second.unknowns,
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,7 +163,7 @@ def climb(case: Case, tolerance: float) -> Climb:
     best: Climb | None = None
     for rung in RUNGS[first_rung(tolerance) :]:
         solution = evaluate(case, rung.plan)
-        error = rung.error(solution.error)
+        error = rung.error(solution.spread, solution.drift, case.rho)
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"
             return Climb(solution, rung, error, True, reason)

@@ -1,8 +1,9 @@
-"""The ladder of meshes: which one to try first for a tolerance, and what its difference of forms is worth.
+"""The ladder of meshes: which one to try first for a tolerance, and how its error is estimated.
 
-Each rung knows the factor by which half the difference of the two forms must be multiplied to bound the error of
-their mean. Coarse meshes err alike in both forms where a resonance is steep, so their factor is above 1; on fine
-ones the mean is far better than the difference says.
+Two things are wrong in the mean of both forms. Near the rim, where the field is singular, the forms err apart: their
+difference bounds it. Smooth waves on polynomials err alike: what relative error they have in the transverse
+wavenumbers squared is a property of the mesh and of how much of the cell the disc fills, found once by comparing
+with the next finer meshes; the solution knows how much it moves for it (``drift``).
 """
 
 from dataclasses import dataclass
@@ -12,28 +13,38 @@ from metalens.modal.mesh import MeshPlan
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """A mesh, its safety factor on half the difference of the forms, and the error it usually meets."""
+    """A mesh and its error model.
+
+    safety: factor on half the difference of the forms. thin, wide: relative error of transverse wavenumbers squared
+    for a thin pillar and what a pillar of the size of the cell adds. usual: the estimate that it usually ends with.
+    """
 
     name: str
     plan: MeshPlan
     safety: float
+    thin: float
+    wide: float
     usual: float
 
-    def error(self, half_difference: float) -> float:
-        """Error estimate of the mean of both forms.
-
-        What both forms miss alike (smooth waves on polynomials) is covered by a thousandth of the usual error.
-        """
-        return self.safety * half_difference + 1e-3 * self.usual
+    def error(self, spread: float, drift: float, rho: float) -> float:
+        """Error estimate of the mean of both forms, for a disc of ``rho`` pitches; see ``engine.Solution``."""
+        return self.safety * spread + (self.thin + self.wide * rho**4) * drift + 1e-12
 
 
 RUNGS = (
-    Rung("coarse", MeshPlan(3, 3, 2, (0.7, 1.3), core=0.45), 4.0, 1e-2),
-    Rung("fair", MeshPlan(3, 4, 3, (0.7, 1.3)), 3.0, 2e-3),
-    Rung("good", MeshPlan(4, 5, 4, (0.7, 1.3)), 2.0, 5e-4),
-    Rung("fine", MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.5, 5e-5),
-    Rung("finest", MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.0, 1e-5),
-    Rung("reference", MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55), 1.0, 2e-6),
+    Rung("coarse", MeshPlan(3, 3, 2, (0.7, 1.3), core=0.45), 1.5, 1e-4, 5e-4, 1e-2),
+    Rung("fair", MeshPlan(3, 4, 3, (0.7, 1.3)), 1.5, 1.5e-5, 7e-5, 2e-3),
+    Rung("good", MeshPlan(4, 5, 4, (0.7, 1.3)), 1.5, 3e-6, 0.0, 5e-4),
+    Rung("fine", MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.0, 1e-6, 0.0, 5e-5),
+    Rung("finest", MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.0, 1e-7, 0.0, 1e-5),
+    Rung(
+        "reference",
+        MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55),
+        1.0,
+        5e-8,
+        0.0,
+        2e-6,
+    ),
 )
 
 

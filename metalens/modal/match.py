@@ -89,23 +89,27 @@ class Match:
 
     carry: the modes that travel; round_trip: (2 carry, 2 carry) system of their amplitudes, waves up at the foot
     first, then waves down at the top; amplitude: (2 carry, ports) its solution for unit power into each port.
+    travel: (carry,) their factors exp(i q h).
     """
 
     matrix: np.ndarray
     carry: np.ndarray
+    travel: np.ndarray
     foot: Interface
     top: Interface
     round_trip: np.ndarray
     amplitude: np.ndarray
 
-    def height_rate(self, layer: LayerModes, height: float) -> np.ndarray:
-        """Derivative of the scattering matrix in the height."""
-        q = layer.q[self.carry]
-        x = np.exp(1j * q * height)
-        moved = swap(self.foot.reflect, self.top.reflect, 1j * q * x) @ self.amplitude
-        out = swap(self.foot.leave, self.top.leave, 1j * q * x) @ self.amplitude
-        rate: np.ndarray = out + swap(self.foot.leave, self.top.leave, x) @ np.linalg.solve(self.round_trip, moved)
-        return rate
+    def rate(self, moved: np.ndarray) -> np.ndarray:
+        """Derivative of the scattering matrix, given those of the factors exp(i q h) of the carrying modes."""
+        c = len(self.carry)
+        push = swap(self.foot.reflect, self.top.reflect, moved) @ self.amplitude
+        echo = np.linalg.solve(self.round_trip, push)
+        x = self.travel
+        out: np.ndarray = swap(self.foot.leave, self.top.leave, moved) @ self.amplitude
+        out[: len(self.foot.leave)] += (self.foot.leave * x) @ echo[c:]
+        out[len(self.foot.leave) :] += (self.top.leave * x) @ echo[:c]
+        return out
 
 
 def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -129,7 +133,7 @@ def scattering(layer: LayerModes, height: float, below: HalfSpace, above: HalfSp
     matrix = swap(foot.leave, top.leave, x) @ amplitude
     matrix[:n, :n] += foot.back
     matrix[n:, n:] += top.back
-    return Match(matrix, carry, foot, top, round_trip, amplitude)
+    return Match(matrix, carry, x, foot, top, round_trip, amplitude)
 
 
 def zero_order(basis: Basis, half: HalfSpace, wavenumber: float, *, te: bool) -> int:
