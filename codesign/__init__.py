@@ -4,12 +4,16 @@ Names load when first used: ``import codesign; codesign.render(states)``.
 """
 
 import importlib
-from types import ModuleType
+from typing import Any
+
+_PUBLIC = {"render": "renderer"}  # name: submodule that defines it
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
     try:
         return importlib.import_module(f"{__name__}.{name}")
     except ModuleNotFoundError as error:

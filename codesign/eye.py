@@ -51,7 +51,7 @@ POPULATION: Mapping[str, Trait] = {
     "fissure_upper_um": Trait(5000, 700, 3300, 6800, "fissure height 10 mm (Farkas 1994), above the pupil's centre"),
     "fissure_lower_um": Trait(5900, 500, 4700, 7000, "lower margin at or just below the limbus"),
     "fissure_half_um": Trait(11600, 350, 10700, 12400, "half chord between the canthi: 30 mm along the curve (Farkas)"),
-    "fissure_skew": Trait(0.16, 0.08, -0.1, 0.4, "peak of the upper margin nasal, of the lower temporal"),
+    "fissure_skew_um": Trait(850, 400, -500, 2000, "peak of the upper margin nasal, of the lower temporal"),
     "fissure_middle_um": Trait(400, 350, -600, 1400, "the temporal canthus is farther from the pupil"),
     "crease_um": Trait(2600, 700, 900, 4500, "upper lid fold above the margin"),
     "plane_um": Trait(7000, 800, 5000, 9500, "face plane behind the corneal apex"),
@@ -191,11 +191,12 @@ def draw(count: int, seed: int | tuple[int, ...], *, motion: Motion | None = Non
     return States(*(torch.from_numpy(np.asarray(value, float)) for value in values))
 
 
-def parameters(states: States, rig: Rig, *, pixel_rad: float) -> Tensor:
+def parameters(states: States, rig: Rig, *, pixel_rad: float, exposed: States | None = None) -> Tensor:
     """(n, COUNT) parameters of :mod:`codesign.render_model` in float64, differentiable in gaze, torsion, slip, mount.
 
     Args:
         pixel_rad: angle of a pixel, which sets the softness of edges.
+        exposed: states that the automatic exposure was set at; by default these, without following their derivatives.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
@@ -210,16 +211,16 @@ def parameters(states: States, rig: Rig, *, pixel_rad: float) -> Tensor:
     lamps = torch.tensor(rig.lamps_um, dtype=torch.float64).flatten().expand(len(states), -1)
     follow = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
     lower = t["fissure_lower_um"] * size + 0.9 * follow
-    shut = -lower - 300.0
-    upper = states.aperture * (t["fissure_upper_um"] * size - follow) + (1 - states.aperture) * shut
+    upper = states.aperture * (t["fissure_upper_um"] * size - follow) - (1 - states.aperture) * lower
     half = t["fissure_half_um"] * size
-    depth = centre[:, 2].detach().clamp_min(1000.0) - behind * 0.7
+    held = states if exposed is None else exposed
+    depth = _exposure_depth(rig, t["depth_um"], behind, held)
     gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
     edge = 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0
     columns = [centre, *face, axis, across, down, plane, lamps]
     scalars = [sclera, cornea, offset, limbus, ring, t["pupil_radius_um"], behind, t["index"]]
     scalars += [sclera + t["lid_thickness_um"], torch.full_like(size, 1600.0), edge]
-    scalars += [upper, lower, t["fissure_skew"], t["fissure_middle_um"], half, t["crease_um"]]
+    scalars += [upper, lower, t["fissure_skew_um"] * size, t["fissure_middle_um"], half, t["crease_um"]]
     scalars += [t[k] for k in ("iris", "iris_contrast", "sclera", "veins", "skin", "pores", "lashes", "pupil", "glint")]
     scalars += [t["ambient"] / (depth.clamp_min(3000.0) / 20e3) ** 2, gain, t["brow"]]
     turn = states.textures[:, 7]
@@ -254,6 +255,12 @@ def _nominal_centre(rig: Rig, depth_um: Tensor, behind_um: Tensor) -> Tensor:
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out
+
+
+def _exposure_depth(rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States) -> Tensor:
+    """(n,) distance of the face for which exposure and edges are set, without derivatives."""
+    centre = _turn(_nominal_centre(rig, depth_um, behind_um), states.mount_rad) + states.slip_um
+    return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)
 
 
 def _turned(face: tuple[Tensor, Tensor, Tensor], states: States) -> tuple[Tensor, Tensor, Tensor]:

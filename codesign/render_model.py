@@ -57,9 +57,9 @@ def lids(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real,
     gy = qx * p[FACE_Y] + qy * p[FACE_Y + 1] + qz * p[FACE_Y + 2]
     along = (gx - p[MIDDLE]) / p[HALF]
     arch = 1.0 - along * along
-    upper = gy + p[UPPER] * arch * (1.0 + p[SKEW] * along)
-    lower = p[LOWER] * arch * (1.0 - p[SKEW] * along) - gy
-    openness = step(upper / p[EDGE]) * step(lower / p[EDGE]) * unit(20.0 * arch)
+    upper = gy + arch * (p[UPPER] + p[SKEW] * along)
+    lower = arch * (p[LOWER] - p[SKEW] * along) - gy
+    openness = step(upper / p[EDGE]) * step(lower / p[EDGE]) * step((upper + lower) / p[EDGE] - 1.0)
     return s, openness, gx, gy, upper, lower, nx * n, ny * n, nz * n
 
 

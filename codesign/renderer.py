@@ -78,14 +78,24 @@ class Rendered:
         return self.frames.radiance.sum(1)
 
 
-def render(states: States, *, rig: Rig | None = None, camera: Camera | None = None, texture_seed: int = 0) -> Rendered:
+def render(
+    states: States,
+    *,
+    rig: Rig | None = None,
+    camera: Camera | None = None,
+    texture_seed: int = 0,
+    exposed: States | None = None,
+) -> Rendered:
     """Render states with labels, masks and depth (float32); compiled, on all threads of numba.
+
+    Args:
+        exposed: states that the automatic exposure was set at, where it shall not follow; by default these.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
     """
     rig, camera = rig or Rig(), camera or Camera()
-    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um)
+    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed)
     light, cover, depth, pupil = _compiled(p, rig, camera, texture_seed)
     scale = states.scale.to(torch.float32)[:, None, None, None]
     frames = Frames(torch.from_numpy(light), torch.from_numpy(cover), torch.from_numpy(depth) * scale)
