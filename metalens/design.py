@@ -49,7 +49,7 @@ class Limits:
     min_gap_nm: least distance between neighbouring pillars.
     """
 
-    min_diameter_nm: float = 80.0
+    min_diameter_nm: float = 82.0
     min_gap_nm: float = 70.0
 
     def __post_init__(self) -> None:

@@ -6,35 +6,16 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from metalens import report
+from metalens import report, store
 from metalens.cli import main as run_verb
 from metalens.commands import Common
 from metalens.errors import ConfigError, MetalensError
-
-CELL = """# Amorphous-silicon pillars on fused silica; see docs/cell_study for how the pitch was chosen.
-[cell]
-pitch_um = 0.30
-height_um = 0.7
-pillar = {n = 3.6}
-substrate = "SiO2"
-
-[sweep]
-wavelengths_um = [0.85]
-tolerance = 1e-3
-"""
-DESIGN = """# The eye at 20 mm onto a sensor 2 mm behind a 1 mm lens (NA 0.24).
-profile = "hyperbolic"
-aperture_mm = {aperture_mm}
-wavelength_nm = 850.0
-sensor_distance_mm = 2.0
-source_distance_mm = 20.0
-library = "library.h5"
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +94,8 @@ def stages() -> tuple[Stage, ...]:
             ("layout", "lens.h5", "--process", "process.toml", "-o", "mask", "--oasis", "--gds"),
             (
                 ("mask/die.png", "The whole die."),
-                ("mask/zoom.png", "Single pillars as polygons of the mask."),
-                ("mask/histogram.png", "How many pillars of each diameter."),
+                ("mask/pillars.png", "Single pillars as polygons of the mask."),
+                ("mask/diameters.png", "How many pillars of each diameter."),
                 ("mask/margins.png", "Distance to the design rules."),
             ),
         ),
@@ -129,9 +110,9 @@ def run(options: Options) -> int:
     if not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cell.toml").write_text(CELL, encoding="utf-8")
-    (folder / "design.toml").write_text(DESIGN.format(aperture_mm=options.aperture_mm), encoding="utf-8")
-    (folder / "process.toml").write_text(_default_process(), encoding="utf-8")
+    for name in ("cell.toml", "design.toml", "process.toml"):
+        text = resources.files("metalens").joinpath("data", "demo", name).read_text(encoding="utf-8")
+        store.write_text(folder / name, text.replace("aperture_mm = 1.0", f"aperture_mm = {options.aperture_mm}"))
     outcomes: list[Outcome] = []
     for outcome in _chain(folder):
         outcomes.append(outcome)
@@ -197,7 +178,3 @@ def _section(folder: Path, outcome: Outcome) -> report.Section:
 
 def _verdict(outcomes: list[Outcome]) -> str:
     return "yes" if not any(o.status for o in outcomes) else "no"
-
-
-def _default_process() -> str:
-    return "# All defaults of the process description; see the mask page of the documentation.\n"
