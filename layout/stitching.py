@@ -12,6 +12,7 @@ import numpy as np
 from layout.fields import FieldPlan
 from layout.focus import Focus, Window, prepare, window
 from layout.process import Process
+from layout.sensitivity import amplitude
 from metalens.lens import Lens
 from metalens.store import Array
 
@@ -83,11 +84,9 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: Focus) -> tuple[int, Array
 
 
 def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    d = lens.diameters.diameter_um[rows, columns]
+    d = lens.diameters.diameter_um[rows, columns].astype(float)
     inside = np.where(d > 0, d, lens.proxy.domain_um[0])
-    phase = lens.proxy.phase_rad(inside, lens.wavelength_um)
-    level = np.where(d > 0, lens.proxy.transmission(inside, lens.wavelength_um), 0)
-    return np.asarray((level * np.exp(1j * np.remainder(phase, 2 * np.pi))).astype(np.complex64))
+    return np.where(d > 0, amplitude(lens.proxy, inside, lens.wavelength_um), 0).astype(np.complex64)
 
 
 def _expansion(focus: Focus, moments: Array, step_um: float) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from layout.bias import Bias, isolation, read_csv
@@ -21,6 +21,7 @@ def test_curve_is_the_polynomial_of_the_diameter_in_100_nm():
     assert Bias(curve_nm=(-8.0, 3.0, -0.2)).at(250.0) == pytest.approx(-8 + 3 * 2.5 - 0.2 * 6.25)
 
 
+@settings(deadline=None)
 @given(
     slopes=st.lists(st.floats(-0.49, 0.49), min_size=1, max_size=6),
     start=st.floats(-20, 20),
