@@ -41,8 +41,8 @@ def solve(
             larger ``t_error`` and ``converged`` False.
         harmonics: fix the largest order instead, and take the estimate there.
 
-    Accuracy: ``t_error`` estimates the truncation, from how t moves between truncations; the wall of a tapered pillar
-        is cut in slices whose number grows along with it. Lossless energy and reciprocity hold to rounding.
+    Accuracy: ``t_error`` estimates the truncation, from how t moves between truncations; the number of
+        steps of a tilted wall is chosen likewise. Lossless energy and reciprocity hold to rounding.
 
     Raises:
         CellError: an impossible diameter, angle, polarisation or tolerance.
@@ -98,7 +98,7 @@ def derivatives(
     Args: as for :func:`solve`.
 
     Accuracy: rounding (1e-10 of the derivative) with respect to the truncated result; as the result itself with
-        respect to the exact one. A tilted wall is cut in eight slices.
+        respect to the exact one. A tilted wall is taken in eight steps of fourth order.
 
     Raises:
         CellError, MaterialError: as :func:`solve`; also where substrate or cover absorb.
@@ -107,5 +107,5 @@ def derivatives(
     if harmonics < 1:
         raise CellError(f"harmonics = {harmonics}: need at least 1")
     this = case(cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
-    slices = 8 if cell.sidewall_rad else 1
-    return differentiate(this, float(diameter_um), harmonics=harmonics, slices=slices, angle_rad=float(angle_rad))
+    steps = 8 if cell.sidewall_rad else 0
+    return differentiate(this, float(diameter_um), harmonics=harmonics, steps=steps, angle_rad=float(angle_rad))

@@ -11,19 +11,22 @@ its power is fixed.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from metalens import materials
-from metalens.cell import Material
+from metalens.cell import Film, Material
 from metalens.errors import CellError
 from metalens.rcwa import changes
 from metalens.rcwa.case import Case, case_waves
 from metalens.rcwa.changes import Change
 from metalens.rcwa.layer import Layer, layer
+from metalens.rcwa.solver import mixed
 from metalens.rcwa.stack import Fields, match, outgoing
+from metalens.rcwa.taper import Section, sections, widening
 from metalens.rcwa.waves import Waves, half_space, normal_component
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -48,18 +51,18 @@ class Derivatives:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Region:
-    """A layer between the half-spaces: its modes, reduced height, and the index of its film, or its diameter."""
+    """A layer between the half-spaces: its modes and reduced height; its film, or its section of the pillar."""
 
     part: Layer
     height: float
     film: Material | None
-    diameter_um: float
-    lift: float
+    section: Section | None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Problem:
     this: Case
+    diameter_um: float
     ways: Waves
     regions: list[_Region]
     light: Fields
@@ -68,17 +71,17 @@ class _Problem:
     t: complex
 
 
-def differentiate(this: Case, diameter_um: float, *, harmonics: int, slices: int, angle_rad: float) -> Derivatives:
+def differentiate(this: Case, diameter_um: float, *, harmonics: int, steps: int, angle_rad: float) -> Derivatives:
     """Derivatives at one truncation.
 
     Raises:
         CellError: an absorbing half-space, or a zero order that does not propagate in the cover.
     """
-    problem = _solve(this, diameter_um, harmonics, slices)
+    problem = _solve(this, diameter_um, harmonics, steps)
     by_index = _by_index(problem)
     return Derivatives(
         problem.t,
-        _by_diameter(problem, [1.0] * len(problem.regions)),
+        _by_diameter(problem, lambda lift: 1.0),
         _by_height(problem),
         by_index,
         1j * by_index,
@@ -87,14 +90,14 @@ def differentiate(this: Case, diameter_um: float, *, harmonics: int, slices: int
     )
 
 
-def _solve(this: Case, diameter_um: float, harmonics: int, slices: int) -> _Problem:
+def _solve(this: Case, diameter_um: float, harmonics: int, steps: int) -> _Problem:
     ways, zero = case_waves(this, harmonics)
     media = this.media
     if media.substrate.imag or media.cover.imag:
         raise CellError("derivatives need a substrate and a cover that do not absorb")
     if media.cover.real <= ways.kappa[zero]:
         raise CellError("derivatives need a zero order that propagates in the cover; here it is totally reflected")
-    regions = _regions(this, ways, diameter_um, slices)
+    regions = _regions(this, ways, diameter_um, steps)
     layers, heights = [region.part for region in regions], tuple(region.height for region in regions)
     below, above = half_space(ways, media.substrate), half_space(ways, media.cover)
     light = match(layers, heights, above, below, _source(below, zero))
@@ -108,7 +111,7 @@ def _solve(this: Case, diameter_um: float, harmonics: int, slices: int) -> _Prob
         (media.cover, transmitted, _returned(above, reverse, unit)),
     )
     t = complex(transmitted[zero] * np.sqrt(above[0][zero] * above[1][zero]))
-    return _Problem(this, ways, regions, light, reverse, ends, t)
+    return _Problem(this, diameter_um, ways, regions, light, reverse, ends, t)
 
 
 def _source(pair: tuple[Array, Array], zero: int) -> Array:
@@ -122,20 +125,16 @@ def _returned(pair: tuple[Array, Array], fields: Fields, unit: Array) -> Array:
     return outgoing(pair, fields.u - pair[0] * incident, pair[1] * incident - fields.w)
 
 
-def _regions(this: Case, ways: Waves, diameter_um: float, slices: int) -> list[_Region]:
-    def films(stack: tuple[Any, ...], indices: tuple[tuple[complex, float], ...]) -> list[_Region]:
+def _regions(this: Case, ways: Waves, diameter_um: float, steps: int) -> list[_Region]:
+    def films(stack: tuple[Film, ...], indices: tuple[tuple[complex, float], ...]) -> list[_Region]:
         pairs = zip(stack, indices, strict=True)
-        return [_Region(_film(ways, index), height, film.material, 0.0, 0.0) for film, (index, height) in pairs]
+        return [_Region(_film(ways, index), height, film.material, None) for film, (index, height) in pairs]
 
-    cell = this.cell
-    tilt = math.tan(cell.sidewall_rad)
     pillar = []
-    for i in range(slices):
-        lift = (i + 0.5) / slices - 0.5
-        diameter = diameter_um - 2 * tilt * cell.height_um * lift
-        part = layer(ways, np.array(diameter), pitch_um=cell.pitch_um, pillar=this.pillar, between=this.between)
-        pillar.append(_Region(part, cell.height_um * this.k0 / slices, None, diameter, lift))
-    return films(cell.under, this.media.under) + pillar + films(cell.over, this.media.over)
+    for section in sections(steps):
+        part = layer(*mixed(this, ways, np.array(diameter_um), section))
+        pillar.append(_Region(part, section.share * this.cell.height_um * this.k0, None, section))
+    return films(this.cell.under, this.media.under) + pillar + films(this.cell.over, this.media.over)
 
 
 def _film(ways: Waves, index: complex) -> Layer:
@@ -146,34 +145,46 @@ def _film(ways: Waves, index: complex) -> Layer:
     return Layer(np.diag(P), np.diag(Q), kz, np.eye(len(kz)), np.diag(Q / kz))
 
 
-def _by_diameter(problem: _Problem, share: list[float]) -> complex:
-    """Slope for diameters that change by ``share`` in each region."""
-    total = 0j
-    for i, (region, weight) in enumerate(zip(problem.regions, share, strict=True)):
-        if region.film is None:
-            change = changes.rim(problem.this, problem.ways, np.array(region.diameter_um))
-            total += weight * _inside(problem, i, change)
-    return total
+def _by_diameter(problem: _Problem, share: Callable[[float], float]) -> complex:
+    """Slope for diameters that change by ``share(lift)``."""
+
+    def rim(diameter: Array, lift: float) -> Change:
+        dP, dQ = changes.rim(problem.this, problem.ways, diameter)
+        return share(lift) * dP, share(lift) * dQ
+
+    return sum(_inside(problem, i, _mix(problem, i, rim)) for i in _pillar(problem))
 
 
 def _by_index(problem: _Problem) -> complex:
-    total = 0j
-    for i, region in enumerate(problem.regions):
-        if region.film is None:
-            change = changes.indices(problem.this, problem.ways, np.array(region.diameter_um), 1.0, 0.0)
-            total += _inside(problem, i, change)
-    return total
+    def bulk(diameter: Array, lift: float) -> Change:
+        return changes.indices(problem.this, problem.ways, diameter, 1.0, 0.0)
+
+    return sum(_inside(problem, i, _mix(problem, i, bulk)) for i in _pillar(problem))
 
 
 def _by_height(problem: _Problem) -> complex:
-    tilt, slices = math.tan(problem.this.cell.sidewall_rad), sum(r.film is None for r in problem.regions)
-    total = 0j
-    for i, region in enumerate(problem.regions):
-        if region.film is None:
-            total += problem.this.k0 / slices * _stretch(problem, i)
-    if tilt:
-        total += _by_diameter(problem, [-2 * tilt * region.lift for region in problem.regions])
+    this, total = problem.this, 0j
+    for region, i in ((problem.regions[i], i) for i in _pillar(problem)):
+        total += region.section.share * this.k0 * _stretch(problem, i) if region.section else 0
+    if this.cell.sidewall_rad:
+        spread = -2 * math.tan(this.cell.sidewall_rad)
+        total += _by_diameter(problem, lambda lift: lift * spread)
     return total
+
+
+def _pillar(problem: _Problem) -> list[int]:
+    return [i for i, region in enumerate(problem.regions) if region.section]
+
+
+def _mix(problem: _Problem, i: int, change: Callable[[Array, float], Change]) -> Change:
+    """Change of the operators of a section, from that of each cross-section (diameter, lift) that it mixes."""
+    section = problem.regions[i].section
+    n = len(problem.ways.kappa)
+    dP, dQ = np.zeros((n, n), complex), np.zeros((n, n), complex)
+    for weight, lift in section.nodes if section else ():
+        part = change(np.array(problem.diameter_um + lift * widening(problem.this.cell)), lift)
+        dP, dQ = dP + weight * part[0], dQ + weight * part[1]
+    return dP, dQ
 
 
 def _by_wavelength(problem: _Problem) -> complex:
@@ -184,16 +195,19 @@ def _by_wavelength(problem: _Problem) -> complex:
         return materials.slope(material, wavelength)
 
     turn = changes.turning(ways, np.stack([ways.m, ways.n]) / cell.pitch_um)
+
+    def pattern(diameter: Array, lift: float) -> Change:
+        bulk = changes.indices(this, ways, diameter, slope(cell.pillar), slope(cell.between))
+        return changes.add(changes.turned_pattern(this, ways, diameter, turn), bulk)
+
     total = 0j
     for i, region in enumerate(problem.regions):
-        total -= region.height / wavelength * _stretch(problem, i)
         if region.film is None:
-            bulk = changes.indices(this, ways, np.array(region.diameter_um), slope(cell.pillar), slope(cell.between))
-            change = changes.add(changes.turned_pattern(this, ways, np.array(region.diameter_um), turn), bulk)
+            change = _mix(problem, i, pattern)
         else:
             index = materials.index(region.film, wavelength)
             change = changes.medium(ways, index, 2 * index * slope(region.film), turn)
-        total += _inside(problem, i, change)
+        total += _inside(problem, i, change) - region.height / wavelength * _stretch(problem, i)
     for (index, out, back), material in zip(problem.ends, (cell.substrate, cell.cover), strict=True):
         total += _outside(ways, index, out, back, changes.medium(ways, index, 2 * index * slope(material), turn))
     return total
@@ -205,10 +219,14 @@ def _by_angle(problem: _Problem, angle_rad: float) -> complex:
         return 0j  # the response is even in the angle
     tilt = math.cos(angle_rad) / math.sin(angle_rad) * np.array([[this.kx], [this.ky]])
     turn = changes.turning(ways, np.broadcast_to(tilt, (2, len(ways.kappa))))
+
+    def pattern(diameter: Array, lift: float) -> Change:
+        return changes.turned_pattern(this, ways, diameter, turn)
+
     total = 0j
     for i, region in enumerate(problem.regions):
         if region.film is None:
-            change = changes.turned_pattern(this, ways, np.array(region.diameter_um), turn)
+            change = _mix(problem, i, pattern)
         else:
             change = changes.medium(ways, materials.index(region.film, this.wavelength_um), 0j, turn)
         total += _inside(problem, i, change)

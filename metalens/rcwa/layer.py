@@ -33,9 +33,8 @@ class Layer:
     V: Array
 
 
-def layer(ways: Waves, diameter_um: Array, *, pitch_um: float, pillar: complex, between: complex) -> Layer:
-    """Modes for a batch of diameters; indices exp(-iwt). All matrices are real where nothing absorbs."""
-    P, Q = operators(ways, diameter_um, pitch_um, pillar, between)
+def layer(P: Array, Q: Array) -> Layer:
+    """The modes of a layer with these operators. Everything stays real where nothing absorbs, but for q and V."""
     q2, W = np.linalg.eig(P @ Q)
     q = np.sqrt(q2.astype(complex))
     q = np.where((q.imag < 0) | ((np.abs(q.imag) <= 1e-13 * np.abs(q)) & (q.real < 0)), -q, q)
@@ -52,7 +51,7 @@ _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincid
 def operators(
     ways: Waves, diameter_um: Array, pitch_um: float, pillar: complex, between: complex
 ) -> tuple[Array, Array]:
-    """P and Q of :mod:`metalens.rcwa.waves` for a batch of diameters, real or complex."""
+    """P and Q of :mod:`metalens.rcwa.waves` for a batch of diameters; real where nothing absorbs (exp(-iwt))."""
     space = ways.space
     shape = fourier.disc(space, diameter_um, pitch_um)
     inside, outside = _real_if_lossless(pillar**2, between**2)

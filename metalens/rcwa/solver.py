@@ -1,15 +1,16 @@
 """Harmonics chosen per entry from the tolerance, with an error estimate from how the result still moves."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from metalens.rcwa.case import Case, case_waves
-from metalens.rcwa.layer import layer
+from metalens.rcwa.layer import layer, operators
 from metalens.rcwa.stack import respond
+from metalens.rcwa.taper import Section, sections, widening
+from metalens.rcwa.waves import Waves
 from metalens.response import Response
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -25,25 +26,25 @@ class Truncated:
     energy: Array
 
 
-def truncated(this: Case, diameter_um: Array, harmonics: int, slices: int = 1) -> Truncated:
-    """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``, the wall in equal slices."""
+def truncated(this: Case, diameter_um: Array, harmonics: int, steps: int = 0) -> Truncated:
+    """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``; a tilted wall in ``steps``."""
     ways, zero = case_waves(this, harmonics)
-    height = this.cell.height_um
-    lift = (np.arange(slices) + 0.5) / slices - 0.5
-    layers = [
-        layer(
-            ways,
-            diameter_um - 2 * math.tan(this.cell.sidewall_rad) * height * z,
-            pitch_um=this.cell.pitch_um,
-            pillar=this.pillar,
-            between=this.between,
-        )
-        for z in lift
-    ]
-    media = dataclasses.replace(this.media, heights=(height * this.k0 / slices,) * slices)
-    result = respond(ways, media, layers, zero)
+    parts = sections(steps)
+    layers = [layer(*mixed(this, ways, diameter_um, part)) for part in parts]
+    heights = tuple(part.share * this.cell.height_um * this.k0 for part in parts)
+    result = respond(ways, dataclasses.replace(this.media, heights=heights), layers, zero)
     energy = (np.abs(result.t) ** 2).sum(axis=-1) + (np.abs(result.r) ** 2).sum(axis=-1)
     return Truncated(result.t[:, zero], result.r[:, zero], energy)
+
+
+def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[Array, Array]:
+    """P and Q of one section of the pillar."""
+    wide = [diameter_um + lift * widening(this.cell) for _, lift in part.nodes]
+    here = [operators(ways, w, this.cell.pitch_um, this.pillar, this.between) for w in wide]
+    weights = [weight for weight, _ in part.nodes]
+    P = sum(weight * P for weight, (P, _) in zip(weights, here, strict=True))
+    Q = sum(weight * Q for weight, (_, Q) in zip(weights, here, strict=True))
+    return np.asarray(P), np.asarray(Q)
 
 
 def film(this: Case, index: complex) -> Truncated:
@@ -61,14 +62,14 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
     empty = film(this, this.between)
     done = {i: _exact(empty) for i in _films(this, diameter_um)}
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
-    slices, cut = (1, 0.0)
+    steps, cut = (0, 0.0)
     if len(left) and this.cell.sidewall_rad:
-        slices, cut = _slices(this, diameter_um[left], tolerance)
+        steps, cut = _steps(this, diameter_um[left], tolerance)
     history: list[Truncated] = []
     for reach in _ladder(this, harmonics):
         if not len(left):
             break
-        history.append(truncated(this, diameter_um[left], reach, slices))
+        history.append(truncated(this, diameter_um[left], reach, steps))
         last = reach == _ladder(this, harmonics)[-1]
         if len(history) <= _COMPARED and not last:
             continue
@@ -88,8 +89,8 @@ _FIRST = 4  # orders of the first truncation, too few for any use but to see t m
 _LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
 _COMPARED = 4
 _SAFETY = 3.0
-_COARSE = 5  # orders that suffice to see what slicing a tilted wall does
-_MOST_SLICES = 64
+_COARSE = 5  # orders that suffice to see what cutting a tilted wall in steps does
+_MOST_STEPS = 16
 
 
 def _ladder(this: Case, harmonics: int | None) -> range:
@@ -110,15 +111,15 @@ def _estimate(t: Array) -> Array:
     return np.asarray(_SAFETY * np.abs(t[-1] - t[-1 - _COMPARED : -1]).max(axis=0) + _ROUNDING)
 
 
-def _slices(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
-    """Number of slices of a tilted wall, and its error (it falls as the square of the number), at few orders."""
-    slices, t = 2, truncated(this, diameter_um, _COARSE, 2).t
+def _steps(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
+    """Number of steps of a tilted wall, and its error (it falls as the fourth power), at few orders."""
+    steps, t = 2, truncated(this, diameter_um, _COARSE, 2).t
     while True:
-        finer = truncated(this, diameter_um, _COARSE, 2 * slices).t
-        left = float(np.abs(finer - t).max()) / 2  # a third where slices are many
-        slices, t = 2 * slices, finer
-        if left <= tolerance / 4 or slices >= _MOST_SLICES:
-            return slices, left
+        finer = truncated(this, diameter_um, _COARSE, 2 * steps).t
+        left = float(np.abs(finer - t).max()) / 4  # a fifteenth where steps are many
+        steps, t = 2 * steps, finer
+        if left <= tolerance / 4 or steps >= _MOST_STEPS:
+            return steps, left
 
 
 def _films(this: Case, diameter_um: Array) -> list[int]:

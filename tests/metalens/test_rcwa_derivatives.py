@@ -36,28 +36,28 @@ def slope(value, at, step):
     return sum(parts) / step
 
 
-def transmission(cell, diameter_um, wavelength_um, direction, slices):
+def transmission(cell, diameter_um, wavelength_um, direction, steps):
     this = case(cell, wavelength_um, **direction)
-    return truncated(this, np.array([diameter_um]), 3, slices).t[0]
+    return truncated(this, np.array([diameter_um]), 3, steps).t[0]
 
 
 @pytest.mark.parametrize(
-    ("cell", "slices", "angle_rad", "azimuth_rad", "polarization"),
+    ("cell", "steps", "angle_rad", "azimuth_rad", "polarization"),
     [
-        (PLAIN, 1, 0.0, 0.0, "x"),
-        (LOSSY, 1, 0.2, 0.0, "p"),
-        (LOSSY, 1, 0.2, math.pi / 2, "s"),
-        (RICH, 2, 0.25, 0.3, "s"),
-        (RICH, 2, -0.25, 0.3, "p"),
+        (PLAIN, 0, 0.0, 0.0, "x"),
+        (LOSSY, 0, 0.2, 0.0, "p"),
+        (LOSSY, 0, 0.2, math.pi / 2, "s"),
+        (RICH, 1, 0.25, 0.3, "s"),
+        (RICH, 1, -0.25, 0.3, "p"),
     ],
 )
-def test_every_derivative_against_differences(cell, slices, angle_rad, azimuth_rad, polarization):
+def test_every_derivative_against_differences(cell, steps, angle_rad, azimuth_rad, polarization):
     diameter, wavelength = 0.21, 0.85
     direction = {"angle_rad": angle_rad, "azimuth_rad": azimuth_rad, "polarization": polarization}
-    got = differentiate(case(cell, wavelength, **direction), diameter, harmonics=3, slices=slices, angle_rad=angle_rad)
+    got = differentiate(case(cell, wavelength, **direction), diameter, harmonics=3, steps=steps, angle_rad=angle_rad)
 
     def t(cell=cell, diameter=diameter, wavelength=wavelength, **turned):
-        return transmission(cell, diameter, wavelength, direction | turned, slices)
+        return transmission(cell, diameter, wavelength, direction | turned, steps)
 
     n, k = cell.pillar.n, cell.pillar.k
     want = {
@@ -95,6 +95,14 @@ def test_hard_degenerate_modes_of_a_homogeneous_layer(diameter_um):
     assert abs(got.height_um - by_height) < 1e-9
     assert abs(got.wavelength_um - by_wavelength) < 1e-9
     assert abs(got.diameter_um) < 1e-12
+
+
+def test_hard_no_height_has_the_slope_of_a_thin_film():
+    n = 1.7
+    flat = replace(PLAIN, pillar=Index(n), between=Index(n), height_um=0.0)
+    got = rcwa.derivatives(flat, 0.2, 0.85, harmonics=3)
+    assert abs(got.height_um - slope(lambda h: film(n, h), 0.0, 1e-3)) < 1e-9
+    assert got.n == got.wavelength_um == 0
 
 
 def test_weak_disc_changes_the_film_by_its_share_of_the_cell():
