@@ -72,7 +72,7 @@ def square_error(normalised: Array, points: Array, chance: Array, difference: Ar
     pairs = n * (n - 1)
     cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
     common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
-    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.1 * float(a.mean(1).sum()))
+    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.06 * float(a.mean(1).sum()))
 
 
 def _intensity(samples: list[Sample]) -> Array:
