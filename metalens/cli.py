@@ -29,7 +29,12 @@ VERBS: dict[str, tuple[str, str]] = {
         "metalens.commands.psf",
         "lens.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
+    "scene": ("codesign.command_scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
     "layout": ("layout.command", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
+    "capture": (
+        "characterize.command_capture",
+        "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",
+    ),
     "fit": ("characterize.command_fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
