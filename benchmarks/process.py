@@ -54,11 +54,12 @@ def rows() -> list[Row]:
 def _process_rows() -> list[Row]:
     source = lens().diameters
     found = cells.quantise(source, BIASED)
-    written = DiameterMap(np.r_[0, found.diameters_nm][found.classes] * 1e-3, 0.4)
+    table = np.r_[0, found.diameters_nm] * 1e-3
+    written = DiameterMap(table[found.classes], 0.4)
     made = BIASED.made_diameter_nm(BIASED.written_diameter_nm(TABLE_UM * 1e3))
     times = {
         "bias": fastest(lambda: cells.quantise(source, BIASED)),
-        "dose": fastest(lambda: dose.correct(written, BIASED)),
+        "dose": fastest(lambda: dose.correct_table(found.classes, table, 0.4, BIASED)),
         "fields": fastest(lambda: fields.split(written, BIASED)),
     }
     result = dose.correct(written, BIASED)

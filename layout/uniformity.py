@@ -90,24 +90,34 @@ def _at(drawn: Pattern, field: Array, row: int, column: int) -> float:
 def _distant(drawn: Pattern, classes: Array, dose: Array, rows: Array, columns: Array) -> Array:
     """(samples,) background from the pillars more than 5 sites away, by the direct sum of Gaussians."""
     (ny, nx), p = drawn.index.shape, drawn.pitch_um
-    away_y = (np.arange(ny)[:, None] - rows) * p
-    away_x = (np.arange(nx)[:, None] - columns) * p
-    near = (abs(away_y) < (_NEIGHBOURS + 0.5) * p, abs(away_x) < (_NEIGHBOURS + 0.5) * p)
     total = np.zeros(len(rows))
+    area, given = drawn.area_um2.astype(np.float32), dose.astype(np.float32)
     for width, weight in zip(drawn.far.widths_um, drawn.far.weights, strict=True):
-        wy, wx = (np.exp(-((away / width) ** 2)).astype(np.float32) for away in (away_y, away_x))
+        wy, wx = (
+            np.exp(-(((np.arange(n)[:, None] - centre) * p / width) ** 2)).astype(np.float32)
+            for n, centre in ((ny, rows), (nx, columns))
+        )
+        share = weight / (np.pi * width**2)
         for band, index in drawn.bands():
-            mass = (drawn.area_um2[index] * dose[classes[band]]).astype(np.float32)
-            whole = ((mass @ wx) * wy[band]).sum(0, dtype=float)
-            inner = ((mass @ (wx * near[1])) * (wy * near[0])[band]).sum(0, dtype=float)
-            total += weight / (np.pi * width**2) * (whole - inner)
+            mass = area.take(index, mode="clip") * given.take(classes[band], mode="clip")
+            total += share * ((mass @ wx) * wy[band]).sum(0, dtype=float)
+        for n, (row, column) in enumerate(zip(rows, columns, strict=True)):
+            near = _block(drawn, int(row), int(column))
+            mass = drawn.area_um2[drawn.index[near]] * dose[classes[near]]
+            total[n] -= share * (wy[near[0], n] @ mass @ wx[near[1], n])
     return total
+
+
+def _block(drawn: Pattern, row: int, column: int) -> tuple[slice, slice]:
+    """Sites within 5 of one, inside the lens."""
+    k = _NEIGHBOURS
+    return slice(max(row - k, 0), row + k + 1), slice(max(column - k, 0), column + k + 1)
 
 
 def _around(drawn: Pattern, classes: Array, dose: Array, site: tuple[int, int], point: PointExposure) -> float:
     """Exposure at the rim of one pillar by itself and by the discs within 5 sites, exact."""
-    (row, column), p, k = site, drawn.pitch_um, _NEIGHBOURS
-    rows, columns = slice(max(row - k, 0), row + k + 1), slice(max(column - k, 0), column + k + 1)
+    (row, column), p = site, drawn.pitch_um
+    rows, columns = _block(drawn, row, column)
     index, level = drawn.index[rows, columns], dose[classes[rows, columns]]
     y = (np.arange(index.shape[0]) + rows.start - row)[:, None] * p
     x = (np.arange(index.shape[1]) + columns.start - column) * p
