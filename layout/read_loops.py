@@ -22,7 +22,8 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
     size = int(data[at + 5]) + 20
     most = min(_RUN, (len(data) - at) // max(size, 1))
     child, x, y = (np.empty(most, np.int32) for _ in range(3))
-    slots, first = np.full(4 * _MOST_NAMES, -1, np.int32), np.empty(_MOST_NAMES, np.int64)
+    first = np.empty(min(_MOST_NAMES, most), np.int64)
+    slots = np.full(4 << len(first).bit_length(), -1, np.int32)
     count, names = _srefs(data, at, size, most, child, x, y, slots, first)
     found = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
     return found, child[:count], x[:count], y[:count], at + count * size
