@@ -53,7 +53,12 @@ def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
         MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    return _Reader(str(path), mapped(path), limit).library()
+    return parse(mapped(path), limit=limit, where=str(path))
+
+
+def parse(data: Array, *, limit: int = LIMIT, where: str = "data") -> MaskContent:
+    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them in errors."""
+    return _Reader(where, data, limit).library()
 
 
 class _Reader:

@@ -13,6 +13,7 @@ from layout import oasis_bytes as oasis
 from layout.content import CellContent, MaskContent, mapped
 from layout.oasis_cells import CellReader, Child, OpenCell
 from layout.oasis_cursor import Cursor
+from metalens.store import Array
 
 LIMIT = 2**29
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
@@ -29,7 +30,12 @@ def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
             pillars holds; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    return _Reader(Cursor(str(path), mapped(path)), limit).whole_file()
+    return parse(mapped(path), limit=limit, where=str(path))
+
+
+def parse(data: Array, *, limit: int = LIMIT, where: str = "data") -> MaskContent:
+    """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them in errors."""
+    return _Reader(Cursor(where, data), limit).whole_file()
 
 
 class _Reader:
