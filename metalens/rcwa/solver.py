@@ -15,6 +15,7 @@ from metalens.response import Response
 
 Array = np.ndarray[Any, np.dtype[Any]]
 _ROUNDING = 1e-13
+_ENTRIES = 1_500_000  # of a matrix of all diameters that are solved together: below 0.5 GB with all its companions
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,11 +31,16 @@ def truncated(this: Case, diameter_um: Array, harmonics: int, steps: int = 0) ->
     """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``; a tilted wall in ``steps``."""
     ways, zero = case_waves(this, harmonics)
     parts = sections(steps)
-    layers = [layer(*mixed(this, ways, diameter_um, part)) for part in parts]
     heights = tuple(part.share * this.cell.height_um * this.k0 for part in parts)
-    result = respond(ways, dataclasses.replace(this.media, heights=heights), layers, zero)
-    energy = (np.abs(result.t) ** 2).sum(axis=-1) + (np.abs(result.r) ** 2).sum(axis=-1)
-    return Truncated(result.t[:, zero], result.r[:, zero], energy)
+    media = dataclasses.replace(this.media, heights=heights)
+    size = max(1, _ENTRIES // (len(ways.kappa) ** 2 * len(parts)))
+    found = []
+    for start in range(0, len(diameter_um), size):
+        some = diameter_um[start : start + size]
+        found.append(respond(ways, media, [layer(*mixed(this, ways, some, part)) for part in parts], zero))
+    t, r = np.concatenate([part.t for part in found]), np.concatenate([part.r for part in found])
+    energy = (np.abs(t) ** 2).sum(axis=-1) + (np.abs(r) ** 2).sum(axis=-1)
+    return Truncated(t[:, zero], r[:, zero], energy)
 
 
 def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[Array, Array]:
