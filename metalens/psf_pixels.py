@@ -30,9 +30,10 @@ def on_pixels(
         PropagationError: bins below 1, or pixels finer than the samples.
     """
     pitch = pitch_um * bins
-    if bins < 1 or not float(pitch) >= stack.step_um:
+    width = float(pitch.detach()) if isinstance(pitch, torch.Tensor) else float(pitch)
+    if bins < 1 or not width >= stack.step_um:
         raise PropagationError(
-            f"pixels of {float(pitch_um)} um binned {bins} x {bins} on samples of {stack.step_um} um; "
+            f"pixels of {width / max(bins, 1)} um binned {bins} x {bins} on samples of {stack.step_um} um; "
             "need bins of 1 or more and pixels at least as wide as the samples"
         )
     light = torch.as_tensor(stack.intensity)
@@ -42,5 +43,4 @@ def on_pixels(
     result: tuple[Any, Any] = pixels / share[..., None, None], torch.as_tensor(stack.energy_um2) * share
     if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
         result = result[0].numpy(), result[1].numpy()
-    step = float(pitch.detach()) if isinstance(pitch, torch.Tensor) else float(pitch)
-    return dataclasses.replace(stack, intensity=result[0], energy_um2=result[1], step_um=step)
+    return dataclasses.replace(stack, intensity=result[0], energy_um2=result[1], step_um=width)

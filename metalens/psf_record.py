@@ -1,6 +1,7 @@
 """The PSF stack as a record and as a file."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,12 @@ import numpy as np
 from metalens import store
 from metalens.propagate_case import axis
 from metalens.store import Array, Provenance
+
+
+@functools.lru_cache(maxsize=1)
+def _made_here() -> Provenance:
+    """Provenance of a stack made in this process; package versions are looked up once."""
+    return Provenance()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,7 +44,7 @@ class PsfStack:
     tolerance: float
     error: float
     reason: str
-    provenance: Provenance = field(default_factory=Provenance)
+    provenance: Provenance = field(default_factory=_made_here)
 
     @property
     def x_um(self) -> Array:
