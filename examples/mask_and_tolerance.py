@@ -19,6 +19,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import Image, display
+from scipy.signal import resample
 
 from layout import (
     build,
@@ -163,20 +164,22 @@ for e in study.effects:
 # million.
 
 # %%
-low, middle, high = study.band("psf")
 x = study.window.x_um
+fine = np.arange(8 * len(x)) * (x[1] - x[0]) / 8 + x[0]
+low, middle, high = (resample(curve, len(fine)) for curve in study.band("psf"))
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-axes[0].fill_between(x, low, high, alpha=0.3, label="5 to 95 %")
-axes[0].plot(x, middle, label="median")
-axes[0].plot(x, study.nominal.psf[0], "k--", lw=0.8, label="as designed")
-axes[0].set(xlabel="x / µm", ylabel="intensity", title="PSF at the design depth", xlim=(-6, 6))
+axes[0].fill_between(fine, low, high, alpha=0.3, label="5 to 95 %")
+axes[0].plot(fine, middle, label="median")
+axes[0].plot(fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8, label="as designed")
+axes[0].set(xlabel="x / µm", ylabel="intensity", title="PSF at the design depth", xlim=(-4, 4))
 axes[0].legend(fontsize=7)
 axes[1].hist(study.draws.efficiency * 100, bins=15)
 axes[1].axvline(100 * study.nominal.efficiency[0], color="k", ls="--")
 axes[1].set(xlabel="efficiency / %", ylabel="draws")
-low, middle, high = study.band("information") / study.nominal.information
+low, middle, high = study.band("information")
 axes[2].errorbar(study.depths_um / 1e3, middle, [middle - low, high - middle], fmt="o", capsize=4)
-axes[2].set(xlabel="depth / mm", ylabel="I(z) / designed", title="axial information (Eq. 11)")
+axes[2].plot(study.depths_um / 1e3, study.nominal.information[0], "k_", ms=14)
+axes[2].set(xlabel="depth / mm", ylabel="I(z) / µm⁻²", yscale="log", title="axial information (Eq. 11)")
 plt.show()
 
 # %% [markdown]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.fields import FieldPlan
-from layout.focus import Focus, Window, prepare, window
+from layout.focus import Focus, Window, peak, prepare, window
 from layout.process import Process
 from layout.sensitivity import amplitude
 from metalens.lens import Lens
@@ -63,7 +63,7 @@ def stitching(lens: Lens, plan: FieldPlan, process: Process, *, draws: int = 500
     change = np.sqrt(((psf - perfect) ** 2).sum((1, 2)) / (perfect**2).sum())
     moved = np.hypot(*(_centroid(psf, focus.window) - _centroid(perfect[None], focus.window))) * 1e3
     worst = int(change.argmax())
-    strehl = psf.max((1, 2)) / perfect.max()
+    strehl = peak(psf) / peak(perfect)
     return StitchReport(
         process.write_field.stitching_nm, strehl, change, moved, perfect, psf[worst], focus.window, held, seed
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.focus import Window, prepare, window
+from layout.focus import Window, peak, prepare, window
 from layout.process import Process
 from layout.sensitivity import Sensitivities, sensitivities
 from layout.spread_model import CAUSES, Model, curve, local_bias_um, missed, reduce, sample
@@ -40,7 +40,7 @@ class Effect:
     """One cause at its standard deviation, both signs; the worse of the two for each number.
 
     phase_rad: rms change of the pillars' phases about their mean. transmission: rms change of |T|.
-    strehl, efficiency, information: relative change; psf: relative L2 change.
+    strehl, efficiency, information (summed over the depths): relative change; psf: relative L2 change.
     """
 
     cause: str
@@ -139,7 +139,7 @@ def _outcome(model: Model, draws: Array) -> Outcome:
         steps = (unit[:, 1::2] - unit[:, ::2]) / DEPTH_STEP_UM
         parts.append(
             (
-                design.max((1, 2)) / reference.max(),
+                peak(design) / peak(reference),
                 design.sum((1, 2)) * view.cell_um2 / incident,
                 np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
                 (steps**2).sum((2, 3)),
@@ -168,7 +168,7 @@ def _effect(model: Model, draws: Array, found: Outcome, nominal: Outcome, cause:
         strehl=worst(found.strehl, nominal.strehl),
         efficiency=worst(found.efficiency, nominal.efficiency),
         psf=float(found.psf_change.max()),
-        information=worst(found.information, nominal.information),
+        information=worst(found.information.sum(1), nominal.information.sum(1)),
     )
 
 

@@ -81,3 +81,11 @@ def test_a_window_without_extent_is_refused():
     lens = random_lens()
     with pytest.raises(PropagationError, match="2 samples"):
         focus.prepare(lens, Window(np.zeros(1), np.zeros(3), 150.0, 0.85, np.array([900.0])))
+
+
+@pytest.mark.parametrize(("x0", "y0"), [(0.0, 0.0), (0.31, -0.44), (0.5, 0.5)])
+def test_the_peak_between_samples_of_an_airy_spot_is_found(x0, y0):
+    # the spot of a square aperture, sinc^2 sinc^2, at its Nyquist step of half a diffraction width
+    axis = np.arange(-20, 21) * 0.5
+    spot = np.sinc(axis - x0 / 2) ** 2 * np.sinc(axis[:, None] - y0 / 2) ** 2
+    assert focus.peak(spot) == pytest.approx(1, abs=1.5e-3)  # cut at 10 widths: tails of 1e-3
