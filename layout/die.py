@@ -126,8 +126,7 @@ def _tests(
     dose_map = _blocks(np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK)
     columns = 2 if len(witnesses) > 1 else 1
     numbers = np.arange(first + len(doses), first + len(doses) + len(witnesses))
-    numbers = np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns)
-    witness_map = _blocks(numbers, _WITNESS)
+    witness_map = _blocks(np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns), _WITNESS)
     inner, outer = unit(radius_um + _CLEAR_UM), die.right - unit(process.die.street_um + _CLEAR_UM)
     middle = (inner + outer) // 2
     lattices, windows = [], []

@@ -74,7 +74,7 @@ def structures_apart(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
     for figure in plan.figures:
         if figure.name in ("MARKS", "LABEL"):
             shapes = [np.asarray(s) for s in itertools.chain.from_iterable(figure.polygons.values())]
-            boxes += [(figure.name, (*map(float, s.min(0)), *map(float, s.max(0)))) for s in shapes]
+            boxes += [(figure.name, _box(s)) for s in shapes]
     for (one, a), (two, b) in itertools.combinations(boxes, 2):
         gap = math.hypot(max(a[0] - b[2], b[0] - a[2], 0), max(a[1] - b[3], b[1] - a[3], 0)) * plan.unit_nm
         if gap < rules.minimum_gap_nm and one != two:
@@ -86,3 +86,8 @@ def _lattice_box(plan: MaskPlan, lattice: Lattice) -> Box:
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
     right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.pitch
     return lattice.x0 - reach, lattice.y0 - bottom - reach, lattice.x0 + right + reach, lattice.y0 + reach
+
+
+def _box(shape: Array) -> Box:
+    (left, bottom), (right, top) = shape.min(0).tolist(), shape.max(0).tolist()
+    return left, bottom, right, top

@@ -144,7 +144,9 @@ class CellReader:
         info, m = c.byte(), self.modal
         if info & 0x80:
             m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
-        child = self._need(c, m.child, "a cell")
+        child = m.child
+        if child is None:
+            raise c.fail("placement without a cell, and none before it in this cell")
         turn = info >> 1 & 3 | (info & 1) << 2
         if kind == oasis.PLACEMENT_ANY:
             size = c.real() if info & 4 else 1.0
@@ -154,7 +156,7 @@ class CellReader:
             turn = int(angle // 90) & 3 | (info & 1) << 2
         m.placement_x, m.placement_y = self._position(c, info, (0x20, 0x10), (m.placement_x, m.placement_y))
         x, y = self._repeated(c, info, 8, m.placement_x, m.placement_y)
-        number = child if isinstance(child, int) else self.cell.names.setdefault(child, -2 - len(self.cell.names))
+        number = self.cell.names.setdefault(child, -2 - len(self.cell.names)) if isinstance(child, str) else child
         small = (np.full(len(x), number, np.int32), x.astype(np.int32), y.astype(np.int32))
         self._add(c, *small, np.full(len(x), turn, np.uint8))
 

@@ -86,13 +86,13 @@ class Cursor:
         """One of the eight forms of a real number."""
         form = self.unsigned()
         if form in (0, 1):
-            return float(self.unsigned()) * (-1) ** form
+            return float(-self.unsigned() if form else self.unsigned())
         if form in (2, 3, 4, 5):
             upper = self.unsigned() if form >= 4 else 1
             lower = self.unsigned()
             if lower == 0:
                 raise self.fail("a real number with denominator 0")
-            return upper / lower * (-1) ** form
+            return (-upper if form % 2 else upper) / lower
         if form in (6, 7):
             size, code = (4, "<f") if form == 6 else (8, "<d")
             return float(struct.unpack(code, self.take(size))[0])
@@ -199,5 +199,5 @@ class Cursor:
             raise self.fail(f"repetition of {n} x {m} copies, more than the limit of {limit}")
         for i in (0, 1):
             self.within(abs(n * a[i]) + abs(m * b[i]))
-        i, j = (v.ravel() for v in np.meshgrid(np.arange(n), np.arange(m)))
-        return Repetition(i * a[0] + j * b[0], i * a[1] + j * b[1])
+        along, across = (v.ravel() for v in np.meshgrid(np.arange(n), np.arange(m)))
+        return Repetition(along * a[0] + across * b[0], along * a[1] + across * b[1])

@@ -74,7 +74,7 @@ def _srefs(
 def _big_endian(data: Array, at: int) -> int:
     value = 0
     for i in range(4):
-        value = value << 8 | np.int64(data[at + i])
+        value = value << 8 | (data[at + i] + 0)  # 64 bits wide
     return value - (1 << 32) if value >= 1 << 31 else value
 
 
@@ -83,7 +83,7 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
     """A variable-length integer of at most 6 bytes and the position after it; -1 where it is cut or longer."""
     value, shift = 0, 0
     while at < end and shift < 42:
-        byte = np.int64(data[at])
+        byte = data[at] + 0  # 64 bits wide
         value |= (byte & 127) << shift
         at += 1
         if byte < 128:
