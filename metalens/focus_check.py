@@ -53,7 +53,9 @@ def check_focus(lens: Lens, *, axial: bool = True) -> FocusCheck:
     """Sum the light of every pillar on a cross of points around the axis, and along it.
 
     Args:
-        axial: also look before and behind the sensor plane; five more sums over the lens.
+        axial: also look before and behind the sensor plane; five more sums over the lens. Lenses of fewer than
+            five Fresnel zones (R² / (wavelength x distance)) have their brightest point far before the focus and
+            are not judged by it.
 
     Accuracy:
         the sum is exact to rounding; the peak is the vertex of a parabola through the three brightest points
@@ -62,6 +64,7 @@ def check_focus(lens: Lens, *, axial: bool = True) -> FocusCheck:
     d = lens.diameters
     aperture = math.sin(math.atan((d.radius_um + d.pitch_um / 2) / lens.sensor_distance_um))
     resolution, depth = lens.wavelength_um / (2 * aperture), lens.wavelength_um / aperture**2
+    zones = (d.radius_um + d.pitch_um / 2) ** 2 / (lens.wavelength_um * lens.sensor_distance_um)
     phase, level = lens.phase_rad(), lens.transmission()
     case = Case(
         shape=(d.diameter_um.shape[0], d.diameter_um.shape[1]),
@@ -81,7 +84,7 @@ def check_focus(lens: Lens, *, axial: bool = True) -> FocusCheck:
     return FocusCheck(
         x_um=_vertex(arm, along_x),
         y_um=_vertex(arm, along_y),
-        z_um=_axial_peak(phase, level, case, depth) if axial else math.nan,
+        z_um=_axial_peak(phase, level, case, depth) if axial and zones >= 5 else math.nan,
         strehl=float(max(along_x.max(), along_y.max())) / _in_step(level, case) ** 2,
         resolution_um=resolution,
         depth_um=depth,

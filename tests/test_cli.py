@@ -81,3 +81,82 @@ def test_info_shows_kind_and_provenance(tmp_path):
     values = json.loads(run("info", tmp_path / "f.h5", "--json").stdout)
     assert values["kind"] == "psf"
     assert values["arrays"]["image"] == "float64 (20, 20)"
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """The whole chain on a 20 µm lens, run as a user would."""
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    done = run("demo", folder, "--aperture-mm", 0.02, "--json")
+    return folder, done
+
+
+def test_the_chain_runs_from_cell_to_checked_mask(demo):
+    folder, done = demo
+    assert done.returncode == cli.SUCCESS, done.stderr
+    values = json.loads(done.stdout)
+    assert values["library"]["max_error"] <= 1e-3
+    assert values["library"]["turns"] >= 1
+    assert values["design"]["focus_passed"]
+    assert values["psf"]["converged"]
+    assert values["layout"]["ok"]
+    assert values["layout"]["pillars"] >= values["design"]["pillars"]
+    for name in ("library.h5", "lens.h5", "psf.h5", "mask/mask.oas", "mask/mask.gds", "mask/report.html"):
+        assert (folder / name).stat().st_size > 0
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png") >= 8
+    assert not [p.name for p in folder.rglob("*.part")]
+
+
+def test_every_artefact_of_the_chain_tells_where_it_comes_from(demo):
+    folder, _ = demo
+    for name, kind in (("library.h5", "library"), ("lens.h5", "lens"), ("psf.h5", "psf")):
+        assert run("info", folder / name).stdout.startswith(f"{kind} version")
+    assert "library.h5 (SHA-256" in run("info", folder / "lens.h5").stdout
+
+
+def test_a_run_with_the_same_input_gives_the_same_bytes(demo, tmp_path):
+    folder, _ = demo
+    for name in ("design.toml", "library.h5"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    assert run("design", "design.toml", "-o", "lens.h5", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "lens.h5").read_bytes() == (folder / "lens.h5").read_bytes()
+
+
+def test_a_filled_folder_is_not_written_into_without_force(demo):
+    folder, _ = demo
+    done = run("demo", folder)
+    assert done.returncode == cli.BAD_INPUT
+    assert "not empty" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[cell]\npitch_um = 0.60\n", "diffraction orders"),
+        ("[cell]\npitch_um = 0.3\n[sweep]\ndiameters_um = [0.1, 0.31]\n", "pillars touch"),
+        ("[cell]\npitch_um = 0.3\npillar = 'a-Si'\n[sweep]\nwavelengths_um = [9.0]\n", "holds from"),
+        ("[cell]\npitch_um = -1.0\n", "pitch_um"),
+        ("[cell]\npitch_um = 0.3\npillar = 'unobtainium'\n", "unobtainium"),
+    ],
+)
+def test_impossible_cells_are_refused_by_name(tmp_path, text, message):
+    (tmp_path / "cell.toml").write_text(text)
+    done = run("library", "cell.toml", "-o", "library.h5", cwd=tmp_path)
+    assert done.returncode == cli.BAD_INPUT, done.stdout
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert os.listdir(tmp_path) == ["cell.toml"]
+
+
+def test_a_truncated_lens_is_refused_by_every_stage(demo, tmp_path):
+    folder, _ = demo
+    whole = (folder / "lens.h5").read_bytes()
+    (tmp_path / "lens.h5").write_bytes(whole[: len(whole) // 2])
+    for words in (("psf", "lens.h5", "-o", "psf.h5"), ("layout", "lens.h5", "-o", "mask")):
+        done = run(*words, cwd=tmp_path)
+        assert done.returncode == cli.BAD_INPUT, done.stdout
+        assert "truncated" in done.stderr
+    assert os.listdir(tmp_path) == ["lens.h5"]
+    (tmp_path / "lens.h5").write_bytes((folder / "library.h5").read_bytes())
+    assert "holds 'library' version 1, need 'lens'" in run("psf", "lens.h5", "-o", "psf.h5", cwd=tmp_path).stderr

@@ -22,12 +22,14 @@ from metalens.errors import ConfigError, MetalensError
 class Stage:
     """One verb of the chain.
 
-    words: of the command line, relative to the demo's folder. pictures: files that the verb leaves, with captions.
+    words: of the command line, relative to the demo's folder. error: entry of the result that says how wrong it may
+    be, and what it means. pictures: files that the verb leaves, with captions.
     """
 
     title: str
     text: str
     words: tuple[str, ...]
+    error: tuple[str, str]
     pictures: tuple[tuple[str, str], ...] = ()
 
 
@@ -62,6 +64,7 @@ def stages() -> tuple[Stage, ...]:
             "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
             "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
             ("library", "cell.toml", "-o", "library.h5"),
+            ("max_error", "largest error bar of |t|"),
             (
                 (
                     "library.png",
@@ -74,12 +77,14 @@ def stages() -> tuple[Stage, ...]:
             "Every site takes the printable diameter whose phase is the wanted one. A direct Rayleigh-Sommerfeld sum "
             "over all pillars then shows where the light really meets.",
             ("design", "design.toml", "-o", "lens.h5"),
+            ("max_phase_error_rad", "rad between wanted and made phase"),
             (("lens.png", "Phase and diameter of the pillars across the lens, and a zoom to single pillars."),),
         ),
         Stage(
             "Point spread functions",
             "Images of point sources from 16 to 26 mm, computed on the sensor window only, to a stated error.",
             ("psf", "lens.h5", "-o", "psf.h5"),
+            ("error", "relative error of the PSFs"),
             (
                 ("psf_xz.png", "Slice through the PSF along depth."),
                 ("psf_montage.png", "PSFs over depth and field angle."),
@@ -92,6 +97,7 @@ def stages() -> tuple[Stage, ...]:
             "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
             "witness cells; checked against the design rules, written, read back and compared.",
             ("layout", "lens.h5", "--process", "process.toml", "-o", "mask", "--oasis", "--gds"),
+            ("differences", "differences between plan and written files"),
             (
                 ("mask/die.png", "The whole die."),
                 ("mask/pillars.png", "Single pillars as polygons of the mask."),
@@ -140,16 +146,20 @@ def _chain(folder: Path) -> Iterator[Outcome]:
 
 def _write(folder: Path, outcomes: list[Outcome]) -> None:
     total = sum(o.seconds for o in outcomes)
-    flat = {name: value for o in outcomes for name, value in o.values.items() if isinstance(value, int | float)}
+    made = {o.stage.words[0]: o.values for o in outcomes}
     keys = [
-        report.KeyFigure("pillars", f"{int(flat.get('pillars', 0)):,}"),
-        report.KeyFigure("numerical aperture", f"{flat.get('numerical_aperture', 0):.3f}"),
-        report.KeyFigure("focusing efficiency", f"{flat.get('efficiency', 0):.1%}"),
+        report.KeyFigure("pillars", f"{made['design'].get('pillars', 0):,}"),
+        report.KeyFigure("numerical aperture", f"{made['design'].get('numerical_aperture', 0):.3f}"),
+        report.KeyFigure("focusing efficiency", f"{made['design'].get('efficiency', 0):.1%}"),
         report.KeyFigure("every stage passed its check", _verdict(outcomes), good=not any(o.status for o in outcomes)),
         report.KeyFigure("from cell to checked mask", f"{total:.0f} s"),
     ]
-    rows = [(o.stage.title, "metalens " + " ".join(o.stage.words), o.seconds, _verdict([o])) for o in outcomes]
-    timing = report.Table(("stage", "command", "seconds", "check"), rows, "Run any of these yourself in this folder.")
+    rows = [
+        (o.stage.title, "metalens " + " ".join(o.stage.words), f"{o.seconds:.1f}", _error(o), _verdict([o]))
+        for o in outcomes
+    ]
+    head = ("stage", "command", "seconds", "how wrong it may be", "passed its check")
+    timing = report.Table(head, rows, "Run any of these yourself in this folder.")
     sections = [_section(folder, outcome) for outcome in outcomes]
     report.write(
         folder / "report.html",
@@ -174,6 +184,14 @@ def _section(folder: Path, outcome: Outcome) -> report.Section:
     ]
     table = report.Table(("result", "value"), rows, f"metalens {' '.join(stage.words)}: {outcome.seconds:.1f} s")
     return report.Section(stage.title, stage.text, (*pictures, table))
+
+
+def _error(outcome: Outcome) -> str:
+    key, meaning = outcome.stage.error
+    found = outcome.values.get(key)
+    if isinstance(found, dict):
+        found = sum(len(differences) for differences in found.values())
+    return f"{found:.2g} {meaning}" if isinstance(found, int | float) else meaning
 
 
 def _verdict(outcomes: list[Outcome]) -> str:

@@ -50,3 +50,10 @@ def test_a_lens_that_focuses_to_the_side_is_told_which_side(proxy):
     half_micron_further = replace(lens, sensor_distance_um=lens.sensor_distance_um - 8.0)
     assert not check_focus(half_micron_further).passed
     assert "NO FOCUS" in check_focus(half_micron_further).text
+
+
+def test_a_lens_of_less_than_a_fresnel_zone_is_judged_in_the_sensor_plane_only(proxy):
+    tiny = design.make(design.phase_of(None, FOCUS, radius_um=5.0), FOCUS, aperture_um=10.0, cell=CELL, proxy=proxy)[0]
+    found = check_focus(tiny)
+    assert np.isnan(found.z_um)
+    assert found.passed
