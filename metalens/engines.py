@@ -49,7 +49,8 @@ def smooth(
     """
     if cell.height_um == 0:
         return precise(cell, light, tolerance=tolerance, engine=engine)
-    levels = _modal_levels(cell, light, tolerance) if engine == "modal" else _rcwa_levels(cell, light, tolerance)
+    make = _modal_levels if engine == "modal" else _rcwa_levels
+    levels = make(cell, light, span_um[1], tolerance)
     probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 0.97)]
     for at in levels[:-1]:
         if all(at(d).converged for d in probes):
@@ -57,15 +58,19 @@ def smooth(
     return levels[-1]
 
 
-def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
+def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
+    """One mesh a level: the one that the ladder takes for the largest diameter."""
     from metalens.modal.engine import case_of, evaluate
     from metalens.modal.ladder import RUNGS, Rung, first_rung
 
     def level(rung: Rung) -> Callable[[float], Response]:
+        mesh = rung.choice(largest_um / cell.pitch_um)
+
         def at(diameter_um: float) -> Response:
             case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
-            made = evaluate(case, rung.plan)
-            error = rung.error(made.spread, made.drift, case.rho)
+            made = evaluate(case, mesh.plan)
+            shared = max(rung.choice(case.rho).thin, mesh.thin) + mesh.wide * case.rho**4
+            error = rung.safety * made.spread + shared * made.drift + 1e-12
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
             return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
 
@@ -74,7 +79,7 @@ def _modal_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[
     return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
 
 
-def _rcwa_levels(cell: Cell, light: Light, tolerance: float) -> list[Callable[[float], Response]]:
+def _rcwa_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
     return [functools.partial(_rcwa, cell, light, tolerance, reach) for reach in (6, 8, 10, 12, 14)]
 
 

@@ -1,5 +1,6 @@
 """Run a library sweep: one rational curve t(D) for every wavelength, angle and polarisation, on all cores."""
 
+import functools
 import json
 import math
 import os
@@ -7,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from metalens import __version__, config, engines, reduced, workers
+from metalens import __version__, config, engines, few_nodes, reduced, workers
 from metalens.cell import Cell
 from metalens.console import Console
 from metalens.engines import Light
+from metalens.few_nodes import Rows
 from metalens.library import PillarLibrary, Sweep
 from metalens.reduced import Curve, Nodes
 from metalens.store import Array, Provenance
@@ -20,39 +22,54 @@ AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where
 FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
 MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
+WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
 
 
 def run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path | None) -> PillarLibrary:
-    """See :func:`metalens.library.sweep`."""
+    """See :func:`metalens.library.sweep`.
+
+    Curves are solved at a few wavelengths and angles first; those that polynomials between them do not give within
+    the tolerance are solved too, and single entries that are still above it one by one.
+    """
     console = console or Console(quiet=True)
     engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
-    lights = _lights(sweep)
-    span = sweep.span_um(cell)
     journal = _Journal(checkpoint, cell, sweep)
-    tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
-    results = journal.run(tasks, console, "curves")
-    curves = [reduced.curve(_nodes(result), tolerance=workers.FIT_SHARE * sweep.tolerance) for result in results]
-    diameters = _diameters(span, sweep.samples, curves)
-    table = np.stack([_evaluate(c, diameters) for c in curves])  # (light, 3, diameter): t, r, error
-    extra = _points(cell, sweep, engine, lights, diameters, table[:, 2].real)
+    span = sweep.span_um(cell)
+
+    def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
+        tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
+        return dict(zip(lights, map(functools.partial(_curve, sweep), journal.run(tasks, console, label)), strict=True))
+
+    first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg))
+    curves = solved(first, "curves")
+    diameters = _diameters(span, sweep.samples, list(curves.values()))
+    rows = {light: _evaluate(curve, diameters) for light, curve in curves.items()}
+    full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+    weak = [light for light, row in full.items() if light not in curves and _misses(row, sweep).sum() > WORTH_A_CURVE]
+    if weak:
+        more = solved(weak, "more curves")
+        curves |= more
+        rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
+        full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+    extra = _points(cell, sweep, engine, diameters, full)
     for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
-        _replace(table[lights.index(Light(*task["light"]))], diameters, result)
-    solves = sum(len(result["diameter_um"]) for result in results) + sum(len(t["diameters_um"]) for t in extra)
-    made = _library(
-        cell, sweep, engine, solves, diameters, dict(zip(lights, zip(curves, table, strict=True), strict=True))
-    )
+        _replace(full[Light(*task["light"])], diameters, result)
+    solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(len(t["diameters_um"]) for t in extra)
+    made = _library(cell, sweep, (engine, solves), diameters, curves, full)
     journal.finish()
     return made
 
 
-def _lights(sweep: Sweep) -> list[Light]:
-    """Every distinct plane wave: at normal incidence s and p are the same."""
-    return [
-        Light(w, math.radians(a), p)
-        for a in sweep.angles_deg
-        for p in (sweep.polarizations if a else ("x",))
-        for w in sweep.wavelengths_um
-    ]
+def _curve(sweep: Sweep, result: Result) -> Curve:
+    return reduced.curve(_nodes(result), tolerance=workers.FIT_SHARE * sweep.tolerance)
+
+
+def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
+    return {light: curve.resonances() for light, curve in curves.items()}
+
+
+def _misses(row: Array, sweep: Sweep) -> Array:
+    return np.asarray(row[2].real > sweep.tolerance)
 
 
 def _nodes(result: Result) -> Nodes:
@@ -80,11 +97,11 @@ def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> 
     return np.unique(np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]]))
 
 
-def _points(cell: Cell, sweep: Sweep, engine: str, lights: list[Light], diameters: Array, error: Array) -> list[Task]:
-    """Tasks for the entries whose error bar on the curve is above the tolerance."""
+def _points(cell: Cell, sweep: Sweep, engine: str, diameters: Array, full: Rows) -> list[Task]:
+    """Tasks for the entries whose error bar is above the tolerance."""
     tasks = []
-    for light, row in zip(lights, error, strict=True):
-        bad = diameters[row > sweep.tolerance].tolist()
+    for light, row in full.items():
+        bad = diameters[_misses(row, sweep)].tolist()
         for start in range(0, len(bad), POINTS):
             some = bad[start : start + POINTS]
             tasks.append(workers.points_task(cell, light, some, tolerance=sweep.tolerance, engine=engine))
@@ -100,21 +117,18 @@ def _replace(row: Array, diameters: Array, result: Result) -> None:
 
 
 def _library(
-    cell: Cell,
-    sweep: Sweep,
-    engine: str,
-    solves: int,
-    diameters: Array,
-    found: dict[Light, tuple[Curve, Array]],
+    cell: Cell, sweep: Sweep, effort: tuple[str, int], diameters: Array, curves: dict[Light, Curve], full: Rows
 ) -> PillarLibrary:
     shape = (len(sweep.polarizations), len(sweep.angles_deg), len(sweep.wavelengths_um), len(diameters))
     t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
     resonances = []
     for i, j, k in np.ndindex(*shape[:3]):
-        angle, wavelength = math.radians(sweep.angles_deg[j]), sweep.wavelengths_um[k]
-        curve, table = found[Light(wavelength, angle, sweep.polarizations[i] if angle else "x")]
-        t[i, j, k], r[i, j, k], error[i, j, k] = table[0], table[1], table[2].real
-        resonances += [(i, angle, wavelength, *pole) for pole in curve.resonances()]
+        light = few_nodes.light(sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i])
+        row = full[light]
+        t[i, j, k], r[i, j, k], error[i, j, k] = row[0], row[1], row[2].real
+        if light in curves:
+            poles = curves[light].resonances()
+            resonances += [(i, light.angle_rad, light.wavelength_um, *pole) for pole in poles]
     return PillarLibrary(
         cell,
         sweep,
@@ -127,8 +141,7 @@ def _library(
         error,
         np.abs(t) ** 2 + np.abs(r) ** 2,
         np.array(resonances, float).reshape(-1, 5),
-        engine,
-        solves,
+        *effort,
         provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
     )
 
