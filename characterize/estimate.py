@@ -46,7 +46,7 @@ def fit(
     """The as-built lens behind a capture.
 
     Args:
-        response: what height, index and sidewall do to the pillars; from rigorous solves of the cell without it.
+        response: what height, index and sidewall do to the pillars; by effective index without it.
 
     Raises:
         CaptureError: depths, pixel or wavelength missing, or frames unusable.
@@ -56,10 +56,7 @@ def fit(
     options = options or Options()
     frames = clean(capture)
     setting, window = _setting(capture, lens, options)
-    if response is None:
-        d = lens.diameters.diameter_um
-        response = sensitivity(lens.cell, lens.wavelength_um, (float(d[d > 0].min()), float(d.max())))
-    model = ForwardModel(lens, setting, response)
+    model = ForwardModel(lens, setting, response or sensitivity(lens))
     data = _data(frames, window)
     known = {k.name: k for k in (*_stated(capture, lens), *options.known)}
     start = vector({name: k.value for name, k in known.items()})

@@ -4,13 +4,12 @@ t(D + b; height, index, sidewall, wavelength) for all small changes lies close t
 summing the lens once for each u_k makes every change of process act on coarse nodes (see :mod:`reduced`).
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Index
+from metalens.cell import Index
 from metalens.errors import FitError
 from metalens.lens import Lens
 from metalens.proxy import Proxy
@@ -36,31 +35,40 @@ class Sensitivity:
         return np.stack([np.polynomial.polynomial.polyval(offset, row) for row in self.coefficients])
 
 
-def sensitivity(cell: Cell, wavelength_um: float, within_um: tuple[float, float], *, degree: int = 4) -> Sensitivity:
-    """Derivatives by central differences of rigorous solves of the cell, smoothed over the diameter.
+def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
+    """Derivatives from the effective index of the pillars that the proxy's phase implies.
 
-    Accuracy: differences of 1 % in height, 1 % in index, 1 degree of sidewall; resonances narrower than the fit of
-    ``degree`` are averaged over.
+    phase(D) = k n_eff(D) h, anchored at the thinnest pillar by the effective medium of thin cylinders across the field
+    (Rayleigh 1892, two dimensions). Then d ln t / dh = ik n_eff; with b = (n_eff² - 1) / (n² - 1) a function of
+    D sqrt(n² - 1) alone (step-index fibre), d n_eff / dn = (b n + n D b' / 2) / n_eff. Pillars are measured at half
+    height, so a sidewall acts in second order: k n_eff'' s h³ / 3 about the design's angle s.
+
+    Accuracy: of an effective index, about 10 % of the slopes; interference between foot and top is left out. A
+    library of other heights and indices gives better ones: pass its differences as :class:`Sensitivity`.
     """
-    from metalens import materials, rcwa
+    from metalens import materials
 
-    diameters = np.linspace(*within_um, 3 * degree + 1)
-    pillar = cell.pillar
-    index = complex(pillar.n, pillar.k) if isinstance(pillar, Index) else materials.index(pillar, wavelength_um)
-    pairs = [
-        [dataclasses.replace(cell, height_um=cell.height_um * (1 + s)) for s in (0.01, -0.01)],
-        [dataclasses.replace(cell, pillar=Index(index.real * (1 + s), index.imag)) for s in (0.01, -0.01)],
-        [dataclasses.replace(cell, sidewall_rad=cell.sidewall_rad + s) for s in (math.pi / 180, 0.0)],
-    ]
-    steps = (0.02 * cell.height_um, 0.02 * index.real, math.pi / 180)
-    rows = []
-    center = sum(within_um) / 2
-    for (up, down), step in zip(pairs, steps, strict=True):
-        high, low = ([rcwa.solve(c, d, wavelength_um, tolerance=3e-3).t for d in diameters] for c in (up, down))
-        slope = np.log(np.array(high) / np.array(low)) / step
-        fit = [np.polynomial.polynomial.polyfit(diameters - center, part, degree) for part in (slope.real, slope.imag)]
-        rows.append(fit[0] + 1j * fit[1])
-    return Sensitivity(np.array(rows), center)
+    cell, wave = lens.cell, lens.wavelength_um
+    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    diameter = np.linspace(
+        max(float(d.min()), lens.proxy.domain_um[0]), min(float(d.max()), lens.proxy.domain_um[1]), 61
+    )
+    index, outer = (m.n if isinstance(m, Index) else materials.index(m, wave).real for m in (cell.pillar, cell.between))
+    k, h = 2 * math.pi / wave, cell.height_um
+    fill = math.pi * diameter[0] ** 2 / 4 / cell.pitch_um**2
+    inside, around = index**2, outer**2
+    thin = around * (inside * (1 + fill) + around * (1 - fill)) / (inside * (1 - fill) + around * (1 + fill))
+    phase = lens.proxy.phase_rad(diameter, wave)
+    center = float(diameter.mean())
+    effective = math.sqrt(thin) + (phase - phase[0]) / (k * h)
+    fit = np.polynomial.Polynomial.fit(diameter - center, effective, degree)
+    n_eff = fit(diameter - center)
+    b = (n_eff**2 - around) / (inside - around)
+    slope = 2 * n_eff * fit.deriv()(diameter - center) / (inside - around)
+    by_index = (b * index + index * diameter * slope / 2) / n_eff
+    by_wall = fit.deriv(2)(diameter - center) * cell.sidewall_rad * h**3 / 3
+    rows = [np.polynomial.polynomial.polyfit(diameter - center, v, degree) for v in (n_eff, by_index * h, by_wall)]
+    return Sensitivity(1j * k * np.array(rows), center)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,29 +108,26 @@ class Pillars:
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
         b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
         self.nodes_um = np.cos(np.pi * (np.arange(b) + 0.5) / b) * span.bias_um
-        columns = [self.exact(bias, p) for bias in self.nodes_um for p in self._training()]
-        u, size, _ = np.linalg.svd(np.array(columns).T, full_matrices=False)
+        columns = np.concatenate([self.exact(self.nodes_um[:, None], p) for p in self._training()])
+        u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
         self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
         self.error = self._measure()
 
-    def exact(self, bias_um: float, change: Process) -> Array:
-        """(grid,) complex t at ``diameter_um`` + bias under a change."""
+    def exact(self, bias_um: Array | float, change: Process) -> Array:
+        """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
         return transmission(self.lens.proxy, self.response, d, wave, change)
 
     def coefficients(self, change: Process) -> Array:
         """(b, r) coefficients of t in the basis at the bias nodes."""
-        return np.array([self.basis @ self.exact(bias, change) for bias in self.nodes_um])
+        return np.asarray(self.exact(self.nodes_um[:, None], change) @ self.basis.T)
 
     def slopes(self, change: Process) -> Array:
         """(3, b, r) derivatives of :meth:`coefficients` by height, index and sidewall."""
-        out = []
-        for bias in self.nodes_um:
-            t = self.exact(bias, change)
-            out.append((self.response.at(self.diameter_um + bias) * t) @ self.basis.T)
-        return np.array(out).transpose(1, 0, 2)
+        bias = self.nodes_um[:, None]
+        return np.asarray((self.response.at(self.diameter_um + bias) * self.exact(bias, change)) @ self.basis.T)
 
     def functions(self, diameter_um: Array) -> Array:
         """(r, *shape) complex: the conjugate basis at designed diameters, 0 where there is no pillar."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from characterize.asbuilt import AsBuilt
 from characterize.pupilfit import PupilFit
 from metalens import report
 from metalens.store import Array
@@ -30,6 +31,52 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
         report.Section("Read with care", "\n\n".join(fit.cautions)),
     ]
     report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
+
+
+def asbuilt_report(path: Path, result: AsBuilt) -> None:
+    """Write the page of an as-built lens: designed, built, residual; intervals; correlations; what to measure next."""
+    keys = [
+        report.KeyFigure("verdict", "trusted" if result.trusted else "refused by its checks", result.trusted),
+        report.KeyFigure("chi² / dof", f"{result.chi2_per_dof:.3f}", 0.9 < result.chi2_per_dof < 1.15),
+        report.KeyFigure("frames", str(len(result.measured))),
+    ]
+    images = frames_figure(
+        (result.nominal, result.measured, result.predicted),
+        result.residual_sigma,
+        ("as designed", "measured", "as built"),
+    )
+    low_high = [result.interval(name) for name in result.names]
+    rows = [
+        (name, float(v), float(s), f"{low:.4g} to {high:.4g}")
+        for name, v, s, (low, high) in zip(result.names, result.value, result.sigma, low_high, strict=True)
+    ]
+    parameters = report.Table(("parameter", "value", "1 sigma", "95 % interval"), rows)
+    seen = "Square root of the light above background; residuals from -5 (blue) to 5 sigma (red)."
+    sections = [
+        report.Section("Frames", result.reason + ".", [report.Figure(images, seen, wide=True)]),
+        report.Section(
+            "Parameters", "", [parameters, report.Figure(_correlation(result), "Correlation of parameters.")]
+        ),
+        report.Section("What the frames fix", "\n\n".join(result.identifiable)),
+        report.Section(
+            "What they cannot tell, and what to measure next", "\n\n".join(result.degeneracies) or "Nothing."
+        ),
+        report.Section("Put right or assumed on the way", "\n\n".join(result.cautions)),
+    ]
+    if result.problems:
+        sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
+    report.write(path, "The lens as built", sections, key_figures=keys)
+
+
+def _correlation(result: AsBuilt) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 5.4))
+    axis = figure.add_subplot()
+    figure.colorbar(axis.imshow(result.correlation, cmap="RdBu_r", vmin=-1, vmax=1), ax=axis)
+    axis.set_xticks(range(len(result.names)), result.names, rotation=90, fontsize=6)
+    axis.set_yticks(range(len(result.names)), result.names, fontsize=6)
+    return report.png(figure)
 
 
 def frames_figure(stacks: tuple[Array, ...], residual_sigma: Array, labels: tuple[str, ...]) -> bytes:

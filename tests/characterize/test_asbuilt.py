@@ -15,7 +15,7 @@ from characterize import asbuilt
 from characterize.estimate import Options
 from characterize.forward import ForwardModel, Setting
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
-from characterize.pillars import Pillars
+from characterize.pillars import Pillars, sensitivity
 from metalens import psf
 from metalens.errors import CaptureError, ConfigError, FitError
 
@@ -152,3 +152,16 @@ def test_missing_numbers_are_refused(change, words):
 def test_unknown_parameters_name_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'height_nm'"):
         Known("heigth_nm", 0.0)
+
+
+def test_effective_index_slopes_scale_as_a_waveguide():
+    found = sensitivity(b.lens())
+    d = np.array([0.12, 0.17, 0.22])
+    height, index, wall = found.at(d)
+    k = 2 * np.pi / 0.85
+    phase = b.lens().proxy.phase_rad(d, 0.85)
+    assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)  # phase = k n_eff h
+    assert (height.imag > k).all()  # guided: n_eff above that of air
+    assert (index.imag > 0).all()
+    assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light
+    assert not wall.any()  # straight walls: second order

@@ -1,0 +1,83 @@
+"""Virtual bench: lens.h5 and a hidden truth -> a capture folder (TIFF frames, stage.csv, dark, flat, capture.toml)."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from characterize import bench
+from characterize.bench import Shots, Truth
+from characterize.pillars import sensitivity
+from metalens import config
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.errors import ConfigError
+from metalens.lens import Lens
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens capture``.
+
+    Attributes:
+        lens: the designed lens.
+        truth: TOML of the hidden as-built lens and of its captures (depths_um, parameter, camera ...).
+        output: folder to write.
+    """
+
+    lens: tyro.conf.Positional[Path]
+    truth: Path
+    output: Output
+
+
+def run(options: Options) -> int:
+    """Shoot and write; exit 0."""
+    target = options.output
+    if target.exists() and not options.force:
+        raise ConfigError(f"{target} exists; give --force to overwrite it")
+    if target.exists() and not (target / "stage.csv").is_file():
+        raise ConfigError(f"{target} is no capture folder (no stage.csv in it): not overwritten; give another name")
+    if not target.parent.is_dir():
+        raise ConfigError(f"{target}: folder {target.parent} does not exist")
+    truth = config.load(options.truth, Truth)
+    design = lenses.load(options.lens)
+    shots = bench.shoot(design, truth, sensitivity(design))
+    write(target, shots, truth, design)
+    values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}
+    options.console.result(values, f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons")
+    return 0
+
+
+def write(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+    """A capture folder as :func:`characterize.load` reads it, written beside and renamed: whole or not at all."""
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        part.mkdir()
+        _fill(part, shots, truth, lens)
+        if folder.exists():
+            shutil.rmtree(folder)
+        part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+    import tifffile
+
+    depths, angles = truth.stated
+    lines = ["file,depth_um,angle_deg"]
+    for i, (frame, z, angle) in enumerate(zip(shots.frames, depths, angles, strict=True)):
+        name = f"frame_{i:03d}.tif"
+        tifffile.imwrite(folder / name, frame, photometric="minisblack", metadata=None)
+        lines.append(f"{name},{z:.10g},{np.degrees(angle[0]):.10g}")
+    (folder / "stage.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for name, stack in (("dark", shots.dark), ("flat", shots.flat)):
+        tifffile.imwrite(folder / f"{name}.tif", stack, photometric="minisblack", metadata=None)
+    about = {"pixel_um": truth.camera.pixel_um, "wavelength_um": lens.wavelength_um, "bits": truth.camera.bits}
+    pinhole = [k.value for k in truth.parameter if k.name == "pinhole_um" and k.value > 0]
+    about |= {"pinhole_um": pinhole[0]} if pinhole else {}
+    text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
+    (folder / "capture.toml").write_text(text, encoding="utf-8")
