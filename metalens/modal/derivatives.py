@@ -134,7 +134,7 @@ def gradient(
     """
     case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
     check_tolerance(tolerance)
-    plan = climb(case, tolerance).rung.plan
+    plan = climb(case, tolerance).rung.choice(case.rho).plan
     (first, d_first), (second, d_second) = (form_rates(case, plan, magnetic=magnetic) for magnetic in (False, True))
     by = {name: mean_rate(first, second, d_first[name], d_second[name])[1, 0] for name in d_first}
     t = complex(geometric_mean(first, second)[1, 0])

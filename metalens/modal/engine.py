@@ -162,7 +162,7 @@ def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate."""
     best: Climb | None = None
     for rung in RUNGS[first_rung(tolerance) :]:
-        solution = evaluate(case, rung.plan)
+        solution = evaluate(case, rung.choice(case.rho).plan)
         error = rung.error(solution.spread, solution.drift, case.rho)
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"

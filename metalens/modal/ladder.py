@@ -2,8 +2,9 @@
 
 Two things are wrong in the mean of both forms. Near the rim, where the field is singular, the forms err apart: their
 difference bounds it. Smooth waves on polynomials err alike: what relative error they have in the transverse
-wavenumbers squared is a property of the mesh and of how much of the cell the disc fills, found once by comparing
-with the next finer meshes; the solution knows how much it moves for it (``drift``).
+wavenumbers squared is a property of the mesh and of how much of the cell the disc fills, found by comparing with
+finer meshes; the solution knows how much it moves for it (``drift``). The factors cover every one of several
+hundred random pillars (index 1.8 to 4 with and without absorption, 5 to 93 % of the pitch) against the fine mesh.
 """
 
 from dataclasses import dataclass
@@ -12,39 +13,65 @@ from metalens.modal.mesh import MeshPlan
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
-    """A mesh and its error model.
+class Choice:
+    """A mesh for discs up to ``up_to`` pitches wide, and the relative error of transverse wavenumbers squared that
+    both forms share on it: ``thin + wide * rho**4``."""
 
-    safety: factor on half the difference of the forms. thin, wide: relative error of transverse wavenumbers squared
-    for a thin pillar and what a pillar of the size of the cell adds. usual: the estimate that it usually ends with.
+    plan: MeshPlan
+    up_to: float
+    thin: float
+    wide: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """Meshes of one accuracy, thinnest disc first.
+
+    safety: factor on half the difference of the forms. usual: the estimate that most pillars end with.
     """
 
     name: str
-    plan: MeshPlan
+    choices: tuple[Choice, ...]
     safety: float
-    thin: float
-    wide: float
     usual: float
 
+    def choice(self, rho: float) -> Choice:
+        """The mesh for a disc of ``rho`` pitches."""
+        return next(c for c in self.choices if rho <= c.up_to)
+
     def error(self, spread: float, drift: float, rho: float) -> float:
-        """Error estimate of the mean of both forms, for a disc of ``rho`` pitches; see ``engine.Solution``."""
-        return self.safety * spread + (self.thin + self.wide * rho**4) * drift + 1e-12
+        """Error estimate of the mean of both forms; spread and drift as in ``engine.Solution``."""
+        c = self.choice(rho)
+        return self.safety * spread + (c.thin + c.wide * rho**4) * drift + 1e-12
 
 
+BOTH = (0.7, 1.3)
+FINE = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
+FINEST = MeshPlan(6, 7, 6, BOTH, (0.85, 1.0), (0.15, 1.0), core=0.55)
+REFERENCE = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
 RUNGS = (
-    Rung("coarse", MeshPlan(3, 3, 2, (0.7, 1.3), core=0.45), 1.5, 1e-4, 5e-4, 1e-2),
-    Rung("fair", MeshPlan(3, 4, 3, (0.7, 1.3)), 1.5, 1.5e-5, 7e-5, 2e-3),
-    Rung("good", MeshPlan(4, 5, 4, (0.7, 1.3)), 1.5, 3e-6, 0.0, 5e-4),
-    Rung("fine", MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.0, 1e-6, 0.0, 5e-5),
-    Rung("finest", MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55), 1.0, 1e-7, 0.0, 1e-5),
     Rung(
-        "reference",
-        MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55),
-        1.0,
-        5e-8,
-        0.0,
-        2e-6,
+        "coarse",
+        (
+            Choice(MeshPlan(3, 3, 2, BOTH, core=0.45), 0.7, 3e-5, 3.5e-4),
+            Choice(MeshPlan(4, 4, 2, BOTH, core=0.45), 1.0, 1e-5, 6e-5),
+        ),
+        1.2,
+        5e-3,
     ),
+    Rung(
+        "fair",
+        (
+            Choice(MeshPlan(3, 4, 3, BOTH), 0.7, 5e-6, 4e-5),
+            Choice(MeshPlan(4, 4, 3, BOTH), 1.0, 5e-6, 4e-5),
+        ),
+        1.2,
+        1e-3,
+    ),
+    Rung("good", (Choice(MeshPlan(4, 5, 4, BOTH), 1.0, 8e-7),), 1.0, 2.5e-4),
+    Rung("fine", (Choice(FINE, 1.0, 5e-7),), 1.0, 5e-5),
+    Rung("finest", (Choice(FINEST, 1.0, 5e-8),), 0.5, 6e-6),
+    Rung("reference", (Choice(REFERENCE, 1.0, 2e-8),), 0.5, 1e-6),
 )
 
 

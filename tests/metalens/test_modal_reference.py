@@ -1,0 +1,68 @@
+"""The modal engine's answers and error estimates against the committed reference values of hard pillars."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import metalens
+from metalens import modal
+from metalens.cell import Cell, Index
+
+FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
+ENTRIES = json.loads(FILE.read_text(encoding="utf-8"))["entries"]
+NORMAL = [e for e in ENTRIES if e["angle_deg"] == 0.0 and e["uncertainty"] < 1e-5]
+OBLIQUE = [e for e in ENTRIES if e["angle_deg"] == 5.0]
+
+
+def label(entry):
+    return f"{entry['name']} {entry['diameter_um']:g} um {entry['angle_deg']:g} deg {entry['polarization']}"
+
+
+def solve(entry, tolerance):
+    parts = entry["cell"]
+    media = [Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")]
+    return modal.solve(
+        Cell(parts["pitch_um"], parts["height_um"], *media),
+        entry["diameter_um"],
+        entry["wavelength_um"],
+        angle_rad=math.radians(entry["angle_deg"]),
+        polarization=entry["polarization"],
+        tolerance=tolerance,
+    )
+
+
+def test_the_table_is_as_good_as_it_says():
+    """Subwavelength lossless cells conserve energy; most entries are known to 1e-6."""
+    for entry in ENTRIES:
+        power = np.abs(np.array(entry["t"]) @ [1, 1j]) ** 2 + np.abs(np.array(entry["r"]) @ [1, 1j]) ** 2
+        lossless = entry["cell"]["pillar"][1] == 0
+        assert abs(power - 1) < 1e-11 if lossless else power < 1
+    assert np.mean([entry["uncertainty"] < 1e-6 for entry in ENTRIES]) > 0.6
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+@pytest.mark.parametrize("entry", NORMAL, ids=label)
+def test_error_estimate_holds(entry, tolerance):
+    got = solve(entry, tolerance)
+    error = abs(got.t - complex(*entry["t"]))
+    assert got.converged
+    assert error <= got.t_error + entry["uncertainty"]
+    assert got.t_error <= tolerance
+
+
+@pytest.mark.parametrize("entry", OBLIQUE, ids=label)
+def test_error_estimate_holds_oblique(entry):
+    """With the dark mode near 272 nm, p, which only a broken symmetry sees."""
+    got = solve(entry, 1e-2)
+    assert abs(got.t - complex(*entry["t"])) <= got.t_error + entry["uncertainty"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("entry", [e for e in NORMAL if e["uncertainty"] < 1e-6], ids=label)
+def test_fine_tolerance(entry):
+    got = solve(entry, 2e-5)
+    assert got.converged
+    assert abs(got.t - complex(*entry["t"])) <= 2e-5
