@@ -24,6 +24,8 @@ from metalens.commands import Common, Output
 from metalens.errors import ConfigError
 from metalens.lens import Lens
 
+_MASKS = ("mask.oas", "mask.gds", "mask.dxf", "pillars.stl", "pillars.step", "module.step")
+
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -92,6 +94,9 @@ def run(options: Options) -> int:
     job = _prepare(options)
     target.mkdir(exist_ok=True)
     _write_masks(job, target)
+    for name in _MASKS:
+        if name not in job.written:
+            (target / name).unlink(missing_ok=True)  # of an earlier run: it would not match the report
     with _timed(job.seconds, "report"):
         _accompany(job, target)
     values = _values(job)
@@ -132,6 +137,22 @@ def _write_masks(job: Job, target: Path) -> None:
         with _timed(job.seconds, "write DXF"):
             write_dxf(plan, target / "mask.dxf", window=options.window)
         job.written["mask.dxf"] = (target / "mask.dxf").stat().st_size
+    if options.stl or options.step:
+        _write_solids(job, target)
+
+
+def _write_solids(job: Job, target: Path) -> None:
+    from layout import solid_files
+
+    options, made = job.options, []
+    if options.stl:
+        with _timed(job.seconds, "write STL"):
+            made += solid_files.write_stl(job.source, job.process, target, options.window)
+    if options.step:
+        with _timed(job.seconds, "write STEP"):
+            radius = job.made.radius_um
+            made += solid_files.write_step(job.source, job.process, target, options.window, radius_um=radius)
+    job.written |= {path.name: path.stat().st_size for path in made}
 
 
 def _read_back(job: Job, path: Path, read: Callable[[Path], Any]) -> None:
