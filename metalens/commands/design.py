@@ -1,7 +1,7 @@
 """DESIGN.toml to lens.h5: a hyperbolic, double-helix, cubic, Fisher or own phase made of printable pillars."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,14 +11,15 @@ from metalens import config, design, lens, lens_plot, library, store
 from metalens.cell import Cell
 from metalens.commands import Common, Output
 from metalens.console import Console
-from metalens.design import Limits, Quality
+from metalens.design import Limits, PhaseOf, Quality
+from metalens.design_fisher_settings import Fisher
 from metalens.errors import ConfigError
 from metalens.focus_check import FocusCheck, check_focus
 from metalens.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.proxy import Proxy
 from metalens.store import write_bytes
 
-Profile = Literal["hyperbolic", "double-helix", "cubic", "map"]
+Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class Design:
     library: library.h5 of the pillar cell, relative to the config; without it ``cell`` is swept first.
     cell: the pillar cell, where no library is given.
     limits: what the process prints.
-    double_helix, cubic, map: of the profile of that name.
+    double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` chooses its own source distance.
     """
 
     profile: Profile = "hyperbolic"
@@ -45,6 +46,7 @@ class Design:
     limits: Limits = field(default_factory=Limits)
     double_helix: DoubleHelix = field(default_factory=DoubleHelix)
     cubic: Cubic = field(default_factory=Cubic)
+    fisher: Fisher = field(default_factory=Fisher)
     map: PhaseMap | None = None
 
     def __post_init__(self) -> None:
@@ -82,12 +84,11 @@ def run(options: Options) -> int:
     target = options.claim(options.output)
     cell, proxy, inputs = _pillars(wanted, options.config, options.console)
     inputs[options.config.name] = store.sha256(options.config)
-    shape = {"double-helix": wanted.double_helix, "cubic": wanted.cubic, "map": _located(wanted, options.config)}
     radius_um = wanted.aperture_mm * 500
-    phase = design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um)
+    phase, focus = _phase(wanted, options, radius_um)
     made, quality = design.make(
         phase,
-        wanted.focus,
+        focus,
         aperture_um=2 * radius_um,
         cell=cell,
         proxy=proxy,
@@ -100,6 +101,23 @@ def run(options: Options) -> int:
     write_bytes(target.with_suffix(".png"), lens_plot.picture(made))
     options.console.result(_values(quality, check), _text(target, wanted, quality, check))
     return 0 if check is None or check.passed else 1
+
+
+def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf, Focus]:
+    """The phase of the profile, and what it images onto what."""
+    if wanted.profile == "fisher":
+        from metalens.design_fisher import fisher_profile
+
+        phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=wanted.fisher)
+        least, mean = float(found.score.encircled.min()), float(found.score.information.mean())
+        options.console.say(f"free form: I(z) {mean:.3f} /mm², encircled energy {least:.2f} or more; {found.reason}")
+        return phase, replace(wanted.focus, source_distance_um=found.focus_um)
+    shape: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
+        "double-helix": wanted.double_helix,
+        "cubic": wanted.cubic,
+        "map": _located(wanted, options.config),
+    }
+    return design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um), wanted.focus
 
 
 def _pillars(wanted: Design, where: Path, console: Console) -> tuple[Cell, Proxy, dict[str, str]]:
