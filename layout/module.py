@@ -4,12 +4,14 @@ The stack that the paper proposes for smart glasses (Sec. 6): 0.5 mm NIR filter,
 a package of 0.5 mm, a flex of 0.2 mm: 3.5 mm in all, less than 2 mm wide. z runs with the light from the pillars' feet.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from layout.process import Process
 from layout.solid_step import Piece, write_pieces
 from metalens.errors import ProcessError
+from metalens.lens import Lens
 
 # part: colour (red, green, blue, opacity)
 COLOURS = {
@@ -67,6 +69,29 @@ class Module:
     def stack_mm(self) -> float:
         """Thickness of the module."""
         return self.filter_mm + self.substrate_mm + self.spacing_mm + self.sensor_mm + self.flex_mm
+
+
+def around(lens: Lens, process: Process) -> Module:
+    """A module for a lens: its aperture, height, substrate to sensor distance; wider parts for a wider lens.
+
+    The substrate is that of the paper's stack (0.3 mm), or the die's own where it is thinner.
+    """
+    default = Module()
+    aperture = 2 * (lens.diameters.radius_um + lens.diameters.pitch_um / 2) / 1e3
+    wider = max(0.0, aperture - default.aperture_mm)
+    spacing = lens.sensor_distance_um / 1e3
+    return replace(
+        default,
+        aperture_mm=aperture,
+        spacing_mm=spacing,
+        ledge_mm=min(default.ledge_mm, spacing / 4),
+        substrate_mm=min(default.substrate_mm, process.die.thickness_um / 1e3),
+        height_mm=lens.cell.height_um / 1e3,
+        side_mm=default.side_mm + wider,
+        filter_side_mm=default.filter_side_mm + wider,
+        die_side_mm=default.die_side_mm + wider,
+        sensor_side_mm=default.sensor_side_mm + wider,
+    )
 
 
 @dataclass(frozen=True, slots=True)

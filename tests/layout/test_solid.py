@@ -41,9 +41,12 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
     lean = 0.7 * math.tan(math.radians(1))
     assert whole.foot_um - whole.top_um == pytest.approx(np.full(3, 2 * lean))
     assert (whole.foot_um + whole.top_um) / 2 == pytest.approx([0.12, 0.2, 0.26])
-    part = solid.tile(lens(), TILTED, side_um=1.6, centre_um=(0.4, -1.0))
+    part = solid.tile(lens(), TILTED, side_um=1.6, centre_um=(0.4, 1.0))
     inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] + 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
     assert len(part.kind) == inside.sum()
+    rows, columns = np.nonzero(inside)
+    assert part.y_um == pytest.approx(-d.y_um[rows])  # first row on top, as in the mask
+    assert part.x_um == pytest.approx(d.x_um[columns])
 
 
 def test_a_frustum_has_the_volume_of_its_cone_and_manifold3d_takes_it():
@@ -239,3 +242,25 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     with pytest.raises(ProcessError):
         solid_mesh.write_stl(target, pillars, sides=2)
     assert target.read_text(encoding="utf-8") == "old"
+
+
+def test_a_module_is_built_around_any_lens():
+    pytest.importorskip("build123d")
+    wide = DiameterMap(np.full((1, 9001), 0.2), 0.4)
+    big = Lens(wide, Cell(0.4, height_um=0.9), PROXY, 0.85, 5000.0, 20000.0, "map")
+    made = module.around(big, TILTED)
+    assert made.aperture_mm == pytest.approx(3.6004)
+    assert made.spacing_mm == 5.0
+    assert made.height_mm == pytest.approx(9e-4)
+    module.clearances(module.assemble(made))
+    close = Lens(lens().diameters, Cell(0.4), PROXY, 0.85, 100.0, 20000.0, "map")
+    module.clearances(module.assemble(module.around(close, TILTED)))
+
+
+def test_files_of_a_square_of_a_lens(tmp_path):
+    pytest.importorskip("build123d")
+    where = {"side_um": 1.2, "centre_um": (0.4, 0.0)}
+    made = solid.write_steps(tmp_path, lens(), TILTED, **where) + solid.write_meshes(tmp_path, lens(), TILTED, **where)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in made)
+    with pytest.raises(ProcessError, match="no pillar"):
+        solid.write_steps(tmp_path, lens(), TILTED, side_um=0.1, centre_um=(90.0, 0.0))
