@@ -32,7 +32,7 @@ __all__ = [
 def write_steps(
     folder: Path, lens: Lens, process: Process, *, side_um: float, centre_um: tuple[float, float]
 ) -> list[Path]:
-    """``module.step`` (everything around the lens, down to the flex) and ``tile.step`` (pillars of a square of the mask).
+    """``module.step`` (all around the lens, down to the flex) and ``tile.step`` (pillars of a square of the mask).
 
     Raises:
         ProcessError: too many pillars in the square, none, or a module that cannot be built around the lens.
