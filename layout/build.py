@@ -1,5 +1,6 @@
 """From a lens and a process to the plan of its mask."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 from layout import cells, die, dose, names
 from layout.dose import DoseResult
 from layout.mask import Lattice, MaskPlan, PillarClass, pillar_classes
-from layout.process import Process
+from layout.process import LayerNumber, Process
 from metalens.errors import ProcessError
 from metalens.lens import DiameterMap, Lens
 from metalens.store import Array
@@ -74,6 +75,7 @@ def prepare(
     radius_um = diameters.radius_um + diameters.pitch_um / 2
     if furnished:
         bare = die.furnish(bare, process, radius_um=radius_um, label=_label(source, radius_um))
+    _check_layers(bare, process)
     return MadePlan(bare, found, doses, radius_um)
 
 
@@ -187,6 +189,22 @@ def _classes(
     lookup = np.zeros(int(used[-1]) + 1, np.uint8 if len(used) <= 255 else np.uint16)
     lookup[used] = np.arange(1, len(used) + 1)
     return made, lookup[pair], doses
+
+
+def _check_layers(plan: MaskPlan, process: Process) -> None:
+    """Refuse datatypes of the doses that are layers of something else."""
+    layers = process.layers
+    fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
+    seen: dict[LayerNumber, str] = {}
+    for made in plan.classes:
+        kind = {"T": "dose", "W": "witness"}.get(made.name[0], "pillar")
+        taken = seen.setdefault(made.layer, kind)
+        if fixed.get(made.layer, kind) != kind or taken != kind:
+            other = taken if taken != kind else fixed[made.layer]
+            raise ProcessError(
+                f"layer {made.layer[0]}/{made.layer[1]} is a dose of the {kind} layer and the {other} layer; give "
+                f"{kind} and {other} different layer numbers"
+            )
 
 
 def _layer_name(made: PillarClass, process: Process) -> str:
