@@ -39,7 +39,7 @@ class Options(Common):
         gds: write GDSII.
         dxf: write DXF of a window.
         step: write STEP of die, aperture, mount and module, with a tile of pillars.
-        stl: write STL of the tapered pillars of a window.
+        stl: write STL, 3MF and glTF of the tapered pillars of a window.
         form: of OASIS: fewest bytes, least time, or one repetition for each diameter.
         circles: true circles in OASIS in place of polygons.
         window: of DXF and STL.
@@ -150,8 +150,7 @@ def _write_solids(job: Job, target: Path) -> None:
             made += solid_files.write_stl(job.source, job.process, target, options.window)
     if options.step:
         with _timed(job.seconds, "write STEP"):
-            radius = job.made.radius_um
-            made += solid_files.write_step(job.source, job.process, target, options.window, radius_um=radius)
+            made += solid_files.write_step(job.source, job.process, target, options.window)
     job.written |= {path.name: path.stat().st_size for path in made}
 
 

@@ -10,7 +10,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from layout import module, solid, solid_mesh, solid_step
+from layout import module, solid, solid_files, solid_mesh, solid_step
+from layout.dxf import Window
 from layout.process import Etch, Process
 from layout.solid_mesh import Mesh
 from metalens.cell import Cell
@@ -257,10 +258,14 @@ def test_a_module_is_built_around_any_lens():
     module.clearances(module.assemble(module.around(close, TILTED)))
 
 
-def test_files_of_a_square_of_a_lens(tmp_path):
+def test_files_of_a_window_of_a_lens(tmp_path):
     pytest.importorskip("build123d")
-    where = {"side_um": 1.2, "centre_um": (0.4, 0.0)}
-    made = solid.write_steps(tmp_path, lens(), TILTED, **where) + solid.write_meshes(tmp_path, lens(), TILTED, **where)
+    window = Window(0.4, 0.6, 1.2)
+    made = solid_files.write_stl(lens(), TILTED, tmp_path, window) + solid_files.write_step(
+        lens(), TILTED, tmp_path, window
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in made)
+    corners = stl(tmp_path / "pillars.stl")[0]["corners"]
+    assert 0.4 < corners[..., 1].mean() < 0.8  # +y up, as in the mask
     with pytest.raises(ProcessError, match="no pillar"):
-        solid.write_steps(tmp_path, lens(), TILTED, side_um=0.1, centre_um=(90.0, 0.0))
+        solid_files.write_step(lens(), TILTED, tmp_path, Window(90.0, 0.0, 0.1))
