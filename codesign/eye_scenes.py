@@ -1,0 +1,98 @@
+"""Eyes as training and test frames: drawn from a seed and a number, with a margin, depth not readable from size."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+
+from codesign import eye
+from codesign.eye import Motion, Rig, States
+from codesign.inner import Batch
+from codesign.renderer import Camera, Rendered, render
+from metalens.errors import ConfigError
+from metalens.scene import Frames
+
+Tensor = torch.Tensor
+TRAINING, VALIDATION, TEST = 0, 1, 2  # streams of the random generator: frames of one are never seen by another
+
+
+@dataclass(frozen=True, slots=True)
+class SceneConfig:
+    """What the camera sees.
+
+    pixels: of the image grid along a side, ``sample_um`` of the optics apart. margin: samples rendered beyond it.
+    scale: spread of the scale ambiguity: depths and labels are multiplied by 1 +- scale at an unchanged pinhole image.
+    slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
+    """
+
+    pixels: int = 128
+    margin: int = 16
+    scale: float = 0.2
+    slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
+    gaze_deg: tuple[float, float] = (18.0, 13.0)
+
+    def __post_init__(self) -> None:
+        if self.pixels < 32 or not 0 <= self.margin < self.pixels or not 0 <= self.scale < 0.5:
+            raise ConfigError(
+                f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
+                "margin below them, and a scale below 0.5"
+            )
+
+    @property
+    def motion(self) -> Motion:
+        """The ranges that states are drawn from."""
+        return replace(
+            Motion(),
+            gaze_x_rad=math.radians(self.gaze_deg[0]),
+            gaze_y_rad=math.radians(self.gaze_deg[1]),
+            slip_um=(self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3),
+            scale=self.scale,
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EyeScenes:
+    """Frames by number; see :class:`codesign.inner.Scenes`.
+
+    seed, stream: choose the subjects and states.
+    """
+
+    settings: SceneConfig
+    sample_um: float
+    sensor_distance_um: float
+    seed: int
+    stream: int = TRAINING
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frame that are rendered to be blurred in."""
+        return self.settings.margin
+
+    @property
+    def rig(self) -> Rig:
+        """Camera and lamps."""
+        return replace(Rig(), sensor_distance_um=self.sensor_distance_um)
+
+    @property
+    def camera(self) -> Camera:
+        """Image grid with its margin."""
+        return Camera(self.settings.pixels + 2 * self.margin, self.sample_um)
+
+    def states(self, step: int, size: int) -> States:
+        """Subjects and states of a step."""
+        return eye.draw(size, (self.seed, self.stream, step), motion=self.settings.motion)
+
+    def rendered(self, step: int, size: int) -> Rendered:
+        """Frames of a step with all labels."""
+        return render(self.states(step, size), rig=self.rig, camera=self.camera)
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Frames of a step, as training takes them."""
+        return as_batch(self.rendered(step, size), self.margin)
+
+
+def as_batch(made: Rendered, margin: int) -> Batch:
+    """Rendered frames as a training batch: the mask without its margin, the slippage in mm."""
+    inside = slice(margin, made.pupil.shape[-1] - margin)
+    frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
+    return Batch(frames, made.pupil[:, inside, inside], (made.labels.slip_um * 1e-3).to(torch.float32))
