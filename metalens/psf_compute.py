@@ -113,6 +113,5 @@ def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
 
 def _incoherent(level: torch.Tensor, case: Case) -> float:
     """Magnitude of the field at the window centre if all pillars added with random phases."""
-    flat = level.reshape(-1)
-    total = math.sqrt(float(torch.dot(flat, flat)))
+    total = math.sqrt(sum(float((rows * rows).sum()) for rows in torch.split(level, 256)))
     return total * case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)

@@ -1,0 +1,337 @@
+"""PSF engine: time beside error for a 1 mm lens of 2500 x 2500 pillars, 850 nm, sensor at 2 mm.
+
+Errors are relative L2 of the intensity against the exact Rayleigh-Sommerfeld sum in float64, on every sixth sample of
+the window and three depths; gradients against float64 at a tolerance of 1e-9.
+"""
+
+import functools
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import Row, fastest
+from metalens import lowrank, propagate, psf
+from metalens.propagate_radial import Radial, field_radial
+from metalens.propagate_spectrum import transfer
+
+PITCH, WAVELENGTH, D, SOURCE, RADIUS = 0.4, 0.85, 2000.0, 20e3, 500.0
+K = 2 * np.pi / WAVELENGTH
+DEPTHS = np.linspace(16e3, 26e3, 21)
+GEOMETRY = dict(pitch_um=PITCH, wavelength_um=WAVELENGTH, sensor_distance_um=D)
+WINDOW = dict(window_um=48.0, samples=64)
+WIDE = dict(window_um=144.0, samples=96)
+KINDS = ("hyperbolic", "free-form", "noisy", "double helix")
+
+
+def lens(kind: str, n: int = 2500) -> tuple[torch.Tensor, torch.Tensor]:
+    """(phase, transmission) float32 of an n x n lens with the focal lengths of the 1 mm lens."""
+    random = np.random.default_rng(7)
+    x = (np.arange(n) - (n - 1) / 2) * PITCH
+    r2 = x**2 + x[:, None] ** 2
+    phase = -K * (r2 / (np.sqrt(r2 + D**2) + D) + r2 / (np.sqrt(r2 + SOURCE**2) + SOURCE))
+    level = (r2 <= (n * PITCH / 2) ** 2).astype("f4")
+    if kind == "free-form":
+        for _ in range(40):
+            turn, length, start = random.uniform(0, 2 * np.pi), random.uniform(60, 500), random.uniform(0, 2 * np.pi)
+            along = np.cos(turn) * x + np.sin(turn) * x[:, None]
+            phase += 0.6 * random.normal() * np.cos(2 * np.pi / length * along + start)
+    if kind == "noisy":
+        phase += random.normal(0, 0.3, phase.shape)
+        level *= random.uniform(0.7, 1, phase.shape).astype("f4")
+    if kind == "double helix":
+        zone = np.clip(np.ceil(r2 / RADIUS**2 * 7), 1, 7)
+        phase += (2 * zone - 1) * np.arctan2(x[:, None], x)
+    turns = phase / (2 * np.pi)
+    return torch.tensor((turns - np.rint(turns)) * 2 * np.pi, dtype=torch.float32), torch.tensor(level)
+
+
+def error(stack: psf.PsfStack, maps: tuple[torch.Tensor, torch.Tensor], row: int = 0) -> float:
+    """Relative L2 against the exact sum on every sixth sample, at three depths of one direction."""
+    light = np.asarray(stack.numpy().intensity * np.asarray(stack.numpy().energy_um2)[..., None, None])
+    light = light.reshape(len(stack.angles_rad), -1, *light.shape[-2:])[row] / stack.step_um**2
+    pick = [0, len(stack.depths_um) // 2, len(stack.depths_um) - 1]
+    at = np.arange(2, light.shape[-1], 6)
+    want = exact(maps, stack, tuple(pick), tuple(at.tolist()), row)
+    got = light[np.ix_(pick, at, at)]
+    return float(np.linalg.norm(got - want) / np.linalg.norm(want))
+
+
+_KNOWN: dict[Any, np.ndarray] = {}
+
+
+def exact(maps: tuple[torch.Tensor, torch.Tensor], stack: psf.PsfStack, depths: Any, at: Any, row: int) -> np.ndarray:
+    """(depth, y, x) exact intensity at some samples; kept, since it takes seconds."""
+    key = (
+        maps[0].data_ptr(),
+        depths,
+        at,
+        row,
+        stack.step_um,
+        tuple(stack.depths_um[list(depths)]),
+        tuple(stack.centres_um[row]),
+    )
+    if key not in _KNOWN:
+        case = propagate.case(
+            maps[0].shape,
+            **GEOMETRY,
+            depths_um=stack.depths_um[list(depths)],
+            angle_rad=stack.angles_rad[row],
+            window_um=stack.step_um,
+            samples=1,
+        )
+        x, y = (c + a[list(at)] for c, a in zip(stack.centres_um[row], (stack.x_um, stack.y_um), strict=True))
+        points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        field = propagate.field_at(maps[0].numpy(), maps[1].numpy(), case, points)
+        _KNOWN[key] = np.abs(field).reshape(len(depths), len(at), len(at)) ** 2
+    return _KNOWN[key]
+
+
+def forward(maps: Any, **arguments: Any) -> psf.PsfStack:
+    """PSF stack with the benchmark's geometry."""
+    return psf.psf_stack(*maps, **GEOMETRY | dict(depths_um=DEPTHS) | WINDOW | arguments)
+
+
+def gradient(maps: Any, **arguments: Any) -> torch.Tensor:
+    """Gradient to every pillar's phase of a merit function without symmetry."""
+    phase = maps[0].clone().requires_grad_()
+    stack = forward((phase, maps[1]), **arguments)
+    shape = stack.intensity.shape
+    weight = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(stack.intensity)
+    (stack.intensity * weight).sum().backward()
+    return phase.grad
+
+
+def peak_mb(work: Callable[[], object]) -> float:
+    """Highest memory of the process during ``work`` above what it held before (Linux; nan elsewhere)."""
+    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    if not reset.exists():
+        return math.nan
+    reset.write_text("5")
+    before = _status(status, "VmRSS")
+    work()
+    return _status(status, "VmHWM") - before
+
+
+def _status(path: Path, key: str) -> float:
+    found = re.search(rf"{key}:\s+(\d+) kB", path.read_text())
+    return float(found.group(1)) / 1024 if found else math.nan
+
+
+def gradient_error(maps: Any, tolerance: float) -> float:
+    """Relative L2 of the gradient against float64 at 1e-9."""
+    want = gradient(tuple(m.double() for m in maps), tolerance=1e-9)
+    return float((gradient(maps, tolerance=tolerance) - want).norm() / want.norm())
+
+
+def textbook(maps: Any, h: torch.Tensor, *, grad: bool) -> torch.Tensor:
+    """One depth by zero-padded complex64 angular spectrum, source phase included; with the gradient if asked."""
+    phase = maps[0].clone().requires_grad_(grad)
+    light = torch.polar(maps[1], phase)
+    field = torch.fft.ifft2(torch.fft.fft2(light, s=h.shape) * h)
+    n = maps[0].shape[0] // 2
+    power = field[n - 60 : n + 60, n - 60 : n + 60].abs() ** 2
+    power = power / power.sum()
+    if grad:
+        (power**2).sum().backward()
+    return power.detach()
+
+
+def rows() -> list[Row]:
+    """All rows of the engine: against the textbook, ladder, depths, angles, lenses, sizes, low rank, Hankel."""
+    return [*_main_rows(), *_ladder_rows(), *_lens_rows(), *_size_rows(), *_other_rows()]
+
+
+def _main_rows() -> list[Row]:
+    maps, threads = lens("hyperbolic"), torch.get_num_threads()
+    case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW)
+    h = torch.tensor(transfer(case, (5000, 5000), band_limited=False).astype("c8"))
+    slow = [fastest(lambda g=g: textbook(maps, h, grad=g), repeats=1) * len(DEPTHS) for g in (False, True)]
+    stack = forward(maps)
+    once = fastest(lambda: forward(maps), repeats=7)
+    both = fastest(lambda: gradient(maps), repeats=7)
+    memory = peak_mb(lambda: forward(maps)), peak_mb(lambda: gradient(maps))
+    true = error(stack, maps)
+    size = maps[0].numel() * 4 / 2**20
+    case_name = "1 mm, 21 depths"
+    return [
+        Row(case_name, "textbook angular spectrum, complex64", slow[0], _lattice_error(maps), "exact sum", threads),
+        Row(case_name, "textbook, with gradient", slow[1], math.nan, "none", threads),
+        Row(
+            case_name,
+            "windowed 1e-4",
+            once,
+            true,
+            f"exact sum (estimate {stack.error:.1e})",
+            threads,
+            memory[0],
+            f"{slow[0] / once:.0f}x textbook (300x), 1e-4, 150 MB",
+        ),
+        Row(
+            case_name,
+            "windowed 1e-4, with gradient",
+            both,
+            gradient_error(maps, 1e-4),
+            "gradient in float64 at 1e-9",
+            threads,
+            memory[1] - size,
+            f"{slow[1] / both:.0f}x textbook (250x), 2e-4, 250 MB",
+        ),
+    ]
+
+
+def _lattice_error(maps: Any) -> float:
+    """Error of the textbook method on a 16 x 16 window of the lattice, one depth."""
+    geometry = GEOMETRY | dict(
+        depths_um=DEPTHS[10], window_um=16 * 2 * PITCH, samples=16, offset_um=(PITCH / 2, PITCH / 2)
+    )
+    arrays = maps[0].numpy(), maps[1].numpy()
+    got = np.abs(propagate.angular_spectrum(*arrays, single=True, **geometry)) ** 2
+    want = np.abs(propagate.exact(*arrays, **geometry)) ** 2
+    return float(np.linalg.norm(got / got.sum() - want / want.sum()) / np.linalg.norm(want / want.sum()))
+
+
+def _ladder_rows() -> list[Row]:
+    maps, threads = lens("hyperbolic"), torch.get_num_threads()
+    base = fastest(lambda: forward(maps))
+    found = []
+    for tolerance, dtype, goal in ((1e-6, torch.float32, "2.5x of 1e-4"), (1e-9, torch.float64, "1e-9")):
+        cast = tuple(m.to(dtype) for m in maps)
+        stack = forward(cast, tolerance=tolerance)
+        seconds = fastest(lambda c=cast, t=tolerance: forward(c, tolerance=t))
+        reached = f"{seconds / base:.2f}x of 1e-4 ({goal}), estimate {stack.error:.1e}"
+        name = f"windowed {tolerance:.0e} {str(dtype)[6:]}"
+        found.append(Row("1 mm, 21 depths", name, seconds, error(stack, cast), "exact sum", threads, goal=reached))
+    depths = np.linspace(16e3, 26e3, 201)
+    seconds, stack = fastest(lambda: forward(maps, depths_um=depths)), forward(maps, depths_um=depths)
+    goal = f"{seconds / base:.2f}x of 21 depths (2.5x)"
+    found.append(Row("1 mm, 201 depths", "windowed 1e-4", seconds, error(stack, maps), "exact sum", threads, goal=goal))
+    return [*found, *_angle_rows(maps, threads)]
+
+
+def _angle_rows(maps: Any, threads: int) -> list[Row]:
+    one = fastest(lambda: forward(maps, **WIDE))
+    angles = [[math.radians(a), 0.0] for a in (0, 5, 10, 15, 20)]
+    stack = forward(maps, angle_rad=angles, **WIDE)
+    seconds = fastest(lambda: forward(maps, angle_rad=angles, **WIDE))
+    worst = max(error(stack, maps, row) for row in range(5))
+    narrow = fastest(lambda: forward(maps))
+    goal = f"{seconds / one:.1f}x one angle of this window, {seconds / narrow:.1f}x of the 48 um window (7x)"
+    return [
+        Row(
+            "1 mm, 21 depths, 144 um window",
+            "windowed 1e-4, 0 deg",
+            one,
+            error(forward(maps, **WIDE), maps),
+            "exact sum",
+            threads,
+        ),
+        Row(
+            "1 mm, 21 depths, 144 um window",
+            "windowed 1e-4, 5 angles to 20 deg",
+            seconds,
+            worst,
+            "exact sum, worst angle",
+            threads,
+            goal=goal,
+        ),
+    ]
+
+
+def _lens_rows() -> list[Row]:
+    threads, found = torch.get_num_threads(), []
+    for kind in KINDS[1:]:
+        maps = lens(kind)
+        stack = forward(maps)
+        seconds = fastest(lambda m=maps: forward(m))
+        about = f"exact sum (estimate {stack.error:.1e})"
+        found.append(Row(f"1 mm {kind}, 21 depths", "windowed 1e-4", seconds, error(stack, maps), about, threads))
+    return found
+
+
+def _size_rows() -> list[Row]:
+    threads, found = torch.get_num_threads(), []
+    for millimetres, depths in ((0.25, 21), (0.5, 21), (2.0, 21), (4.0, 21), (1.0, 101), (1.0, 401)):
+        maps = lens("hyperbolic", round(millimetres * 1000 / PITCH))
+        arguments = dict(depths_um=np.linspace(16e3, 26e3, depths))
+        stack = forward(maps, **arguments)
+        seconds = fastest(lambda m=maps, a=arguments: forward(m, **a))
+        memory = peak_mb(lambda m=maps, a=arguments: forward(m, **a))
+        name = f"{millimetres:g} mm, {depths} depths"
+        found.append(Row(name, "windowed 1e-4", seconds, stack.error, "own estimate", threads, memory))
+    return found
+
+
+def _other_rows() -> list[Row]:
+    threads, maps = torch.get_num_threads(), lens("hyperbolic")
+    stack = forward(maps, depths_um=np.linspace(16e3, 26e3, 51))
+    small = lowrank.compress(stack, tolerance=1e-3)
+    seconds = fastest(lambda: lowrank.compress(stack, tolerance=1e-3))
+    round_lens = Radial(
+        lambda r: -K * (r * r / (np.hypot(r, D) + D) + r * r / (np.hypot(r, SOURCE) + SOURCE)), np.ones_like, RADIUS
+    )
+    case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS, **WINDOW)
+    hankel = field_radial(round_lens, case, 1e-4)
+    light = np.abs(hankel.field) ** 2
+    energy = light.sum((1, 2))
+    as_stack = replace(forward(maps), intensity=light / energy[:, None, None], energy_um2=energy * stack.step_um**2)
+    return [
+        Row(
+            "51 depths of 64 x 64",
+            f"low rank 1e-3: {small.rank} basis PSFs",
+            seconds,
+            float(small.errors.max()),
+            "the stack",
+            threads,
+        ),
+        Row(
+            "1 mm, 21 depths",
+            "Hankel 1e-4",
+            fastest(lambda: field_radial(round_lens, case, 1e-4)),
+            error(as_stack, maps),
+            f"exact sum of the pixelated lens (estimate {hankel.error:.1e})",
+            threads,
+        ),
+    ]
+
+
+def peer_rows() -> list[Row]:
+    """torchoptics' direct integration, one depth times 21, in an environment that holds it; none elsewhere."""
+    try:
+        from torchoptics import Field
+    except ImportError:
+        return []
+    maps, threads = lens("hyperbolic"), torch.get_num_threads()
+    x = (torch.arange(2500, dtype=torch.float64) - 1249.5) * PITCH
+    z = DEPTHS[10]
+    r2 = x**2 + x[:, None] ** 2
+    source = r2 / ((r2 + z * z).sqrt() + z)
+    light = torch.polar(maps[1].double(), maps[0].double() + K * source).to(torch.complex64)
+    metre = 1e-6
+    field = Field(light, wavelength=WAVELENGTH * metre, z=0.0, spacing=PITCH * metre)
+    go = functools.partial(field.propagate, 64, D * metre, spacing=0.75 * metre, propagation_method="DIM")
+    seconds = fastest(go, repeats=1) * len(DEPTHS)
+    power = go().data.abs().double().numpy() ** 2
+    ours = fastest(lambda: forward(maps), repeats=5)
+    stack = forward(maps, depths_um=DEPTHS[10:11])
+    at = np.arange(2, 64, 6)
+    want = exact(maps, stack, (0,), tuple(at.tolist()), 0)[0]
+    got = power[np.ix_(at, at)]
+    wrong = float(np.linalg.norm(got / got.sum() - want / want.sum()) / np.linalg.norm(want / want.sum()))
+    return [
+        Row("1 mm, 21 depths", "torchoptics direct integration", seconds, wrong, "exact sum", threads),
+        Row(
+            "1 mm, 21 depths",
+            "windowed 1e-4",
+            ours,
+            stack.error,
+            "own estimate",
+            threads,
+            goal=f"{seconds / ours:.0f}x (700x)",
+        ),
+    ]
