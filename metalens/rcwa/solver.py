@@ -66,27 +66,32 @@ def film(this: Case, index: complex) -> Truncated:
 def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: int | None) -> list[Response]:
     """Responses for (d,) diameters, each at the least truncation that meets the tolerance."""
     empty = film(this, this.between)
-    done = {i: _exact(empty) for i in _films(this, diameter_um)}
+    rounding = _ROUNDING * (1 + this.k0 * this.cell.height_um)  # of the phase
+    done = {i: _exact(empty, rounding) for i in _films(this, diameter_um)}
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
     steps, cut = (0, 0.0)
     if len(left) and this.cell.sidewall_rad:
         steps, cut = _steps(this, diameter_um[left], tolerance)
-    history: list[Truncated] = []
-    for reach in _ladder(this, harmonics):
+    ladder = _ladder(this, harmonics)
+    history: list[Array] = []
+    for reach in ladder:
         if not len(left):
             break
-        history.append(truncated(this, diameter_um[left], reach, steps))
-        last = reach == _ladder(this, harmonics)[-1]
-        if len(history) <= _COMPARED and not last:
+        wide = diameter_um[left]
+        found = truncated(this, wide, reach, min(steps, _FEW_STEPS))
+        history.append(found.t)
+        if len(history) <= _COMPARED and reach != ladder[-1]:
             continue
-        error = _estimate(np.array([step.t for step in history])) + cut
-        blurred = reach * diameter_um[left] < this.cell.pitch_um  # too thin for these orders: believe no change
-        error = np.where(blurred, np.maximum(error, np.abs(history[-1].t - empty.t)), error)
-        error = np.minimum(error, 2.0)  # |t| <= 1
-        settled = (error <= tolerance) | last
-        for place in map(int, np.flatnonzero(settled)):
-            done[int(left[place])] = _response(history[-1], place, reach, float(error[place]), tolerance)
-        history = [Truncated(step.t[~settled], step.r[~settled], step.energy[~settled]) for step in history]
+        error = np.minimum(_blur(this, wide, reach, found.t - empty.t, _estimate(np.array(history))) + cut, 2.0)
+        settled = (error <= tolerance) | (reach == ladder[-1])
+        chosen = np.flatnonzero(settled)
+        if len(chosen) and steps > _FEW_STEPS:
+            found = truncated(this, wide[chosen], reach, steps)
+        else:
+            found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
+        for row, place in enumerate(chosen):
+            done[int(left[place])] = _response(found, row, reach, float(error[place]), tolerance)
+        history = [t[~settled] for t in history]
         left = left[~settled]
     return [done[i] for i in range(len(diameter_um))]
 
@@ -95,6 +100,7 @@ _FIRST = 4  # orders of the first truncation, too few for any use but to see t m
 _LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
 _COMPARED = 4
 _SAFETY = 3.0
+_FEW_STEPS = 2  # of a tilted wall, enough to see how t moves between truncations
 _COARSE = 5  # orders that suffice to see what cutting a tilted wall in steps does
 _MOST_STEPS = 16
 
@@ -109,12 +115,18 @@ def _estimate(t: Array) -> Array:
     """Error of the last of the results t (rungs, d): three times the farthest of the four truncations before it.
 
     Truncation errors fall as reach^-2 and swing with the number of orders that fit across the disc; a swing takes up
-    to four rungs. Over 150 pillars and truncations of 8 to 16 orders the true error was 0.5 of the farthest distance
-    in the median and 2.7 of it at most, so that the estimate was never too small. (Below 8 orders it was up to 4.8.)
+    to four rungs. For 52 diameters in three cells at 8 to 16 orders, and for 86 random cells (pitch, height, index,
+    absorption, wavelength, diameter), the true error was 0.4 of the farthest distance in the median and 2.7 of it at
+    most, so that the estimate was never too small. (Below 8 orders it was up to 4.8 of it.)
     """
     if len(t) < 2:
         return np.full(t.shape[1], np.inf)
     return np.asarray(_SAFETY * np.abs(t[-1] - t[-1 - _COMPARED : -1]).max(axis=0) + _ROUNDING)
+
+
+def _blur(this: Case, diameter_um: Array, reach: int, change: Array, error: Array) -> Array:
+    """Where the orders do not resolve the pillar, none of its effect (d,) is believed."""
+    return np.where(reach * diameter_um < this.cell.pitch_um, np.maximum(error, np.abs(change)), error)
 
 
 def _steps(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
@@ -135,11 +147,9 @@ def _films(this: Case, diameter_um: Array) -> list[int]:
     return [int(i) for i in np.flatnonzero(diameter_um == 0)]
 
 
-def _exact(exact: Truncated) -> Response:
+def _exact(exact: Truncated, rounding: float) -> Response:
     reason = "a homogeneous layer: exact"
-    return Response(
-        complex(exact.t[0]), complex(exact.r[0]), _ROUNDING, 1, float(exact.energy[0]), "film", True, reason
-    )
+    return Response(complex(exact.t[0]), complex(exact.r[0]), rounding, 1, float(exact.energy[0]), "film", True, reason)
 
 
 def _response(result: Truncated, place: int, reach: int, error: float, tolerance: float) -> Response:
