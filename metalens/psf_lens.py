@@ -38,7 +38,8 @@ def from_lens(
 ) -> PsfStack:
     """PSFs of a lens, (angle, depth, y, x), float32 where the tolerance allows it.
 
-    The proxy is asked at the angle of every direction where its library has angles, else at normal incidence.
+    The proxy is asked at the angle of every direction where its library has angles, else at normal incidence. Light is
+    unpolarised: at an angle the proxy holds the mean of both polarisations, at normal incidence they are alike.
 
     Args:
         spectrum: wavelengths and weights; by default the design wavelength alone.
