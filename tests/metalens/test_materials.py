@@ -102,6 +102,26 @@ def test_a_bad_table_is_refused_with_its_line(tmp_path: Path, text, message):
         materials.index(str(file), 0.85)
 
 
+@given(
+    st.lists(
+        st.tuples(st.floats(0.2, 20.0), st.floats(1e-3, 10.0), st.floats(0.0, 20.0)),
+        min_size=2,
+        max_size=20,
+        unique_by=lambda row: row[0],
+    )
+)
+def test_any_table_comes_back_at_its_rows_and_never_leaves_them_in_between(tmp_path_factory, rows):
+    rows = sorted(rows)
+    file = tmp_path_factory.mktemp("nk") / "any.csv"
+    file.write_text("wavelength_um,n,k\n" + "".join(f"{w!r},{n!r},{k!r}\n" for w, n, k in rows))
+    record = materials.read_csv(file)
+    assert record.range_um == (rows[0][0], rows[-1][0])
+    for w, n, k in rows:
+        assert abs(materials.index(record, w) - complex(n, k)) < 1e-12 * (n + k)
+    middle = materials.index(record, (rows[0][0] + rows[1][0]) / 2)
+    assert min(rows[0][2], rows[1][2]) * (1 - 1e-12) <= middle.imag <= max(rows[0][2], rows[1][2]) * (1 + 1e-12)
+
+
 def test_missing_and_binary_files_are_refused(tmp_path: Path):
     with pytest.raises(MaterialError, match="no such file"):
         materials.index(str(tmp_path / "none.csv"), 0.85)

@@ -9,6 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index
@@ -151,6 +153,26 @@ def test_hard_swap_of_sides_keeps_the_transmission(direction, k):
     assert abs(there.t - back.t) < ROUNDING
     if k == 0.0:
         assert there.energy < 1  # the film over the pillar absorbs
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    pitch_um=st.floats(0.25, 0.8),
+    fill=st.floats(0.0, 1.0),
+    height_um=st.floats(0.0, 3.0),
+    n=st.floats(0.2, 5.0),
+    substrate=st.floats(1.0, 2.0),
+    angle_rad=st.floats(-1.5, 1.5),
+    polarization=st.sampled_from(["s", "p"]),
+)
+def test_any_lossless_cell_conserves_power_and_is_reciprocal(
+    pitch_um, fill, height_um, n, substrate, angle_rad, polarization
+):
+    cell = Cell(pitch_um, height_um, pillar=Index(n), substrate=Index(substrate))
+    light = {"angle_rad": angle_rad, "polarization": polarization}
+    there, back = (amplitude(side, fill * pitch_um, harmonics=3, **light) for side in (cell, turned_over(cell)))
+    assert abs(there.energy - 1) < 1e-9  # some draws sit on a mode or an order at its cut-off
+    assert abs(there.t - back.t) < 1e-9
 
 
 def test_swap_of_sides_with_a_tilted_wall():
