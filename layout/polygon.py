@@ -66,12 +66,22 @@ def pillar(diameter: float, *, vertices: int = 32, shape: str = "round") -> Pill
     return _pillar(float(diameter), 8 if shape == "shot" else vertices, shape)
 
 
+_GOOD = 1e-3  # area error at which fewer vertices are not tried
+_FEWER = (48, 32, 24, 20, 16, 12)  # a coarse grid suits few vertices better
+
+
 @functools.lru_cache(maxsize=70000)
 def _pillar(diameter: float, vertices: int, shape: str) -> PillarShape:
-    eighth = _octagon(diameter) if vertices == 8 else _round(diameter, vertices)
-    points = mirrored(eighth)
-    points.setflags(write=False)
-    return PillarShape(points, diameter)
+    best: PillarShape | None = None
+    for count in (vertices, *(n for n in _FEWER if n < vertices)):
+        points = mirrored(_octagon(diameter) if count == 8 else _round(diameter, count))
+        points.setflags(write=False)
+        made = PillarShape(points, diameter)
+        if best is None or abs(made.area_error) < 0.7 * abs(best.area_error):
+            best = made
+        if abs(best.area_error) <= _GOOD or shape == "shot":
+            break
+    return best or made
 
 
 def _octagon(diameter: float) -> Array:

@@ -1,0 +1,307 @@
+"""Mask files and their check: a 1 mm lens of 4.9 million free-form pillars in 101 diameters, and far larger ones.
+
+Errors: pillars or sites that differ from the plan when the file is read back, or the worst area error of a class.
+"""
+
+import contextlib
+import functools
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+import layout
+from benchmarks import Row, fastest
+from layout import drc, gdsii_write, oasis_write, polygon, verify
+from layout.mask import Lattice, MaskPlan, pillar_classes
+from layout.process import Rules
+from metalens import store
+from metalens.store import Array
+
+PITCH = 400
+SIZES = np.arange(100, 302, 2)
+RULES = Rules(minimum_gap_nm=70, minimum_feature_nm=80)
+NAN = float("nan")
+
+
+@functools.cache
+def sites(*, freeform: bool) -> Array:
+    """(2501, 2501) classes 1..101 of a focusing lens, with or without a strong free-form phase added; 0 outside."""
+    x = (np.arange(2501) - 1250) * 0.4
+    r2 = x**2 + x[:, None] ** 2
+    phase = -2 * np.pi / 0.94 * (np.sqrt(r2 + 2000.0**2) - 2000)
+    if freeform:
+        u, v = x / 500, x[:, None] / 500
+        rng = np.random.default_rng(0)
+        phase = phase + 40 * (u**3 + v**3)
+        for _ in range(12):
+            a, fx, fy, shift = 3 * rng.normal(), *12 * rng.normal(size=2), rng.uniform(0, 6.28)
+            phase += a * np.sin(fx * u + fy * v + shift)
+    turn = np.remainder(phase, 2 * np.pi) / (2 * np.pi)
+    classes = np.round(100 * turn**0.8).astype(np.uint8) + np.uint8(1)
+    return np.where(r2 <= 499.85**2, classes, np.uint8(0))
+
+
+@functools.cache
+def plan(*, freeform: bool = True) -> MaskPlan:
+    """The mask of the lens alone."""
+    return _plan(Lattice.of("LENS", sites(freeform=freeform), pitch=PITCH, x0=-1250 * PITCH, y0=1250 * PITCH))
+
+
+def _plan(lattice: Lattice) -> MaskPlan:
+    classes = pillar_classes(SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round")
+    return MaskPlan("TOP", classes, (lattice,), layer_names={(1, 0): "pillar"})
+
+
+def large(diameter_mm: float) -> MaskPlan:
+    """A lens too large for memory: its classes are computed row block by row block."""
+    count = int(diameter_mm * 1e6 / PITCH)
+    x = (np.arange(count, dtype=np.float32) - (count - 1) / 2) * (PITCH * 1e-3)
+    focus, reach = 2000 * diameter_mm, (diameter_mm * 500) ** 2
+
+    def rows(first: int, end: int) -> Array:
+        out = np.zeros((end - first, count), np.uint8)
+        for row in range(first, end):
+            r2 = x**2 + x[row] ** 2
+            phase = (np.sqrt(r2 + focus**2) - focus) / 0.94
+            out[row - first] = np.where(r2 <= reach, 1 + (101 * (1 - phase % 1)).astype(np.uint8) % 101, 0)
+        return out
+
+    half = (count - 1) * PITCH // 2
+    return _plan(Lattice("LENS", count, count, PITCH, -half, half, rows))
+
+
+@contextlib.contextmanager
+def peak_mb() -> Iterator[list[float]]:
+    """Growth of the resident memory above what it is now, as the kernel keeps it."""
+    grown = [NAN]
+    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    with contextlib.suppress(OSError):
+        reset.write_text("5")
+    before = _resident(status, "VmRSS")
+    yield grown
+    grown[0] = _resident(status, "VmHWM") - before
+
+
+def _resident(status: Path, key: str) -> float:
+    if not status.exists():
+        return NAN
+    return next(float(line.split()[1]) / 1024 for line in status.read_text().splitlines() if line.startswith(key))
+
+
+def measured(work: Callable[[], object], *, repeats: int = 3) -> tuple[float, float]:
+    """(seconds, MB above the inputs)."""
+    seconds = fastest(work, repeats=repeats)
+    with peak_mb() as grown:
+        work()
+    return seconds, grown[0]
+
+
+def rows() -> list[Row]:
+    """All rows of this toolchain alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder)
+        return [*_file_rows(target), *_check_rows(), *_polygon_rows(), *_streaming_rows(target), *_command_rows(target)]
+
+
+def _file_rows(target: Path) -> list[Row]:
+    free, symmetric = plan(), plan(freeform=False)
+    cases = [
+        ("free-form", "GDSII", free, "m.gds", {}, "write <= 1.3x a raw write"),
+        ("free-form", "OASIS small", free, "s.oas", {"form": "small"}, "<= 3.0 MB (2.0), <= 1 s"),
+        ("free-form", "OASIS fast", free, "f.oas", {"form": "fast"}, "10x gdstk level 6, <= 0.75 of its size"),
+        ("free-form", "OASIS reader", free, "r.oas", {"form": "reader"}, "<= 6.5 MB"),
+        ("free-form", "OASIS circles", free, "c.oas", {"circles": True}, ""),
+        ("symmetric", "OASIS small", symmetric, "y.oas", {"form": "small"}, "<= 0.36 MB, <= 0.15 s"),
+    ]
+    made = []
+    for case, method, mask, name, options, goal in cases:
+        path = target / name
+        write = layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis
+        read = layout.read_gdsii if path.suffix == ".gds" else layout.read_oasis
+        seconds, peak = measured(lambda w=write, m=mask, p=path, o=options: w(m, p, **o))
+        size = path.stat().st_size
+        start = time.perf_counter()
+        outcome = verify.compare(mask, read(path))
+        back = time.perf_counter() - start
+        threads = 1 if path.suffix == ".gds" else 2
+        wrong = float(len(outcome.differences) + outcome.pillars - np.count_nonzero(mask.lattices[0].whole()))
+        text = f"{size / 1e6:.3f} MB; differences after reading back"
+        made.append(Row(case, f"write {method}", seconds, wrong, text, threads, peak, goal))
+        made.append(Row(case, f"read back and compare {method}", back, wrong, text, 1, NAN, ""))
+    return [*made, _raw_row(target)]
+
+
+def _raw_row(target: Path) -> Row:
+    """The same bytes as the GDSII file, written from memory in the same blocks, made durable in the same way."""
+    size = (target / "m.gds").stat().st_size
+    block = memoryview(bytes(gdsii_write._BLOCK))
+
+    def raw() -> None:
+        with store.replacing(target / "raw") as part, open(part, "wb", buffering=0) as file:
+            for _ in range(size // len(block)):
+                file.write(block)
+            file.write(block[: size % len(block)])
+
+    return Row("free-form", "raw write of the GDSII bytes", fastest(raw), 0.0, f"{size / 1e6:.1f} MB of zeros")
+
+
+def _check_rows() -> list[Row]:
+    mask = plan()
+    seconds, peak = measured(lambda: drc.check(mask, RULES))
+    found = drc.check(mask, RULES)
+    goal = "<= 0.25 s, <= 100 MB"
+    text = "gap less that of the widest neighbours / nm"
+    return [Row("free-form", "design-rule check", seconds, found.minimum_gap_nm - 100, text, 1, peak, goal)]
+
+
+def _polygon_rows() -> list[Row]:
+    made = []
+    for grid in (1, 2, 5):
+        for point in polygon.frontier(range(100, 302, 10), grid_nm=grid, vertices=(8, 16, 24, 32, 48, 64)):
+            text = f"area; edge {point.edge_error_nm:.2f} nm, {point.corners:.0f} vertices, {point.shots:.0f} shots"
+            start = time.perf_counter()
+            polygon._pillar.cache_clear()
+            list(polygon.frontier([200], grid_nm=grid, vertices=(point.vertices,)))
+            seconds = time.perf_counter() - start
+            made.append(Row(f"grid {grid} nm", f"{point.shape} {point.vertices}", seconds, point.area_error, text))
+    return made
+
+
+def _streaming_rows(target: Path) -> list[Row]:
+    made = []
+    for diameter_mm, goal in ((4.0, "<= 8 s, <= 64 MB"), (10.0, "<= 60 s, <= 64 MB")):
+        mask = large(diameter_mm)
+        for method, write, name in (
+            ("OASIS fast", lambda p, m=mask: oasis_write.write(m, p, form="fast"), "l.oas"),
+            ("OASIS small", lambda p, m=mask: oasis_write.write(m, p), "l.oas"),
+        ):
+            with peak_mb() as grown:
+                start = time.perf_counter()
+                write(target / name)
+                seconds = time.perf_counter() - start
+            size = (target / name).stat().st_size / 1e6
+            text = f"{size:.1f} MB; the error of the 1 mm lens holds"
+            made.append(Row(f"{diameter_mm:g} mm", f"stream {method}", seconds, NAN, text, 2, grown[0], goal))
+            os.unlink(target / name)
+    return made
+
+
+def _command_rows(target: Path) -> list[Row]:
+    """The whole command on a lens file."""
+    from benchmarks.process import lens
+    from layout import command
+    from metalens import lens as lenses
+
+    lenses.save(target / "lens.h5", lens())
+    options = command.Options(lens=target / "lens.h5", output=target / "mask", quiet=True, force=True)
+    seconds, peak = measured(lambda: command.run(options), repeats=1)
+    error = float(command.run(options))
+    goal = "<= 15 s, <= 1.5 GB"
+    return [Row("1 mm lens", "metalens layout, all of it", seconds, error, "exit status", 2, peak, goal)]
+
+
+def peer_rows() -> list[Row]:
+    """gdstk and KLayout at their best on the same pillars, and their agreement with our files."""
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder)
+        return [*_gdstk_rows(target), *_klayout_rows(target)]
+
+
+def _gdstk_rows(target: Path) -> list[Row]:
+    try:
+        import gdstk
+    except ImportError:
+        return []
+    mask = plan()
+    grid = mask.lattices[0].whole()
+
+    def build(size: float) -> "gdstk.Library":
+        library = gdstk.Library("TOP", unit=1e-6, precision=1e-9)
+        top = library.new_cell("TOP")
+        for k, made in enumerate(mask.classes, 1):
+            cell = library.new_cell(made.name)
+            cell.add(gdstk.Polygon(made.outline * 1e-3, layer=1))
+            row, column = np.nonzero(grid == k)
+            place = np.column_stack([(column - 1250) * size, (1250 - row) * size])
+            reference = gdstk.Reference(cell, tuple(place[0]))
+            reference.repetition = gdstk.Repetition(offsets=(place - place[0])[1:])
+            top.add(reference)
+        return library
+
+    made = []
+    for name, write in (
+        ("GDSII", lambda: build(0.4).write_gds(target / "g.gds")),
+        ("OASIS level 6", lambda: build(0.4).write_oas(target / "g.oas", compression_level=6)),
+    ):
+        seconds = fastest(write, repeats=1)
+        size = (target / ("g.gds" if name == "GDSII" else "g.oas")).stat().st_size / 1e6
+        made.append(Row("free-form", f"gdstk build + write {name}", seconds, NAN, f"{size:.2f} MB, no comparison"))
+    layout.write_oasis(mask, target / "r.oas", form="reader")
+    start = time.perf_counter()
+    library = gdstk.read_oas(target / "r.oas")
+    seconds = time.perf_counter() - start
+    lens = next(cell for cell in library.cells if cell.name == "LENS")
+    count = sum(r.repetition.size or 1 for r in lens.references)
+    wrong = float(count - np.count_nonzero(grid))
+    valid, _ = gdstk.oas_validate(target / "r.oas")
+    text = f"pillars less the plan; checksum {'right' if valid else 'WRONG'}"
+    return [*made, Row("free-form", "gdstk opens OASIS reader", seconds, wrong, text, goal="<= 0.5 s")]
+
+
+def _klayout_rows(target: Path) -> list[Row]:
+    try:
+        import klayout.db as db
+    except ImportError:
+        return []
+    mask = plan()
+    grid = mask.lattices[0].whole()
+
+    def build() -> "db.Layout":
+        made = db.Layout()
+        made.dbu = 0.001
+        top, layer = made.create_cell("TOP"), made.layer(1, 0)
+        cells = []
+        for kind in mask.classes:
+            cell = made.create_cell(kind.name)
+            cell.shapes(layer).insert(db.Polygon([db.Point(*p) for p in kind.outline.tolist()]))
+            cells.append(cell.cell_index())
+        rows, columns = np.nonzero(grid)
+        x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
+        for k, px, py in zip(grid[rows, columns].tolist(), x, y, strict=True):
+            top.insert(db.CellInstArray(cells[k - 1], db.Vector(px, py)))
+        return made
+
+    start = time.perf_counter()
+    build().write(str(target / "k.gds"))
+    made = [Row("free-form", "KLayout build + write GDSII", time.perf_counter() - start, NAN, "no comparison")]
+    for name, write in (("m.gds", layout.write_gdsii), ("m.oas", layout.write_oasis)):
+        write(mask, target / name)
+        start = time.perf_counter()
+        read = db.Layout()
+        read.read(str(target / name))
+        seconds = time.perf_counter() - start
+        count = db.Region(read.cell("TOP").begin_shapes_rec(read.layer(1, 0))).count()
+        wrong = float(count - np.count_nonzero(grid))
+        made.append(Row("free-form", f"KLayout reads {name[2:]}", seconds, wrong, "pillars less the plan"))
+    return [*made, _klayout_check(db, mask)]
+
+
+def _klayout_check(db: object, mask: MaskPlan) -> Row:
+    """The space check of KLayout on a patch of 240 000 pillars."""
+    patch = mask.lattices[0].whole()[1005:1495, 1005:1495]
+    region = db.Region()  # type: ignore[attr-defined]
+    shapes = [db.Polygon([db.Point(*p) for p in kind.outline.tolist()]) for kind in mask.classes]  # type: ignore[attr-defined]
+    for row, column in np.argwhere(patch > 0).tolist():
+        region.insert(shapes[patch[row, column] - 1].moved(column * PITCH, -row * PITCH))
+    region.merged_semantics = False
+    start = time.perf_counter()
+    count = region.space_check(70, False, db.Region.Euclidian).count()  # type: ignore[attr-defined]
+    seconds = time.perf_counter() - start
+    own = drc.check(_plan(Lattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0)), RULES).counts["gap"]
+    return Row(
+        "240 100 pillars", "KLayout space check", seconds, float(abs(count - own)), "violations, ours less theirs"
+    )
