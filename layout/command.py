@@ -45,6 +45,7 @@ class Options(Common):
         window: of DXF and STL.
         name: of the top cell.
         dose: proximity correction, where the process asks for it.
+        study: add stitching, tolerance (Monte Carlo) and the tolerant choice to the report.
     """
 
     lens: tyro.conf.Positional[Path]
@@ -60,6 +61,7 @@ class Options(Common):
     window: Window = field(default_factory=Window)
     name: str = "METALENS"
     dose: bool = True
+    study: bool = False
 
 
 @dataclass(eq=False, slots=True)

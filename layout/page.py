@@ -26,6 +26,10 @@ def write(job: "Job", target: Path) -> None:
     for name, png in shots.items():
         (target / name).write_bytes(png)
     sections = [_overview(job, shots), _rules(job, shots), _classes(job, shots), _doses(job), _fields(job), _files(job)]
+    if job.options.study:
+        from layout import study_page
+
+        sections[-1:-1] = study_page.sections(job.source, job.process, job.fields)
     report.write(
         target / "report.html",
         f"Mask {job.plan.name}",

@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout import focus, tolerance, tolerant
-from layout.process import Process, Spread
+from layout import fields, focus, study_page, tolerance, tolerant
+from layout.process import Process, Spread, WriteField
 from layout.sensitivity import Sensitivities, amplitude, sensitivities
 from layout.spread_model import CAUSES, local_bias_um, missed, reduce, sample
 from metalens.cell import Cell
 from metalens.errors import ProcessError
 from metalens.lens import DiameterMap, Lens
 from metalens.proxy import Proxy
+from metalens.report import Figure, Table
 
 PROXY = Proxy(np.array([[4.6, 4.2, 0.5, 0.3]]), np.array([[0.9, 0.02, 0.04]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
 DIAMETERS = np.linspace(0.1, 0.3, 9)
@@ -164,3 +165,17 @@ def test_chosen_diameters_are_printable():
 def test_an_impossible_phase_tolerance_is_refused(bad):
     with pytest.raises(ProcessError, match="between 0 and pi"):
         tolerant.choose(hyperbolic(41), Process(), tolerance_rad=bad)
+
+
+def test_the_report_sections_say_what_was_found():
+    lens = hyperbolic(101)
+    process = Process(write_field=WriteField(size_um=20.0))
+    made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
+    assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
+    tables = [item for section in made for item in section.items if isinstance(item, Table)]
+    assert [row[0] for row in tables[1].rows] == list(CAUSES)
+    assert all(
+        np.isfinite(value) for table in tables for row in table.rows for value in row if isinstance(value, float)
+    )
+    pictures = [item for section in made for item in section.items if isinstance(item, Figure)]
+    assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
