@@ -10,7 +10,7 @@ from metalens import propagate
 from metalens.errors import PropagationError
 from metalens.propagate_case import Case, check_aperture
 from metalens.propagate_window import Moving
-from metalens.psf_compute import intensity
+from metalens.psf_compute import Result, intensity
 from metalens.psf_record import PsfStack
 from metalens.store import Array
 
@@ -54,43 +54,56 @@ def psf_stack(
     Accuracy: ``error`` of the record, 1 to 3 times the true error.
     """
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
-    several = np.ndim(_value(angle_rad)) == 2
-    shape = maps[0].shape
     about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
     about |= {"offset_um": _value(offset_um)}
-    lenses = [m.reshape(-1, len(waves), *shape[-2:]) for m in maps]
-    parts, errors = [], []
-    cases: list[Case] = []
+    several = np.ndim(_value(angle_rad)) == 2
+    cases, found = [], []
     for angle in angle_rad if several else [angle_rad]:
-        row = [propagate.case(shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
-        if not cases:
-            _check(lenses, row[0])
+        cases.append([propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves])
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um)
-        found = [
-            intensity(p, t, row, share.tolist(), tolerance=tolerance, moving=moving)
-            for p, t in zip(*lenses, strict=True)
-        ]
-        parts.append(torch.stack([f.intensity for f in found]).view(*shape[:-3], *found[0].intensity.shape))
-        errors += [f.error for f in found]
-        cases.append(row[0])
-    light = torch.stack(parts, dim=-4) if several else parts[0]
+        found.append(_direction(maps, cases[-1], share.tolist(), tolerance, moving))
+    light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
+    worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
+    axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
+    stack = _record(light, [row[0] for row in cases], axes, worst, tolerance)
+    return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
+
+
+def _direction(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    cases: list[Case],
+    weights: list[float],
+    tolerance: float,
+    moving: Moving | None,
+) -> tuple[torch.Tensor, list[Result]]:
+    """(…, depth, y, x) intensity of every lens in one direction, and the results it is made of."""
+    shape = maps[0].shape
+    lenses = [m.reshape(-1, *shape[-3:]) for m in maps]
+    _check(lenses, cases[0])
+    found = [intensity(p, t, cases, weights, tolerance=tolerance, moving=moving) for p, t in zip(*lenses, strict=True)]
+    light = torch.stack([result.intensity for result in found])
+    return light.view(*shape[:-3], *light.shape[1:]), found
+
+
+def _record(
+    light: torch.Tensor, cases: list[Case], axes: tuple[Array, Array, Array], worst: Result, tolerance: float
+) -> PsfStack:
+    """The stack for intensities (…, depth, y, x), a case for each angle; axes are depths, wavelengths, weights."""
     energy = light.sum((-1, -2))
-    results: tuple[Any, Any] = light / energy[..., None, None], energy * cases[0].step_um ** 2
-    if not isinstance(phase_rad, torch.Tensor):
-        results = results[0].detach().numpy(), results[1].detach().numpy()
     return PsfStack(
-        *results,
-        depths_um=np.atleast_1d(np.asarray(_value(depths_um), float)),
+        light / energy[..., None, None],
+        energy * cases[0].step_um ** 2,
+        depths_um=axes[0],
         angles_rad=np.arctan([c.tangents for c in cases]),
-        wavelengths_um=np.array(waves),
-        weights=share,
+        wavelengths_um=axes[1],
+        weights=axes[2],
         step_um=cases[0].step_um,
         centres_um=np.array([c.centre_um for c in cases]),
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
-        error=max(errors),
-        reason=found[0].reason,
+        error=worst.error,
+        reason=worst.reason,
     )
 
 
