@@ -38,7 +38,9 @@ class Tile:
 def tile(
     lens: Lens, process: Process, *, side_um: float | None = None, centre_um: tuple[float, float] = (0.0, 0.0)
 ) -> Tile:
-    """The pillars whose sites lie in a square of the lens (all of it without ``side_um``), walls tilted by the process.
+    """The pillars whose sites lie in a square of the lens (all of it without ``side_um``), as they will be made.
+
+    Drawn in the steps of the process, then its bias (of a full lattice), corner rounding and tilted walls.
 
     Raises:
         ProcessError: no pillar in the square, a taper that leaves no top or makes the feet touch.
@@ -52,9 +54,11 @@ def tile(
     row, column = np.nonzero(part)
     if not len(row):
         raise ProcessError(f"no pillar within {side_um} um around {centre_um}; move or enlarge the square")
-    sizes, kind = np.unique(np.rint(part[row, column] * 1e5).astype(np.int64), return_inverse=True)
+    step = process.rules.diameter_step_nm
+    drawn = np.rint(process.written_diameter_nm(part[row, column] * 1e3) / step).astype(np.int64)
+    sizes, kind = np.unique(drawn, return_inverse=True)
     height = lens.cell.height_um
-    top, foot = (d * 1e-3 for d in process.top_foot_nm(sizes * 1e-2, height * 1e3))
+    top, foot = (d * 1e-3 for d in process.top_foot_nm(process.made_diameter_nm(sizes * step), height * 1e3))
     widest = np.maximum(top, foot)
     if min(top.min(), foot.min()) <= 0 or widest.max() >= grid.pitch_um:
         raise ProcessError(

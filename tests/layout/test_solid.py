@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from layout import module, solid, solid_files, solid_mesh, solid_step
+from layout.bias import Bias
 from layout.dxf import Window
 from layout.process import Etch, Process
 from layout.solid_mesh import Mesh
@@ -41,7 +42,7 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
     assert len(whole.kind) == (d.diameter_um > 0).sum()
     lean = 0.7 * math.tan(math.radians(1))
     assert whole.foot_um - whole.top_um == pytest.approx(np.full(3, 2 * lean))
-    assert (whole.foot_um + whole.top_um) / 2 == pytest.approx([0.12, 0.2, 0.26])
+    assert (whole.foot_um + whole.top_um) / 2 == pytest.approx([0.12, 0.2, 0.26], abs=1e-5)  # corners: 3e-6
     part = solid.tile(lens(), TILTED, side_um=1.6, centre_um=(0.4, 1.0))
     inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] + 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
     assert len(part.kind) == inside.sum()
@@ -62,6 +63,18 @@ def test_a_frustum_has_the_volume_of_its_cone_and_manifold3d_takes_it():
     )
     assert body.status() == manifold3d.Error.NoError
     assert body.volume() == pytest.approx(want, rel=1e-5)
+
+
+def test_a_continuous_design_becomes_few_classes_of_made_pillars():
+    rng = np.random.default_rng(1)
+    many = Lens(DiameterMap(rng.uniform(0.1, 0.2, (60, 60)), 0.4), Cell(0.4), PROXY, 0.85, 100.0, 1000.0, "map")
+    biased = Process(bias=Bias(table_nm=((80.0, -6.0), (300.0, 1.0))))
+    pillars = solid.tile(many, biased)
+    assert len(pillars.names) <= 52
+    made = (pillars.foot_um + pillars.top_um)[pillars.kind] / 2
+    assert (
+        abs(made - many.diameters.diameter_um.ravel()).max() < 1.05e-3
+    )  # half a step of 2 nm, times 1 + slope of the bias
 
 
 @pytest.mark.parametrize("damage", ["hole", "flip", "double", "inside out"])
