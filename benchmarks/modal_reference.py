@@ -22,9 +22,7 @@ FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.5
 FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
 BOTH = MeshPlan(5, 6, 5, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0))
 OTHER = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
-GAP_FINE = MeshPlan(6, 6, 6, (0.7, 1.3), (1.0,), (1.0,), (0.3, 1.0))
-GAP_OTHER = MeshPlan(5, 5, 5, (0.7,), (1.0,), (0.25, 1.0), (0.25, 1.0))
-NORMAL, OBLIQUE, GAP = (FINEST, FINE), (BOTH, OTHER), (GAP_FINE, GAP_OTHER)
+NORMAL, OBLIQUE, DARK = (FINEST, FINE), (BOTH, OTHER), (FINE, BOTH)
 PAPER = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
 NIR = Cell(0.40, 0.7, Index(3.6), Index(1.4513), Index(1.0), Index(1.0))
 DISPUTED = Cell(0.418, 0.7, Index(3.698, 0.0086), Index(1.4513), Index(1.0), Index(1.0))
@@ -47,12 +45,13 @@ def wanted() -> list[Wanted]:
         out.append(("disputed", DISPUTED, d, 0.94, 0.0, "x", NORMAL))
     for k in (0.1, 3.0):
         out.append((f"absorbing {k:g}", absorbing(k), 0.2, 0.85, 0.0, "x", NORMAL))
-    out.append(("nearly touching", PAPER, 0.39, 0.85, 0.0, "x", GAP))
+    out.append(("nearly touching", PAPER, 0.39, 0.85, 0.0, "x", NORMAL))
     for angle in (5.0, 10.0, 20.0):
         for d in (0.2, 0.272, 0.128):
             for polarization in "ps":
                 name = "dark mode" if (angle, d, polarization) == (5.0, 0.272, "p") else "oblique"
-                out.append((name, PAPER, d, 0.85, angle, polarization, OBLIQUE))
+                plans = DARK if name == "dark mode" else OBLIQUE
+                out.append((name, PAPER, d, 0.85, angle, polarization, plans))
     return out
 
 

@@ -47,6 +47,7 @@ class Rung:
 
 BOTH = (0.7, 1.3)
 FINE = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
+FINER = MeshPlan(5, 6, 5, BOTH, (0.85, 1.0), (0.15, 1.0))
 FINEST = MeshPlan(6, 7, 6, BOTH, (0.85, 1.0), (0.15, 1.0), core=0.55)
 REFERENCE = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
 RUNGS = (
@@ -68,10 +69,11 @@ RUNGS = (
         1.2,
         1e-3,
     ),
-    Rung("good", (Choice(MeshPlan(4, 5, 4, BOTH), 1.0, 8e-7),), 1.0, 2.5e-4),
-    Rung("fine", (Choice(FINE, 1.0, 5e-7),), 1.0, 5e-5),
-    Rung("finest", (Choice(FINEST, 1.0, 5e-8),), 0.5, 6e-6),
-    Rung("reference", (Choice(REFERENCE, 1.0, 2e-8),), 0.5, 1e-6),
+    Rung("good", (Choice(MeshPlan(5, 5, 5, BOTH), 1.0, 1e-7),), 0.5, 1e-4),
+    Rung("fine", (Choice(FINE, 1.0, 5e-8),), 0.5, 2.5e-5),
+    Rung("finer", (Choice(FINER, 1.0, 2e-8),), 0.4, 8e-6),
+    Rung("finest", (Choice(FINEST, 1.0, 1e-8),), 0.3, 3e-6),
+    Rung("reference", (Choice(REFERENCE, 1.0, 5e-9),), 0.25, 1e-6),
 )
 
 
