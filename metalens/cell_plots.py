@@ -37,9 +37,9 @@ def study_figure(path: Path, study: "Study", verdicts: "list[Verdict]") -> None:
 
 
 def library_figure(path: Path, library: "PillarLibrary", made: "ProxyFit | None") -> None:
-    """Phase and |t| with error bars, and what the proxy leaves, for every wavelength and angle."""
-    figure = Figure(figsize=(7.5, 7.5), layout="constrained", dpi=110)
-    phase, level, rest = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
+    """Phase and |t| with error bars, the bars by themselves beside the tolerance, and what the proxy leaves."""
+    figure = Figure(figsize=(7.5, 8.5), layout="constrained", dpi=110)
+    phase, level, bars, rest = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 1.2, 1.8))
     d = NM * library.diameter_um
     for i, j, k in np.ndindex(*library.t.shape[:3]):
         t, error = library.t[i, j, k], library.t_error[i, j, k]
@@ -51,8 +51,11 @@ def library_figure(path: Path, library: "PillarLibrary", made: "ProxyFit | None"
         kind: dict[str, Any] = {"lw": 0.9, "elinewidth": 2.5, "alpha": 0.9}
         phase.errorbar(d, turns - turns[0], error / np.maximum(size, error) / (2 * np.pi), label=label, **kind)
         level.errorbar(d, size, error, **kind)
+        bars.semilogy(d, error, lw=0.9)
     phase.set_ylabel("phase (turns)")
     level.set(ylabel="|t|", ylim=(0, 1.05))
+    bars.axhline(library.sweep.tolerance, color="0.5", lw=0.8, ls="--")
+    bars.set_ylabel("error bar of t")
     if library.t.shape[0] * library.t.shape[1] * library.t.shape[2] <= 12:
         phase.legend(fontsize=7)
     cell = library.cell

@@ -80,8 +80,8 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
     """The proxy of a library.
 
     Every other diameter is fitted (least largest deviation, by Lawson's weights), all are judged: half of them
-    the fit never saw. Phase and |T| have their own polynomials in diameter^power; |T| is scaled until its
-    certified bound lies below 1.
+    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have their own polynomials in
+    diameter^power; |T| is scaled until its certified bound lies below 1.
 
     Raises:
         DomainError: no stretch of diameters without resonance holds enough entries.
@@ -119,22 +119,23 @@ def _longest(data: _Data, wanted: Wanted, terms: int) -> tuple[_Data, Proxy]:
 
 
 def _meets(proxy: Proxy, wanted: Wanted) -> bool:
-    return (
-        proxy.max_phase_error_rad <= wanted.phase_tolerance_rad
-        and proxy.max_transmission_error <= wanted.transmission_tolerance
-    )
+    return _cost(proxy, wanted) <= 1
 
 
 def _best(data: _Data, wanted: Wanted, terms: int) -> Proxy:
     """Of the powers of the diameter, the one with the least error in units of the tolerances."""
+    return min((fit_terms(data, power, terms) for power in POWERS), key=lambda proxy: _cost(proxy, wanted))
 
-    def cost(proxy: Proxy) -> float:
-        return max(
-            proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
-            proxy.max_transmission_error / wanted.transmission_tolerance,
-        )
 
-    return min((fit_terms(data, power, terms) for power in POWERS), key=cost)
+def _cost(proxy: Proxy, wanted: Wanted) -> float:
+    """The larger error in units of its tolerance; infinite where the phase turns back (the library's does not)."""
+    middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
+    if not all(proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}):
+        return math.inf
+    return max(
+        proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
+        proxy.max_transmission_error / wanted.transmission_tolerance,
+    )
 
 
 def fit_terms(data: _Data, power: int, terms: int) -> Proxy:

@@ -81,3 +81,18 @@ def test_ceiling_takes_off_rounding_alone():
     p = polynomial.curve(np.array([1.0 + 1e-9]), (LOW, HIGH), 1, 1.0)
     assert polynomial.value(p, np.array([0.1])) == 1.0
     assert polynomial_torch.value(p, torch.tensor([0.1])) == 1.0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_tensors_stay_on_their_device():
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 3)
+    host = torch.linspace(0.09, 0.2, 1000, dtype=torch.float64)
+    d = host.cuda().requires_grad_()
+    value = polynomial_torch.value(p, d)
+    value.sum().backward()
+    assert value.is_cuda
+    assert d.grad is not None
+    assert torch.allclose(value.detach().cpu(), polynomial_torch.value(p, host), rtol=1e-13)
+    assert torch.allclose(d.grad.cpu(), polynomial_torch.slope(p, host), rtol=1e-12)
+    with pytest.raises(DomainError):
+        polynomial_torch.value(p, 2 * d.detach())
