@@ -78,7 +78,8 @@ def write_pieces(path: str | Path, label: str, pieces: Sequence[Piece], *, unit_
             shapes.AddComponent(root, stored, TopLoc_Location(move))
     shapes.UpdateAssemblies()
     with store.replacing(path) as part:
-        _write(document, part)
+        if not _write(document, part):
+            raise ProcessError(f"{path}: the CAD kernel could not write the STEP file; is the disk full?")
         text = part.read_text(encoding="utf-8")
         part.write_text(_painted(_renumbered(text), {p.label: p.colour for p in pieces}), encoding="utf-8")
 
@@ -113,7 +114,7 @@ def _name(label: Any, text: str) -> None:
     TDataStd_Name.Set_s(label, TCollection_ExtendedString(text))
 
 
-def _write(document: Any, path: Path) -> None:
+def _write(document: Any, path: Path) -> bool:
     from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
     from OCP.IFSelect import IFSelect_ReturnStatus
     from OCP.Message import Message, Message_Gravity
@@ -128,8 +129,7 @@ def _write(document: Any, path: Path) -> None:
     writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
     header = APIHeaderSection_MakeHeader(writer.Writer().Model())
     header.SetTimeStamp(TCollection_HAsciiString(_TIME))
-    if writer.Write(str(path)) != IFSelect_ReturnStatus.IFSelect_RetDone:
-        raise ProcessError(f"{path.name}: the CAD kernel could not write the STEP file; is the disk full?")
+    return bool(writer.Write(str(path)) == IFSelect_ReturnStatus.IFSelect_RetDone)
 
 
 def _renumbered(text: str) -> str:

@@ -4,6 +4,8 @@ import json
 import math
 import re
 import struct
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 import zipfile
 
@@ -282,3 +284,30 @@ def test_files_of_a_window_of_a_lens(tmp_path):
     assert 0.4 < corners[..., 1].mean() < 0.8  # +y up, as in the mask
     with pytest.raises(ProcessError, match="no pillar"):
         solid_files.write_step(lens(), TILTED, tmp_path, Window(90.0, 0.0, 0.1))
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from layout import solid
+from layout.solid_tile import Tile
+from metalens.errors import ProcessError
+folder = Path(sys.argv[1])
+x = np.arange(400) * 0.4
+pillars = Tile(np.full(1, 0.2), np.full(1, 0.18), x, x, np.zeros(400, int), 0.7, 0.4)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+for name, write in (("a.stl", solid.write_stl), ("a.glb", solid.write_gltf), ("a.step", solid.write_step)):
+    (folder / name).write_text("old")
+    try:
+        write(folder / name, pillars)
+    except (OSError, ProcessError):
+        print(name, (folder / name).read_text(), len(list(folder.iterdir())))
+        (folder / name).unlink()
+"""
+
+
+def test_a_full_disk_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
+    pytest.importorskip("build123d")
+    done = subprocess.run([sys.executable, "-c", FULL_DISK, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:3] == ["a.stl old 1", "a.glb old 1", "a.step old 1"]
