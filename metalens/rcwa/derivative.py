@@ -24,7 +24,7 @@ from metalens.rcwa import changes
 from metalens.rcwa.case import Case, case_waves
 from metalens.rcwa.changes import Change
 from metalens.rcwa.layer import Layer, layer
-from metalens.rcwa.solver import mixed
+from metalens.rcwa.solver import homogeneous, mixed
 from metalens.rcwa.stack import Fields, match, outgoing
 from metalens.rcwa.taper import Section, sections, widening
 from metalens.rcwa.waves import Waves, half_space, normal_component
@@ -132,7 +132,8 @@ def _regions(this: Case, ways: Waves, diameter_um: float, steps: int) -> list[_R
 
     pillar = []
     for section in sections(steps):
-        part = layer(*mixed(this, ways, np.array(diameter_um), section))
+        flat = bool(homogeneous(this, np.array(diameter_um)))
+        part = _film(ways, this.between) if flat else layer(*mixed(this, ways, np.array(diameter_um), section))
         pillar.append(_Region(part, section.share * this.cell.height_um * this.k0, None, section))
     return films(this.cell.under, this.media.under) + pillar + films(this.cell.over, this.media.over)
 

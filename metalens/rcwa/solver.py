@@ -1,6 +1,7 @@
 """Harmonics chosen per entry from the tolerance, with an error estimate from how the result still moves."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,7 +68,7 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
     """Responses for (d,) diameters, each at the least truncation that meets the tolerance."""
     empty = film(this, this.between)
     rounding = _ROUNDING * (1 + this.k0 * this.cell.height_um)  # of the phase
-    done = {i: _exact(empty, rounding) for i in _films(this, diameter_um)}
+    done = {int(i): _exact(empty, rounding) for i in np.flatnonzero(homogeneous(this, diameter_um))}
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
     steps, cut = (0, 0.0)
     if len(left) and this.cell.sidewall_rad:
@@ -140,11 +141,11 @@ def _steps(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float
             return steps, left
 
 
-def _films(this: Case, diameter_um: Array) -> list[int]:
-    """Places of the entries whose pillar layer is homogeneous."""
-    if this.pillar == this.between or this.cell.height_um == 0:
-        return list(range(len(diameter_um)))
-    return [int(i) for i in np.flatnonzero(diameter_um == 0)]
+def homogeneous(this: Case, diameter_um: Array) -> Array:
+    """Where the pillar layer is a film to rounding: (d,) truth values."""
+    share = math.pi / 4 * (diameter_um / this.cell.pitch_um) ** 2
+    effect = share * abs(this.pillar**2 - this.between**2) * this.k0 * this.cell.height_um
+    return np.asarray(effect < _ROUNDING)
 
 
 def _exact(exact: Truncated, rounding: float) -> Response:

@@ -394,6 +394,14 @@ def test_hard_rayleigh_anomalies_are_approached_as_a_square_root(n_side):
     assert distance[1e-8] < 2e-2 * distance[1e-4] + 1e-6
 
 
+@pytest.mark.parametrize("n", [1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6])
+def test_hard_layer_of_air_whose_own_orders_graze(n):
+    got = amplitude(replace(CELL, pitch_um=WAVELENGTH, pillar=Index(n)), 0.3)
+    t, _ = fresnel_stack([1.4525, 1.0, 1.0], [0.7])
+    assert abs(got.t - t) < 1e-10 + 10 * (n - 1)
+    assert abs(got.energy - 1) < 1e-10
+
+
 def test_hard_below_cutoff_of_the_substrate_against_the_modal_method():
     got = amplitude(replace(CELL, pitch_um=WAVELENGTH / 1.4525 * (1 - 1e-4)), 0.2, harmonics=9)
     assert abs(got.t - (-0.029922 - 0.999525j)) < min(got.t_error, 2e-2)

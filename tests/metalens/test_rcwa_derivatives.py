@@ -129,8 +129,10 @@ def test_slope_with_angle_vanishes_at_normal_incidence_and_joins():
     assert abs(near.angle_rad) < 1e-5
 
 
-def test_hard_rayleigh_anomaly_gives_numbers():
-    got = rcwa.derivatives(replace(PLAIN, pitch_um=0.85 / 1.4525), 0.2, 0.85, harmonics=3)
+@pytest.mark.parametrize(("n_side", "n"), [(1.4525, 3.6), (1.0, 3.6), (1.0, 1.0)])
+def test_hard_rayleigh_anomaly_gives_numbers(n_side, n):
+    cell = replace(PLAIN, pitch_um=0.85 / n_side, pillar=Index(n))
+    got = rcwa.derivatives(cell, 0.2, 0.85, harmonics=3)
     assert all(cmath.isfinite(getattr(got, name)) for name in got.__slots__)
 
 
