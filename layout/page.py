@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def write(job: "Job", target: Path) -> None:
     """Write report.html and the pictures beside it."""
     shots = {
-        "die.png": pictures.whole_die(job.plan),
+        "die.png": pictures.whole_die(job.plan, job.drc),
         "pillars.png": pictures.pillars(job.plan, (Window(0, 0, 8), pictures.edge_window(job.plan, 8))),
         "diameters.png": pictures.diameters(job.plan),
         "margins.png": pictures.margins(job.drc),
@@ -130,7 +130,7 @@ def _doses(job: "Job") -> Section | None:
 def _fields(job: "Job") -> Section:
     split = job.fields
     text = (
-        f"{split.used} write fields ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm at most; no "
+        f"Write fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm at most; no "
         f"border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis would "
         f"have cut {split.cut_before:,} pillars."
     )

@@ -13,8 +13,8 @@ from metalens.store import Array
 _FILLED = ("marks", "label")
 
 
-def whole_die(plan: MaskPlan) -> bytes:
-    """Everything on the die; each lattice as an image of its diameters."""
+def whole_die(plan: MaskPlan, found: DrcReport) -> bytes:
+    """Everything on the die; each lattice as an image of its diameters; listed violations as crosses."""
     figure, axes = report.canvas(size=(7.2, 6.6))
     axes.grid(False)
     low, high = (f(made.diameter_nm for made in plan.classes) for f in (min, max))
@@ -29,6 +29,10 @@ def whole_die(plan: MaskPlan) -> bytes:
             interpolation="nearest",
         )
     _draw_figures(axes, plan)
+    if found.violations:
+        x, y = np.array([violation.centre for violation in found.violations]).T * plan.unit_nm * 1e-3
+        axes.plot(x, y, "x", color="red", ms=4, mew=1, label="violations")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09), ncols=6, frameon=False, fontsize=8)
     reach = max((float(np.abs(p).max()) for p in _polygons(plan)), default=0.0) * plan.unit_nm * 1e-3
     reach = 1.03 * (reach or max(map(abs, _extent(plan, plan.lattices[0]))))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x / µm", ylabel="y / µm")
