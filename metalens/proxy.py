@@ -49,7 +49,7 @@ class Proxy:
         if not 0 <= low < high < math.inf:
             raise DomainError(f"proxy domain is {self.domain_um} um, need 0 <= least < largest")
         least, most = polynomial.bounds(self.transmission_coefficients)
-        slack = 1e-3 * (most - least) + 1e-12  # the width of the certificate, not of the polynomial
+        slack = 3e-3 * (most - least) + 1e-12  # the width of the certificate, not of the polynomial
         if not (least >= -slack and most <= 1 + slack):
             raise DomainError(f"|T| of the proxy runs from {least:.6f} to {most:.6f}, need 0 to 1: fit it again")
 
