@@ -9,7 +9,8 @@ from layout import fields, focus, study_page, tolerance, tolerant
 from layout.process import Process, Spread, WriteField
 from layout.sensitivity import Sensitivities, amplitude, sensitivities
 from layout.spread_model import CAUSES, local_bias_um, missed, reduce, sample
-from metalens.cell import Cell
+from metalens import modal
+from metalens.cell import Cell, Index
 from metalens.errors import ProcessError
 from metalens.lens import DiameterMap, Lens
 from metalens.proxy import Proxy
@@ -179,3 +180,19 @@ def test_the_report_sections_say_what_was_found():
     )
     pictures = [item for section in made for item in section.items if isinstance(item, Figure)]
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
+
+
+def test_sensitivities_agree_with_an_independent_solver():
+    cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
+    narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
+    found = sensitivities(dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3)
+
+    def rate(low, high, step):
+        less, more = (modal.solve(each, 0.13, 0.85, tolerance=1e-4).t for each in (low, high))
+        return np.log(more / less) / (2 * step)
+
+    height = rate(dataclasses.replace(cell, height_um=0.69), dataclasses.replace(cell, height_um=0.71), 0.01)
+    index = rate(dataclasses.replace(cell, pillar=Index(3.58)), dataclasses.replace(cell, pillar=Index(3.62)), 0.02)
+    assert abs(found.height[1] / height - 1) < 0.03  # truncation of the plane waves: 1 to 2 % here
+    assert abs(found.index[1] / index - 1) < 0.05
+    assert 2 * np.pi / 0.85 < found.height[1].imag < 2 * np.pi / 0.85 * 3.6  # between air and bulk
