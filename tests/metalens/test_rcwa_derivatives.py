@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from metalens import rcwa
+from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Index
 from metalens.errors import CellError
 from metalens.rcwa.case import case
@@ -81,6 +81,16 @@ def film(n, height, wavelength=0.85, below=1.4525):
     down, up = (n - below) / (n + below), (n - 1) / (n + 1)
     phase = cmath.exp(2j * math.pi * n * height / wavelength)
     return enter * leave * phase / (1 - down * up * phase**2) / math.sqrt(below)
+
+
+@pytest.mark.parametrize(("angle_rad", "polarization"), [(0.0, "x"), (0.15, "p")])
+def test_the_modal_method_has_the_same_slopes(angle_rad, polarization):
+    light = {"angle_rad": angle_rad, "polarization": polarization}
+    ours = rcwa.derivatives(LOSSY, 0.13, 0.85, harmonics=8, **light)
+    theirs = modal.gradient(LOSSY, 0.13, 0.85, **light)
+    for name in ("t", "diameter_um", "height_um", "n", "k", "wavelength_um", "angle_rad"):
+        want = getattr(theirs, name)
+        assert abs(getattr(ours, name) - want) <= 4e-2 * abs(want), name  # truncation of 8 orders, on a slope
 
 
 @pytest.mark.parametrize("diameter_um", [0.0, 0.2, 0.4])
