@@ -69,7 +69,7 @@ def test_angular_spectrum_nears_the_sum_as_padding_grows():
 
 
 def test_evanescent_cut_off_exactly_hit_gives_finite_light():
-    geometry = GEOMETRY | dict(pitch_um=0.425, window_um=4 * 0.425, samples=4)  # fx = 1/(2p)·... = 1/λ on the FFT grid
+    geometry = GEOMETRY | dict(pitch_um=0.425, window_um=4 * 0.425, samples=4)  # 1/(2p) is 1/λ: cut-off on the grid
     field = propagate.angular_spectrum(np.zeros((8, 8)), np.ones((8, 8)), depths_um=np.inf, **geometry)
     assert np.isfinite(field).all()
     assert np.abs(field).min() > 0

@@ -210,6 +210,19 @@ def score(phase, level, **geometry):
     return (torch.sin(0.37 * ramp) * stack.intensity).sum() + 1e-3 * stack.energy_um2.sum()
 
 
+def test_gradcheck_of_the_moments_and_of_the_window():
+    from metalens.propagate_pillars import moments, reduce
+    from metalens.propagate_window import plan, zoom
+
+    case = propagate.case((5, 4), **GEOMETRY | dict(samples=3))
+    made = moments(case, 1e-3, (3, 4), torch.float64)
+    maps = [torch.tensor(m).requires_grad_() for m in lens((5, 4), kind="noisy")]
+    assert torch.autograd.gradcheck(lambda p, t: torch.view_as_real(reduce(p, t, made)), maps)
+    tensors = plan(case, 1e-4, torch.float64, torch.device("cpu")).tensors
+    light = torch.randn(tensors["basis"].shape, dtype=torch.complex128, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(zoom(v, tensors)), light)
+
+
 def test_directional_derivatives_in_phase_and_transmission():
     phase, level = (torch.tensor(m) for m in lens((48, 48), kind="noisy"))
     random = torch.Generator().manual_seed(0)
