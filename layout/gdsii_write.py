@@ -1,6 +1,6 @@
 """GDSII: one structure for each pillar class, one reference for each pillar, written in blocks of rows.
 
-Bytes are the same for the same plan: the time stamps are zero. Memory is one block, whatever the lens.
+Bytes are the same for the same plan: the time stamps are fixed. Memory is one block, whatever the lens.
 """
 
 from collections.abc import Iterator
@@ -18,6 +18,7 @@ from metalens.errors import ProcessError
 from metalens.store import Array
 
 _BLOCK = 1 << 18  # bytes of references made before they are written: within the processor's cache
+_TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access
 MOST_LAYERS = 32767  # layer numbers are signed 16-bit
 
 
@@ -41,7 +42,7 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
 
 
 def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
-    yield gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *[0] * 12) + gds.text(gds.LIBNAME, plan.name)
+    yield gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *_TIMES) + gds.text(gds.LIBNAME, plan.name)
     yield gds.record(gds.UNITS, gds.real(plan.unit_nm * 1e-3) + gds.real(plan.unit_nm * 1e-9))
     for figure in plan.figures:
         yield _figure_structure(figure)
@@ -57,7 +58,7 @@ def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
 
 
 def _begin(name: str) -> bytes:
-    return gds.shorts(gds.BGNSTR, *[0] * 12) + gds.text(gds.STRNAME, name)
+    return gds.shorts(gds.BGNSTR, *_TIMES) + gds.text(gds.STRNAME, name)
 
 
 def _class_structure(made: PillarClass) -> bytes:

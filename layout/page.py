@@ -130,9 +130,9 @@ def _doses(job: "Job") -> Section | None:
 def _fields(job: "Job") -> Section:
     split = job.fields
     text = (
-        f"Write fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm at most; no "
-        f"border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis would "
-        f"have cut {split.cut_before:,} pillars."
+        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm "
+        f"at most; no border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis "
+        f"would have cut {split.cut_before:,} pillars."
     )
     return Section("Write fields", text)
 

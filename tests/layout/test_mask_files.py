@@ -304,6 +304,17 @@ def test_a_moved_pillar_and_another_diameter_are_found(make_plan, tmp_path):
     assert "off the lattice" in layout.compare(shifted, layout.read_gdsii(path)).differences[0]
 
 
+@pytest.mark.parametrize("form", ["small", "fast", "reader"])
+def test_klayout_reads_our_oasis_in_strict_mode(plan, tmp_path, form):
+    db = pytest.importorskip("klayout.db")
+    path = write(plan, tmp_path / "m.oas", {"form": form})
+    options = db.LoadLayoutOptions()
+    options.oasis_expect_strict_mode = 1
+    read = db.Layout()
+    read.read(str(path), options)
+    assert {read.get_info(i).name for i in read.layer_indexes()} == {"pillar", "marks"}
+
+
 def test_masks_of_klayout_are_read(tmp_path):
     db = pytest.importorskip("klayout.db")
     made = db.Layout()
