@@ -198,11 +198,15 @@ def case_of(
         CellError: films or a tilted sidewall (use metalens.rcwa), a plane of incidence off the lattice axes, an
             absorbing half-space, an unknown polarisation, or a number out of range.
     """
+    diameter_um, wavelength_um = float(diameter_um), float(wavelength_um)
+    angle_rad, azimuth_rad = float(angle_rad), float(azimuth_rad)
     check_shape(cell, diameter_um)
     if not (math.isfinite(wavelength_um) and wavelength_um > 0):
         raise CellError(f"wavelength_um = {wavelength_um}: need a finite length above 0")
-    if not abs(angle_rad) < math.pi / 2:
-        raise CellError(f"angle_rad = {angle_rad}: need an angle within +-pi/2")
+    if not (abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
+        raise CellError(
+            f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, the first within +-pi/2"
+        )
     if polarization not in POLARIZATIONS:
         raise CellError(f"polarization = {polarization!r}: need one of {', '.join(POLARIZATIONS)}")
     quarter = azimuth_rad / (math.pi / 2)

@@ -40,11 +40,16 @@ class Rung:
         return next(c for c in self.choices if rho <= c.up_to)
 
     def error(self, spread: float, drift: float, rho: float) -> float:
-        """Error estimate of the mean of both forms; spread and drift as in ``engine.Solution``."""
+        """Error estimate of the mean of both forms; spread and drift as in ``engine.Solution``.
+
+        A disc that nearly fills the cell leaves a gap that the angular functions resolve late, in both forms alike.
+        """
         c = self.choice(rho)
-        return self.safety * spread + (c.thin + c.wide * rho**4) * drift + 1e-12
+        safety = self.safety * (GAP if rho > NARROW else 1.0)
+        return safety * spread + (c.thin + c.wide * rho**4) * drift + 1e-12
 
 
+NARROW, GAP = 0.9, 2.5  # from this diameter in pitches, the safety factor times this
 BOTH = (0.7, 1.3)
 FINE = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
 FINER = MeshPlan(5, 6, 5, BOTH, (0.85, 1.0), (0.15, 1.0))

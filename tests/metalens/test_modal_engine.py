@@ -242,6 +242,34 @@ def test_angle_and_azimuth_have_the_symmetry_of_the_square():
     assert one == two == three
 
 
+def test_hard_float32_numbers_are_taken_in_double_precision():
+    diameter, wavelength = np.float32(0.2), np.float32(0.85)
+    single = modal.solve(cell(), diameter, wavelength, tolerance=1e-2)
+    double = modal.solve(cell(), float(diameter), float(wavelength), tolerance=1e-2)
+    assert single == double
+
+
+def test_table_is_made_of_single_solves():
+    calls = []
+    table = modal.solve_many(
+        cell(),
+        [0.1, 0.2],
+        [0.84, 0.85],
+        angles_rad=[0.0, 0.2],
+        polarizations=("s", "p"),
+        tolerance=1e-2,
+        progress=calls.append,
+    )
+    assert table.t.shape == (2, 2, 2, 2)
+    assert sum(calls) == table.t.size
+    one = modal.solve(cell(), 0.2, 0.84, angle_rad=0.2, polarization="p", tolerance=1e-2)
+    assert table.t[1, 1, 0, 1] == one.t
+    assert table.t_error[1, 1, 0, 1] == one.t_error
+    assert (table.t[0, 0] == table.t[1, 0]).all()
+    assert (table.t_error <= 1e-2).all()
+    assert table.converged.all()
+
+
 # --- refusals ------------------------------------------------------------
 
 
@@ -253,6 +281,8 @@ def test_angle_and_azimuth_have_the_symmetry_of_the_square():
         ({"diameter_um": math.nan}, "diameter_um"),
         ({"wavelength_um": -1.0}, "wavelength_um"),
         ({"angle_rad": 2.0}, "angle_rad"),
+        ({"angle_rad": math.nan}, "angle_rad"),
+        ({"angle_rad": 0.1, "azimuth_rad": math.inf}, "azimuth_rad"),
         ({"angle_rad": 0.1, "azimuth_rad": 0.3}, "rcwa"),
         ({"polarization": "z"}, "polarization"),
         ({"tolerance": 0.0}, "tolerance"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import metalens
-from metalens import modal
+from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 
 FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
@@ -58,6 +58,27 @@ def test_error_estimate_holds_oblique(entry):
     """With the dark mode near 272 nm, p, which only a broken symmetry sees."""
     got = solve(entry, 1e-2)
     assert abs(got.t - complex(*entry["t"])) <= got.t_error + entry["uncertainty"]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [e for e in ENTRIES if e["name"] in ("128", "absorbing 0.1") or (e["diameter_um"], e["angle_deg"]) == (0.2, 10.0)],
+    ids=label,
+)
+def test_coupled_waves_agree(entry):
+    """An independent method: Fourier harmonics instead of elements, one field form instead of two."""
+    parts = entry["cell"]
+    media = [Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")]
+    got = rcwa.solve(
+        Cell(parts["pitch_um"], parts["height_um"], *media),
+        entry["diameter_um"],
+        entry["wavelength_um"],
+        angle_rad=math.radians(entry["angle_deg"]),
+        polarization=entry["polarization"],
+        harmonics=9,
+    )
+    assert abs(got.t - complex(*entry["t"])) < max(got.t_error, 5e-3)
+    assert abs(got.t - complex(*entry["t"])) < 2e-2
 
 
 @pytest.mark.slow
