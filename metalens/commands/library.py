@@ -53,13 +53,20 @@ def run(options: Options) -> int:
     seconds = time.perf_counter() - start
     fitted, refusal = _fit(made, wanted.proxy)
     notes = fitted.notes if fitted else (refusal,)
-    about = store.Provenance(config.dumps(wanted), {options.config.name: store.sha256(options.config)})
+    about = store.Provenance(config.dumps(wanted), _inputs(options.config, wanted.cell))
     made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
     library.save(target, made)
     _draw(target, made, fitted)
     failures = _failures(made, fitted, refusal)
     options.console.result(_values(made, fitted, seconds, failures), _text(target, made, fitted, seconds, failures))
     return 1 if failures else 0
+
+
+def _inputs(path: Path, cell: Cell) -> dict[str, str]:
+    """Hashes of the config and of the material tables that the cell names."""
+    names = (cell.pillar, cell.substrate, cell.cover, cell.between, *(f.material for f in (*cell.under, *cell.over)))
+    tables = [Path(name) for name in names if isinstance(name, str) and name.lower().endswith(".csv")]
+    return {file.name: store.sha256(file) for file in (path, *tables)}
 
 
 def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:

@@ -64,6 +64,13 @@ def test_the_table_of_speed_and_error(cell, capsys):
     assert "cut at" in shown
 
 
+def test_a_material_table_is_named_in_the_provenance(cell, tmp_path):
+    table = tmp_path / "film.csv"
+    table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.59,0\n")
+    assert cell(QUICK.replace("{ n = 3.6, k = 0.0 }", f'"{table}"'), "--quiet") == 0
+    assert library.load(tmp_path / "library.h5").provenance.inputs.keys() == {"cell.toml", "film.csv"}
+
+
 def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
     assert cell(QUICK.replace("height_um = 0.7", "height_um = 0.3")) == 1
     assert "a lens needs 1" in capsys.readouterr().out

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -109,6 +111,11 @@ def test_oblique_polarisations_agree_at_normal_incidence():
         exact = rcwa.solve(DEFAULT_CELL, d, 0.85, angle_rad=angle, polarization=name, harmonics=8)
         assert abs(made.t[i, 1, 0, 10] - exact.t) <= made.t_error[i, 1, 0, 10] + exact.t_error
     assert abs(made.t[0, 1, 0, 10] - made.t[1, 1, 0, 10]) > 0
+
+
+def test_loading_a_library_needs_neither_torch_nor_matplotlib():
+    code = "import sys, metalens.library; print({'torch', 'matplotlib', 'numba'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
 
 
 def test_films_go_to_rcwa():
