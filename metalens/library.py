@@ -13,6 +13,7 @@ from metalens.cell import Cell, Index
 from metalens.engines import Polarization
 from metalens.errors import CellError, ConfigError, DomainError
 from metalens.materials import index
+from metalens.orders import check_subwavelength
 from metalens.proxy import Proxy
 from metalens.store import Array, Provenance
 
@@ -140,23 +141,7 @@ def check(cell: Cell, sweep: Sweep) -> None:
     for wavelength in sweep.wavelengths_um:
         for material in (cell.pillar, cell.between, *films):
             index(material, wavelength)
-        for side in ("substrate", "cover"):
-            _check_orders(cell, side, wavelength, math.radians(sweep.angles_deg[-1]))
-
-
-def _check_orders(cell: Cell, side: str, wavelength_um: float, angle_rad: float) -> None:
-    n = index(getattr(cell, side), wavelength_um).real
-    reach, sine = n * cell.pitch_um / wavelength_um, math.sin(angle_rad) * cell.pitch_um / wavelength_um
-    span = range(-math.ceil(2 * reach) - 1, math.ceil(2 * reach) + 2)
-    orders = [(i, j) for i in span for j in span if (i, j) != (0, 0) and (i + sine) ** 2 + j**2 <= reach**2]
-    if orders:
-        named = ", ".join(f"({i}, {j})" for i, j in sorted(orders, key=lambda o: (o[0] ** 2 + o[1] ** 2, o))[:4])
-        more = f" and {len(orders) - 4} more" if len(orders) > 4 else ""
-        raise CellError(
-            f"pitch {cell.pitch_um:g} um at {wavelength_um:g} um: diffraction orders {named}{more} propagate in the "
-            f"{side} (n = {n:.4f}); need pitch < wavelength / (n + sin(angle)) = "
-            f"{wavelength_um / (n + math.sin(angle_rad)):.4f} um: lessen the pitch or the angle"
-        )
+        check_subwavelength(cell, wavelength, angle_rad=math.radians(sweep.angles_deg[-1]))
 
 
 def sweep(

@@ -83,7 +83,7 @@ def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
         ("pitch_um", "pich_um", "did you mean 'pitch_um'"),
         ("samples", "sampels", "did you mean 'samples'"),
         ("[sweep]", "[swep]", "did you mean 'sweep'"),
-        ("pitch_um = 0.30", "pitch_um = 0.60", "orders (-1, 0), (0, -1), (0, 1), (1, 0) propagate"),
+        ("pitch_um = 0.30", "pitch_um = 0.60", "(-1, 0) in the substrate"),
         ("pitch_um = 0.30", "pitch_um = -1.0", "need a finite length above 0"),
         ("pitch_um = 0.30", "pitch_um = inf", "need a finite length above 0"),
         ("pitch_um = 0.30", "pitch_um = nan", "pitch_um is nan"),
