@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from codesign import losses
 from codesign import optics as lens
-from codesign.architecture import Architecture, largest, sample, smallest
+from codesign.architecture import Architecture, Space, largest, sample, smallest
 from codesign.formation import depth_loss, network_macs, read_out
 from codesign.optics import OpticsConfig
 from codesign.supernet import Supernet
@@ -41,7 +41,9 @@ class Batch:
 class Scenes(Protocol):
     """Where frames come from: the same step gives the same frames."""
 
-    margin: int
+    @property
+    def margin(self) -> int:
+        """Samples around the frames that are blurred in but not seen."""
 
     def batch(self, step: int, size: int) -> Batch:
         """``size`` frames of training step ``step``."""
@@ -139,11 +141,11 @@ class Record:
     skipped: int
 
 
-def model(settings: OpticsConfig, *, pitch_um: float, seed: int) -> Model:
+def model(settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None) -> Model:
     """A fresh model: network weights from the seed, a lens without added phase."""
     torch.manual_seed(seed)
     return Model(
-        Supernet(),
+        Supernet(space),
         nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
         nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
     )

@@ -36,6 +36,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",
     ),
     "fit": ("characterize.command_fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
+    "codesign": ("codesign.command_codesign", "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
 }

@@ -36,7 +36,20 @@ def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: not valid TOML: {error}") from None
+    return from_table(table, record, where=where)
+
+
+def from_table(table: dict[str, Any], record: type[Record], *, where: str = "config") -> Record:
+    """As :func:`load`, from a table that is already parsed (or merged from several)."""
     return typing.cast(Record, _build(table, record, where, ""))
+
+
+def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """``base`` with the entries of ``over`` in their place, table by table."""
+    both = {
+        k: merged(base[k], v) if isinstance(v, dict) and isinstance(base.get(k), dict) else v for k, v in over.items()
+    }
+    return base | both
 
 
 def dumps(record: Any) -> str:

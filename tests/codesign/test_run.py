@@ -1,0 +1,152 @@
+"""A whole run at the smallest size: presets, stop and resume bit for bit, search within budgets, refusals by name."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from codesign import command_codesign, run
+from metalens.errors import ConfigError, TrainingError
+
+TINY = """
+preset = "smoke"
+checkpoint_every = 1
+validation_batches = 1
+test_batches = 1
+[scenes]
+pixels = 48
+[inner]
+steps = 2
+batch = 2
+[inner.optics]
+rate = 0.02
+start = 0.0
+end = 0.9
+[search]
+population = 2
+tournament = 1
+rounds = 3
+[run]
+budgets_mmacs = [2.0]
+[optics]
+aperture_mm = 0.3
+sensor_distance_mm = 1.0
+depth_count = 4
+window_samples = 9
+"""
+
+
+@pytest.fixture
+def settings(tmp_path):
+    (tmp_path / "run.toml").write_text(TINY)
+    return run.load(tmp_path / "run.toml")
+
+
+def _end(going, path):
+    list(run.train(going, path))
+    list(run.search(going, path))
+    return run.finish(going)
+
+
+def test_preset_fills_what_the_file_leaves_out(settings):
+    assert settings.scenes.pixels == 48  # from the file
+    assert settings.scenes.margin == 8  # from the preset
+    assert settings.inner.weights.rate == 4e-3  # default
+
+
+def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(settings, tmp_path):
+    whole = run.start(settings)
+    rows = _end(whole, tmp_path / "whole")
+
+    first = run.start(settings)
+    steps = run.train(first, tmp_path / "part")
+    next(steps), next(steps)
+    second = run.resume(tmp_path / "part", settings)
+    assert second.trainer.step == 1  # the checkpoint of the second step is written after the record is taken
+    list(run.train(second, tmp_path / "part"))
+    births = run.search(second, tmp_path / "part")
+    next(births), next(births)
+    third = run.resume(tmp_path / "part", settings)
+    assert _end(third, tmp_path / "part") == rows
+    for a, b in zip(
+        whole.trainer.model.net.state_dict().values(), third.trainer.model.net.state_dict().values(), strict=True
+    ):
+        assert torch.equal(a, b)
+    assert torch.equal(run.coefficients(whole), run.coefficients(third))
+    assert float(run.coefficients(whole).abs().max()) > 0
+    assert all(c.macs <= 2e6 for s in whole.searches for c in s.history)
+
+
+def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
+    going = run.start(settings)
+    run.save(tmp_path / "c", going)
+    (tmp_path / "other.toml").write_text(TINY.replace("steps = 2", "steps = 4"))
+    with pytest.raises(TrainingError, match=r"inner\.steps: 2 -> 4"):
+        run.resume(tmp_path / "c", run.load(tmp_path / "other.toml"))
+    with pytest.raises(TrainingError, match="0 of 1 searches"):
+        run.finish(going)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('preset = "laptp"', r"preset is 'laptp'; did you mean 'laptop'\?"),
+        ("[run]\npitch_um = 500.0", "pixels of a"),
+        ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
+        ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
+    ],
+)
+def test_bad_configs_are_refused_by_name(tmp_path, change, message):
+    (tmp_path / "run.toml").write_text(change + "\n")
+    with pytest.raises(ConfigError, match=message):
+        run.load(tmp_path / "run.toml")
+
+
+def test_budget_below_the_smallest_network_is_refused(settings, tmp_path):
+    from dataclasses import replace
+
+    going = run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+    with pytest.raises(TrainingError, match="below the smallest network"):
+        list(run.search(going, tmp_path / "c"))
+
+
+def test_a_log_line_cut_by_a_kill_is_dropped(settings, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    going = run.start(settings)
+    next(run.train(going, folder / "unused"))
+    run.save(folder / command_codesign.CHECKPOINT, going)
+    lines = [json.dumps({"kind": "step", "step": s}) for s in (1, 2, 3)]
+    (folder / command_codesign.LOG).write_text("\n".join(lines)[:-5])
+    command_codesign._resume(folder, settings)
+    assert (folder / command_codesign.LOG).read_text() == lines[0] + "\n"
+
+
+@pytest.mark.slow
+def test_kill_at_random_moments_changes_nothing(tmp_path):
+    (tmp_path / "run.toml").write_text(TINY)
+
+    def start(folder, *words):
+        command = [sys.executable, "-m", "metalens", "codesign", "run.toml", "-o", folder, *words]
+        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    assert start("whole").wait() == 0
+    moment = 3.0
+    child = start("killed")
+    while True:
+        time.sleep(moment)
+        if child.poll() is not None:
+            break
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        moment += 1.7
+        resumable = (tmp_path / "killed" / command_codesign.CHECKPOINT).exists()
+        child = start("killed", "--resume") if resumable else start("killed", "--force")
+    assert child.returncode == 0
+    for name in ("result.json", "log.jsonl", "checkpoint.safetensors", "lens.h5", "subnet_2.safetensors"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes(), name
