@@ -60,12 +60,12 @@ class Solution:
     unknowns: int
 
 
-@lru_cache(maxsize=6)
+@lru_cache(maxsize=4)
 def geometry(rho: float, plan: MeshPlan) -> Geometry:
     return assemble(rho, plan)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)
 def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float) -> Basis:
     """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change."""
     symmetry_class = space(geometry(rho, plan), electric=electric, half_phase_rad=bloch or None)
@@ -92,7 +92,8 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True, eq=False, slots=True)
 class Form:
     """What one form gives: zero-order matrix (2, 2), power out per unit power in, size; and of the layer modes that
-    travel, by falling axial wavenumber, q (m,) and the derivative of the matrix in each (m, 2, 2)."""
+    travel, by falling axial wavenumber, q (m,) and, for the electric form, the derivative of the matrix in each
+    (m, 2, 2)."""
 
     matrix: np.ndarray
     energy: float
@@ -116,6 +117,7 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool) -> Form:
     travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
     moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
+    moved = moved[:0] if magnetic else moved
     sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic else np.ones((2, 2))
     return Form(
         matrix=match.matrix[np.ix_(pair, pair)] * sign,
