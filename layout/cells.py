@@ -1,5 +1,6 @@
 """Diameter map to pillar classes: equal drawn diameters become one class, a site becomes a class number."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,9 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
         LensError: no pillar at all.
     """
     drawn = drawn_steps(diameters, process)
-    counts = np.bincount(drawn.ravel())
+    counts = np.zeros(int(drawn.max(initial=0)) + 1, np.int64)
+    for rows in _row_blocks(drawn):
+        counts += np.bincount(drawn[rows].ravel(), minlength=len(counts))
     if counts[1:].sum() == 0:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     used = np.flatnonzero(counts)
@@ -48,7 +51,10 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
     lookup = np.zeros(len(counts), np.uint8 if len(used) <= 255 else np.uint16)
     lookup[used] = np.arange(1, len(used) + 1)
     step = process.rules.diameter_step_nm
-    return Cells(lookup[drawn], used * step, counts[used], step / 2)
+    classes = np.empty(drawn.shape, lookup.dtype)
+    for rows in _row_blocks(drawn):
+        np.take(lookup, drawn[rows], out=classes[rows])
+    return Cells(classes, used * step, counts[used], step / 2)
 
 
 def drawn_steps(diameters: DiameterMap, process: Process) -> Array:
@@ -57,16 +63,26 @@ def drawn_steps(diameters: DiameterMap, process: Process) -> Array:
     The bias is looked up in a table of 1/16 nm; isolation is worked out where the process knows it.
     """
     design = diameters.diameter_um
-    index = np.rint(np.multiply(design, _FINE / nm, dtype=np.float32)).astype(np.int32)
     step = process.rules.diameter_step_nm
-    table = np.arange(int(index.max(initial=0)) + 1) / _FINE
+    table = np.arange(round(float(design.max(initial=0)) * _FINE / nm) + 2) / _FINE
     straight = np.rint(process.written_diameter_nm(table) / step)
     straight[0] = 0
-    drawn = np.clip(straight, 0, 65535).astype(np.uint16)[index]
+    lookup = np.clip(straight, 0, 65535).astype(np.uint16)
+    drawn = np.empty(design.shape, np.uint16)
+    for rows in _row_blocks(design):
+        index = np.rint(np.multiply(design[rows], _FINE / nm, dtype=np.float32)).astype(np.int32)
+        np.take(lookup, index, out=drawn[rows])
     if process.bias.isolated_nm:
         _add_isolation(drawn, diameters, process)
     _refuse_impossible(drawn, diameters, step)
     return drawn
+
+
+def _row_blocks(array: Array, sites: int = 1 << 20) -> Iterator[slice]:
+    """Blocks of rows, so that what is made on the way stays small."""
+    size = max(1, sites // max(1, array.shape[1]))
+    for first in range(0, array.shape[0], size):
+        yield slice(first, first + size)
 
 
 def _add_isolation(drawn: Array, diameters: DiameterMap, process: Process) -> None:
@@ -77,21 +93,23 @@ def _add_isolation(drawn: Array, diameters: DiameterMap, process: Process) -> No
     if not len(rows):
         return
     wanted = process.written_diameter_nm(design[rows, columns] / nm, alone[rows, columns])
-    drawn[rows, columns] = np.rint(wanted / process.rules.diameter_step_nm)
+    drawn[rows, columns] = np.clip(np.rint(wanted / process.rules.diameter_step_nm), 0, 65535)
 
 
 def _refuse_impossible(drawn: Array, diameters: DiameterMap, step: int) -> None:
     widest = int(drawn.max(initial=0)) * step * nm
     if widest >= diameters.pitch_um:
-        row, column = np.unravel_index(int(drawn.argmax()), drawn.shape)
+        row, column = divmod(int(drawn.argmax()), drawn.shape[1])
         raise ProcessError(
             f"drawn diameter at row {row}, column {column} is {widest:g} um, need less than the pitch of "
             f"{diameters.pitch_um:g} um; cap the diameters or check the bias"
         )
-    vanished = (drawn == 0) & (diameters.diameter_um > 0)
-    if vanished.any():
-        row, column = np.unravel_index(int(vanished.argmax()), drawn.shape)
-        raise ProcessError(
-            f"pillar at row {row}, column {column}, {diameters.diameter_um[row, column]} um wide, would be drawn with "
-            f"diameter 0 (step {step} nm); raise the smallest diameter or check the bias"
-        )
+    for rows in _row_blocks(drawn):
+        vanished = (drawn[rows] == 0) & (diameters.diameter_um[rows] > 0)
+        if vanished.any():
+            block_row, column = (int(i) for i in np.argwhere(vanished)[0])
+            row = rows.start + block_row
+            raise ProcessError(
+                f"pillar at row {row}, column {column}, {diameters.diameter_um[row, column]} um wide, would be drawn "
+                f"with diameter 0 (step {step} nm); raise the smallest diameter or check the bias"
+            )

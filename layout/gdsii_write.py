@@ -4,6 +4,7 @@ Bytes are the same for the same plan: the time stamps are fixed. Memory is one b
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,7 +18,7 @@ from metalens import store
 from metalens.errors import ProcessError
 from metalens.store import Array
 
-_BLOCK = 1 << 18  # bytes of references made before they are written: within the processor's cache
+_BLOCK = 1 << 19  # bytes of references made before they are written: within the processor's cache
 _TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access
 MOST_LAYERS = 32767  # layer numbers are signed 16-bit
 
@@ -30,8 +31,19 @@ def write(plan: MaskPlan, path: str | Path) -> None:
         OSError: the target cannot be written, or the disk is full; what was there before stays.
     """
     with store.replacing(path) as part, open(part, "wb", buffering=0) as file:
-        for piece in _pieces(plan):
-            _write_all(file, piece)
+        _write_beside(file, _pieces(plan))
+
+
+def _write_beside(file: BinaryIO, pieces: Iterator[bytes | memoryview]) -> None:
+    """Write each piece while the next is made; a piece must stay as it is until the next but one is asked for."""
+    with ThreadPoolExecutor(1, thread_name_prefix="mask") as pool:
+        busy: Future[None] | None = None
+        for piece in pieces:
+            if busy is not None:
+                busy.result()
+            busy = pool.submit(_write_all, file, piece)
+        if busy is not None:
+            busy.result()
 
 
 def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
@@ -87,19 +99,21 @@ def _reference(name: str, x: int = 0, y: int = 0) -> bytes:
 
 
 def _references(plan: MaskPlan, lattice: Lattice, counts: Array) -> Iterator[memoryview]:
-    """The references of a lattice, in one buffer that is filled again and again; ``counts`` adds up the classes."""
+    """The references of a lattice, in two buffers that are filled in turn; ``counts`` adds up the classes."""
     templates = _templates(plan)
     word = templates.dtype.itemsize
-    buffer = np.empty((_BLOCK // (templates.shape[1] * word), templates.shape[1]), templates.dtype)
+    buffers = np.empty((2, _BLOCK // (templates.shape[1] * word), templates.shape[1]), templates.dtype)
+    turn = 0
     xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), templates.dtype)
     for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
         ys = _words(lattice.y0 - lattice.pitch * np.arange(first, first + len(block)), templates.dtype)
         count_classes(block, counts)
         row, column = 0, 0
         while row < len(block):
-            row, column, used = _fill(buffer, block, row, column, templates, xs, ys)
+            row, column, used = _fill(buffers[turn], block, row, column, templates, xs, ys)
             if used:
-                yield buffer[:used].data.cast("B")
+                yield buffers[turn, :used].data.cast("B")
+                turn = 1 - turn  # the last one is still being written
 
 
 def _templates(plan: MaskPlan) -> Array:
