@@ -1,0 +1,116 @@
+"""Rendering, derivatives and image formation: frames a second beside errors."""
+
+import time
+
+import numpy as np
+import torch
+
+from benchmarks import Row, fastest
+from codesign import dataset, renderer
+from codesign.eye import Rig, parameters
+from codesign.renderer import Camera
+from metalens import pupil, scene, sensor
+from metalens.pupil import Pupil
+
+NONE = float("nan")
+
+
+def rows() -> list[Row]:
+    """Rows of this topic."""
+    import numba
+
+    return [*_rendering(numba.get_num_threads()), *_derivatives(numba.get_num_threads()), *_imaging(), *_sensor()]
+
+
+def _twin_error(states: object, camera: Camera) -> float:
+    few = states[:2]  # type: ignore[index]
+    out = renderer.render(few, camera=camera)
+    p = parameters(few, Rig(), pixel_rad=camera.pitch_um / 2000.0)
+    light, *_ = renderer.twin(p, Rig(), camera)
+    return float((out.frames.radiance - light).norm() / light.norm())
+
+
+def _rendering(threads: int) -> list[Row]:
+    out = []
+    for pixels, pitch, goal in ((160, 9.0, 800), (400, 3.6, 100)):
+        camera, states = Camera(pixels, pitch), dataset.states_at(torch.arange(32), 1)
+        seconds = fastest(lambda c=camera, s=states: renderer.render(s, camera=c)) / len(states)
+        row = Row(
+            f"frame {pixels}²", "compiled, with depth, masks, labels", seconds, _twin_error(states, camera),
+            "float64 twin, relative L2", threads, goal=f"{1 / seconds:.0f}/s; asked {goal}/s",
+        )  # fmt: skip
+        out.append(row)
+    return out
+
+
+def _derivatives(threads: int) -> list[Row]:
+    camera, states = Camera(), dataset.states_at(torch.arange(16), 1)
+    plain = fastest(lambda: renderer.render(states, camera=camera)) / len(states)
+    dual = fastest(lambda: renderer.sensitivities(states, camera=camera)) / len(states)
+    few = states[:3]
+    made = renderer.sensitivities(few, camera=camera)
+    p, first, second = renderer.parameter_tangents(few, ("gaze_x", "slip_z"), rig=Rig(), camera=camera)
+    triple = dataset.triplets(few, gaze_step_rad=np.radians(0.5), slip_step_um=200.0, camera=camera)
+    coarse = {
+        "gaze": (triple.gaze.pinhole() - triple.anchor.pinhole()) / triple.gaze_step_rad,
+        "slip": (triple.slip.pinhole() - triple.anchor.pinhole()) / triple.slip_step_um,
+    }
+    out = []
+    for name, got, tangent in (("gaze", made.first, first), ("slip", made.second, second)):
+        _, want = torch.func.jvp(lambda q: renderer.twin(q, Rig(), camera)[0], (p,), (tangent,))
+        error = float((got.radiance - want).norm() / want.norm())
+        goal = f"{dual / plain:.1f} x the primal for both tangents; asked 4 x at 1e-3"
+        out.append(Row(f"d frame / d {name}", "compiled dual numbers", dual, error, "float64 twin", threads, goal=goal))
+        flat = want.sum(1)
+        wrong = float((coarse[name] - flat).norm() / flat.norm())
+        label = "difference over 0.5 deg / 0.2 mm"
+        out.append(Row(f"d frame / d {name}", label, 2 * plain, wrong, "float64 twin", threads))
+    return out
+
+
+def _imaging() -> list[Row]:
+    states = dataset.states_at(torch.arange(8), 2)
+    frames = renderer.render(states, camera=Camera()).frames
+    depths = 1 / torch.linspace(1 / 32e3, 1 / 12e3, 21, dtype=torch.float64).flip(0)
+    optics = Pupil(nodes=224)
+    fine = pupil.psf(torch.zeros(224, 224, dtype=torch.float64), optics, depths_um=depths, focus_um=20e3,
+                     sample_um=0.75, samples=372)  # fmt: skip
+    stack = sensor.integrate(fine, 0.75, pitch_um=9.0, shape=(31, 31))
+    stack = stack / stack.sum((1, 2), keepdim=True)
+    layers = scene.cut(frames, depths)
+    order = [int((depths - d).abs().argmin()) for d in layers.depth_um]
+    exact = scene.image_layers(layers, stack[order])
+    empty = torch.zeros(8, 21, 160, 160)
+    all_layers = scene.Layers(empty, empty, depths, torch.zeros(21, dtype=torch.bool))
+    plain = fastest(lambda: scene.published(all_layers, stack)) / 8
+    start = time.perf_counter()
+    made = scene.imager(scene.basis(stack, depths, tolerance=1e-3), (160, 160), margin=16)
+    prepare = time.perf_counter() - start
+    image = scene.image(frames, made, margin=16)
+    fast = fastest(lambda: scene.image(frames, made, margin=16)) / 8
+    error = float((image - exact[:, 16:144, 16:144]).norm() / exact.norm())
+    flat = scene.Frames(0.4 * frames.coverage, frames.coverage, frames.depth_um)
+    constant = float((scene.image(flat, made) - 0.4).abs().max() / 0.4)
+    sorted_ = torch.argsort(layers.depth_um)
+    whole = scene.Layers(
+        layers.coverage[:, sorted_], layers.coverage[:, sorted_], layers.depth_um[sorted_], layers.near[sorted_]
+    )
+    lost = 1 - scene.published(whole, stack[[order[i] for i in sorted_]])
+    goal = f"{plain / fast:.1f} x plain; {1 / fast:.0f}/s; asked 5 x at 1e-3 and 400/s"
+    kernels = f"{len(made.psf.kernels)} kernels (made in {1e3 * prepare:.0f} ms)"
+    against = "layer by layer, relative L2"
+    torch_threads = torch.get_num_threads()
+    return [
+        Row("image 128² of 21 depths", "plain: 21 layers by FFT", plain, NONE, "-", torch_threads),
+        Row("image 128² of 21 depths", kernels, fast, error, against, torch_threads, goal=goal),
+        Row("constant radiance", "two sheets", fast, constant, "the constant", torch_threads, goal="asked 1e-5"),
+        Row("constant radiance", "published formula", plain, float(lost.abs().max()), "the constant", torch_threads),
+    ]
+
+
+def _sensor() -> list[Row]:
+    image = torch.rand(8, 640, 640)
+    seconds = fastest(lambda: sensor.integrate(image, 1.0, pitch_um=3.7)) / 8
+    kept = torch.nn.functional.pad(image.double(), (12, 12, 12, 12))
+    error = abs(float(sensor.integrate(kept, 1.0, pitch_um=3.7).sum() / kept.sum()) - 1)
+    return [Row("640² samples on 3.7 um pixels", "exact overlap", seconds, error, "energy", torch.get_num_threads())]
