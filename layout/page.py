@@ -106,9 +106,21 @@ def _classes(job: "Job", shots: dict[str, bytes]) -> Section:
         f"{100 * worst:.3f} %."
     )
     head = ("diameter / nm", "vertices", "shots", "area error / %", "edge error / nm")
-    return Section(
-        "Pillars", text, [Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True), Table(head, rows)]
-    )
+    picture = Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True)
+    items: list[Figure | Table] = [picture, Table(head, rows), _frontier(made, unit)]
+    return Section("Pillars", text, items)
+
+
+def _frontier(made: list[polygon.PillarShape], unit_nm: float) -> Table:
+    """What other numbers of vertices would give and cost, for five of the diameters."""
+    picked = np.unique(np.linspace(0, len(made) - 1, 5).round().astype(int))
+    sizes = [made[i].diameter * unit_nm for i in picked]
+    rows = [
+        [p.shape, p.vertices, *(f"{v:.2f}" for v in (1e4 * p.area_error, p.edge_error_nm, p.corners, p.shots))]
+        for p in polygon.frontier(sizes, grid_nm=unit_nm, vertices=(12, 16, 24, 32, 48, 64))
+    ]
+    head = ("shape", "at most", "area error / 1e-4", "edge error / nm", "vertices", "shots")
+    return Table(head, rows, "Worst errors and mean cost of a pillar by number of vertices, on this grid.")
 
 
 def _doses(job: "Job") -> Section | None:
