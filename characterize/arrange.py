@@ -1,11 +1,13 @@
 """Before the fit: how the frames lie. Orientation, order and stage zero, judged against the nominal lens."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft, optimize
 
 from characterize.forward import ForwardModel
+from characterize.leastsquares import Data
 from characterize.parameters import PLACE, vector
 from metalens.store import Array
 
@@ -22,6 +24,7 @@ class Arrangement:
     order: (n,) frame that fits the i-th stated depth best; reordered: whether it clearly differs from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the stated one beyond doubt.
+    orientation_seen: whether the nominal images change under turns and mirrors at all.
     """
 
     stage_zero_um: float
@@ -32,6 +35,7 @@ class Arrangement:
     order_seen: bool
     orientation: int
     clearly: bool
+    orientation_seen: bool
 
     @property
     def words(self) -> str:
@@ -45,11 +49,11 @@ def turn(frames: Array, orientation: int) -> Array:
     return np.rot90(turned, orientation % 4, axes=(-2, -1))
 
 
-def arrange(
-    model: ForwardModel, frames: Array, usable: Array, *, scan_um: float, start: Array | None = None
-) -> Arrangement:
+def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | None = None) -> Arrangement:
     """Scan the stage zero over +-``scan_um`` and compare every frame with every depth, in all eight orientations."""
-    light = _prepare(np.where(usable, frames, np.nan))
+    light = _prepare(np.where(data.usable, data.electrons, np.nan))
+    noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
+    clipped = data.saturated.mean((1, 2))
     start = vector() if start is None else start.copy()
     nearest = float(model.setting.depth_um.min())
     zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, 17) if scan_um > 0 else np.zeros(1)
@@ -57,46 +61,65 @@ def arrange(
     scores = []
     for zero in zeros:
         start[PLACE["stage_zero_um"]] = zero
-        expected = _prepare(model.images(_bare(start))[0])
-        scores.append(np.mean([_likeness(a, b)[0] for a, b in zip(light, expected, strict=True)]))
+        scores.append(np.mean([score for score, _ in _compare(light, _expected(model, start, clipped), noise)]))
     best = int(np.argmax(scores))
     start[PLACE["stage_zero_um"]] = zeros[best]
-    expected = _prepare(model.images(_bare(start))[0])
-    found = [_likeness(a, b) for a, b in zip(light, expected, strict=True)]
-    order, reordered, seen = _order(light, expected, model)
-    orientation, clearly = _orientation(light, expected)
+    expected = _expected(model, start, clipped)
+    found = _compare(light, expected, noise)
+    order, reordered, seen = _order(light, expected, noise, model)
+    orientation, clearly = _orientation(light, expected, noise)
+    turned = [np.mean([s for s, _ in _compare(turn(expected, k), expected, 0 * noise)]) for k in range(0, 8, 2)]
     shift = np.median([s for _, s in found], axis=0)
     return Arrangement(
-        float(zeros[best]),
-        (float(shift[0]), float(shift[1])),
-        float(scores[best]),
-        order,
-        reordered,
-        seen,
-        orientation,
-        clearly,
+        stage_zero_um=float(zeros[best]),
+        shift_px=(float(shift[0]), float(shift[1])),
+        likeness=float(scores[best]),
+        order=order,
+        reordered=reordered,
+        order_seen=seen,
+        orientation=orientation,
+        clearly=clearly,
+        orientation_seen=bool(max(turned[1:]) < 0.997),
     )
 
 
-def _order(light: Array, expected: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
-    """Assignment of frames to depths of one angle each; (order, clearly different, observable at all)."""
+def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
+    """Nominal frames without background, clipped in as large a share of their pixels as the measured ones."""
+    images = model.images(_bare(x))[0]
+    tops = [np.quantile(image, 1 - share) for image, share in zip(images, clipped, strict=True)]
+    return _prepare(np.minimum(images, np.array(tops)[:, None, None]))
+
+
+def _compare(light: Array, expected: Array, noise: Array) -> list[tuple[float, tuple[float, float]]]:
+    return [_likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
+
+
+def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
+    """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
     n = len(light)
-    table = np.full((n, n), -1.0)
-    alike = np.full((n, n), -1.0)
+    bright = expected * (light.sum() / max(expected.sum(), 1e-300))
+    apart = np.full((n, n), np.inf)
+    unlike = np.full((n, n), np.inf)
     for group in model.groups:
         for i in group.index:
             for j in group.index:
-                table[i, j] = _likeness(light[j], expected[i])[0]
-                alike[i, j] = _likeness(expected[j], expected[i])[0]
-    rows, columns = optimize.linear_sum_assignment(-table)
-    gain = table[rows, columns].sum() - np.trace(table)
-    others = alike - 2 * np.eye(n)
-    distinct = bool(n > 1 and np.median(others.max(1)) < 0.997)
-    moved = int((columns != rows).sum())
-    return columns, bool(moved >= 2 and gain > 0.01 * moved and distinct), distinct
+                apart[i, j] = _distance(light[j], bright[i]) / noise[j] ** 2
+                unlike[i, j] = _distance(bright[j], bright[i]) / noise[j] ** 2
+    finite = np.where(np.isfinite(apart), apart, 1e12)
+    rows, columns = optimize.linear_sum_assignment(finite)
+    stated, best = float(np.trace(apart)), float(finite[rows, columns].sum())
+    neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
+    distinct = bool(n > 1 and np.median(neighbours) > 0.2)
+    return columns, bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct), distinct
 
 
-def _orientation(light: Array, expected: Array) -> tuple[int, bool]:
+def _distance(a: Array, b: Array) -> float:
+    """Squared difference of two images after the shift that makes them most alike."""
+    _, (dy, dx) = _likeness(a, b, 0.0)
+    return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
+
+
+def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool]:
     scores = []
     square = light.shape[1] == light.shape[2]
     for orientation in range(8):
@@ -104,7 +127,7 @@ def _orientation(light: Array, expected: Array) -> tuple[int, bool]:
             scores.append(-1.0)
             continue
         turned = turn(light, orientation)
-        scores.append(float(np.mean([_likeness(a, b)[0] for a, b in zip(turned, expected, strict=True)])))
+        scores.append(float(np.mean([score for score, _ in _compare(turned, expected, noise)])))
     best = int(np.argmax(scores))
     return best, best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02
 
@@ -132,16 +155,20 @@ def _prepare(frames: Array) -> Array:
     return out
 
 
-def _likeness(a: Array, b: Array) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels."""
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
+def _likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
+    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
+
+    The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
+    """
+    power = float((a**2).sum())
+    norm = math.sqrt(max(power - noise**2, 0.1 * power)) * float(np.linalg.norm(b))
     if norm == 0:
         return 0.0, (0.0, 0.0)
     shape = [2 * s for s in a.shape]
     cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
     row, column = np.unravel_index(int(cross.argmax()), cross.shape)
     shift = [int(i) - s if i >= s // 2 else int(i) for i, s in ((row, shape[0]), (column, shape[1]))]
-    return float(cross.max()) / norm, (float(shift[0]), float(shift[1]))
+    return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
 def rearranged(values: Array, arrangement: Arrangement) -> Array:

@@ -20,7 +20,7 @@ from metalens.errors import CaptureError, FitError
 from metalens.lens import Lens
 from metalens.store import Array
 
-MISFIT, LIKENESS = 1.15, 0.55
+MISFIT, LIKENESS, LEAST_PEAK_E = 1.15, 0.45, 100.0
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
 
 
@@ -61,7 +61,7 @@ def fit(
     known = {k.name: k for k in (*_stated(capture, lens), *options.known)}
     start = vector({name: k.value for name, k in known.items()})
     scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
-    found = arrange(model, data.electrons, data.usable, scan_um=scan, start=start)
+    found = arrange(model, data, scan_um=scan, start=start)
     _check_likeness(found, lens)
     cautions = [*frames.corrections, *_arranged_words(found)]
     data = _rearranged(data, found)
@@ -145,8 +145,15 @@ def _arranged_words(found: Arrangement) -> list[str]:
         words.append(f"frames fit the design only {found.words}: used so")
     if found.reordered:
         words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
+    if not found.orientation_seen:
+        words.append(
+            "the design looks the same turned or mirrored: the orientation of the frames cannot be seen; gradients, "
+            "coma, astigmatism, trefoil and decentre are along the camera's axes"
+        )
     if not found.order_seen:
-        words.append("images of neighbouring depths are alike: the order of the frames cannot be checked")
+        words.append(
+            "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
+        )
     return words
 
 
@@ -299,6 +306,12 @@ def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain_kno
     words = []
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
+    peak = float((solution.image - np.median(solution.image)).max())
+    if gain_known and peak < LEAST_PEAK_E:
+        words.append(
+            f"too little light: brightest pixel {peak:.0f} electrons above background, need {LEAST_PEAK_E:.0f} or more "
+            "for intervals that hold; expose longer, or average frames"
+        )
     outliers = float((np.abs(solution.residual_sigma) > 6).mean())
     if gain_known and not _explained(solution):
         frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))

@@ -218,7 +218,7 @@ def _solution(data: Data, state: _State, prior: Prior, converged: bool, reason: 
 
 def invert(matrix: Array) -> Array:
     """Inverse of a symmetric, possibly nearly singular information matrix, scaled so that units do not matter."""
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-60))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
     values = np.maximum(values, 1e-13)
     return np.asarray((vectors / values) @ vectors.T / np.outer(size, size))
