@@ -99,11 +99,12 @@ class CellReader:
         state = np.array([m.placement_x, m.placement_y, m.relative, m.child if isinstance(m.child, int) else -1])
         while True:
             size = min(_BATCH, c.left // 2 + 1)
-            child, x, y, turn = (np.empty(size, t) for t in (np.int32, np.int32, np.int32, np.uint8))
-            at, count = placements(c.data, c.at, c.end, state, child, x, y, turn)
+            out = np.empty((4, size), np.int32)
+            at, count = placements(c.data, c.at, c.end, state, out)
             moved, c.at = at > c.at, int(at)
             if count:
-                self._add(c, child[:count].copy(), x[:count].copy(), y[:count].copy(), turn[:count].copy())
+                child, x, y, turn = (row.copy() for row in out[:, :count])
+                self._add(c, child, x, y, turn.astype(np.uint8))
                 m.placement_x, m.placement_y, m.child = int(state[0]), int(state[1]), int(state[3])
             m.relative = bool(state[2])
             if not moved:

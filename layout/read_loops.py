@@ -21,21 +21,21 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
         return [], nothing, nothing, nothing, at
     size = int(data[at + 5]) + 20
     most = min(_RUN, (len(data) - at) // max(size, 1))
-    child, x, y = (np.empty(most, np.int32) for _ in range(3))
+    out = np.empty((3, most), np.int32)
     first = np.empty(min(_MOST_NAMES, most), np.int64)
     slots = np.full(4 << len(first).bit_length(), -1, np.int32)
-    count, names = _srefs(data, at, size, most, child, x, y, slots, first)
+    count, names = _srefs(data, at, size, out, slots, first)
     found = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
-    return found, child[:count], x[:count], y[:count], at + count * size
+    child, x, y = out[:, :count]
+    return found, child, x, y, at + count * size
 
 
 @compiled
-def _srefs(
-    data: Array, at: int, size: int, most: int, child: Array, x: Array, y: Array, slots: Array, first: Array
-) -> tuple[int, int]:
-    """Fill child, x, y; ``slots`` is a hash table of the names, ``first`` where each stands first."""
+def _srefs(data: Array, at: int, size: int, out: Array, slots: Array, first: Array) -> tuple[int, int]:
+    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where each stands first."""
+    child, x, y = out[0], out[1], out[2]
     names, mask = 0, slots.shape[0] - 1
-    for n in range(most):
+    for n in range(out.shape[1]):
         p = at + n * size
         q = p + size - 16
         if not (data[p] == 0 and data[p + 1] == 4 and data[p + 2] == 10 and data[p + 3] == 0 and data[p + 4] == 0):
@@ -67,7 +67,7 @@ def _srefs(
         child[n] = slots[slot]
         x[n] = _big_endian(data, q + 4)
         y[n] = _big_endian(data, q + 8)
-    return most, names
+    return out.shape[1], names
 
 
 @compiled
@@ -93,18 +93,17 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
 
 
 @compiled
-def placements(
-    data: Array, at: int, end: int, state: Array, child: Array, x: Array, y: Array, turn: Array
-) -> tuple[int, int]:
+def placements(data: Array, at: int, end: int, state: Array, out: Array) -> tuple[int, int]:
     """OASIS placements by reference number without repetition, and switches of the coordinate mode.
 
+    out: (4, n) child, x, y, turn of each, filled.
     state: (4,) placement x, y, whether relative, and the cell placed last (-1: none), kept up to date.
 
     Returns:
         (position of the first record that is something else or broken, placements read)
     """
-    count = 0
-    while at < end and count < child.shape[0]:
+    count, child, x, y, turn = 0, out[0], out[1], out[2], out[3]
+    while at < end and count < out.shape[1]:
         kind = data[at]
         if kind == 15 or kind == 16:
             state[2] = kind - 15
