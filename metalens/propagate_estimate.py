@@ -20,7 +20,8 @@ from metalens.store import Array
 from metalens.threads import split
 
 MORE = 8
-POINTS = 256
+POINTS = 256  # where nothing else is said
+WORK = 3e6  # node sums that an estimate may take
 DEPTHS = 16
 SAFETY = 1.7
 
@@ -55,7 +56,8 @@ def relative_error(tiles: list[list[Sample]]) -> float:
     energy = light.sum(1)
     depths = np.unique(np.linspace(0, len(light) - 1, min(len(light), DEPTHS)).round().astype(int))
     normalised = light[depths] / energy[depths, None]
-    points, chance = draw(normalised, edges, POINTS * min(4, len(tiles)))
+    count = int(np.clip(WORK / tiles[0][0].moments.size, 128, 512)) * min(4, len(tiles))
+    points, chance = draw(normalised, edges, count)
     difference = _difference(tiles, light, depths, points) / energy[depths, None]
     noise = sum(2 * s.weight * s.noise**2 * (1 / energy[depths]).sum() for s in tiles[0])
     total = square_error(normalised, points, chance, difference) + float(noise)
@@ -72,7 +74,7 @@ def square_error(normalised: Array, points: Array, chance: Array, difference: Ar
     pairs = n * (n - 1)
     cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
     common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
-    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.06 * float(a.mean(1).sum()))
+    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.03 * float(a.mean(1).sum()))
 
 
 def _intensity(samples: list[Sample]) -> Array:

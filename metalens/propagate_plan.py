@@ -76,7 +76,7 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     Raises:
         PropagationError: more than 1500 nodes would be needed; the window is too large for this method.
     """
-    share = tolerance / 2
+    share = tolerance / 4
     high_y, high_x = case.half_size_um
     nodes_x = _count(lambda t: _over_lens(case, t * high_x, None), share, "lens columns")
     nodes_y = _count(lambda t: _over_lens(case, None, t * high_y), share, "lens rows")
