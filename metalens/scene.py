@@ -14,7 +14,7 @@ from metalens.errors import SceneError
 
 Tensor = torch.Tensor
 CODES = 4096  # depths of the look-up table of kernel weights, at equal steps of 1/z
-FAINT = 1e-3  # blurred coverage below which a far sheet is not continued behind the near one
+FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one; rounding grows by its inverse
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -276,7 +276,8 @@ def cut(frames: Frames, depths_um: Tensor) -> Layers:
 def _over(light: Tensor, cover: Tensor) -> Tensor:
     """Near sheet over far sheet, (frames, 2, y, x) blurred light and coverage -> (frames, y, x)."""
     free = (1 - cover[:, 0]).clamp(0, 1)
-    behind = free / (cover[:, 1].clamp_min(0) + FAINT)
+    share = (cover[:, 1] / FAINT).clamp(0, 1)  # fades smoothly in below FAINT, exact above
+    behind = free * share * (3 - 2 * share) / cover[:, 1].clamp_min(FAINT)
     weight = cover[:, 0] + behind * cover[:, 1]
     over: Tensor = (light[:, 0] + behind * light[:, 1]) / weight.clamp_min(FAINT)
     return over

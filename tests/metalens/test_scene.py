@@ -43,6 +43,13 @@ def test_constant_radiance_stays_constant_at_every_edge():
     assert (slow - 0.37).abs().max() < 1e-12
 
 
+def test_constant_radiance_stays_constant_in_single_precision():
+    flat = _eye(radiance=0.37)
+    single = Frames(flat.radiance.float(), flat.coverage.float(), flat.depth_um.float())
+    psf = scene.basis(STACK.float(), DEPTHS)
+    assert float((scene.image(single, scene.imager(psf, (N, N))) / 0.37 - 1).abs().max()) < 1e-5
+
+
 def test_the_published_formula_loses_light_at_edges():
     """A near layer in strong blur before a sharp far one: epsilon = 1e-3 loses more than a fifth beside the edge."""
     near = torch.zeros(1, 1, N, N, dtype=torch.float64)
@@ -77,7 +84,7 @@ def test_one_depth_is_an_ordinary_convolution():
     kernel = _stack(torch.tensor([2.0]))
     image = scene.image(flat, scene.imager(scene.basis(kernel, torch.tensor([20e3])), (N, N)))
     want = torch.nn.functional.conv2d(light, kernel[None])[:, 0]
-    assert (image[:, 15:-15, 15:-15] - want).abs().max() < 2e-6 * want.max()  # far sheet is weighted A / (A + 1e-3)
+    assert (image[:, 15:-15, 15:-15] - want).abs().max() < 2e-6 * want.max()  # rounding of the transforms
 
 
 def test_an_off_centre_psf_moves_the_image_the_same_way():
@@ -85,7 +92,8 @@ def test_an_off_centre_psf_moves_the_image_the_same_way():
     kernel[0, 15 + 2, 15 + 5] = 1
     frames = _eye()
     image = scene.image(frames, scene.imager(scene.basis(kernel, torch.tensor([20e3])), (N, N)))
-    assert (image[:, 12:90, 15:90] - frames.radiance.sum(1)[:, 10:88, 10:85]).abs().max() < 1e-3
+    moved = frames.radiance.sum(1)[:, 10:88, 10:85]
+    assert (image[:, 12:90, 15:90] - moved).abs().max() < 4e-3  # far sheet under 1 % of coverage fades
 
 
 def _psfs_of(layers):
