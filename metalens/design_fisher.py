@@ -1,7 +1,7 @@
 """Free-form phases that carry depth: the axial information of Eq. 11, measured honestly, at a bounded spread of light.
 
 The phase is a cubic spline on a control grid that is refined in stages (coarse to fine), on top of a hyperbolic
-focus or of a double helix, whose vortices no smooth phase can grow. Adam climbs the mean log information over the
+focus or of a double helix, whose vortices no smooth phase can grow. Adam climbs the information over the
 depths, at random sub-pixel positions each step, so that nothing can be gained from one position; a growing penalty
 holds the encircled energy, and the best iterate that keeps it at every depth, judged on the honest average, is
 returned. Several starts, all reported.
@@ -164,7 +164,7 @@ def _climb(pupil: Pupil, settings: Fisher, focus_um: float, zones: int, generato
 def _loss(
     phase: Tensor, pupil: Pupil, settings: Fisher, focus_um: float, hold: float, generator: torch.Generator
 ) -> Tensor:
-    """Minus the mean log information at jittered depths and two random positions, plus the energy that is missing."""
+    """Minus the log information at jittered depths and two random positions, plus the energy that is missing."""
     jitter = 1e3 * (settings.depths_mm[1] - settings.depths_mm[0]) / 12
     depths = _depths(settings, 7) + jitter * (torch.rand(7, generator=generator, dtype=torch.float64) - 0.5)
     near, far = _stacks(phase, pupil, focus_um, depths)
@@ -180,7 +180,8 @@ def _loss(
             normalisation=settings.normalisation,
             shift_um=(y, x),
         )
-        total = total - torch.log(value + 1e-4).mean() / 2
+        spread, mean = torch.log(value + 1e-4).mean(), torch.log(value.mean() + 1e-4)
+        total = total - (settings.even * spread + (1 - settings.even) * mean) / 2
     energy = encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)
     missing = torch.relu(settings.encircled + 0.01 - energy)
     return total + hold * missing.mean() + 10 * hold * (missing**2).mean()

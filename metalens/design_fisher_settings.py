@@ -19,6 +19,7 @@ class Fisher:
     grids: control points across the aperture, stage by stage. iterations: of every stage. starts: tried.
     zones: rings of the double helix that the starts begin from, in turn; 0 for none.
     spread_rad: deviation of the random start (a tenth of it on a double helix).
+    even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth), 0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
     """
 
@@ -32,6 +33,7 @@ class Fisher:
     starts: int = 2
     zones: tuple[int, ...] = (2, 0)
     spread_rad: float = 3.0
+    even: float = 0.3
     normalisation: Literal["sum", "l2"] = "l2"
     seed: int = 0
 
