@@ -25,10 +25,10 @@ helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
 
 # %% [markdown]
 # ## A short design
-# One start on a double helix, 30 steps a stage; `metalens design` with `profile = "fisher"` does more.
+# One start on a double helix, 50 steps a stage; `metalens design` with `profile = "fisher"` does more.
 
 # %%
-settings = Fisher(iterations=30, starts=1, zones=(2,), focus_mm=(20.0, 20.0), grids=(8, 16))
+settings = Fisher(iterations=50, starts=1, zones=(2,), focus_mm=(20.0, 20.0), grids=(8, 16, 32))
 made = design_fisher.optimise(optics, settings)
 weights_x, weights_y = (design_fisher.spline(a.ravel() / 500.0, len(made.controls)) for a in (x, y))
 free = torch.from_numpy((weights_y @ made.controls.numpy() * weights_x).sum(1).reshape(x.shape)) + helix
