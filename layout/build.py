@@ -106,7 +106,8 @@ def stream(
     classes = _plain_classes(steps * rules.diameter_step_nm, process)
     kind = np.uint8 if len(classes) <= 255 else np.uint16
 
-    def sites(first: int, end: int) -> Array:
+    def sites(top: int, bottom: int) -> Array:
+        first, end = shape[0] - bottom, shape[0] - top  # rows of the map, which run upwards on the mask
         begin, stop = max(0, first - reach), min(shape[0], end + reach)
         block = np.asarray(rows(begin, stop))
         if not block.any():
@@ -114,7 +115,7 @@ def stream(
         drawn = cells.drawn_steps(DiameterMap(block, pitch_um), process)[first - begin : end - begin]
         if (drawn[drawn > 0] < steps[0]).any() or (drawn > steps[-1]).any():
             raise ProcessError(f"rows {first} to {end - 1}: a diameter outside {range_um} um; widen range_um")
-        return np.where(drawn > 0, drawn - (thinnest - 1), 0).astype(kind)
+        return np.where(drawn > 0, drawn - (thinnest - 1), 0).astype(kind)[::-1]
 
     x0, y0, axis = _origin(shape, pitch, rules.grid_nm)
     lattice = Lattice("LENS", shape[0], shape[1], pitch, x0, y0, sites)
@@ -137,6 +138,8 @@ def pitch_units(pitch_um: float, process: Process) -> int:
 
 
 def _lattice(sites: Array, pitch: int, grid: int) -> tuple[Lattice, tuple[float, float]]:
+    """The map upside down: its rows run towards +y, and +y is up on the mask."""
+    sites = np.ascontiguousarray(sites[::-1])
     x0, y0, axis = _origin(sites.shape, pitch, grid)
     return Lattice.of("LENS", sites, pitch=pitch, x0=x0, y0=y0), axis
 

@@ -10,7 +10,7 @@ from layout.process import Process
 
 
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
-    """``plan`` with one rectangle for each write field, clipped to the lens; +y down there is +y up here."""
+    """``plan`` with one rectangle for each write field, clipped to the lens."""
     lattice = plan.lattices[0]
     half = lattice.pitch // 2
 
@@ -18,10 +18,11 @@ def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
         return [int(s) * lattice.pitch - half for s in np.unique(np.clip(sites, 0, most))]
 
     xs = [lattice.x0 + v for v in edges(split.columns, lattice.columns)]
-    ys = [lattice.y0 - v for v in edges(split.rows, lattice.rows)]
+    first_row = lattice.y0 - (lattice.rows - 1) * lattice.pitch
+    ys = [first_row + v for v in edges(split.rows, lattice.rows)]
     boxes = tuple(
         np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) // plan.grid * plan.grid
-        for (left, right), (top, bottom) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys))
+        for (left, right), (bottom, top) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys))
     )
     layer = process.layers.fields
     figure = Figure("FIELDS", {layer: boxes})

@@ -64,7 +64,8 @@ def _overview(job: "Job", shots: dict[str, bytes]) -> Section:
     text = (
         "Two lithography steps: the pillar layer (with marks, label, dose-test array and witness cells) and the "
         "aperture layer, which draws the openings of the opaque film. The F stands in the upper left "
-        "corner; +y is up, so the first row of the diameter map is the topmost."
+        "corner. The mask is seen from the pillar side, against the light, in the coordinates of the lens: +y is up "
+        "here, so the first row of the diameter map is the lowest."
     )
     items = [
         Figure(shots["die.png"], "The whole die. Colour: drawn diameter.", wide=True),

@@ -46,8 +46,7 @@ def tile(
         ProcessError: no pillar in the square, a taper that leaves no top or makes the feet touch.
     """
     grid = lens.diameters
-    up = -grid.y_um  # the first row of the map is the topmost
-    away = abs(grid.x_um - centre_um[0]), abs(up - centre_um[1])
+    away = abs(grid.x_um - centre_um[0]), abs(grid.y_um - centre_um[1])
     reach = np.inf if side_um is None else side_um / 2 + 1e-9
     columns, rows = np.flatnonzero(away[0] <= reach), np.flatnonzero(away[1] <= reach)
     part = grid.diameter_um[np.ix_(rows, columns)]
@@ -66,7 +65,7 @@ def tile(
             f"{1e3 * min(top.min(), foot.min()):.0f} to {1e3 * widest.max():.0f} nm on a pitch of "
             f"{1e3 * grid.pitch_um:.0f} nm; need above 0 and below the pitch"
         )
-    return Tile(foot, top, grid.x_um[columns[column]], up[rows[row]], kind, height, grid.pitch_um)
+    return Tile(foot, top, grid.x_um[columns[column]], grid.y_um[rows[row]], kind, height, grid.pitch_um)
 
 
 def check_count(pillars: Tile, form: str) -> None:

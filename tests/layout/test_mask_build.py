@@ -94,14 +94,14 @@ def test_coordinates_beyond_32_bit_are_refused():
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 10])
-def test_the_axis_of_the_lens_is_the_origin_and_rows_go_down(n):
+def test_the_axis_of_the_lens_is_the_origin_and_coordinates_are_those_of_the_lens(n):
     d = np.zeros((n, n))
     d[0, n - 1] = 0.2
     plan = layout.plan(DiameterMap(d, 0.4), PLAIN, furnished=False)
     lattice = plan.lattices[0]
     half = (n - 1) * 200
     assert (lattice.x0, lattice.y0) == (-half, half)
-    assert lattice.whole()[0, n - 1] == 1  # the first row is the topmost: +y down there, +y up here
+    assert lattice.whole()[n - 1, n - 1] == 1  # the map's first row, at negative y, is the lowest of the mask
     assert plan.axis == (0, 0)
 
 
@@ -145,7 +145,7 @@ def test_doses_become_datatypes_of_the_pillar_layer():
     source = disc_map(61)
     made = build.prepare(source, Process(exposure=Exposure(tolerance=0.02)), furnished=False)
     assert made.dose is not None
-    lattice = made.plan.lattices[0].whole()
+    lattice = made.plan.lattices[0].whole()[::-1]  # rows of the map run upwards on the mask
     there = lattice > 0
     kinds = np.array([0, *(c.layer[1] for c in made.plan.classes)])
     assert np.array_equal(kinds[lattice][there], made.dose.classes[there])
@@ -235,3 +235,20 @@ def test_dose_test_layers_keep_clear_of_the_others():
     layers = Layers(marks=(5, 3))  # the dose array uses 5/0 to 5/8
     with pytest.raises(ProcessError, match="5/3"):
         layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=layers))
+
+
+def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independent_reader_sees_them(tmp_path):
+    """One pillar right of the axis and one at positive y, read back by KLayout: neither axis is mirrored."""
+    db = pytest.importorskip("klayout.db")
+    d = np.zeros((21, 21))
+    d[10, 15], d[18, 10] = 0.20, 0.30  # (x, y) = (+2.0, 0) and (0, +3.2) um
+    mask = layout.plan(DiameterMap(d, 0.4), PLAIN, furnished=False)
+    for write, name in ((layout.write_oasis, "m.oas"), (layout.write_gdsii, "m.gds")):
+        write(mask, tmp_path / name)
+        read = db.Layout()
+        read.read(str(tmp_path / name))
+        region = db.Region(read.top_cell().begin_shapes_rec(read.layer(1, 0)))
+        found = {(round(p.bbox().center().x), round(p.bbox().center().y)): p.bbox().width() for p in region.each()}
+        assert found.keys() == {(2000, 0), (0, 3200)}
+        assert found[2000, 0] == pytest.approx(200, abs=4)
+        assert found[0, 3200] == pytest.approx(300, abs=4)

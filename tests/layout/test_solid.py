@@ -46,10 +46,10 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
     assert whole.foot_um - whole.top_um == pytest.approx(np.full(3, 2 * lean))
     assert (whole.foot_um + whole.top_um) / 2 == pytest.approx([0.12, 0.2, 0.26], abs=1e-5)  # corners: 3e-6
     part = solid.tile(lens(), TILTED, side_um=1.6, centre_um=(0.4, 1.0))
-    inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] + 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
+    inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] - 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
     assert len(part.kind) == inside.sum()
     rows, columns = np.nonzero(inside)
-    assert part.y_um == pytest.approx(-d.y_um[rows])  # first row on top, as in the mask
+    assert part.y_um == pytest.approx(d.y_um[rows])  # first row on top, as in the mask
     assert part.x_um == pytest.approx(d.x_um[columns])
 
 
