@@ -49,7 +49,7 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
     inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] - 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
     assert len(part.kind) == inside.sum()
     rows, columns = np.nonzero(inside)
-    assert part.y_um == pytest.approx(d.y_um[rows])  # first row on top, as in the mask
+    assert part.y_um == pytest.approx(d.y_um[rows])
     assert part.x_um == pytest.approx(d.x_um[columns])
 
 
