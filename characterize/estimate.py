@@ -323,6 +323,9 @@ def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain_kno
         words.append(
             f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
         )
+    wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
+    if wave > 0.9:
+        words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
     for name, value, low, high in zip(names, solution.value, prior.low, prior.high, strict=True):
         at_zero = name in ("pinhole_um", "bandwidth_nm", "crosstalk_px") and value <= low
         if not at_zero and (value <= low or value >= high):
