@@ -12,6 +12,8 @@ from metalens.errors import LensError
 from metalens.proxy import Proxy
 from metalens.store import Array, Provenance
 
+_BLOCK_ROWS = 256
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DiameterMap:
@@ -53,9 +55,17 @@ class DiameterMap:
 
     @property
     def radius_um(self) -> float:
-        """Distance from the axis to the outermost pillar centre."""
-        rows, columns = np.nonzero(self.diameter_um)
-        return float(np.sqrt((self.y_um[rows] ** 2 + self.x_um[columns] ** 2).max()))
+        """Distance from the axis to the outermost pillar centre; memory of a few rows."""
+        farthest = 0.0
+        for start in range(0, len(self.diameter_um), _BLOCK_ROWS):
+            rows = slice(start, start + _BLOCK_ROWS)
+            there = self.diameter_um[rows] > 0
+            held = there.any(axis=1)
+            if held.any():
+                first, last = there.argmax(axis=1), there.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
+                outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
+                farthest = max(farthest, float(np.hypot(outer, self.y_um[rows])[held].max()))
+        return farthest
 
 
 @dataclass(frozen=True, eq=False, slots=True)
