@@ -6,7 +6,7 @@ Names load when first used: ``import codesign; codesign.render(states)``.
 import importlib
 from typing import Any
 
-_PUBLIC = {"render": "renderer"}  # name: submodule that defines it
+_PUBLIC = {"render": "renderer", "Supernet": "supernet", "macs": "cost"}  # name: submodule that defines it
 
 
 def __getattr__(name: str) -> Any:

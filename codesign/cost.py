@@ -94,10 +94,11 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
     return size
 
 
-def macs(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:
+def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:
     """Multiply-accumulates at a continuous input size, differentiable; exact where ``size`` is an integer.
 
-    A cubic Hermite spline runs through the exact counts with the slopes of their central differences.
+    A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more pixels never cost less, and where
+    two counts are equal the gradient between them is zero.
 
     Args:
         size: pixels along the edge of the input, 16 or more, scalar.
@@ -106,7 +107,7 @@ def macs(space: Space, architecture: Architecture, size: Tensor | float) -> Tens
     low = int(torch.floor(size.detach()))
     counts = network(space, architecture).at(np.arange(low - 1, low + 3)).astype(float)
     before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
-    slope, next_slope = (after - before) / 2, (beyond - here) / 2
+    slope, next_slope = _slope(here - before, after - here), _slope(after - here, beyond - after)
     u = size - low
     return (
         here * (1 + 2 * u) * (1 - u) ** 2
@@ -114,6 +115,26 @@ def macs(space: Space, architecture: Architecture, size: Tensor | float) -> Tens
         + slope * u * (1 - u) ** 2
         + next_slope * u**2 * (u - 1)
     )
+
+
+def _slope(left: Tensor, right: Tensor) -> Tensor:
+    """Harmonic mean of two rises; zero where one of them is."""
+    return torch.where((left > 0) & (right > 0), 2 * left * right / (left + right).clamp_min(1), torch.zeros_like(left))
+
+
+def macs(
+    architecture: Architecture, pitch_um: Tensor | float, *, window_um: float, space: Space | None = None
+) -> Tensor:
+    """Multiply-accumulates C_total of one inference as a function of the pixel pitch (paper Eq. 9), differentiable.
+
+    Args:
+        pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on the sensor.
+
+    Raises:
+        ConfigError: a pitch that leaves less than 16 pixels.
+    """
+    input_size(window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution)
+    return macs_of_size(space or Space(), architecture, window_um / pitch_um * architecture.resolution)
 
 
 def mobilenet_v3(variant: str, *, size: int = 224, classes: int = 1000) -> int:

@@ -24,7 +24,7 @@ def read_out(
 
 def network_macs(net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
     """Multiply-accumulates of one member at this pitch, differentiable."""
-    return cost.macs(net.space, architecture, window_um / pitch_um * architecture.resolution)
+    return cost.macs_of_size(net.space, architecture, window_um / pitch_um * architecture.resolution)
 
 
 def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:

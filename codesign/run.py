@@ -104,9 +104,8 @@ class Run:
 
     def macs(self, architecture: Architecture) -> float:
         """Multiply-accumulates of an architecture at the pitch that was found."""
-        pitch = float(self.trainer.model.pitch_um.detach())
-        size = self.window_um / pitch * architecture.resolution
-        return float(cost.macs(self.settings.space, architecture, size))
+        pitch = self.trainer.model.pitch_um.detach()
+        return float(cost.macs(architecture, pitch, window_um=self.window_um, space=self.settings.space))
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
