@@ -17,7 +17,7 @@ from metalens.propagate_case import Case, chief_path
 from metalens.propagate_plan import reference_depth
 from metalens.propagate_sincos import turns64
 from metalens.store import Array
-from metalens.threads import split
+from metalens.threads import one_blas_thread, split
 
 MORE = 8
 POINTS = 256  # where nothing else is said
@@ -122,7 +122,8 @@ def _direct(sample: Sample, at: tuple[Array, Array, Array]) -> Array:
     """(point,) field at (depth, y, x) indices, summed over the finer nodes."""
     case = sample.case
     m, n = sample.moments.shape
-    light = legendre.to_nodes(m).T @ sample.moments @ legendre.to_nodes(n)
+    with one_blas_thread():
+        light = legendre.to_nodes(m).T @ sample.moments @ legendre.to_nodes(n)
     (hy, hx), (wy, wx) = case.half_size_um, case.window_um
     e, x = legendre.mapped(m, -hy, hy), legendre.mapped(n, -hx, hx)
     points = np.stack([wx[at[2]], wy[at[1]]], -1)

@@ -1,10 +1,13 @@
 """Threads for compiled loops that release the interpreter lock: as many as torch uses, safe after a fork."""
 
+import contextlib
 import functools
 import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+
+from threadpoolctl import ThreadpoolController
 
 
 def split(count: int, work: Callable[[int, int], object]) -> None:
@@ -25,3 +28,14 @@ def split(count: int, work: Callable[[int, int], object]) -> None:
 @functools.lru_cache(maxsize=2)
 def _pool(process: int, parts: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(parts, thread_name_prefix=f"metalens-{process}")
+
+
+def one_blas_thread() -> contextlib.AbstractContextManager[object]:
+    """Run numpy's and scipy's BLAS on one thread: its idle threads spin for a while and take torch's cores."""
+    limit: contextlib.AbstractContextManager[object] = _blas().limit(limits=1)
+    return limit
+
+
+@functools.lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
