@@ -3,6 +3,7 @@
 Bytes are the same for the same plan: the time stamps are fixed. Memory is one block, whatever the lens.
 """
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +20,7 @@ from metalens.errors import ProcessError
 from metalens.store import Array
 
 _BLOCK = 1 << 19  # bytes of references made before they are written: within the processor's cache
+_FLUSHED = 16  # pieces after which the disk is given what was written
 _TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access
 MOST_LAYERS = 32767  # layer numbers are signed 16-bit
 
@@ -35,15 +37,25 @@ def write(plan: MaskPlan, path: str | Path) -> None:
 
 
 def _write_beside(file: BinaryIO, pieces: Iterator[bytes | memoryview]) -> None:
-    """Write each piece while the next is made; a piece must stay as it is until the next but one is asked for."""
-    with ThreadPoolExecutor(1, thread_name_prefix="mask") as pool:
+    """Write each piece while the next is made; a piece must stay as it is until the next but one is asked for.
+
+    What was written is sent to the disk meanwhile, so that little is left to wait for at the end.
+    """
+    with (
+        ThreadPoolExecutor(1, thread_name_prefix="mask") as pool,
+        ThreadPoolExecutor(1, thread_name_prefix="disk") as disk,
+    ):
         busy: Future[None] | None = None
-        for piece in pieces:
+        flush: Future[None] | None = None
+        for count, piece in enumerate(pieces, 1):
             if busy is not None:
                 busy.result()
             busy = pool.submit(_write_all, file, piece)
-        if busy is not None:
-            busy.result()
+            if count % _FLUSHED == 0 and (flush is None or flush.done()):
+                flush = disk.submit(os.fsync, file.fileno())
+        for job in (busy, flush):
+            if job is not None:
+                job.result()
 
 
 def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
