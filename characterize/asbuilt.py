@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from characterize.parameters import PLACE, bias_um, vector
-from metalens import config, store
-from metalens.cell import Cell
+from metalens import lens as lenses
+from metalens import store
 from metalens.lens import DiameterMap, Lens
-from metalens.proxy import Proxy
 from metalens.store import Array, Provenance
 
 
@@ -136,16 +135,9 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
-    arrays["design/diameter_um"] = np.asarray(result.design.diameters.diameter_um, float)
-    arrays |= {f"design/proxy/{name}": array for name, array in result.design.proxy.to_arrays().items()}
-    lens = result.design
-    about: dict[str, Any] = {
-        "pitch_um": lens.diameters.pitch_um,
-        "cell": config.dumps(lens.cell),
-        "wavelength_um": lens.wavelength_um,
-        "sensor_distance_um": lens.sensor_distance_um,
-        "source_distance_um": lens.source_distance_um,
-        "profile": lens.profile,
+    design, about = lenses.parts(result.design, group="design/")
+    arrays |= design | {"design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)}
+    about |= {
         "pixel_um": result.pixel_um,
         "chi2_per_dof": result.chi2_per_dof,
         "converged": result.converged,
@@ -162,16 +154,7 @@ def load(path: str | Path) -> AsBuilt:
     """
     stored = store.load(path, "asbuilt")
     a, about = stored.arrays, stored.attributes
-    proxy = {name[13:]: array for name, array in a.items() if name.startswith("design/proxy/")}
-    design = Lens(
-        diameters=DiameterMap(a["design/diameter_um"], about["pitch_um"]),
-        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
-        proxy=Proxy.from_arrays(proxy),
-        wavelength_um=about["wavelength_um"],
-        sensor_distance_um=about["sensor_distance_um"],
-        source_distance_um=about["source_distance_um"],
-        profile=about["profile"],
-    )
+    design = lenses.from_parts(a, about, where=str(path), group="design/")
     fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
     fields |= {name: tuple(w for w in _text(a[name]) if w) for name in _WORDS}
     return AsBuilt(

@@ -71,16 +71,9 @@ def load(path: str | Path) -> RunConfig:
     Raises:
         ConfigError: see :func:`metalens.config.load`; an unknown preset.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file; need a TOML config (RunConfig)")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
-    return config.from_table(
-        config.merged(preset_table(table.get("preset", "laptop")), table), RunConfig, where=str(path)
-    )
+    table = config.read(path, RunConfig)
+    preset = preset_table(table.get("preset", "laptop"))
+    return config.from_table(config.merged(preset, table), RunConfig, where=str(path))
 
 
 def preset_table(name: str) -> dict[str, Any]:

@@ -20,6 +20,15 @@ def load(path: str | Path, record: type[Record]) -> Record:
         ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
             record refuses; the message gives file and key.
     """
+    return from_table(read(path, record), record, where=str(path))
+
+
+def read(path: str | Path, record: type[Any]) -> dict[str, Any]:
+    """The tables of a TOML file that is to become ``record``.
+
+    Raises:
+        ConfigError: missing file, not text, or not TOML.
+    """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -27,16 +36,12 @@ def load(path: str | Path, record: type[Record]) -> Record:
         raise ConfigError(f"{path}: no such file; need a TOML config ({record.__name__})") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file ({error})") from None
-    return loads(text, record, where=str(path))
+    return _parsed(text, str(path))
 
 
 def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
     """As :func:`load`, from TOML text; ``where`` names it in errors."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not valid TOML: {error}") from None
-    return from_table(table, record, where=where)
+    return from_table(_parsed(text, where), record, where=where)
 
 
 def from_table(table: dict[str, Any], record: type[Record], *, where: str = "config") -> Record:
@@ -57,6 +62,13 @@ def dumps(record: Any) -> str:
     lines: list[str] = []
     _dump(record, "", lines)
     return "\n".join(lines) + "\n"
+
+
+def _parsed(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not valid TOML: {error}") from None
 
 
 def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:

@@ -109,8 +109,9 @@ def make(
     reach = aperture_um / 2 - cell.pitch_um / 2 if count > 1 else 0.0
     diameter = np.zeros((count, count), np.float32)
     sums = _Sums()
-    for start in range(0, count, max(1, _BLOCK_SITES // count)):
-        rows = slice(start, min(count, start + max(1, _BLOCK_SITES // count)))
+    block = max(1, _BLOCK_SITES // count)
+    for start in range(0, count, block):
+        rows = slice(start, start + block)
         inside = axis[rows, None] ** 2 + axis**2 <= reach**2 * (1 + 1e-12)
         wanted = phase(axis, axis[rows])[inside]
         made = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within)

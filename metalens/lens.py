@@ -1,6 +1,7 @@
 """The lens that is handed on: a diameter map, and what is needed to know its phase at any wavelength."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -109,16 +110,7 @@ class Lens:
 
 def save(path: str | Path, lens: Lens) -> None:
     """Write a lens file (kind ``lens``); diameters keep their dtype."""
-    arrays: dict[str, Array] = {"diameter_um": lens.diameters.diameter_um}
-    arrays |= {f"proxy/{name}": array for name, array in lens.proxy.to_arrays().items()}
-    attributes: dict[str, Any] = {
-        "pitch_um": lens.diameters.pitch_um,
-        "cell": config.dumps(lens.cell),
-        "wavelength_um": lens.wavelength_um,
-        "sensor_distance_um": lens.sensor_distance_um,
-        "source_distance_um": lens.source_distance_um,
-        "profile": lens.profile,
-    }
+    arrays, attributes = parts(lens)
     store.save(path, "lens", arrays, attributes=attributes, provenance=lens.provenance)
 
 
@@ -129,17 +121,37 @@ def load(path: str | Path) -> Lens:
         StoreError: not a lens file; LensError: its diameters are invalid.
     """
     stored = store.load(path, "lens")
-    about = stored.attributes
-    proxy = {name[6:]: array for name, array in stored.arrays.items() if name.startswith("proxy/")}
+    lens = from_parts(stored.arrays, stored.attributes, where=str(path))
+    return replace(lens, provenance=stored.provenance)
+
+
+def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:
+    """(arrays, attributes) of a lens for a store file; ``group`` stands before the names of the arrays."""
+    arrays: dict[str, Array] = {f"{group}diameter_um": lens.diameters.diameter_um}
+    arrays |= {f"{group}proxy/{name}": array for name, array in lens.proxy.to_arrays().items()}
+    attributes = {
+        "pitch_um": lens.diameters.pitch_um,
+        "cell": config.dumps(lens.cell),
+        "wavelength_um": lens.wavelength_um,
+        "sensor_distance_um": lens.sensor_distance_um,
+        "source_distance_um": lens.source_distance_um,
+        "profile": lens.profile,
+    }
+    return arrays, attributes
+
+
+def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, where: str, group: str = "") -> Lens:
+    """Inverse of :func:`parts`; ``where`` names the file in errors."""
+    start = f"{group}proxy/"
+    proxy = {name[len(start) :]: array for name, array in arrays.items() if name.startswith(start)}
     return Lens(
-        diameters=DiameterMap(stored.arrays["diameter_um"], about["pitch_um"]),
-        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
+        diameters=DiameterMap(arrays[f"{group}diameter_um"], attributes["pitch_um"]),
+        cell=config.loads(attributes["cell"], Cell, where=f"{where}: cell"),
         proxy=Proxy.from_arrays(proxy),
-        wavelength_um=about["wavelength_um"],
-        sensor_distance_um=about["sensor_distance_um"],
-        source_distance_um=about["source_distance_um"],
-        profile=about["profile"],
-        provenance=stored.provenance,
+        wavelength_um=attributes["wavelength_um"],
+        sensor_distance_um=attributes["sensor_distance_um"],
+        source_distance_um=attributes["source_distance_um"],
+        profile=attributes["profile"],
     )
 
 

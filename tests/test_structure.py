@@ -71,3 +71,8 @@ def test_help_loads_neither_numpy_nor_torch():
 def test_test_files_have_unique_names():
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert len(names) == len(set(names))
+
+
+def test_the_demo_and_the_examples_show_the_same_process():
+    example, shipped = ROOT / "examples" / "process.toml", ROOT / "metalens" / "data" / "demo" / "process.toml"
+    assert example.read_bytes() == shipped.read_bytes()
