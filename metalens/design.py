@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens import profiles
+from metalens import phase_map, profiles
 from metalens.cell import Cell
 from metalens.errors import ConfigError, LensError
 from metalens.lens import DiameterMap, Lens
@@ -62,10 +62,10 @@ class Limits:
 def phase_of(shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float) -> PhaseOf:
     """The wanted phase as a function of position: ``shape`` on top of the focus, None for hyperbolic."""
     if isinstance(shape, PhaseMap):
-        samples = profiles.read_map(shape)
+        samples = phase_map.read(shape)
 
         def mapped(x_um: Array, y_um: Array) -> Array:
-            phase = profiles.interpolate(samples, shape.pitch_um, x_um, y_um)
+            phase = phase_map.interpolate(samples, x_um, y_um, radius_um=radius_um)
             return phase + profiles.hyperbolic(x_um, y_um[:, None], focus) if shape.add_focus else phase
 
         return mapped

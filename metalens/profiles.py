@@ -56,19 +56,23 @@ class Cubic:
 
 @dataclass(frozen=True, slots=True)
 class PhaseMap:
-    """Phase read from a file (.npy, or .csv of numbers) in radians, (y, x), centred on the lens axis.
+    """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see :mod:`metalens.phase_map`.
 
-    file: its path.
-    pitch_um: sampling of the map; interpolated onto the pillars through the phasor exp(i phase).
+    file: its path (.npy, .mat, a Zemax grid phase .dat, else text).
+    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the phasor exp(i phase).
     add_focus: whether the hyperbolic focus is added to the map.
+    variable: name of the matrix in a .mat file that holds several.
+    conjugate: change the sign, for maps made with exp(+iwt).
     """
 
     file: Path
-    pitch_um: float
+    pitch_um: float | None = None
     add_focus: bool = False
+    variable: str | None = None
+    conjugate: bool = False
 
     def __post_init__(self) -> None:
-        if not self.pitch_um > 0:
+        if self.pitch_um is not None and not self.pitch_um > 0:
             raise ConfigError(f"pitch_um = {self.pitch_um} of the phase map: need a length above 0")
 
 
@@ -109,61 +113,3 @@ def cubic(x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: fl
     """Hyperbolic phase plus :class:`Cubic`."""
     x, y = x_um / radius_um, y_um / radius_um
     return np.asarray(hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3))
-
-
-def read_map(shape: PhaseMap) -> Array:
-    """(y, x) phase in rad from the file of a :class:`PhaseMap`.
-
-    Raises:
-        LensError: missing or unreadable file, not 2-D, or a value that is not finite (row and column named).
-    """
-    path = shape.file
-    try:
-        if path.suffix.lower() == ".npy":
-            phase = np.load(path, allow_pickle=False)
-        else:
-            phase = np.loadtxt(path, delimiter=",", ndmin=2)
-    except FileNotFoundError:
-        raise LensError(f"{path}: no such file; need a phase map (.npy or .csv)") from None
-    except ValueError as error:
-        raise LensError(f"{path}: not a phase map: {error}") from error
-    if phase.ndim != 2 or min(phase.shape) < 2 or phase.dtype.kind not in "fiu":
-        raise LensError(f"{path}: holds {phase.dtype} of shape {phase.shape}, need real (y, x) of 2 by 2 or more")
-    if not np.isfinite(phase).all():
-        row, column = (int(i) for i in np.argwhere(~np.isfinite(phase))[0])
-        raise LensError(f"{path}: phase at row {row}, column {column} is {phase[row, column]}, need finite radians")
-    return np.asarray(phase, float)
-
-
-def interpolate(phase_rad: Array, pitch_um: float, x_um: Array, y_um: Array) -> Array:
-    """Phase of a map between its samples, (y, x), by bilinear interpolation of the phasor exp(i phase).
-
-    Args:
-        phase_rad: (rows, columns) samples ``pitch_um`` apart, centred on the axis.
-        x_um: (x,) positions; y_um: (y,) positions, all inside the map.
-
-    Raises:
-        LensError: a position lies outside the map, or neighbouring samples differ by nearly half a turn, so
-            that the phase between them is not known.
-    """
-    rows, columns = phase_rad.shape
-    row, column = y_um / pitch_um + (rows - 1) / 2, x_um / pitch_um + (columns - 1) / 2
-    if min(row.min(), column.min()) < -0.5 or row.max() > rows - 0.5 or column.max() > columns - 0.5:
-        size = columns * pitch_um, rows * pitch_um
-        raise LensError(f"the phase map covers {size[0]:.1f} x {size[1]:.1f} um, less than the aperture")
-    phasor = np.exp(1j * phase_rad)
-    between = _blend(_blend(phasor, row).T, column).T
-    if np.abs(between).min() < 0.5:
-        i, j = np.unravel_index(int(np.abs(between).argmin()), between.shape)
-        raise LensError(
-            f"the phase map turns by more than 2/3 of half a turn between samples near row {row[i]:.1f}, "
-            f"column {column[j]:.1f}; give it on a finer pitch than {pitch_um} um"
-        )
-    return np.asarray(np.angle(between))
-
-
-def _blend(samples: Array, position: Array) -> Array:
-    """Linear interpolation along the first axis; positions beyond the ends take the end sample."""
-    low = np.clip(np.floor(position).astype(int), 0, len(samples) - 2)
-    weight = np.clip(position - low, 0, 1)[:, None]
-    return np.asarray(samples[low] * (1 - weight) + samples[low + 1] * weight)

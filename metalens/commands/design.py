@@ -85,6 +85,9 @@ def run(options: Options) -> int:
     target = options.claim(options.output)
     cell, proxy, inputs = _pillars(wanted, options.config, options.console)
     inputs[options.config.name] = store.sha256(options.config)
+    own = _located(wanted, options.config)
+    if wanted.profile == "map" and own is not None and own.file.is_file():
+        inputs[own.file.name] = store.sha256(own.file)
     radius_um = wanted.aperture_mm * 500
     phase, focus = _phase(wanted, options, radius_um)
     made, quality = design.make(
@@ -145,7 +148,7 @@ def _located(wanted: Design, where: Path) -> PhaseMap | None:
     """The phase map with its file relative to the config."""
     if wanted.map is None:
         return None
-    return PhaseMap(where.parent / wanted.map.file, wanted.map.pitch_um, wanted.map.add_focus)
+    return replace(wanted.map, file=where.parent / wanted.map.file)
 
 
 def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from metalens import design, lens, profiles
+from metalens import design, lens, phase_map, profiles
 from metalens.cell import Cell, Index
 from metalens.design import Limits
 from metalens.errors import ConfigError, LensError
@@ -128,7 +128,7 @@ def test_bad_maps_are_refused(tmp_path, array, message):
 
 def test_missing_map_and_bad_settings_are_refused(tmp_path):
     with pytest.raises(LensError, match="no such file"):
-        profiles.read_map(PhaseMap(tmp_path / "absent.npy", 1.0))
+        phase_map.read(PhaseMap(tmp_path / "absent.npy", 1.0))
     with pytest.raises(ConfigError, match="zones"):
         DoubleHelix(zones=0)
     with pytest.raises(LensError, match="source_distance_um"):
