@@ -10,6 +10,7 @@ from codesign.architecture import Architecture
 from codesign.eye_scenes import EyeScenes
 from codesign.formation import read_out
 from codesign.inner import InnerConfig, Trainer
+from codesign.optics import Stack
 from codesign.supernet import Supernet, recalibrate
 from metalens.scene import image
 
@@ -44,9 +45,9 @@ class Assessment:
 
 
 @torch.no_grad()
-def frames(trainer: Trainer, scenes: EyeScenes, batches: int) -> Seen:
-    """Frames through the lens and sensor as they are now, with fixed noise."""
-    made = lens.stack(trainer.optics, trainer.model.coefficients_rad)
+def frames(trainer: Trainer, scenes: EyeScenes, batches: int, *, stack: Stack | None = None) -> Seen:
+    """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
+    made = stack or lens.stack(trainer.optics, trainer.model.coefficients_rad)
     pixels, masks, slips = [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)

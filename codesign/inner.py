@@ -18,7 +18,7 @@ from codesign import losses
 from codesign import optics as lens
 from codesign.architecture import Architecture, Space, largest, sample, smallest
 from codesign.formation import depth_loss, network_macs, read_out
-from codesign.optics import OpticsConfig
+from codesign.optics import OpticsConfig, Stack
 from codesign.supernet import Supernet
 from metalens.errors import ConfigError, TrainingError
 from metalens.scene import Frames, Imager, image
@@ -163,9 +163,12 @@ class Trainer:
         made: Model,
         *,
         architecture: Architecture | None = None,
+        stacks: Sequence[Stack] = (),
     ) -> None:
+        """``stacks``: PSFs of a lens that is already made; every step draws one of them, and no optics move."""
         self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
-        self.architecture = architecture
+        self.architecture, self.stacks = architecture, tuple(stacks)
+        self._imagers: dict[int, Imager] = {}
         self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, list(made.net.parameters())),
             "optics": (inner.optics, [made.coefficients_rad] if made.coefficients_rad.numel() else []),
@@ -248,6 +251,8 @@ class Trainer:
 
     def _light(self, frames: Frames, live: bool) -> tuple[Imager, Tensor]:
         """Imager of this step, and the optics loss; kept from step to step while the optics are fixed."""
+        if self.stacks:
+            return self._given(frames.radiance.shape[-1]), torch.zeros(())
         spread = self._lens_error()
         if not live and spread is None and self._imager is not None:
             return self._imager, torch.zeros(())
@@ -255,6 +260,13 @@ class Trainer:
         prepared = lens.prepared(self.optics, made, frames.radiance.shape[-1], margin=self.scenes.margin)
         self._imager = None if live or spread is not None else prepared
         return prepared, depth_loss(made, self.optics, energy=self.inner.energy)
+
+    def _given(self, frame: int) -> Imager:
+        """Imager of the given PSFs that this step draws."""
+        drawn = int(np.random.default_rng([self.inner.seed, self.step, 4]).integers(len(self.stacks)))
+        if drawn not in self._imagers:
+            self._imagers[drawn] = lens.prepared(self.optics, self.stacks[drawn], frame, margin=self.scenes.margin)
+        return self._imagers[drawn]
 
     def _lens_error(self) -> Tensor | None:
         spread = self.optics.spread
