@@ -3,16 +3,16 @@ of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals ov
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from codesign.dataset import triplets
+from codesign.dataset import Triplets, triplets
 from codesign.eye import Rig, States
 from codesign.renderer import Camera, Rendered
 from metalens import scene
-from metalens.errors import SceneError
+from metalens.errors import ConfigError, SceneError
 from metalens.fisher import Normalisation, axial_information, encircled_energy
 from metalens.lens import Lens
 from metalens.psf import View, from_lens
@@ -41,6 +41,50 @@ class Setting:
     radius_um: float = 18.0
     tolerance: float = 1e-3
 
+    def __post_init__(self) -> None:
+        low, high = self.depths_mm
+        if not (0 < low <= high and self.count >= 1 and self.angles_deg and self.binnings and min(self.binnings) >= 1):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
+                f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
+            )
+        if not (self.window_um >= 4 * self.sample_um > 0 and self.pixel_um > 0 and self.radius_um > 0):
+            raise ConfigError(
+                f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
+                f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """What the sensitivity of whole scenes is measured on.
+
+    count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the paper's kind of step).
+    pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the light within it.
+    """
+
+    count: int = 24
+    seed: int = 11
+    gaze_step_deg: float = 1.0
+    slip_step_mm: float = 0.5
+    pitch_um: float = 6.0
+    pixels: int = 240
+    window_um: float = 288.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= 100_000:
+            raise ConfigError(f"count = {self.count} scenes: need 1 to 100000")
+        if not (0 < abs(self.gaze_step_deg) <= 20 and 0 < abs(self.slip_step_mm) <= 5):
+            raise ConfigError(
+                f"gaze_step_deg = {self.gaze_step_deg}, slip_step_mm = {self.slip_step_mm}: need steps other than 0, "
+                "up to 20 degrees and 5 mm"
+            )
+        if not (self.window_um >= 4 * self.pitch_um > 0 and 8 <= self.pixels <= 4096):
+            raise ConfigError(
+                f"window_um = {self.window_um}, pitch_um = {self.pitch_um}, pixels = {self.pixels}: need a pitch above "
+                "0, a window of four pixels or more, and 8 to 4096 pixels"
+            )
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Axial:
@@ -48,11 +92,13 @@ class Axial:
 
     information: (angles, binnings, depths) per mm², over sub-pixel positions. encircled: (angles, depths) share of the
     light through the lens that falls within the radius of the PSF's centroid. psf_error: estimate of the engine.
+    slices: (depths, x) the light on axis summed over y, on samples: what a line across the PSF's image shows.
     """
 
     information: Tensor
     encircled: Tensor
     psf_error: float
+    slices: Tensor
 
 
 def axial(lens: Lens, setting: Setting | None = None) -> Axial:
@@ -78,10 +124,10 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
             )
         )
     light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(len(angles), s.count)
-    passed = float((lens.transmission() ** 2).sum()) * lens.diameters.pitch_um**2
-    share = light / passed / torch.cos(torch.tensor([a for a, _ in angles]))[:, None]
+    share = light / passed_um2(lens) / torch.cos(torch.tensor([a for a, _ in angles]))[:, None]
     inside = encircled_energy(_centred(intensity[:, 0]), s.sample_um, radius_um=s.radius_um)
-    return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error))
+    slices = intensity[0, 0].sum(1)
+    return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error), slices)
 
 
 def _centred(intensity: Tensor) -> Tensor:
@@ -100,87 +146,97 @@ class SceneEnergy:
     """Table 1 of one lens: (scenes,) squared differences of energy-matched images, summed over pixels.
 
     gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
+    light: least share of the light through the lens that the PSFs' window holds, over the depths of the scenes.
+    maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared difference of gaze and slip (Fig. 5).
     """
 
     gaze: Tensor
     slip: Tensor
     separability: Tensor
+    light: float
+    maps: Tensor
+
+    @property
+    def angle_rad(self) -> Tensor:
+        """(scenes,) span angle of Eq. 5 between the changes with gaze and with slip."""
+        along = (self.gaze + self.slip - self.separability) / (2 * torch.sqrt(self.gaze * self.slip).clamp_min(1e-300))
+        return torch.arccos(along.clamp(-1, 1))
 
 
 def scene_energies(
-    lenses: Sequence[Lens],
-    states: States,
-    *,
-    gaze_step_rad: float = math.radians(1.0),
-    slip_step_um: float = 500.0,
-    pitch_um: float = 6.0,
-    pixels: int = 256,
-    window_um: float = 192.0,
+    lenses: Sequence[Lens], states: States, settings: Scenes | None = None, *, views: Triplets | None = None
 ) -> list[SceneEnergy]:
     """Table 1: how much the images of the same scenes change with gaze and with axial slip.
 
     Images of all lenses are scaled to the same mean (the paper normalises the PSFs' sums). The steps are the paper's
     kind of perturbation, not infinitesimal ones.
 
+    Args:
+        views: rendered triplets of the states, where they are at hand.
+
     Raises:
-        SceneError: no lens is given.
+        SceneError: no lens is given, or they differ in their sensor distance.
     """
     if not lenses:
         raise SceneError("no lens to evaluate; give at least one")
-    rig = Rig()
-    camera = Camera(pixels, pitch_um)
-    views = triplets(states, gaze_step_rad=gaze_step_rad, slip_step_um=slip_step_um, rig=rig, camera=camera)
+    settings = settings or Scenes()
+    distance = lenses[0].sensor_distance_um
+    for number, lens in enumerate(lenses):
+        if abs(lens.sensor_distance_um / distance - 1) > 1e-3:
+            raise SceneError(
+                f"lens {number + 1} is made for a sensor at {lens.sensor_distance_um} um, the first for {distance} um: "
+                "their images differ in size; compare lenses of one sensor distance"
+            )
+    views = views or scene_views(states, settings, sensor_distance_um=distance)
     out = []
     for lens in lenses:
-        basis = lens_basis(lens, (views.anchor, views.gaze, views.slip), pitch_um=pitch_um, window_um=window_um)
-        optics = scene.imager(basis, (pixels, pixels))
-        images = [scene.image(v.frames, optics) for v in (views.anchor, views.gaze, views.slip)]
-        anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
-        sums = [((a - b) ** 2).sum((1, 2)) for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
-        out.append(SceneEnergy(*sums))
+        rendered = (views.anchor, views.gaze, views.slip)
+        basis, light = lens_basis(lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um)
+        out.append(energies_of(scene.imager(basis, (settings.pixels, settings.pixels)), views, light=light))
     return out
 
 
+def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0) -> Triplets:
+    """Anchor, gaze and slip views of the states."""
+    return triplets(
+        states,
+        gaze_step_rad=math.radians(settings.gaze_step_deg),
+        slip_step_um=1e3 * settings.slip_step_mm,
+        rig=replace(Rig(), sensor_distance_um=sensor_distance_um),
+        camera=Camera(settings.pixels, settings.pitch_um),
+    )
+
+
+def energies_of(optics: scene.Imager, views: Triplets, *, light: float = 1.0) -> SceneEnergy:
+    """Table 1 of any PSFs, see :func:`scene_energies`."""
+    images = [scene.image(v.frames, optics) for v in (views.anchor, views.gaze, views.slip)]
+    anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
+    maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
+    sums = [m.sum((1, 2)) for m in maps]
+    return SceneEnergy(sums[0], sums[1], sums[2], light, torch.stack([anchor[0], maps[0][0], maps[2][0]]))
+
+
 def lens_basis(
-    lens: Lens, views: Sequence[Rendered], *, pitch_um: float, window_um: float = 192.0, tolerance: float = 1e-3
-) -> scene.PsfBasis:
-    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few kernels."""
+    lens: Lens, views: Sequence[Rendered], *, pitch_um: float, window_um: float = 288.0, tolerance: float = 1e-3
+) -> tuple[scene.PsfBasis, float]:
+    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few kernels of sum 1.
+
+    Also the least share of the light through the lens that the window holds: what lies outside is left out of the
+    images, where a real sensor would show it as haze.
+    """
     seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
     low, high = max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
     count = max(2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1)  # 0.5 mm at the pupil, more beyond
     depths = 1 / torch.linspace(1 / high, 1 / low, count, dtype=torch.float64).flip(0)
     fine, window = max(1, math.ceil(pitch_um / 0.85)), 2 * math.ceil(window_um / (2 * pitch_um))
     view = View(tuple(depths.tolist()), ((0.0, 0.0),), window * pitch_um, window * fine)
-    stack = torch.as_tensor(from_lens(lens, view, tolerance=1e-3).intensity).reshape(count, window * fine, -1)
-    pixels = integrate(stack, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1))  # odd: centred
-    return scene.basis(pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance)
+    stack = from_lens(lens, view, tolerance=1e-3)
+    intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
+    pixels = integrate(intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1))  # odd: centred
+    light = float(torch.as_tensor(stack.energy_um2).min()) / passed_um2(lens)
+    return scene.basis(pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance), min(light, 1.0)
 
 
-def ratio(values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0) -> tuple[float, float, float]:
-    """Ratio of means over scenes and its 95 % interval, by a paired bootstrap over the scenes."""
-    rng = np.random.default_rng(seed)
-    a, b = values.double().numpy(), reference.double().numpy()
-    rows = rng.integers(0, len(a), (draws, len(a)))
-    low, high = np.quantile(a[rows].mean(1) / b[rows].mean(1), [0.025, 0.975])
-    return float(a.mean() / b.mean()), float(low), float(high)
-
-
-def tables(names: Sequence[str], lenses: Sequence[Lens], states: States, *, setting: Setting | None = None) -> str:
-    """Tables 1 and 3 of the paper for these lenses, as text; ratios are against the first lens."""
-    s = setting or Setting()
-    lines = [f"Axial information I(z), {s.normalisation} normalisation, mean over {s.depths_mm} mm, per mm²"]
-    lines.append(f"{'lens':<20}" + "".join(f"{a:>9g}deg" for a in s.angles_deg) + "   binning   least encircled energy")
-    for name, lens in zip(names, lenses, strict=True):
-        found = axial(lens, s)
-        for k, b in enumerate(s.binnings):
-            row = "".join(f"{float(v):12.3f}" for v in found.information[:, k].mean(-1))
-            lines.append(f"{name if k == 0 else '':<20}{row}   {b} x {b}     {float(found.encircled[0].min()):.2f}")
-    energies = scene_energies(lenses, states)
-    lines += ["", f"Scenes: ratio to {names[0]}, 95 % interval over {len(states)} scenes"]
-    for name, e in zip(names, energies, strict=True):
-        parts = []
-        for kind in ("gaze", "slip", "separability"):
-            value, low, high = ratio(getattr(e, kind), getattr(energies[0], kind))
-            parts.append(f"{kind} {value:.2f} [{low:.2f}, {high:.2f}]")
-        lines.append(f"{name:<20}" + "   ".join(parts))
-    return "\n".join(lines)
+def passed_um2(lens: Lens) -> float:
+    """Light through the lens at unit irradiance: sum of |T|² times the cell's area."""
+    return float((lens.transmission() ** 2).sum()) * lens.diameters.pitch_um**2

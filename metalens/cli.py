@@ -1,7 +1,7 @@
 """The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails its own check, 2 on bad input.
 
 A verb lives beside its stage, as a frozen dataclass of its options and a function ``run(options) -> int``; only
-the verb that is asked for is imported.
+the verb that is asked for is imported. A module with a table ``PARTS`` in place of them has verbs of its own.
 """
 
 import importlib
@@ -30,6 +30,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "lens.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
     "scene": ("codesign.command_scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
+    "evaluate": ("codesign.command_evaluate", "optics and more: the paper's tables and figures for your own files"),
     "layout": ("layout.command", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
     "capture": (
         "characterize.command_capture",
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        sys.stdout.write(_help())
+        sys.stdout.write(_help(VERBS))
         return SUCCESS if words else BAD_INPUT
     if words[0] == "--version":
         from metalens import __version__
@@ -68,13 +69,22 @@ def _dispatch(verb: str, words: list[str]) -> int:
     import tyro
 
     module = importlib.import_module(VERBS[verb][0])
+    parts: dict[str, tuple[str, str]] = getattr(module, "PARTS", {})
+    if parts:
+        if not words or words[0] in ("-h", "--help"):
+            sys.stdout.write(_help(parts, f"metalens {verb}"))
+            return SUCCESS if words else BAD_INPUT
+        if words[0] not in parts:
+            return _refuse(f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}")
+        module = importlib.import_module(parts[words[0]][0])
+        verb, words = f"{verb} {words[0]}", words[1:]
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
     return int(module.run(options))
 
 
-def _help() -> str:
-    rows = "\n".join(f"  {verb:<10} {summary}" for verb, (_, summary) in VERBS.items())
-    return f"usage: metalens COMMAND ... (metalens COMMAND --help for its options)\n\n{rows}\n"
+def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
+    rows = "\n".join(f"  {verb:<10} {summary}" for verb, (_, summary) in verbs.items())
+    return f"usage: {name} COMMAND ... ({name} COMMAND --help for its options)\n\n{rows}\n"
 
 
 def _refuse(message: str, status: int = BAD_INPUT) -> int:

@@ -30,11 +30,19 @@ def test_no_command_and_unknown_command_are_bad_input():
     assert "did you mean 'design'?" in done.stderr
 
 
-@pytest.mark.parametrize("verb", sorted(cli.VERBS))
+@pytest.mark.parametrize("verb", sorted(set(cli.VERBS) - {"evaluate"} | {"evaluate optics"}))
 def test_every_verb_has_help_and_names_its_options(verb):
-    done = run(verb, "--help")
+    done = run(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
     assert "--json" in done.stdout
+
+
+def test_verb_with_verbs_of_its_own_lists_them():
+    done = run("evaluate", "--help")
+    assert done.returncode == cli.SUCCESS
+    assert "  optics" in done.stdout
+    assert run("evaluate").returncode == cli.BAD_INPUT
+    assert "did you mean 'optics'?" in run("evaluate", "opticz").stderr
 
 
 def test_version():

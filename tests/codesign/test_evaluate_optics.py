@@ -8,7 +8,8 @@ import torch
 
 from codesign import dataset
 from codesign import evaluate_optics as evaluate
-from codesign.evaluate_optics import Setting
+from codesign.evaluate_optics import Scenes, Setting
+from codesign.evaluate_tables import ratio
 from metalens import design
 from metalens import pupil as pupils
 from metalens.cell import Cell, Index
@@ -52,8 +53,8 @@ def test_full_lens_agrees_with_the_pupil_model():
 def test_scene_energies_tell_lenses_apart():
     states = dataset.states_at(torch.arange(2), 2)
     lenses = [_lens(20e3), _lens(20e3, zones=3)]
-    plain, helix = evaluate.scene_energies(lenses, states, pixels=64, pitch_um=24.0, window_um=96.0)
-    assert evaluate.ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
+    plain, helix = evaluate.scene_energies(lenses, states, Scenes(pixels=64, pitch_um=24.0, window_um=96.0))
+    assert ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
     assert not torch.allclose(helix.gaze, plain.gaze, rtol=1e-3)
     assert bool((plain.separability > 0).all())
     assert bool((plain.separability <= 2 * (plain.gaze + plain.slip) * (1 + 1e-6)).all())  # triangle inequality
@@ -65,7 +66,7 @@ def test_bootstrap_interval_covers_the_true_ratio():
     for k in range(100):
         shared = rng.gamma(4.0, 1.0, 40)
         a, b = (torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40)) for level in (1.5, 1.0))
-        _, low, high = evaluate.ratio(a, b, draws=400, seed=k)
+        _, low, high = ratio(a, b, draws=400, seed=k)
         covered += low <= 1.5 <= high
     assert 85 <= covered <= 100  # 95 asked; binomial sd 2.2, percentile bootstrap of 40 scenes a little short
 

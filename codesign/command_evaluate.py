@@ -1,0 +1,9 @@
+"""What a lens, a run or the paper's claims are worth: ``metalens evaluate optics | ...``, a module each."""
+
+# sub-verb: (module that holds ``Options`` and ``run``, one line of help)
+PARTS: dict[str, tuple[str, str]] = {
+    "optics": (
+        "codesign.command_evaluate_optics",
+        "LENS... -> axial information, PSF slices and scene sensitivity of lenses (Tables 1 and 3, Figs. 5 and 7)",
+    ),
+}

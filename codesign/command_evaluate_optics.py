@@ -1,0 +1,88 @@
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
+
+import dataclasses
+import html
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+import tyro
+
+from codesign import evaluate_optics, evaluate_plots, evaluate_tables
+from codesign.dataset import states_at
+from codesign.evaluate_optics import Scenes, Setting
+from metalens import config, store
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.errors import ConfigError
+from metalens.report import Figure, Markup, Section, write
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The content of OPTICS.toml; every key may be left out.
+
+    axial: how the axial information is measured. scenes: what the scene table is made of.
+    """
+
+    axial: Setting = field(default_factory=Setting)
+    scenes: Scenes = field(default_factory=Scenes)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate optics``.
+
+    Attributes:
+        lenses: lens files; the first is what the others are compared with.
+        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
+        config: OPTICS.toml with the tables [axial] and [scenes]; without it the defaults.
+        scenes: number of scenes, in place of the one in the settings.
+    """
+
+    lenses: tyro.conf.Positional[tuple[Path, ...]]
+    output: Output = Path("optics")
+    config: Path | None = None
+    scenes: int | None = None
+
+
+def run(options: Options) -> int:
+    """Measure, print, draw, write."""
+    if not options.lenses:
+        raise ConfigError("no lens to evaluate; give at least one lens file")
+    settings = Settings() if options.config is None else config.load(options.config, Settings)
+    if options.scenes is not None:
+        settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
+    made = [lenses.load(path) for path in options.lenses]
+    names = distinct([path.stem for path in options.lenses])
+    folder = options.claim(options.output)
+    states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
+    pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
+    axial = {name: evaluate_optics.axial(lens, settings.axial) for name, lens in pairs}
+    scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
+    text = evaluate_tables.tables(axial, scenes, settings.axial)
+    values = evaluate_tables.values(axial, scenes, settings.axial)
+    folder.mkdir(exist_ok=True)
+    store.write_text(folder / "tables.txt", text + "\n")
+    store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
+    pictures = {
+        "axial": evaluate_plots.information(axial, settings.axial),
+        "slices": evaluate_plots.slices(axial, settings.axial),
+        "scenes": evaluate_plots.scenes(scenes),
+    }
+    for name, image in pictures.items():
+        store.write_bytes(folder / f"{name}.png", image)
+    items = [Figure(image, evaluate_plots.CAPTIONS[name], wide=True) for name, image in pictures.items()]
+    write(
+        folder / "report.html",
+        "What the lenses tell",
+        [Section("Pictures", items=items), Section("Tables", items=[Markup(f"<pre>{html.escape(text)}</pre>")])],
+    )
+    options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html")
+    return 0
+
+
+def distinct(names: list[str]) -> list[str]:
+    """Names of lenses, numbered where two files have the same stem."""
+    return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]
