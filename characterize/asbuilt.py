@@ -1,23 +1,47 @@
-"""The lens that was made, as a record and as a file: values, covariance, what can and what cannot be known."""
+"""The lens that was made, as a record and as a file: values, covariance, what can and what cannot be known.
+
+For those who build on it (retraining, mask correction)::
+
+    built = AsBuilt.load("asbuilt.h5")             # built.save(path) writes it
+    built.names, built.value, built.covariance     # (p,), (p,), (p, p) of the fitted parameters; built.sigma
+    built.trusted, built.problems                  # whether the fit passed its own checks
+    built.lens()                                   # Lens with the as-built diameters, wavelength and distance
+    built.diameters                                # its DiameterMap
+    built.pillars()                                # (y, x) complex t of every pillar: process and wave front too
+    built.psf                                      # PsfStack at the depths and angles of the captures
+    built.psf_stack(View(depths_um, angles_rad, window_um, samples))   # PsfStack anywhere else
+    draws = built.samples(16, seed=0)              # (16, p) from the posterior
+    built.psf_stack(view, draws[3])                # ... and the lens, pillars and PSFs of each:
+    built.lens(draws[3]), built.pillars(draws[3])
+
+PSFs hold all that belongs to the lens (pillars, process, aberrations, distance, wavelength), nothing of the bench.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from characterize.parameters import PLACE, bias_um, vector
+from characterize import made
+from characterize.parameters import PLACE, vector
+from characterize.pillars import Sensitivity
 from metalens import lens as lenses
 from metalens import store
 from metalens.lens import DiameterMap, Lens
+from metalens.psf_record import PsfStack
 from metalens.store import Array, Provenance
+
+if TYPE_CHECKING:
+    from metalens.psf_lens import View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AsBuilt:
     """Result of :func:`characterize.fit`.
 
-    design: the lens as designed. names, value, covariance: of the fitted parameters, priors included.
+    design: the lens as designed. response: what height, index and sidewall do to its pillars.
+    names, value, covariance: of the fitted parameters, priors included.
     held: {name: value} of parameters that were not fitted.
     information: Fisher information of the frames alone.
     depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the sensor.
@@ -26,9 +50,11 @@ class AsBuilt:
     identifiable: combinations of parameters that the frames alone fix, with their 1 sigma, best first, in words.
     degeneracies: what cannot be told apart, in words. cautions: everything that was put right or assumed.
     trusted: every check passed; problems: those that did not.
+    psf: of the lens as built at the true depths of the captures, (angle, depth, y, x); None before it is computed.
     """
 
     design: Lens
+    response: Sensitivity
     names: tuple[str, ...]
     value: Array
     covariance: Array
@@ -48,6 +74,7 @@ class AsBuilt:
     degeneracies: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
+    psf: PsfStack | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
     @property
@@ -77,7 +104,7 @@ class AsBuilt:
         fitted = self.value if value is None else value
         return vector(self.held | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True)))
 
-    def samples(self, count: int, *, seed: int) -> Array:
+    def samples(self, count: int, seed: int = 0) -> Array:
         """(count, p) draws of the fitted parameters from their (Gaussian) posterior, for training under uncertainty."""
         random = np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(self.covariance)
@@ -86,32 +113,39 @@ class AsBuilt:
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of :meth:`samples`."""
-        return built_lens(self.design, self.parameters(value))
+        return made.built_lens(self.design, self.parameters(value))
 
     @property
     def diameters(self) -> DiameterMap:
         """The as-built diameter map."""
         return self.lens().diameters
 
+    def pillars(self, value: Array | None = None) -> Array:
+        """(y, x) complex transmission of every as-built pillar at normal incidence, wave-front errors included."""
+        return made.pillars(self.design, self.response, self.parameters(value))
 
-def built_lens(design: Lens, x: Array) -> Lens:
-    """The design with the diameter bias and distance of a full parameter vector."""
-    d = design.diameters
-    radius = d.radius_um
-    u, v = np.meshgrid(d.x_um / radius, d.y_um / radius)
-    bias, _ = bias_um(x, u, v)
-    low, high = design.proxy.domain_um
-    grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
-    return Lens(
-        diameters=DiameterMap(np.where(d.diameter_um > 0, grown, 0.0), d.pitch_um),
-        cell=design.cell,
-        proxy=design.proxy,
-        wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
-        sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
-        source_distance_um=design.source_distance_um,
-        profile="as-built",
-        provenance=design.provenance,
-    )
+    def psf_stack(self, view: "View", value: Array | None = None, *, tolerance: float = 1e-4) -> PsfStack:
+        """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of :meth:`samples`.
+
+        Windows are centred on the chief ray of the best fit. A draw's own is moved by the difference of the two
+        decentres, so that draws differ by what the frames leave open and not by a gradient of the bias that
+        the decentre makes up for.
+
+        Raises:
+            PropagationError: as :func:`metalens.psf.psf_stack`.
+        """
+        x, best = self.parameters(value), self.parameters()
+        dx, dy = (float(x[PLACE[name]] - best[PLACE[name]]) for name in ("decentre_x_um", "decentre_y_um"))
+        return made.psf_stack(self.design, self.response, x, view, offset_um=(dx, dy), tolerance=tolerance)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file; see :func:`save`."""
+        save(path, self)
+
+    @staticmethod
+    def load(path: str | Path) -> "AsBuilt":
+        """Read the file; see :func:`load`."""
+        return load(path)
 
 
 _ARRAYS = (
@@ -125,6 +159,17 @@ _ARRAYS = (
     "nominal",
     "residual_sigma",
 )
+_PSF_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error")
+_PSF = (
+    "intensity",
+    "energy_um2",
+    "depths_um",
+    "angles_rad",
+    "wavelengths_um",
+    "weights",
+    "centres_um",
+    *_PSF_NUMBERS,
+)
 _WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems")
 
 
@@ -134,6 +179,9 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
+    arrays |= {"response/coefficients": result.response.coefficients}
+    if result.psf is not None:
+        arrays |= {f"psf/{name}": np.asarray(getattr(result.psf, name)) for name in _PSF}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
     design, about = lenses.parts(result.design, group="design/")
     arrays |= design | {"design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)}
@@ -142,6 +190,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
         "chi2_per_dof": result.chi2_per_dof,
         "converged": result.converged,
         "reason": result.reason,
+        "response_center_um": result.response.center_um,
     }
     store.save(path, "asbuilt", arrays, attributes=about, provenance=result.provenance)
 
@@ -159,6 +208,8 @@ def load(path: str | Path) -> AsBuilt:
     fields |= {name: tuple(w for w in _text(a[name]) if w) for name in _WORDS}
     return AsBuilt(
         design=design,
+        response=Sensitivity(a["response/coefficients"], about["response_center_um"]),
+        psf=_psf(a),
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],
         chi2_per_dof=about["chi2_per_dof"],
@@ -167,6 +218,14 @@ def load(path: str | Path) -> AsBuilt:
         provenance=stored.provenance,
         **fields,
     )
+
+
+def _psf(arrays: dict[str, Array]) -> PsfStack | None:
+    if "psf/intensity" not in arrays:
+        return None
+    fields: dict[str, Any] = {name: arrays[f"psf/{name}"] for name in _PSF}
+    fields |= {name: fields[name].item() for name in _PSF_NUMBERS}
+    return PsfStack(**fields, reason="as built, at the depths of the captures")
 
 
 def _text(array: Array) -> list[str]:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.forward import process, spectrum
-from characterize.parameters import ABERRATIONS, PLACE, Known, aberrations, bias_um, vector
-from characterize.pillars import Sensitivity, transmission
+from characterize import made
+from characterize.forward import spectrum
+from characterize.parameters import PLACE, Known, vector
+from characterize.pillars import Sensitivity, incidence_rad
 from metalens import psf
 from metalens.errors import FitError
 from metalens.lens import Lens
@@ -121,12 +122,13 @@ def _frame(
     (x, offset_nm, noise), (z, angle) = state, at
     x = x.copy()
     x[PLACE["wavelength_nm"]] += offset_nm
-    t = pillars(lens, response, x, noise)
     camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
     tilt = [math.radians(x[PLACE[f"tilt_{a}_deg"]]) for a in "xy"]
     chief = [math.tan(a) + math.tan(b) for a, b in zip(angle, tilt, strict=True)]
     source = [c - x[PLACE[f"source_{a}_um"]] / z for c, a in zip(chief, "xy", strict=True)]
     shift = [distance * (c - s) + x[PLACE[f"decentre_{a}_um"]] for c, s, a in zip(chief, source, "xy", strict=True)]
+    incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
+    t = made.pillars(lens, response, x, noise_um=noise, angle_rad=incidence)
     margin = 4
     side = camera.pixels + 2 * margin
     middle = 0.0 if camera.pixels % 2 else -camera.pixel_um / 2  # the chief ray meets pixel (n // 2, n // 2)
@@ -148,17 +150,6 @@ def _frame(
     light = _blur(light, x[PLACE["pinhole_um"]] * distance / z / step, x[PLACE["crosstalk_px"]] * FINE)
     pixels = light.reshape(side, FINE, side, FINE).sum((1, 3))
     return np.asarray(pixels[margin:-margin, margin:-margin])
-
-
-def pillars(lens: Lens, response: Sensitivity, x: Array, noise_um: Array | float = 0.0) -> Array:
-    """(y, x) complex transmission of every as-built pillar, aberrations included."""
-    d = lens.diameters
-    u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
-    bias, _ = bias_um(x, u, v)
-    wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
-    t = transmission(lens.proxy, response, d.diameter_um + bias + noise_um, wave, process(x))
-    strength = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
-    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.tensordot(strength, aberrations(u, v), 1)), 0))
 
 
 def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize import knowable, leastsquares
+from characterize import knowable, leastsquares, made
 from characterize.arrange import Arrangement, arrange, rearranged
 from characterize.asbuilt import AsBuilt
 from characterize.capture import Capture
 from characterize.clean import Frames, Gain, clean
-from characterize.forward import ForwardModel, Setting
+from characterize.forward import ForwardModel, Setting, true_depth
 from characterize.leastsquares import Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Sensitivity, sensitivity
 from metalens.errors import CaptureError, FitError
 from metalens.lens import Lens
+from metalens.psf_lens import View
+from metalens.psf_record import PsfStack
 from metalens.store import Array
 
 MISFIT, LIKENESS, LEAST_PEAK_E = 1.15, 0.45, 100.0
@@ -267,6 +269,8 @@ def _result(
     held = {name: float(start[PLACE[name]]) for name in NAMES if name not in fitted}
     return AsBuilt(
         design=lens,
+        response=model.response,
+        psf=_psf(lens, model, _full(names, solution, start)),
         names=names,
         value=solution.value,
         covariance=_with_gain(names, solution, gain),
@@ -287,6 +291,17 @@ def _result(
         cautions=tuple(cautions),
         problems=tuple(_problems(names, solution, prior, gain.known)),
     )
+
+
+def _psf(lens: Lens, model: ForwardModel, x: Array) -> PsfStack:
+    """PSFs of the as-built lens at the true depths of the frames, as fine as the light is, on the fitted window."""
+    s = model.setting
+    depths = np.unique(np.round(true_depth(x, s, model.stage_centre_um), 3))
+    side = max(s.rows, s.columns)
+    samples = side * model.grid.oversample
+    angles = tuple((float(a[0]), float(a[1])) for a in np.unique(s.angle_rad, axis=0))
+    view = View(tuple(depths.tolist()), angles, side * s.pixel_um, samples)
+    return made.psf_stack(lens, model.response, x, view, tolerance=1e-3)
 
 
 def _with_gain(names: tuple[str, ...], solution: Solution, gain: Gain) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from characterize import detector
 from characterize.parameters import ABERRATIONS, BIAS, NAMES, PLACE, aberrations, bias_um
-from characterize.pillars import Pillars, Process, Range, Sensitivity
+from characterize.pillars import Pillars, Range, Sensitivity, incidence_rad, process
 from characterize.reduced import Bench, Operators, Reduced, sensor_path, source_path
 from metalens.errors import FitError
 from metalens.lens import Lens
@@ -63,6 +63,7 @@ class _Group:
     """Frames of one field angle."""
 
     index: Array
+    pillars: Pillars
     reduced: Reduced
     zernike: Array
     bias: Array
@@ -71,7 +72,7 @@ class _Group:
 class ForwardModel:
     """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
 
-    Accuracy: of the pillars ``pillars.error`` in t, of the geometry ``setting.tolerance`` in the field; a test and the
+    Accuracy: of the pillars ``Pillars.error`` in t, of the geometry ``setting.tolerance`` in the field; a test and the
     benchmark hold both against the sum over all pillars.
     """
 
@@ -81,7 +82,8 @@ class ForwardModel:
         sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
         over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
-        self.pillars = Pillars(lens, response, span=span)
+        self.response, self._span = response, span
+        self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
         self.stage_centre_um = float(setting.depth_um.mean())
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
@@ -95,11 +97,13 @@ class ForwardModel:
         bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
         window = (max(setting.rows, setting.columns) + 2 * setting.margin) * setting.pixel_um + 20.0
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
-        reduced = Reduced(
-            self.lens, self.pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance
-        )
+        incidence = incidence_rad(self.lens.proxy, angle_rad)
+        if incidence not in self._pillars:
+            self._pillars[incidence] = Pillars(self.lens, self.response, span=self._span, angle_rad=incidence)
+        pillars = self._pillars[incidence]
+        reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
         _, maps = bias_um(np.zeros(len(NAMES)), reduced.u, reduced.v)
-        return _Group(index, reduced, aberrations(reduced.u, reduced.v), maps)
+        return _Group(index, pillars, reduced, aberrations(reduced.u, reduced.v), maps)
 
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
@@ -212,12 +216,12 @@ class ForwardModel:
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, and by height, index, sidewall units."""
         bias, _ = bias_um(x, group.reduced.u, group.reduced.v)
-        reach = self.pillars.span.bias_um
-        weight, rate = self.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
+        reach = group.pillars.span.bias_um
+        weight, rate = group.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
         change = process(x)
         gathered = group.reduced.gathered
         r, b, shape = len(gathered), len(weight), gathered.shape[1:]
-        values = self.pillars.coefficients(change)
+        values = group.pillars.coefficients(change)
 
         def combine(w: Array, c: Array) -> Array:
             return np.asarray(((c.T @ w.reshape(b, -1)).reshape(r, *shape) * gathered).sum(0))
@@ -226,7 +230,7 @@ class ForwardModel:
         if not slopes:
             return pupil, pupil, pupil
         units = (1e-3, 1.0, math.pi / 180)
-        by_process = [combine(weight, c) * u for c, u in zip(self.pillars.slopes(change), units, strict=True)]
+        by_process = [combine(weight, c) * u for c, u in zip(group.pillars.slopes(change), units, strict=True)]
         return pupil, combine(rate, values), np.stack(by_process)
 
     def _phase(self, x: Array, group: _Group) -> Array:
@@ -296,16 +300,6 @@ def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
     stated = setting.depth_um
     depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - centre_um)
     return np.asarray(np.maximum(depth, 0.2 * stated))
-
-
-def process(x: Array) -> Process:
-    """The pillars' change that the parameters mean."""
-    return Process(
-        x[PLACE["height_nm"]] * 1e-3,
-        x[PLACE["index"]],
-        math.radians(x[PLACE["sidewall_deg"]]),
-        x[PLACE["wavelength_nm"]] * 1e-3,
-    )
 
 
 def spectrum(bandwidth_nm: float) -> list[tuple[float, float]]:

@@ -5,10 +5,12 @@ summing the lens once for each u_k makes every change of process act on coarse n
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.parameters import PLACE
 from metalens.cell import Index
 from metalens.errors import FitError
 from metalens.lens import Lens
@@ -100,10 +102,16 @@ class Pillars:
     """
 
     def __init__(
-        self, lens: Lens, response: Sensitivity, *, span: Range | None = None, tolerance: float = 3e-5
+        self,
+        lens: Lens,
+        response: Sensitivity,
+        *,
+        span: Range | None = None,
+        tolerance: float = 3e-5,
+        angle_rad: float = 0.0,
     ) -> None:
         span = span or Range()
-        self.lens, self.response, self.span = lens, response, span
+        self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
         built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
         b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
@@ -118,7 +126,7 @@ class Pillars:
         """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
-        return transmission(self.lens.proxy, self.response, d, wave, change)
+        return transmission(self.lens.proxy, self.response, d, wave, change, angle_rad=self.angle_rad)
 
     def coefficients(self, change: Process) -> Array:
         """(b, r) coefficients of t in the basis at the bias nodes."""
@@ -169,8 +177,32 @@ class Pillars:
         return worst
 
 
-def transmission(proxy: Proxy, response: Sensitivity, d_um: Array, wavelength_um: float, change: Process) -> Array:
-    """Complex t of pillars of diameter ``d_um`` (any shape) under a change of process.
+def process(x: Array) -> Process:
+    """The pillars' change that the parameters mean."""
+    return Process(
+        x[PLACE["height_nm"]] * 1e-3,
+        x[PLACE["index"]],
+        math.radians(x[PLACE["sidewall_deg"]]),
+        x[PLACE["wavelength_nm"]] * 1e-3,
+    )
+
+
+def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
+    """Angle of incidence for a field angle (x, y): 0 where the proxy holds at normal incidence only."""
+    tilt = math.atan(math.hypot(*(math.tan(a) for a in angle_rad)))
+    return tilt if proxy.max_angle_rad > 0 else 0.0
+
+
+def transmission(
+    proxy: Proxy,
+    response: Sensitivity,
+    d_um: Array,
+    wavelength_um: float,
+    change: Process,
+    *,
+    angle_rad: float = 0.0,
+) -> Array:
+    """Complex t of pillars of diameter ``d_um`` (any shape) under a change of process, at an angle of incidence.
 
     Beyond the ends of the proxy's domain phase and |T| go on along their tangents (held within 0 to 1).
 
@@ -183,8 +215,12 @@ def transmission(proxy: Proxy, response: Sensitivity, d_um: Array, wavelength_um
     wave = low if high == low else wavelength_um
     inside = np.clip(d_um, *proxy.domain_um)
     beyond = d_um - inside
-    phase = proxy.phase_rad(inside, wave) + beyond * proxy.dphase_ddiameter(inside, wave)
-    level = np.clip(proxy.transmission(inside, wave) + beyond * proxy.dtransmission_ddiameter(inside, wave), 0, 1)
+    phase = proxy.phase_rad(inside, wave, angle_rad) + beyond * proxy.dphase_ddiameter(inside, wave, angle_rad)
+    level = np.clip(
+        proxy.transmission(inside, wave, angle_rad) + beyond * proxy.dtransmission_ddiameter(inside, wave, angle_rad),
+        0,
+        1,
+    )
     amounts = [getattr(change, name) for name in CHANGES]
     return np.asarray(level * np.exp(1j * phase + np.tensordot(amounts, response.at(d_um), 1)))
 

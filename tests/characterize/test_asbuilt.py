@@ -11,13 +11,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import bench_lens as b
 
 import characterize
-from characterize import asbuilt
+from characterize import asbuilt, made
+from characterize.asbuilt import AsBuilt
 from characterize.estimate import Options
 from characterize.forward import ForwardModel, Setting
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Pillars, sensitivity
 from metalens import psf
 from metalens.errors import CaptureError, ConfigError, FitError
+from metalens.psf_lens import View
 
 SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
 USUAL = Options(scan_um=60.0)
@@ -101,6 +103,31 @@ def test_saved_result_comes_back(fitted, tmp_path):
     assert again.samples(3, seed=1).shape == (3, len(fitted.names))
     asbuilt.save(tmp_path / "b.h5", fitted)
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
+    """The stored stack, through the pixels, is what the fit predicts; a draw of the posterior gives another one."""
+    fitted.save(tmp_path / "a.h5")
+    again = AsBuilt.load(tmp_path / "a.h5")
+    assert np.array_equal(again.psf.intensity, fitted.psf.intensity)
+    true = b.truth().vector()
+    want = psf.psf_stack(
+        *(f(made.pillars(b.lens(), b.RESPONSE, true)) for f in (np.angle, np.abs)),
+        pitch_um=0.4,
+        wavelength_um=0.85 + 0.4e-3,
+        sensor_distance_um=112.0,
+        depths_um=again.psf.depths_um,
+        window_um=24.0,
+        samples=again.psf.intensity.shape[-1],
+        offset_um=[b.VALUES[n] - fitted.value[fitted.names.index(n)] for n in ("decentre_x_um", "decentre_y_um")],
+    )
+    found = again.psf.intensity[0]
+    assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(want.intensity)  # intervals of the fit
+    view = View((600.0,), ((0.0, 0.0), (0.05, 0.0)), 24.0, 48)
+    draw = again.psf_stack(view, again.samples(1, seed=2)[0])
+    best = again.psf_stack(view)
+    assert draw.intensity.shape == (2, 1, 48, 48)
+    assert 1e-4 < np.linalg.norm(draw.intensity - best.intensity) / np.linalg.norm(best.intensity) < 0.05
 
 
 def test_samples_have_the_posterior_covariance(fitted):

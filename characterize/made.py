@@ -1,0 +1,97 @@
+"""Every pillar of an as-built lens: its transmission, the lens it makes, and the PSFs of that lens."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from characterize.parameters import ABERRATIONS, PLACE, aberrations, bias_um
+from characterize.pillars import Sensitivity, incidence_rad, process, transmission
+from metalens.lens import DiameterMap, Lens
+from metalens.store import Array
+
+if TYPE_CHECKING:
+    from metalens.psf_lens import View
+    from metalens.psf_record import PsfStack
+
+
+def pillars(
+    lens: Lens, response: Sensitivity, x: Array, *, noise_um: Array | float = 0.0, angle_rad: float = 0.0
+) -> Array:
+    """(y, x) complex transmission of every as-built pillar: diameter, process and wave-front aberrations.
+
+    Args:
+        x: all parameters, in the order of ``parameters.NAMES``.
+        noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence, where the proxy knows angles.
+    """
+    d = lens.diameters
+    u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
+    bias, _ = bias_um(x, u, v)
+    wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
+    t = transmission(lens.proxy, response, d.diameter_um + bias + noise_um, wave, process(x), angle_rad=angle_rad)
+    strength = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
+    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.tensordot(strength, aberrations(u, v), 1)), 0))
+
+
+def built_lens(design: Lens, x: Array) -> Lens:
+    """The design with the as-built diameters, wavelength and distance; they are clipped to the proxy's domain.
+
+    Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and :func:`psf_stack` hold them.
+    """
+    d = design.diameters
+    radius = d.radius_um
+    u, v = np.meshgrid(d.x_um / radius, d.y_um / radius)
+    bias, _ = bias_um(x, u, v)
+    low, high = design.proxy.domain_um
+    grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
+    return Lens(
+        diameters=DiameterMap(np.where(d.diameter_um > 0, grown, 0.0), d.pitch_um),
+        cell=design.cell,
+        proxy=design.proxy,
+        wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+        sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
+        source_distance_um=design.source_distance_um,
+        profile="as-built",
+        provenance=design.provenance,
+    )
+
+
+def psf_stack(
+    lens: Lens,
+    response: Sensitivity,
+    x: Array,
+    view: "View",
+    *,
+    offset_um: tuple[float, float] = (0.0, 0.0),
+    tolerance: float = 1e-4,
+) -> "PsfStack":
+    """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs: :func:`metalens.psf.psf_stack`.
+
+    Pillars, process, aberrations and distance enter; what belongs to one bench (stage, decentre, source size,
+    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the chief ray. Accuracy:
+    ``error`` of the record, relative L2.
+    """
+    from metalens import psf
+
+    parts = []
+    for angle in view.angles_rad:
+        t = pillars(lens, response, x, angle_rad=incidence_rad(lens.proxy, angle))
+        parts.append(
+            psf.psf_stack(
+                np.angle(t).astype(np.float32),
+                np.abs(t).astype(np.float32),
+                pitch_um=lens.diameters.pitch_um,
+                wavelength_um=lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+                sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
+                depths_um=np.array(view.depths_um),
+                angle_rad=[list(angle)],
+                window_um=view.window_um,
+                samples=view.samples,
+                tolerance=tolerance,
+                offset_um=offset_um,
+            )
+        )
+    worst = max(parts, key=lambda part: part.error)
+    fields = ("intensity", "energy_um2", "angles_rad", "centres_um")
+    join: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+    return dataclasses.replace(worst, **join)
