@@ -8,8 +8,6 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from characterize import bench, capture, sem
-from characterize.asbuilt import AsBuilt
-from characterize.estimate import Options, fit
 from characterize.forward import ForwardModel, Setting
 from characterize.parameters import vector
 from characterize.pupil import PupilSpec
@@ -18,16 +16,13 @@ from characterize.pupilfit import fit_pupil
 ROOT = Path(__file__).parents[1]
 BEADS = ROOT.parent / "shared" / "captures" / "bead_stack" / "psf_wl520nm_z300nm_x130nm_na0.85_n1.0.tif"
 sys.path.insert(0, str(ROOT / "tests" / "characterize"))
-SEEDS = 100
 
 
 def rows() -> list[Row]:
-    """All rows; the seeds take some minutes."""
+    """All rows; a hundred hidden lenses are in ``characterize_study``."""
     return [
         *_beads(),
         *_reduced(),
-        *_seeds(8000.0, SEEDS, "<= 1.10"),
-        *_seeds(200.0, SEEDS, "<= 1.25"),
         *_micrographs(),
     ]
 
@@ -77,48 +72,6 @@ def _reduced() -> list[Row]:
             goal=f"<= 1e-3; {full / quick:.0f} times faster",
         ),
     ]
-
-
-def _seeds(peak_e: float, count: int, goal: str) -> list[Row]:
-    import bench_lens as b
-
-    light = b.electrons(peak_e)
-    start = time.perf_counter()
-    results = [
-        fit(b.capture(light, seed=seed), b.lens(), Options(scan_um=60.0, insist=True), response=b.RESPONSE)
-        for seed in range(count)
-    ]
-    seconds = (time.perf_counter() - start) / count
-    z = np.array([_normalised(result, b.VALUES) for result in results])
-    covered = float((np.abs(z) < 1.96).mean())
-    chi2 = np.array([result.chi2_per_dof for result in results])
-    held = [float(np.linalg.norm(r.predicted - light) / np.linalg.norm(light - 20)) for r in results]
-    case = f"{count} seeds, peak {peak_e:.0f} e"
-    return [
-        Row(
-            case,
-            "rms error in sigma along identifiable directions",
-            seconds,
-            float(np.sqrt((z**2).mean())),
-            "truth",
-            goal=goal,
-        ),
-        Row(case, "coverage of 95 % intervals, shortfall", seconds, 0.95 - covered, "truth", goal="0.92 to 0.98"),
-        Row(case, "predicted frames, mean NRMSE", seconds, float(np.mean(held)), "noise-free truth", goal="<= 0.01"),
-        Row(case, "chi-square per degree, mean less 1", seconds, float(chi2.mean() - 1), "1", goal="within 0.05"),
-        Row(case, "fits with problems", seconds, float(np.mean([not r.trusted for r in results])), "none", goal="0"),
-    ]
-
-
-def _normalised(result: AsBuilt, truth: dict[str, float]) -> np.ndarray:
-    """Errors along the eigenvectors of the correlation matrix that the frames determine, in sigma of each."""
-    keep = [i for i, name in enumerate(result.names) if name != "log_gain"]
-    error = np.array([result.value[i] - truth.get(result.names[i], 0.0) for i in keep])
-    covariance = result.covariance[np.ix_(keep, keep)]
-    size = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-    good = values < 1.0  # the wide ones are held by prior knowledge
-    return np.asarray((vectors.T @ (error / size))[good] / np.sqrt(values[good]))
 
 
 def _micrographs() -> list[Row]:

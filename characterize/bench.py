@@ -85,8 +85,7 @@ def shoot(lens: Lens, truth: Truth, response: Sensitivity) -> Shots:
     """Frames with noise; the same seed gives the same frames."""
     random = np.random.default_rng(truth.seed)
     light = irradiance(lens, truth, response)
-    x = truth.vector()
-    electrons = light * (truth.peak_e / light.max()) + _background(x, truth.camera)
+    electrons = light * (truth.peak_e / light.max()) + background(truth)
     camera = truth.camera
     hot = random.random(electrons.shape[1:]) < camera.hot_share
     frames = np.stack([_read(frame, camera, random, hot) for frame in electrons])
@@ -162,7 +161,9 @@ def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:
     return np.asarray(ndimage.gaussian_filter(light, gauss_px, truncate=6) if gauss_px > 0 else light)
 
 
-def _background(x: Array, camera: Camera) -> Array:
+def background(truth: Truth) -> Array:
+    """(y, x) electrons of the background plane."""
+    x, camera = truth.vector(), truth.camera
     n = camera.pixels
     edge = (np.arange(n) - n // 2) / (n / 2)
     plane = x[PLACE["background_e"]] + x[PLACE["background_x_e"]] * edge + x[PLACE["background_y_e"]] * edge[:, None]

@@ -93,4 +93,4 @@ def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, 
 def electrons(peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float) -> np.ndarray:
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
-    return bright * (peak_e / bright.max()) + bench._background(truth(**more).vector(), truth().camera)
+    return bright * (peak_e / bright.max()) + bench.background(truth(**more))
