@@ -7,12 +7,11 @@ import torch
 from codesign import losses
 from codesign import optics as lens
 from codesign.architecture import Architecture
-from codesign.eye_scenes import EyeScenes
+from codesign.flat import irradiance, samples
 from codesign.formation import read_out
-from codesign.inner import InnerConfig, Trainer
+from codesign.inner import InnerConfig, Scenes, Trainer
 from codesign.optics import Stack
 from codesign.supernet import Supernet, recalibrate
-from metalens.scene import image
 
 Tensor = torch.Tensor
 
@@ -45,20 +44,44 @@ class Assessment:
 
 
 @torch.no_grad()
-def frames(trainer: Trainer, scenes: EyeScenes, batches: int, *, stack: Stack | None = None) -> Seen:
+def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None) -> Seen:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
     made = stack or lens.stack(trainer.optics, trainer.model.coefficients_rad)
     pixels, masks, slips = [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)
-        prepared = lens.prepared(trainer.optics, made, batch.frames.radiance.shape[-1], margin=scenes.margin)
-        irradiance = image(batch.frames, prepared, margin=scenes.margin)
-        noise = torch.Generator().manual_seed(1_000_003 * (scenes.stream + 1) + number)
+        prepared = lens.prepared(trainer.optics, made, samples(batch.frames), margin=scenes.margin)
+        light = irradiance(batch.frames, prepared, margin=scenes.margin)
+        noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
         pitch = trainer.model.pitch_um
-        pixels.append(read_out(irradiance, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))
+        pixels.append(read_out(light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))
         masks.append(batch.mask)
         slips.append(batch.slip_mm)
     return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answers:
+    """What a network said of frames.
+
+    slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle. iou: (n,) of the pupil.
+    """
+
+    slip_mm: Tensor
+    centre: Tensor
+    iou: Tensor
+
+
+@torch.no_grad()
+def predict(net: Supernet, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Answers:
+    """Answers with the batch statistics that the network holds (see :func:`codesign.supernet.recalibrate`)."""
+    training = net.training
+    net.eval()
+    found = [net(seen.frames[i : i + seen.batch], architecture) for i in range(0, len(seen.frames), seen.batch)]
+    net.train(training)
+    slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
+    shared = losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask)
+    return Answers(slip, torch.cat([f.centre for f in found]), shared)
 
 
 @torch.no_grad()
@@ -66,10 +89,7 @@ def assess(net: Supernet, architecture: Architecture, seen: Seen, inner: InnerCo
     """Errors of one architecture, with its own batch statistics measured on the first half of the frames."""
     parts = [seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)]
     recalibrate(net, architecture, parts[: max(1, len(parts) // 2)])
-    scale = torch.tensor(inner.slip_scale_mm)
-    found = [net(part, architecture) for part in parts]
-    slip = torch.cat([f.slip for f in found]) * scale
-    error = (slip - seen.slip_mm).abs().mean(0)
-    shared = losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask)
+    answers = predict(net, architecture, seen, inner)
+    error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     net.train()
-    return Assessment(float(error[2]), float(error[:2].mean()), float(shared.mean()))
+    return Assessment(float(error[2]), float(error[:2].mean()), float(answers.iou.mean()))

@@ -9,13 +9,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.fft
 import torch
 
 from metalens import profiles
 from metalens.design import PhaseOf
 from metalens.errors import ConfigError, TrainingError
 from metalens.profiles import Focus
-from metalens.pupil import Pupil, coordinates, psf, radius
+from metalens.pupil import Pupil, amplitude, coordinates, radius, spherical_path
 from metalens.scene import Imager, PsfBasis, basis, imager
 from metalens.store import Array
 
@@ -118,7 +119,11 @@ class Stack:
 
 
 def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: Tensor | None = None) -> Stack:
-    """PSFs of the lens whose polynomial coefficients are these; differentiable.
+    """PSFs of the lens whose polynomial coefficients are these, on samples of the image; differentiable.
+
+    Each is the light on square samples, low-passed to what the grid of the samples can show: so it does not depend
+    on where a source falls on the grid, and no optimiser can exploit that. The low frequencies of the intensity are
+    the autocorrelation of the pupil, exact from one padded transform of the pupil's nodes a depth.
 
     Args:
         coefficients_rad: (polynomials,) in rad of root-mean-square phase over the aperture.
@@ -129,22 +134,17 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: Tensor | N
     """
     if not bool(torch.isfinite(coefficients_rad).all()):
         raise TrainingError("the optics left the finite numbers: lower the learning rate of the optics")
-    pupil = settings.pupil
     phase = added_phase(settings, coefficients_rad)
     if error is not None:
         phase = phase + _error_phase(settings, error)
-    fine = settings.fine
-    intensity = psf(
-        phase,
-        pupil,
-        depths_um=settings.depths_um,
-        focus_um=settings.focus_mm * 1e3,
-        sample_um=settings.sample_um / fine,
-        samples=settings.window_samples * fine,
-    )
-    size = settings.window_samples
-    pixels = intensity.reshape(-1, size, fine, size, fine).sum((2, 4))
-    return Stack(pixels, settings.depths_um)
+    carriers, shape = _carriers(settings)
+    turn = torch.polar(torch.ones_like(phase, dtype=torch.float32), torch.remainder(phase, 2 * math.pi).float())
+    field = torch.fft.fft2(carriers * turn, s=shape)
+    transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
+    rows, columns = _sample_rows(settings)
+    low = len(columns)
+    kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
+    return Stack((rows @ (kept @ columns)).real, settings.depths_um)
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
@@ -216,6 +216,39 @@ def _vortex_phase(pupil: Pupil, zones: int) -> Tensor:
 def _vortices(settings: OpticsConfig) -> Tensor:
     pupil = settings.pupil
     return _vortex_phase(pupil, settings.zones) if settings.zones else torch.zeros_like(radius(pupil))
+
+
+@functools.lru_cache(maxsize=8)
+def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
+    """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic lens; size of its transforms.
+
+    The size leaves the autocorrelation free of wrap-around at all frequencies that are kept. complex64.
+    """
+    pupil = settings.pupil
+    k = 2 * math.pi / pupil.wavelength_um
+    inward = spherical_path(radius(pupil), settings.focus_mm * 1e3)
+    angle = torch.stack([k * (spherical_path(radius(pupil), float(z)) - inward) for z in settings.depths_um])
+    size = scipy.fft.next_fast_len(pupil.nodes + _frequencies(settings) + 1)
+    return torch.polar(amplitude(pupil), torch.remainder(angle, 2 * math.pi)).to(torch.complex64), (size, size)
+
+
+def _frequencies(settings: OpticsConfig) -> int:
+    """Harmonics of the pupil's period that the grid of the samples can show."""
+    return math.floor(settings.pupil.period_um / (2 * settings.sample_um))
+
+
+@functools.lru_cache(maxsize=8)
+def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
+    """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to the light on each sample."""
+    pupil, size = settings.pupil, settings.window_samples
+    harmonic = torch.arange(_frequencies(settings) + 1, dtype=torch.float64) / pupil.period_um
+    place = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * settings.sample_um
+    half = torch.exp(2j * math.pi * place[:, None] * harmonic) * torch.sinc(harmonic * settings.sample_um)
+    rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
+    columns = half * torch.where(harmonic == 0, 1.0, 2.0)  # the other half of the frequencies is its conjugate
+    nodes_light = float((amplitude(pupil) ** 2).sum()) * _carriers(settings)[1][0] ** 2
+    scale = (settings.sample_um / pupil.period_um) ** 2 / nodes_light
+    return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
 
 
 def _error_phase(settings: OpticsConfig, error: Tensor) -> Tensor:

@@ -1,0 +1,204 @@
+"""Which lens lets a small network read depth: fixed lenses against lenses trained together with the network.
+
+    python -m benchmarks.codesign_study run --work DIR             # every run of the plan that has no line yet
+    python -m benchmarks.codesign_study run --work DIR --only p18/hyper33/0
+    python -m benchmarks.codesign_study report --work DIR          # JSON, table and figures from the lines there are
+
+Every run draws the same number of frames from one pool, with the same network, noise and schedule; the lens alone
+differs. One JSON line a run, errors of every test frame beside it; a stopped study goes on where it was.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from codesign import ambiguity, assess, cost, dataset, inner, pool
+from codesign.architecture import Architecture, Space
+from codesign.depth_test import depth_response
+from codesign.eye import States
+from codesign.eye_scenes import TEST, TRAINING, EyeScenes, SceneConfig
+from codesign.inner import Batch, InnerConfig, Schedule, Trainer
+from codesign.optics import OpticsConfig
+from codesign.pool import PoolScenes
+from codesign.renderer import render
+from codesign.supernet import recalibrate
+from metalens.scene import Frames
+from metalens.sensor import Sensor
+
+LINES = "runs.jsonl"
+SCENES = SceneConfig(pixels=128, margin=16, pool=4096)
+FREE = Schedule(0.02, 0.12, 0.8, clip=1.0)
+SPACE = Space(widths=(0.25, 0.5), depths=(2, 3), expansions=(3, 4), kernels=(3, 5), resolution=(0.5, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Conditions that all lenses of a comparison share.
+
+    pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of 32 frames.
+    width: of the network.
+    """
+
+    pitch_um: float
+    electrons: float = 2000.0
+    steps: int = 800
+    width: float = 0.5
+
+
+CASES = {
+    "p9": Case(9.0),
+    "p18": Case(18.0),
+    "p18dim": Case(18.0, electrons=100.0),
+    "p18small": Case(18.0, width=0.25),
+}
+
+
+def optics_of(lens: str) -> tuple[OpticsConfig, Schedule]:
+    """Optics and their schedule: hyperF (fixed, focused at F mm), helixN (N zones), jointF (trained from hyperF)."""
+    kind, number = lens.rstrip("0123456789"), float(lens.lstrip("abcdefghijklmnopqrstuvwxyz"))
+    fixed = OpticsConfig(polynomials=0, depth_count=20)
+    if kind == "hyper":
+        return replace(fixed, focus_mm=number), Schedule(0.0)
+    if kind == "helix":
+        return replace(fixed, zones=int(number)), Schedule(0.0)
+    if kind == "joint":
+        return replace(fixed, polynomials=35, focus_mm=number), FREE
+    if kind == "jointhelix":
+        return replace(fixed, polynomials=35, zones=int(number)), FREE
+    raise SystemExit(f"no lens {lens!r}: need hyperF, helixN, jointF or jointhelixN")
+
+
+def architecture_of(width: float) -> Architecture:
+    """The network of all runs: two blocks a stage, kernels of 5, expansion 3."""
+    return Architecture((2,) * 5, (5,) * SPACE.slots, (3,) * SPACE.slots, width, 1.0)
+
+
+def scenes_of(stream: int) -> EyeScenes:
+    """Frames of a stream; the same for every run."""
+    return EyeScenes(SCENES, 9.0, 2000.0, 0, stream)
+
+
+def pool_of(work: Path) -> pool.Pool:
+    """Training frames, rendered once."""
+    path = work / "pool.h5"
+    if not path.exists():
+        pool.save(path, pool.fill(scenes_of(TRAINING), SCENES.pool))
+    return pool.load(path)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Kept:
+    """Test frames with both sheets, rendered once; see :class:`codesign.inner.Scenes`."""
+
+    frames: Frames
+    mask: torch.Tensor
+    slip_mm: torch.Tensor
+    stream: int
+    margin: int = SCENES.margin
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Frames of a step."""
+        part = slice(step * size, (step + 1) * size)
+        frames = Frames(*(getattr(self.frames, n)[part] for n in Frames.__slots__))
+        return Batch(frames, self.mask[part], self.slip_mm[part])
+
+
+def kept(work: Path, name: str, count: int) -> Kept:
+    """``ambiguous`` or ``natural`` test frames."""
+    path = work / f"{name}.h5"
+    scenes = scenes_of(TEST)
+    if not path.exists():
+        states = ambiguity.ambiguous(scenes, count // 2, 17).states if name == "ambiguous" else _natural(scenes, count)
+        dataset.write_shard(path, render(states, rig=scenes.rig, camera=scenes.camera), seed=17)
+    frames, mask, labels = dataset.read_shard(path)
+    inside = slice(SCENES.margin, mask.shape[-1] - SCENES.margin)
+    return Kept(frames, mask[:, inside, inside], (labels["slip_um"] * 1e-3).float(), 2 if name == "natural" else 3)
+
+
+def _natural(scenes: EyeScenes, count: int) -> States:
+    states = scenes.states(0, count)
+    return replace(states, scale=torch.ones_like(states.scale))
+
+
+def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
+    """The trainer at the end of its run, with the batch statistics of the final lens."""
+    optics, moving = optics_of(lens)
+    settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
+    sensor = Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
+    scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
+    made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE)
+    trainer = Trainer(settings, optics, sensor, scenes, made, architecture=architecture_of(case.width))
+    for record in trainer.run():
+        if record.step % 100 == 0:
+            print(f"{lens}/{seed} step {record.step}: task {record.task:.3f}, {record.skipped} skipped", flush=True)
+    seen = assess.frames(trainer, scenes, 8)
+    recalibrate(made.net, architecture_of(case.width), [seen.frames[i : i + 32] for i in range(0, 256, 32)])
+    return trainer
+
+
+def run_one(work: Path, name: str) -> dict[str, Any]:
+    """Train and test one run of the plan; its line."""
+    case_name, lens, seed = name.split("/")
+    case = CASES[case_name]
+    start = time.perf_counter()
+    trainer = train_one(work, case, lens, int(seed))
+    seconds = time.perf_counter() - start
+    net, architecture = trainer.model.net, architecture_of(case.width)
+    frames = case.steps * trainer.inner.batch
+    macs = float(cost.macs(architecture, case.pitch_um, window_um=SCENES.pixels * 9.0, space=SPACE))
+    line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
+    errors = {}
+    for test in ("ambiguous", "natural"):
+        scenes = kept(work, test, 512)
+        seen = assess.frames(trainer, scenes, 16)
+        answers = assess.predict(net, architecture, seen, trainer.inner)
+        error = (answers.slip_mm - seen.slip_mm).abs()
+        errors[test] = error.numpy()
+        line[test] = {"axial_mm": float(error[:, 2].mean()), "lateral_mm": float(error[:, :2].mean()),
+                      "iou": float(answers.iou.mean())}  # fmt: skip
+    response = depth_response(trainer, kept(work, "ambiguous", 512), net, architecture, batches=8)
+    line["depth_response"] = {"mm_per_mm": response.mean, "standard_error": response.standard_error}
+    line["skipped_steps"] = trainer.skipped
+    line["coefficients_rad"] = [round(float(v), 4) for v in trainer.model.coefficients_rad.detach()]
+    stem = work / name.replace("/", "-")
+    np.savez_compressed(stem.with_suffix(".npz"), ambiguous=errors["ambiguous"], natural=errors["natural"])
+    save_file({k: v.contiguous() for k, v in net.state_dict().items()}, stem.with_suffix(".safetensors"))
+    return line
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("verb", choices=["run", "report"])
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=None)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.work.mkdir(parents=True, exist_ok=True)
+    for name in options.only or PLAN:
+        if name not in done(options.work):
+            line = run_one(options.work, name)
+            with open(options.work / LINES, "a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+            print(json.dumps({k: v for k, v in line.items() if k != "coefficients_rad"}), flush=True)
+
+
+LENSES = ("hyper33", "joint33", "hyper20", "hyper28", "joint20", "hyper40", "helix2", "hyper24", "helix3", "hyper50")
+PLAN = [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+
+
+def done(work: Path) -> set[str]:
+    """Runs that have a line."""
+    path = work / LINES
+    return {json.loads(text)["run"] for text in path.read_text().splitlines()} if path.exists() else set()
+
+
+if __name__ == "__main__":
+    main()
