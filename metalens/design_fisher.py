@@ -1,10 +1,9 @@
-"""Free-form phases that carry depth: the axial information of Eq. 11, measured honestly, at a bounded spread of light.
+"""Free-form phases that carry depth: an objective climbed at a bounded spread of light, coarse to fine.
 
-The phase is a cubic spline on a control grid that is refined in stages (coarse to fine), on top of a hyperbolic
-focus or of a double helix, whose vortices no smooth phase can grow. Adam climbs the information over the
-depths, at random sub-pixel positions each step, so that nothing can be gained from one position; a growing penalty
-holds the encircled energy, and the best iterate that keeps it at every depth, judged on the honest average, is
-returned. Several starts, all reported.
+The phase is a cubic spline on a control grid that is refined in stages, on top of a hyperbolic focus or of a double
+helix, whose vortices no smooth phase can grow. Adam climbs the objective (the honest axial information of Eq. 11 at
+random sub-pixel positions, or Eq. 6 on scenes); a penalty whose target follows the energy that is reached holds the
+encircled energy, and the best iterate that keeps it at every depth is returned. Several starts, all reported.
 """
 
 import math
@@ -15,28 +14,17 @@ import torch
 
 from metalens import pupil as pupils
 from metalens.design import PhaseOf
-from metalens.design_fisher_settings import SAMPLE_UM, Fisher
+from metalens.design_fisher_settings import Fisher
+from metalens.design_objective import WINDOW_UM, AxialObjective, Objective, Robust, Score, score
 from metalens.errors import ConfigError
-from metalens.fisher import axial_information, encircled_energy, pixel_information
 from metalens.profiles import Focus, hyperbolic
 from metalens.pupil import Pupil
 from metalens.store import Array
 
 Tensor = torch.Tensor
-STEP_UM = 200.0  # of the difference in Eq. 11
-WINDOW_UM = 144.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Score:
-    """Honest figures of a phase on the quick pupil model.
-
-    information: (depths,) I(z) per mm², averaged over sub-pixel positions.
-    encircled: (depths,) share of the light through the aperture inside the radius.
-    """
-
-    information: Tensor
-    encircled: Tensor
+RATE = 0.15  # first step of Adam, rad
+CHECKS = 20  # iterations between two honest looks
+__all__ = ["Fisher", "FisherPhase", "Score", "fisher_profile", "optimise", "phase_on", "score", "spline", "vortices"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,14 +46,16 @@ class FisherPhase:
     reason: str
 
 
-def fisher_profile(focus: Focus, *, radius_um: float, settings: Fisher | None = None) -> tuple[PhaseOf, FisherPhase]:
+def fisher_profile(
+    focus: Focus, *, radius_um: float, settings: Fisher | None = None, objective: Objective | None = None
+) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase (focus and free form) as a function of position, and how it was found.
 
     ``focus.source_distance_um`` is not used: the settings choose the focus.
     """
     settings = settings or Fisher()
-    pupil = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes=_nodes(radius_um, focus))
-    found = optimise(pupil, settings)
+    pupil = design_pupil(focus, radius_um)
+    found = optimise(pupil, settings, objective=objective)
     base = Focus(focus.wavelength_um, focus.sensor_distance_um, found.focus_um)
     controls = found.controls.numpy()
 
@@ -77,15 +67,36 @@ def fisher_profile(focus: Focus, *, radius_um: float, settings: Fisher | None = 
     return phase, found
 
 
-def optimise(pupil: Pupil, settings: Fisher) -> FisherPhase:
-    """Best of several starts; deterministic for a seed."""
+def design_pupil(focus: Focus, radius_um: float) -> Pupil:
+    """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
+    edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
+    nodes = max(64, 16 * math.ceil(1.9 * WINDOW_UM * 2 * edge / focus.wavelength_um / 16))
+    return Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes)
+
+
+def optimise(pupil: Pupil, settings: Fisher, *, objective: Objective | None = None) -> FisherPhase:
+    """Best of several starts; deterministic for a seed.
+
+    Args:
+        objective: by default the axial information; :mod:`codesign.design_scenes` has Eq. 6 on scenes.
+
+    Raises:
+        ConfigError: the settings ask for scenes and no such objective is given.
+    """
+    if objective is None:
+        if settings.objective != "axial":
+            raise ConfigError(f"objective {settings.objective!r} needs its scenes: give optimise(objective=...)")
+        objective = AxialObjective(pupil, settings)
+    if settings.variation.phase or settings.variation.distance_um:
+        objective = Robust(objective, pupil, settings.variation)
     best: FisherPhase | None = None
     reached = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
         focus = 1e3 * (settings.focus_mm[0] + share * (settings.focus_mm[1] - settings.focus_mm[0]))
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
-        made = _climb(pupil, settings, focus, settings.zones[start % len(settings.zones)], generator)
+        zones = settings.zones[start % len(settings.zones)]
+        made = _climb(pupil, settings, objective, focus, zones, generator)
         information, least = float(made.score.information.mean()), float(made.score.encircled.min())
         reached.append((information, least))
         if best is None or (made.converged, information) > (best.converged, float(best.score.information.mean())):
@@ -95,18 +106,9 @@ def optimise(pupil: Pupil, settings: Fisher) -> FisherPhase:
     return replace(best, starts=tuple(reached))
 
 
-def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Fisher, depths: int = 11) -> Score:
-    """Information and encircled energy of a phase on the pupil's nodes, at ``depths`` depths of the range."""
-    near, far = _stacks(phase_rad, pupil, focus_um, _depths(settings, depths))
-    value = axial_information(
-        near,
-        far,
-        step_um=STEP_UM,
-        sample_um=SAMPLE_UM,
-        pixel_um=settings.pixel_um,
-        normalisation=settings.normalisation,
-    )
-    return Score(value.detach(), encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um).detach())
+def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
+    """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus."""
+    return _Phase(pupil, len(made.controls), made.zones)(made.controls)
 
 
 def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
@@ -129,80 +131,65 @@ def spline(position: Array, count: int) -> Array:
     return weights
 
 
-def _climb(pupil: Pupil, settings: Fisher, focus_um: float, zones: int, generator: torch.Generator) -> FisherPhase:
+class _Best:
+    """The best iterate seen: first whether it keeps the energy, then its information."""
+
+    def __init__(self, objective: Objective, settings: Fisher, focus_um: float) -> None:
+        self.objective, self.settings, self.focus_um = objective, settings, focus_um
+        self.rank: tuple[bool, float] = (False, -math.inf)
+        self.controls: Tensor | None = None
+        self.score: Score | None = None
+
+    def look(self, controls: Tensor, phase: Tensor) -> float:
+        """Judge an iterate; returns the energy that is to spare."""
+        seen = self.objective.judge(phase.detach(), self.focus_um)
+        spare = float(seen.encircled.min()) - self.settings.encircled
+        rank = (spare >= -5e-4, float(seen.information.mean()))
+        if self.controls is None or rank > self.rank or (not self.rank[0] and rank[0]):
+            self.rank, self.controls, self.score = rank, controls.detach().clone(), seen
+        return spare
+
+
+def _climb(
+    pupil: Pupil, settings: Fisher, objective: Objective, focus_um: float, zones: int, generator: torch.Generator
+) -> FisherPhase:
     spread = settings.spread_rad * (0.1 if zones else 1.0)
     controls = spread * torch.randn(settings.grids[0], settings.grids[0], generator=generator, dtype=torch.float64)
-    best: tuple[tuple[bool, float], Tensor, Score] | None = None
-    for stage, grid in enumerate(settings.grids):
-        if len(controls) != grid:
-            controls = _refined(controls, grid)
-        build = _Phase(pupil, grid, zones)
-        controls.requires_grad_(True)
-        step = torch.optim.Adam([controls], lr=0.12)
-        for i in range(settings.iterations):
+    total, done, margin = settings.iterations, 0, 0.01
+    best = _Best(objective, settings, focus_um)
+    for grid, count in zip(settings.grids, _shares(settings), strict=True):
+        controls = (_refined(controls, grid) if len(controls) != grid else controls).requires_grad_(True)
+        build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=RATE, betas=(0.9, 0.99))
+        for _ in range(count):
             for group in step.param_groups:
-                group["lr"] = 0.12 * (0.5 + 0.5 * math.cos(math.pi * i / settings.iterations)) + 0.004
-            hold = 10.0 * (1 + 2 * (stage * settings.iterations + i) / (settings.iterations * len(settings.grids)))
-            loss = _loss(build(controls), pupil, settings, focus_um, hold, generator)
+                group["lr"] = RATE * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
+            loss, energy = objective.loss(build(controls), focus_um, generator)
+            missing = torch.relu(settings.encircled + margin - energy)
+            loss = loss + 10 * (1 + 4 * done / total) * (missing.mean() + 8 * (missing**2).mean())
             step.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             step.step()
-            last = i == settings.iterations - 1
-            if last or (stage == len(settings.grids) - 1 and i % 10 == 9):
-                seen = score(build(controls.detach()), pupil, focus_um=focus_um, settings=settings)
-                kept = bool(seen.encircled.min() >= settings.encircled - 1e-3)
-                rank = (kept, float(seen.information.mean()))
-                if best is None or rank > best[0]:
-                    best = (rank, controls.detach().clone(), seen)
+            done += 1
+            if grid == settings.grids[-1] and (done % CHECKS == 0 or done == total):
+                spare = best.look(controls, build(controls))
+                margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
         controls = controls.detach()
-    if best is None:
+    if settings.refine:
+        from metalens.design_mma import refine
+
+        refined = refine(best.controls if best.controls is not None else controls, build, objective, settings, focus_um)
+        best.look(refined, build(refined))
+    if best.controls is None or best.score is None:
         raise ConfigError("no iterate was judged")
-    reason = "encircled energy kept at every depth" if best[0][0] else "encircled energy missed: raise iterations"
-    return FisherPhase(best[1], focus_um, zones, best[2], (), best[0][0], reason)
+    reason = "encircled energy kept at every depth" if best.rank[0] else "encircled energy missed: raise iterations"
+    return FisherPhase(best.controls, focus_um, zones, best.score, (), best.rank[0], reason)
 
 
-def _loss(
-    phase: Tensor, pupil: Pupil, settings: Fisher, focus_um: float, hold: float, generator: torch.Generator
-) -> Tensor:
-    """Minus the log information at jittered depths and two random positions, plus the energy that is missing."""
-    jitter = 1e3 * (settings.depths_mm[1] - settings.depths_mm[0]) / 12
-    depths = _depths(settings, 7) + jitter * (torch.rand(7, generator=generator, dtype=torch.float64) - 0.5)
-    near, far = _stacks(phase, pupil, focus_um, depths)
-    total = phase.new_zeros(())
-    for _ in range(2):
-        y, x = ((torch.rand(2, generator=generator) - 0.5) * settings.pixel_um).tolist()
-        value = pixel_information(
-            near,
-            far,
-            step_um=STEP_UM,
-            sample_um=SAMPLE_UM,
-            pixel_um=settings.pixel_um,
-            normalisation=settings.normalisation,
-            shift_um=(y, x),
-        )
-        spread, mean = torch.log(value + 1e-4).mean(), torch.log(value.mean() + 1e-4)
-        total = total - (settings.even * spread + (1 - settings.even) * mean) / 2
-    energy = encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)
-    missing = torch.relu(settings.encircled + 0.01 - energy)
-    return total + hold * missing.mean() + 10 * hold * (missing**2).mean()
-
-
-def _stacks(phase: Tensor, pupil: Pupil, focus_um: float, depths_um: Tensor) -> tuple[Tensor, Tensor]:
-    samples = int(min(WINDOW_UM, pupil.period_um) / SAMPLE_UM)
-    both = torch.cat([depths_um, depths_um + STEP_UM])
-    stack = pupils.psf(phase, pupil, depths_um=both, focus_um=focus_um, sample_um=SAMPLE_UM, samples=samples)
-    return stack[: len(depths_um)], stack[len(depths_um) :]
-
-
-def _depths(settings: Fisher, count: int) -> Tensor:
-    low, high = (1e3 * d for d in settings.depths_mm)
-    return torch.linspace(low, high, count, dtype=torch.float64)
-
-
-def _nodes(radius_um: float, focus: Focus) -> int:
-    """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
-    edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
-    return max(64, 16 * math.ceil(1.9 * WINDOW_UM * 2 * edge / focus.wavelength_um / 16))
+def _shares(settings: Fisher) -> list[int]:
+    """Iterations of every stage: in proportion to its grid, at least one."""
+    whole = sum(settings.grids)
+    early = [max(1, settings.iterations * grid // whole) for grid in settings.grids[:-1]]
+    return [*early, max(1, settings.iterations - sum(early))]
 
 
 class _Phase:

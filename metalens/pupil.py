@@ -52,6 +52,7 @@ def coordinates(pupil: Pupil) -> tuple[Tensor, Tensor]:
     return qx * stretch, qy * stretch
 
 
+@functools.lru_cache(maxsize=16)
 def radius(pupil: Pupil) -> Tensor:
     """(nodes, nodes) distance of the nodes from the axis on the lens, um."""
     return torch.hypot(*coordinates(pupil))
@@ -102,13 +103,16 @@ def psf(
         )
     kernel, defocus, weight = _tables(pupil, float(focus_um), sample_um, samples)
     k = 2 * math.pi / pupil.wavelength_um
-    fields = []
-    for depth in depths_um.tolist():
-        angle = phase_rad + k * (spherical_path(radius(pupil), depth) - defocus)
-        field = torch.polar(weight, angle).to(torch.complex64)
-        fields.append(kernel @ field @ kernel.mT)
-    stack = torch.stack(fields)
-    return (stack.real**2 + stack.imag**2) * _share(pupil, sample_um)
+    path = torch.stack([spherical_path(radius(pupil), depth) - defocus for depth in depths_um.tolist()])
+    angle = wrapped(k * path).float() + wrapped(phase_rad).float()
+    field = torch.polar(weight.expand_as(angle), angle)
+    image = kernel @ (field @ kernel.mT)
+    return (image.real**2 + image.imag**2) * _share(pupil, sample_um)
+
+
+def wrapped(phase_rad: Tensor) -> Tensor:
+    """The phase less whole turns, so that single precision holds it; the gradient is that of the phase."""
+    return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))
 
 
 @functools.lru_cache(maxsize=16)
@@ -116,7 +120,7 @@ def _tables(pupil: Pupil, focus_um: float, sample_um: float, samples: int) -> tu
     position = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * sample_um
     k = 2 * math.pi / pupil.wavelength_um
     kernel = torch.exp(-1j * k * position[:, None] * _axis(pupil)).to(torch.complex64)
-    return kernel, spherical_path(radius(pupil), focus_um), amplitude(pupil)
+    return kernel, spherical_path(radius(pupil), focus_um), amplitude(pupil).float()
 
 
 def _share(pupil: Pupil, sample_um: float) -> float:

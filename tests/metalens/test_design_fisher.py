@@ -14,7 +14,7 @@ from metalens.profiles import Focus
 from metalens.pupil import Pupil
 
 SMALL = Pupil(radius_um=400.0, nodes=136)
-QUICK = Fisher(grids=(6, 10), iterations=14, starts=1, zones=(2,), focus_mm=(20.0, 20.0))
+QUICK = Fisher(grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0))
 
 
 def test_spline_makes_constants_lines_and_is_smooth():
