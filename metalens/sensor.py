@@ -190,11 +190,12 @@ def low_snr(sensor: Sensor, mean_irradiance: float, *, snr_db: float = 15.0, amb
 
 def _smooth_step(t: Tensor) -> Tensor:
     """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left of -1, 1 right of 2."""
-    u, v, w = (t + 1).clamp(0, 1), t.clamp(0, 1), (t - 1).clamp(0, 1)
+    u, w = t + 1, t - 1
     before = 0.5 * u**2 * (u - 1)
-    inside = v * (0.5 + v * (1.5 - v))
-    after = 0.5 * w * (1 - w) ** 2
-    return before + inside + after
+    inside = t * (0.5 + t * (1.5 - t))
+    after = 1 + 0.5 * w * (1 - w) ** 2
+    left = torch.where(t < 0, torch.where(t < -1, 0.0, before), inside)  # one piece each: its slope counts once
+    return torch.where(t < 1, left, torch.where(t < 2, after, 1.0))
 
 
 def _check(name: str, value: float, *, above: bool) -> None:

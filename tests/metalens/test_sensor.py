@@ -42,6 +42,15 @@ def test_pitch_gradient_is_continuous_where_edges_meet():
     assert gradient(3.3) == pytest.approx(float(slope), rel=1e-8)
 
 
+def test_pitch_gradient_where_a_pixel_edge_lies_on_a_sample_edge():
+    """At a pitch of 4 samples all pixel edges lie on sample edges: the slope there is that from either side."""
+    p = torch.tensor(4.0, dtype=torch.float64, requires_grad=True)
+    got = torch.autograd.grad((sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p)[0]
+    step = 1e-5
+    high, low = ((sensors.integrate(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum() for s in (step, -step))
+    assert float(got) == pytest.approx(float(high - low) / (2 * step), rel=1e-6)  # second derivative jumps: 1e-9
+
+
 def test_pixel_larger_than_the_image_holds_all_its_light():
     pixels = sensors.integrate(IMAGE, 1.0, pitch_um=60.0)
     assert pixels.shape == (1, 1)
