@@ -6,7 +6,13 @@ Names load when first used: ``import codesign; codesign.render(states)``.
 import importlib
 from typing import Any
 
-_PUBLIC = {"render": "renderer", "Supernet": "supernet", "macs": "cost"}  # name: submodule that defines it
+_PUBLIC = {
+    "render": "renderer",
+    "Supernet": "supernet",
+    "macs": "cost",
+    "search": "evolution",
+    "retrain": "retraining",
+}  # name: submodule that defines it
 
 
 def __getattr__(name: str) -> Any:

@@ -7,6 +7,7 @@ import torch
 from codesign import losses
 from codesign import optics as lens
 from codesign.architecture import Architecture
+from codesign.baselines import Baseline
 from codesign.flat import irradiance, samples
 from codesign.formation import read_out
 from codesign.inner import InnerConfig, Scenes, Trainer
@@ -73,7 +74,7 @@ class Answers:
 
 
 @torch.no_grad()
-def predict(net: Supernet, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Answers:
+def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Answers:
     """Answers with the batch statistics that the network holds (see :func:`codesign.supernet.recalibrate`)."""
     training = net.training
     net.eval()
@@ -84,11 +85,16 @@ def predict(net: Supernet, architecture: Architecture, seen: Seen, inner: InnerC
     return Answers(slip, torch.cat([f.centre for f in found]), shared)
 
 
+def parts(seen: Seen) -> list[Tensor]:
+    """Frames a batch at a time."""
+    return [seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)]
+
+
 @torch.no_grad()
-def assess(net: Supernet, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Assessment:
+def assess(net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Assessment:
     """Errors of one architecture, with its own batch statistics measured on the first half of the frames."""
-    parts = [seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)]
-    recalibrate(net, architecture, parts[: max(1, len(parts) // 2)])
+    batches = parts(seen)
+    recalibrate(net, architecture, batches[: max(1, len(batches) // 2)])
     answers = predict(net, architecture, seen, inner)
     error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     net.train()

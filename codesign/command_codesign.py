@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,13 @@ import tyro
 from safetensors.torch import save_file
 
 from codesign import optics as trained
+from codesign import pictures
 from codesign import run as runs
+from codesign.baselines import Baseline
 from codesign.evolution import best, pareto
-from codesign.inner import Record
+from codesign.finish import finished
+from codesign.inner import Model, Record
+from codesign.journal import Journal
 from codesign.run import Run, RunConfig
 from codesign.subnet import Subnet
 from metalens import config, design, lens, library, report, store
@@ -32,20 +36,27 @@ class Options(Common):
         config: RUN.toml.
         output: folder of the run.
         resume: go on from the folder's checkpoint, bit for bit.
+        freeze: parts that stay as they start, beside those of the config: the ablations.
+        events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
     """
 
     config: tyro.conf.Positional[Path]
     output: Output = Path("run")
     resume: bool = False
+    freeze: tuple[runs.Part, ...] = ()
+    events: bool = False
 
 
 def run(options: Options) -> int:
     """Train, search, finish; exit 0."""
-    settings = runs.load(options.config)
+    settings = _frozen(runs.load(options.config), options.freeze)
     folder, console = options.output, options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings, force=options.force)
+    journal = Journal(folder) if options.events else None
     for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
         _log(folder, {"kind": "step", **asdict(record)})
+        if journal:
+            _events(journal, going, record)
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
@@ -54,10 +65,24 @@ def run(options: Options) -> int:
     for budget, born in runs.search(going, folder / CHECKPOINT):
         _log(folder, {"kind": "birth", "budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6})
         console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
-    rows = runs.finish(going)
-    _keep(folder, going, rows)
+    ends = finished(going)
+    rows = [row for row, _ in ends]
+    _keep(folder, going, ends)
     console.result({"rows": rows, "folder": str(folder)}, _table(rows))
     return 0
+
+
+def _frozen(settings: RunConfig, parts: tuple[runs.Part, ...]) -> RunConfig:
+    both = tuple(sorted({*settings.run.frozen, *parts}))
+    return replace(settings, run=replace(settings.run, frozen=both))
+
+
+def _events(journal: Journal, going: Run, record: Record) -> None:
+    values = {k: float(v) for k, v in asdict(record).items() if k != "step"}
+    journal.scalars(record.step, values)
+    if record.step % going.settings.checkpoint_every == 0:
+        for name, picture in pictures.all_of(going).items():
+            journal.picture(record.step, name, picture)
 
 
 def _start(folder: Path, settings: RunConfig, *, force: bool) -> Run:
@@ -106,18 +131,24 @@ def _log(folder: Path, entry: dict[str, Any]) -> None:
         file.write(json.dumps(entry) + "\n")
 
 
-def _keep(folder: Path, going: Run, rows: list[dict[str, Any]]) -> None:
+def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:
     """lens.h5, the networks, result.json and the plot of the Pareto set."""
     settings = going.settings
     _lens(folder / "lens.h5", going)
-    for budget, state in zip(settings.run.budgets_mmacs, going.searches, strict=True):
-        cut = Subnet(going.trainer.model.net, best(state.history).architecture)
-        with store.replacing(folder / f"subnet_{budget:g}.safetensors") as part:
-            save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})
+    for (row, made), state in zip(ends, [*going.searches, None], strict=False):
+        net = made.net
+        kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
+        name = settings.network if row["budget_mmacs"] is None else f"subnet_{row['budget_mmacs']:g}"
+        with store.replacing(folder / f"{name}.safetensors") as part:
+            tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
+            save_file(tensors, str(part), metadata={"kind": "subnet", "version": "1"})
     pitch = float(going.trainer.model.pitch_um.detach())
+    rows = [row for row, _ in ends]
     found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
+    found |= {"network": settings.network, "frozen": list(settings.run.frozen)}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
-    store.write_bytes(folder / "pareto.png", _plot(going))
+    if going.searches:
+        store.write_bytes(folder / "pareto.png", _plot(going))
 
 
 def _lens(path: Path, going: Run) -> None:
@@ -149,7 +180,11 @@ def _plot(going: Run) -> bytes:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    head = "budget  MMACs  axial / mm  lateral / mm   IoU"
-    names = ("budget_mmacs", "mmacs", "axial_slip_mm", "lateral_slip_mm", "iou")
-    lines = ["{:6g}  {:5.2f}  {:10.3f}  {:12.3f}  {:.3f}".format(*(r[name] for name in names)) for r in rows]
+    head = "budget  MMACs  axial / mm  lateral / mm   IoU  mm per mm of PSF depth"
+    lines = []
+    for r in rows:
+        budget = "     -" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:6g}"
+        iou = "    -" if r["iou"] is None else f"{r['iou']:.3f}"
+        errors = f"{r['axial_slip_mm']:10.3f}  {r['lateral_slip_mm']:12.3f}"
+        lines.append(f"{budget}  {r['mmacs']:5.2f}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}")
     return "\n".join([head, *lines])

@@ -5,7 +5,7 @@ stride s on an input of n pixels has ceil(n / s)² pixels. So a network is a sho
 output pixel) and a constant; at integer n the sum is exact, between integers it follows a C1 cubic.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,15 +97,24 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
 def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:
     """Multiply-accumulates at a continuous input size, differentiable; exact where ``size`` is an integer.
 
+    Args:
+        size: pixels along the edge of the input, 16 or more, scalar.
+    """
+    return interpolated(network(space, architecture).at, size)
+
+
+def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
+    """Counts at integer sizes continued to a continuous size, differentiable.
+
     A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more pixels never cost less, and where
     two counts are equal the gradient between them is zero.
 
     Args:
-        size: pixels along the edge of the input, 16 or more, scalar.
+        at: exact counts at integer sizes. size: scalar.
     """
     size = torch.as_tensor(size, dtype=torch.float64)
     low = int(torch.floor(size.detach()))
-    counts = network(space, architecture).at(np.arange(low - 1, low + 3)).astype(float)
+    counts = at(np.arange(low - 1, low + 3)).astype(float)
     before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
     slope, next_slope = _slope(here - before, after - here), _slope(after - here, beyond - after)
     u = size - low

@@ -7,6 +7,7 @@ import torch
 
 from codesign import assess
 from codesign.architecture import Architecture
+from codesign.baselines import Baseline
 from codesign.flat import Flat
 from codesign.inner import Batch, Scenes, Trainer
 from codesign.optics import Stack
@@ -64,7 +65,7 @@ class DepthResponse:
 def depth_response(
     trainer: Trainer,
     scenes: Scenes,
-    net: Supernet,
+    net: Supernet | Baseline,
     architecture: Architecture,
     *,
     batches: int,
@@ -83,7 +84,12 @@ def depth_response(
 
 
 def _axial(
-    trainer: Trainer, scenes: Scenes, net: Supernet, architecture: Architecture, batches: int, stack: Stack | None
+    trainer: Trainer,
+    scenes: Scenes,
+    net: Supernet | Baseline,
+    architecture: Architecture,
+    batches: int,
+    stack: Stack | None,
 ) -> Tensor:
     seen = assess.frames(trainer, scenes, batches, stack=stack)
     return assess.predict(net, architecture, seen, trainer.inner).slip_mm[:, 2]

@@ -37,10 +37,10 @@ class Plan:
     mutation: float = 0.15
 
     def __post_init__(self) -> None:
-        if not (self.population >= 2 and 1 <= self.tournament <= self.population <= self.rounds):
+        if not (self.population >= 1 and 1 <= self.tournament <= self.population <= self.rounds):
             raise TrainingError(
                 f"population {self.population}, tournament {self.tournament}, rounds {self.rounds}: need "
-                "2 <= population, 1 <= tournament <= population <= rounds"
+                "1 <= population, 1 <= tournament <= population <= rounds"
             )
 
 
@@ -65,13 +65,44 @@ Count = Callable[[Architecture], float]
 
 
 def evolve(
-    space: Space, plan: Plan, evaluate: Evaluate, count: Count, *, budget: float, seed: int, start: Search | None = None
+    space: Space,
+    plan: Plan,
+    evaluate: Evaluate,
+    count: Count,
+    *,
+    budget: float,
+    seed: int,
+    start: Search | None = None,
+    uniform: bool = False,
 ) -> Iterator[Search]:
     """Search state after every birth; give the last one as ``start`` to go on exactly where it stopped.
 
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
         count: its multiply-accumulates; only candidates within ``budget`` are evaluated.
+        uniform: the first candidate is the largest uniform network within the budget (:func:`within`).
+
+    Raises:
+        TrainingError: the smallest network of the space is beyond the budget.
+    """
+    affordable(space, count, budget)
+    state = start or Search(generator=dict(np.random.default_rng(seed).bit_generator.state))
+    known = {active(space, c.architecture): c.error for c in state.history}
+    while len(state.history) < plan.rounds:
+        generator = np.random.default_rng()
+        generator.bit_generator.state = state.generator
+        first = uniform and not state.history
+        chosen = within(space, count, budget) if first else _next(space, plan, state, count, budget, generator)
+        key = active(space, chosen)
+        if key not in known:
+            known[key] = float(evaluate(chosen))
+        born = Candidate(chosen, known[key], float(count(chosen)))
+        state = Search((*state.history, born), dict(generator.bit_generator.state))
+        yield state
+
+
+def affordable(space: Space, count: Count, budget: float) -> None:
+    """Refuse a budget below the smallest network.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -82,18 +113,20 @@ def evolve(
             f"budget of {budget / 1e6:.1f} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
             "raise the budget or the pixel pitch"
         )
-    state = start or Search(generator=dict(np.random.default_rng(seed).bit_generator.state))
-    known = {active(space, c.architecture): c.error for c in state.history}
-    while len(state.history) < plan.rounds:
-        generator = np.random.default_rng()
-        generator.bit_generator.state = state.generator
-        chosen = _next(space, plan, state, count, budget, generator)
-        key = active(space, chosen)
-        if key not in known:
-            known[key] = float(evaluate(chosen))
-        born = Candidate(chosen, known[key], float(count(chosen)))
-        state = Search((*state.history, born), dict(generator.bit_generator.state))
-        yield state
+
+
+def search(
+    space: Space, plan: Plan, evaluate: Evaluate, count: Count, *, budget: float, seed: int
+) -> tuple[Candidate, ...]:
+    """A whole search: every candidate in order of birth; :func:`best` and :func:`pareto` read it.
+
+    Raises:
+        TrainingError: the smallest network of the space is beyond the budget.
+    """
+    state = Search()
+    for born in evolve(space, plan, evaluate, count, budget=budget, seed=seed):
+        state = born
+    return state.history
 
 
 def _next(

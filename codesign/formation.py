@@ -7,6 +7,7 @@ from torch import Tensor
 
 from codesign import cost
 from codesign.architecture import Architecture
+from codesign.baselines import Baseline
 from codesign.optics import OpticsConfig, Stack
 from codesign.supernet import Supernet
 from metalens import sensor as camera
@@ -46,9 +47,10 @@ def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None) -> 
     return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 + 1e-6)
 
 
-def network_macs(net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
+def network_macs(net: Supernet | Baseline, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
     """Multiply-accumulates of one member at this pitch, differentiable."""
-    return cost.macs_of_size(net.space, architecture, window_um / pitch_um * architecture.resolution)
+    size = window_um / pitch_um * architecture.resolution
+    return cost.interpolated(lambda sizes: net.counts(architecture, sizes), size)
 
 
 def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from codesign import losses
 from codesign import optics as lens
 from codesign.architecture import Architecture, Space, largest, sample, smallest
+from codesign.baselines import Baseline, Name, make
 from codesign.flat import Flat, irradiance, samples
 from codesign.formation import depth_loss, network_macs, read_out
 from codesign.optics import OpticsConfig, Stack
@@ -116,7 +117,7 @@ class Model:
     coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um.
     """
 
-    net: Supernet
+    net: Supernet | Baseline
     coefficients_rad: nn.Parameter
     log_pitch: nn.Parameter
 
@@ -142,10 +143,12 @@ class Record:
     skipped: int
 
 
-def model(settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None) -> Model:
+def model(
+    settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None, network: Name = "supernet"
+) -> Model:
     """A fresh model: network weights from the seed, a lens without added phase."""
     torch.manual_seed(seed)
-    net = Supernet(space)
+    net = Supernet(space) if network == "supernet" else make(network)
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
     return Model(
         net,
@@ -275,14 +278,14 @@ class Trainer:
         return self._imagers[drawn]
 
     def _lens_error(self) -> Tensor | None:
-        spread = self.optics.spread
-        deviations = torch.tensor([spread.focus_um, spread.tilt_waves, spread.astigmatism_waves])
-        return deviations * torch.randn(3, generator=self._generator(2)) if bool(deviations.any()) else None
+        return self.optics.spread.draw(self._generator(2))
 
     def _members(self) -> Sequence[Architecture]:
         if self.architecture is not None:
             return [self.architecture]
         space = self.model.net.space
+        if isinstance(self.model.net, Baseline):
+            return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
         return [largest(space), smallest(space), *(sample(space, generator) for _ in range(self.inner.subnets))]
 

@@ -35,8 +35,23 @@ def slip(predicted: Tensor, truth: Tensor, scale: Tensor, *, knee: float = 0.3) 
 
 
 def task(found: Prediction, mask: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, slip_weight: float = 2.0) -> Tensor:
-    """L_task = L_seg + lambda_slip L_calib."""
-    return segmentation(found.mask_logits, mask) + slip_weight * slip(found.slip, slip_mm, scale_mm)
+    """L_task = L_seg + lambda_slip L_calib; a network without a mask is held to the pupil's centre in its place."""
+    seen = segmentation(found.mask_logits, mask) if found.mask_logits.numel() else place(found.centre, mask)
+    return seen + slip_weight * slip(found.slip, slip_mm, scale_mm)
+
+
+def place(centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3) -> Tensor:
+    """Distance of the pupil's centre from the centroid of its mask, in units of 2 % of the frame; 0 for empty masks.
+
+    Args:
+        centre: (batch, 2) x, y as a fraction of the frame from its middle. mask: (batch, y, x) coverage.
+    """
+    total = mask.sum((1, 2))
+    y, x = ((torch.arange(n, dtype=mask.dtype) + 0.5) / n - 0.5 for n in mask.shape[-2:])
+    truth = torch.stack([(mask.sum(1) * x).sum(1), (mask.sum(2) * y).sum(1)], -1) / total.clamp_min(1e-6)[:, None]
+    each = F.smooth_l1_loss(centre / unit, truth / unit, beta=knee, reduction="none").mean(1)
+    seen = total > 0.5
+    return (each * seen).sum() / seen.sum().clamp_min(1)
 
 
 def over_budget(macs: Tensor, budget: float) -> Tensor:
@@ -52,7 +67,9 @@ def resized(mask: Tensor, like: Tensor) -> Tensor:
 
 
 def overlap(logits: Tensor, mask: Tensor) -> Tensor:
-    """(batch,) intersection over union of the thresholded masks; 1 where both are empty."""
+    """(batch,) intersection over union of the thresholded masks; 1 where both are empty, nan without a mask."""
+    if not logits.numel():
+        return torch.full((len(mask),), float("nan"))
     found, truth = logits > 0, resized(mask, logits) > 0.5
     union = (found | truth).sum((1, 2))
     both = (found & truth).sum((1, 2))

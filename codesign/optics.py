@@ -21,6 +21,8 @@ from metalens.scene import Imager, PsfBasis, basis, imager
 from metalens.store import Array
 
 Tensor = torch.Tensor
+# (co)variance over a turn of phase of d phase / d diameter and d phase / d height of the default cell, rad² per nm²
+PHASE_VARIANCE = (7.8e-4, 6.5e-5, 7.1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +30,52 @@ class Spread:
     """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
 
     focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
-    astigmatism_waves: of stress and stage errors, waves at the rim.
+    astigmatism_waves: of stress and stage errors, waves at the rim. bias_nm: of all diameters. height_nm: of the
+    pillars. correlation: (5, 5) between them in this order, rows one after the other; empty for none.
     """
 
     focus_um: float = 0.0
     tilt_waves: float = 0.0
     astigmatism_waves: float = 0.0
+    bias_nm: float = 0.0
+    height_nm: float = 0.0
+    correlation: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if min(self.deviations) < 0:
+            raise ConfigError(f"spread {self.deviations}: need standard deviations of 0 or more")
+        if self.correlation:
+            self._check()
+
+    @property
+    def deviations(self) -> tuple[float, ...]:
+        """Standard deviations in order."""
+        return self.focus_um, self.tilt_waves, self.astigmatism_waves, self.bias_nm, self.height_nm
+
+    @property
+    def covariance(self) -> Array:
+        """(5, 5) of the errors."""
+        size = len(self.deviations)
+        correlation = np.reshape(self.correlation, (size, size)) if self.correlation else np.eye(size)
+        return np.asarray(correlation * np.outer(self.deviations, self.deviations))
+
+    def draw(self, generator: torch.Generator) -> Tensor | None:
+        """(5,) errors of one lens; None where nothing varies."""
+        if not any(self.deviations):
+            return None
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = torch.from_numpy(vectors * np.sqrt(values.clip(0)))
+        return root @ torch.randn(len(self.deviations), generator=generator, dtype=torch.float64)
+
+    def _check(self) -> None:
+        size = len(self.deviations)
+        if len(self.correlation) != size**2:
+            raise ConfigError(f"correlation has {len(self.correlation)} entries, need {size} x {size} = {size**2}")
+        matrix = np.reshape(self.correlation, (size, size))
+        if not np.allclose(np.diag(matrix), 1) or not np.allclose(matrix, matrix.T):
+            raise ConfigError("correlation must be symmetric with ones on its diagonal")
+        if np.linalg.eigvalsh(matrix)[0] < -1e-9:
+            raise ConfigError("correlation is not positive semi-definite: no errors can be correlated like that")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +169,7 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: Tensor | N
 
     Args:
         coefficients_rad: (polynomials,) in rad of root-mean-square phase over the aperture.
-        error: (3,) focus_um, tilt_waves, astigmatism_waves of one draw of :class:`Spread`.
+        error: (5,) one draw of :class:`Spread`.
 
     Raises:
         TrainingError: a coefficient is not finite.
@@ -144,7 +186,8 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: Tensor | N
     rows, columns = _sample_rows(settings)
     low = len(columns)
     kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
-    return Stack((rows @ (kept @ columns)).real, settings.depths_um)
+    light = (rows @ (kept @ columns)).real
+    return Stack(light if error is None else _hazy(settings, light, error), settings.depths_um)
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
@@ -255,7 +298,20 @@ def _error_phase(settings: OpticsConfig, error: Tensor) -> Tensor:
     pupil = settings.pupil
     x, y = (c / pupil.radius_um for c in coordinates(pupil))
     rho2 = x**2 + y**2
-    focus_um, tilt, astigmatism = error.double().unbind()
+    focus_um, tilt, astigmatism = error[:3].double().unbind()
     k = 2 * math.pi / pupil.wavelength_um
     defocus = -k * focus_um * (pupil.radius_um / pupil.sensor_distance_um) ** 2 / 2 * rho2
     return defocus + 2 * math.pi * (tilt * rho2 * x + astigmatism * (x**2 - y**2))
+
+
+def _hazy(settings: OpticsConfig, light: Tensor, error: Tensor) -> Tensor:
+    """Light of pillars that are wrong by a bias and a height: their phases differ by more than a constant.
+
+    With the phases of a lens spread evenly over a turn, an error of variance V leaves exp(-V) of the light in the
+    image (Marechal) and sends the rest straight on, over the shadow of the aperture.
+    """
+    bias, height = error[3:].double().unbind()
+    variance = PHASE_VARIANCE[0] * bias**2 + 2 * PHASE_VARIANCE[1] * bias * height + PHASE_VARIANCE[2] * height**2
+    kept = torch.exp(-variance).to(light)
+    shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)
+    return kept * light + (1 - kept) * shadow

@@ -1,26 +1,29 @@
 """A co-design run from its config: joint training, search over architectures under budgets, and what is kept of it."""
 
-import json
 import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
 from codesign import assess, checkpoint, cost, evolution
 from codesign.architecture import Architecture, Space
+from codesign.baselines import Name
 from codesign.evolution import Candidate, Plan, Search
-from codesign.eye_scenes import TEST, VALIDATION, EyeScenes, SceneConfig
-from codesign.inner import InnerConfig, Record, Trainer, model
+from codesign.eye_scenes import VALIDATION, EyeScenes, SceneConfig
+from codesign.formation import network_macs
+from codesign.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
 from codesign.optics import OpticsConfig
+from codesign.pool import PoolScenes, fill
 from metalens import config
-from metalens.errors import ConfigError, TrainingError
+from metalens.errors import ConfigError
 from metalens.sensor import Sensor
 
-Preset = Literal["smoke", "laptop"]
+Preset = Literal["smoke", "laptop", "paper"]
+Part = Literal["optics", "pitch", "architecture"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +32,21 @@ class Budgets:
 
     pitch_um: effective pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
     budgets_mmacs: one search each; the results together are the Pareto set.
+    frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest uniform one
+        within each budget.
+    finetune_steps: of further training of the weights of each budget's network, on its own.
     """
 
     pitch_um: float = 9.0
     budgets_mmacs: tuple[float, ...] = (12.0,)
+    frozen: tuple[Part, ...] = ()
+    finetune_steps: int = 0
 
     def __post_init__(self) -> None:
         if not self.pitch_um > 0 or not self.budgets_mmacs or min(self.budgets_mmacs) <= 0:
             raise ConfigError(f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0")
+        if self.finetune_steps < 0:
+            raise ConfigError(f"finetune_steps = {self.finetune_steps}: need 0 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +54,16 @@ class RunConfig:
     """The content of RUN.toml; a preset gives every value that the file leaves out.
 
     checkpoint_every: steps. validation_batches: judge architectures. test_batches: judge the result.
+    network: the elastic network, or a baseline in its place (no search; one row without a budget).
+    ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that test out.
     """
 
     preset: Preset = "laptop"
     checkpoint_every: int = 50
     validation_batches: int = 8
     test_batches: int = 32
+    network: Name = "supernet"
+    ambiguity_pairs: int = 0
     scenes: SceneConfig = field(default_factory=SceneConfig)
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     sensor: Sensor = field(default_factory=Sensor)
@@ -61,6 +75,11 @@ class RunConfig:
     def __post_init__(self) -> None:
         if min(self.checkpoint_every, self.validation_batches, self.test_batches) < 1:
             raise ConfigError("checkpoint_every, validation_batches and test_batches must be 1 or more")
+        if 0 < self.scenes.pool < self.inner.batch or self.ambiguity_pairs < 0:
+            raise ConfigError(
+                f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}, ambiguity_pairs = "
+                f"{self.ambiguity_pairs}: need a pool of a batch or more (or 0), and pairs of 0 or more"
+            )
         for resolution in (self.space.resolution[0], 1.0):
             cost.input_size(self.scenes.pixels * self.optics.sample_um, self.run.pitch_um, resolution)
 
@@ -78,7 +97,7 @@ def load(path: str | Path) -> RunConfig:
 
 def preset_table(name: str) -> dict[str, Any]:
     """The settings of a preset; of laptop for a name that is none, which :func:`load` then refuses."""
-    known = name if name in ("smoke", "laptop") else "laptop"
+    known = name if name in get_args(Preset) else "laptop"
     return tomllib.loads(resources.files("codesign").joinpath("data", f"{known}.toml").read_text(encoding="utf-8"))
 
 
@@ -98,7 +117,8 @@ class Run:
     def macs(self, architecture: Architecture) -> float:
         """Multiply-accumulates of an architecture at the pitch that was found."""
         pitch = self.trainer.model.pitch_um.detach()
-        return float(cost.macs(architecture, pitch, window_um=self.window_um, space=self.settings.space))
+        cost.input_size(self.window_um, float(pitch), architecture.resolution)
+        return float(network_macs(self.trainer.model.net, architecture, self.window_um, pitch))
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
@@ -107,12 +127,26 @@ class Run:
 
 
 def start(settings: RunConfig) -> Run:
-    """A fresh run."""
-    made = model(settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space)
-    scenes = EyeScenes(
-        settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, settings.inner.seed
+    """A fresh run; renders the pool of frames where there is one.
+
+    Raises:
+        TrainingError: a budget is below the smallest network.
+    """
+    seed, frozen = settings.inner.seed, settings.run.frozen
+    inner = settings.inner
+    inner = replace(inner, optics=Schedule(0.0)) if "optics" in frozen else inner
+    inner = replace(inner, pitch=Schedule(0.0)) if "pitch" in frozen else inner
+    made = model(
+        settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space, network=settings.network
     )
-    return Run(settings, Trainer(settings.inner, settings.optics, settings.sensor, scenes, made), [])
+    fresh = EyeScenes(settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, seed)
+    scenes: Scenes = fresh
+    if settings.scenes.pool:
+        scenes = PoolScenes(fill(fresh, settings.scenes.pool), fresh.margin, settings.scenes.scale, seed)
+    run = Run(settings, Trainer(inner, settings.optics, settings.sensor, scenes, made), [])
+    if settings.network == "supernet" and inner.pitch.rate == 0:
+        evolution.affordable(settings.space, run.macs, min(settings.run.budgets_mmacs) * 1e6)
+    return run
 
 
 def save(path: Path, run: Run) -> None:
@@ -149,7 +183,12 @@ def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
         (budget in MMACs, the candidate that was born).
     """
     settings = run.settings
+    if settings.network != "supernet":
+        return
     frames = assess.frames(run.trainer, run.scenes(VALIDATION), settings.validation_batches)
+    plan = settings.search
+    if "architecture" in settings.run.frozen:
+        plan = Plan(population=1, tournament=1, rounds=1)
 
     def error(architecture: Architecture) -> float:
         return assess.assess(run.trainer.model.net, architecture, frames, settings.inner).slip_mm
@@ -158,46 +197,18 @@ def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
         before = run.searches[i] if i < len(run.searches) else None
         states = evolution.evolve(
             settings.space,
-            settings.search,
+            plan,
             error,
             run.macs,
             budget=budget * 1e6,
             seed=settings.inner.seed + i,
             start=before,
+            uniform="architecture" in settings.run.frozen,
         )
         for state in states:
             yield budget, state.history[-1]
             run.searches[i:] = [state]
             save(path, run)
-
-
-def finish(run: Run) -> list[dict[str, Any]]:
-    """The best of every budget on the test frames: one row a budget.
-
-    Raises:
-        TrainingError: a search has not ended.
-    """
-    settings = run.settings
-    if len(run.searches) < len(settings.run.budgets_mmacs):
-        raise TrainingError(
-            f"{len(run.searches)} of {len(settings.run.budgets_mmacs)} searches are done; resume the run"
-        )
-    frames = assess.frames(run.trainer, run.scenes(TEST), settings.test_batches)
-    rows = []
-    for budget, state in zip(settings.run.budgets_mmacs, run.searches, strict=True):
-        best = evolution.best(state.history)
-        found = assess.assess(run.trainer.model.net, best.architecture, frames, settings.inner)
-        rows.append(
-            {
-                "budget_mmacs": budget,
-                "mmacs": best.macs / 1e6,
-                "axial_slip_mm": found.axial_mm,
-                "lateral_slip_mm": found.lateral_mm,
-                "iou": found.iou,
-                "architecture": json.loads(evolution.dumps(Search((best,))))["history"][0],
-            }
-        )
-    return rows
 
 
 def coefficients(run: Run) -> torch.Tensor:

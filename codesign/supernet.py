@@ -13,15 +13,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from codesign.architecture import Architecture, Block, Space, blocks, largest, stem_channels
-from codesign.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides
+from codesign.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
 from metalens.errors import TrainingError
+from metalens.store import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Prediction:
     """What the network says of a frame.
 
-    mask_logits: (batch, y, x) at a quarter of the input resolution.
+    mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a network that gives no mask.
     centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle, -0.5 at the left and top edge.
     slip: (batch, 3) camera displacement in units of the scale that the loss divides by (paper Eq. 7).
     """
@@ -187,6 +188,10 @@ class Supernet(nn.Module):
         logits = self.perception(features)
         return Prediction(logits, soft_argmax(logits), self.calibration(x))
 
+    def counts(self, architecture: Architecture, sizes: Array) -> Array:
+        """Multiply-accumulates of a member for square frames of these sizes after scaling (integers), exact."""
+        return network(self.space, architecture).at(sizes)
+
     def _stem(self, architecture: Architecture) -> int:
         return stem_channels(self.space, architecture)
 
@@ -222,7 +227,7 @@ def soft_argmax(logits: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def recalibrate(net: Supernet, architecture: Architecture, batches: Iterable[Tensor]) -> None:
+def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]) -> None:
     """Measure the batch statistics of one architecture from a reset, on fixed batches; leaves eval mode.
 
     Raises:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign import optics
-from codesign.optics import OpticsConfig
+from codesign.optics import OpticsConfig, Spread
 from metalens.errors import ConfigError, TrainingError
 from metalens.psf import psf_stack
 from metalens.pupil import coordinates, psf
@@ -116,7 +116,7 @@ def test_a_shifted_sensor_is_a_shifted_focus():
     """A longer sensor distance d + e is in focus for 1/z = 1/z0 + e/d² (paraxial): the error phase does that."""
     shifted = 2.0
     vergence = 1 / 20_000.0 + shifted / 400.0**2
-    error = torch.tensor([shifted, 0.0, 0.0])
+    error = torch.tensor([shifted, 0.0, 0.0, 0.0, 0.0])
     with_error = optics.stack(SMALL, torch.zeros(12), error=error).intensity
     peaks = [
         float(optics.stack(replace(SMALL, focus_mm=1e-3 / v), torch.zeros(12)).intensity[0].max())
@@ -128,7 +128,7 @@ def test_a_shifted_sensor_is_a_shifted_focus():
 
 def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():
     plain = optics.stack(SMALL, torch.zeros(12)).intensity[1]
-    bent = optics.stack(SMALL, torch.zeros(12), error=torch.tensor([0.0, 0.3, 0.3])).intensity[1]
+    bent = optics.stack(SMALL, torch.zeros(12), error=torch.tensor([0.0, 0.3, 0.3, 0.0, 0.0])).intensity[1]
     assert torch.allclose(plain, plain.mT, atol=1e-6)
     assert not torch.allclose(bent, bent.mT, atol=1e-3)
     # the light within the window, of which the ripples of the low-pass at its edge are 1 %
@@ -142,3 +142,44 @@ def test_lost_optics_and_impossible_settings_are_refused():
         replace(SMALL, depths_mm=(20.0, 10.0))
     with pytest.raises(ConfigError, match="odd number"):
         replace(SMALL, window_samples=16)
+
+
+def test_lens_errors_have_the_covariance_that_was_asked_for():
+    correlation = np.eye(5)
+    correlation[3, 4] = correlation[4, 3] = -0.6
+    spread = Spread(2.0, 0.1, 0.0, 4.0, 8.0, tuple(correlation.ravel()))
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.stack([spread.draw(generator) for _ in range(4000)]).numpy()
+    scale = np.outer(spread.deviations, spread.deviations) + 1e-12
+    assert np.abs((np.cov(drawn.T) - spread.covariance) / np.sqrt(np.outer(*[np.diag(scale)] * 2))).max() < 0.06
+    assert Spread().draw(generator) is None
+    with pytest.raises(ConfigError, match="positive semi-definite"):
+        bad = np.full((5, 5), -0.9) + 1.9 * np.eye(5)
+        Spread(correlation=tuple(bad.ravel()))
+
+
+def test_a_bias_of_the_diameters_sends_light_straight_on():
+    plain = optics.stack(SMALL, torch.zeros(12)).intensity
+    hazy = optics.stack(SMALL, torch.zeros(12), error=torch.tensor([0.0, 0.0, 0.0, 20.0, 0.0])).intensity
+    lost = 1 - math.exp(-optics.PHASE_VARIANCE[0] * 400)
+    window = (SMALL.window_samples * SMALL.sample_um) ** 2 / (math.pi * 100.0**2)
+    want = (1 - lost) * plain.sum((1, 2)) + lost * window
+    torch.testing.assert_close(hazy.sum((1, 2)), want, rtol=1e-4, atol=0)
+
+
+@pytest.mark.slow
+def test_phase_variances_are_those_of_the_default_cell():
+    """Derivatives of the phase by diameter and height, over diameters whose phases fill a turn evenly."""
+    from metalens import library
+
+    cell = library.DEFAULT_CELL
+    low, high = (
+        library.proxy_of(library.sweep(replace(cell, height_um=h), wavelengths_um=(0.85,)))
+        for h in (cell.height_um, cell.height_um + 0.01)
+    )
+    turn = np.linspace(0, 2 * math.pi, 400, endpoint=False)
+    diameters = np.asarray(low.diameter_um(low.phase_rad(np.array([low.domain_um[0]]), 0.85)[0] + turn, 0.85))
+    by_diameter = low.dphase_ddiameter(diameters, 0.85) * 1e-3
+    by_height = (high.phase_rad(diameters, 0.85) - low.phase_rad(diameters, 0.85)) / 10
+    found = np.cov(np.stack([by_diameter, by_height]))
+    assert [found[0, 0], found[0, 1], found[1, 1]] == pytest.approx(optics.PHASE_VARIANCE, rel=0.03)

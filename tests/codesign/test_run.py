@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 import torch
 
 from codesign import command_codesign, run
+from codesign.finish import finish, finished
 from metalens.errors import ConfigError, TrainingError
 
 TINY = """
@@ -20,6 +22,7 @@ validation_batches = 1
 test_batches = 1
 [scenes]
 pixels = 48
+pool = 6
 [inner]
 steps = 2
 batch = 2
@@ -50,7 +53,7 @@ def settings(tmp_path):
 def _end(going, path):
     list(run.train(going, path))
     list(run.search(going, path))
-    return run.finish(going)
+    return finish(going)
 
 
 def test_preset_fills_what_the_file_leaves_out(settings):
@@ -89,7 +92,7 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
     with pytest.raises(TrainingError, match=r"inner\.steps: 2 -> 4"):
         run.resume(tmp_path / "c", run.load(tmp_path / "other.toml"))
     with pytest.raises(TrainingError, match="0 of 1 searches"):
-        run.finish(going)
+        finish(going)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,11 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
         ("[run]\npitch_um = 500.0", "pixels of a"),
         ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
         ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
+        ("[scenes]\npool = 3", "need a pool of a batch or more"),
+        ("[run]\nfrozen = ['lens']", "frozen"),
+        ("network = 'resnet'", "network"),
+        ("[optics.spread]\nfocus_um = -1.0", "standard deviations of 0 or more"),
+        ("[optics.spread]\ncorrelation = [1.0]", "need 5 x 5 = 25"),
     ],
 )
 def test_bad_configs_are_refused_by_name(tmp_path, change, message):
@@ -107,12 +115,43 @@ def test_bad_configs_are_refused_by_name(tmp_path, change, message):
         run.load(tmp_path / "run.toml")
 
 
-def test_budget_below_the_smallest_network_is_refused(settings, tmp_path):
-    from dataclasses import replace
-
-    going = run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
     with pytest.raises(TrainingError, match="below the smallest network"):
-        list(run.search(going, tmp_path / "c"))
+        run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+
+
+def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
+    going = run.start(replace(settings, run=replace(settings.run, frozen=("optics", "architecture"))))
+    rows = _end(going, tmp_path / "c")
+    assert not run.coefficients(going).any()
+    assert [len(s.history) for s in going.searches] == [1]
+    assert len(set(rows[0]["architecture"]["kernels"])) == 1
+    assert rows[0]["mmacs"] <= 2.0
+
+
+@pytest.mark.parametrize("network", ["nvgaze", "popovic", "de2gaze"])
+def test_baselines_run_from_the_same_config(settings, tmp_path, network):
+    going = run.start(replace(settings, network=network))
+    (row,) = _end(going, tmp_path / "c")
+    assert row["budget_mmacs"] is None
+    assert row["mmacs"] > 0.5
+    assert (row["iou"] is None) == (network == "nvgaze")
+    again = run.resume(tmp_path / "c", replace(settings, network=network))
+    assert finish(again) == [row]
+
+
+def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tmp_path):
+    tuned = replace(settings, run=replace(settings.run, finetune_steps=2), ambiguity_pairs=2)
+    going = run.start(tuned)
+    rows = _end(going, tmp_path / "c")
+    plain = finish(run.resume(tmp_path / "c", tuned))
+    assert plain == rows
+    assert {"ambiguous_axial_slip_mm", "depth_response_mm_per_mm"} <= set(rows[0])
+    before = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
+    row, made = finished(going)[0]
+    assert row == rows[0]
+    assert torch.equal(made.coefficients_rad, going.trainer.model.coefficients_rad)
+    assert not torch.equal(made.net.stem.weight, before["stem.weight"])
 
 
 def test_a_log_line_cut_by_a_kill_is_dropped(settings, tmp_path):
