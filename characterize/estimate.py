@@ -197,20 +197,36 @@ def _search(
     prior, base = prior_of(names, known), start.copy()
     place = [PLACE[name] for name in names]
 
-    def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
-        x = base.copy()
-        x[place] = values
-        return model.images(x, names if jacobian else None)
+    def problem(of: ForwardModel) -> leastsquares.Model:
+        def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
+            x = base.copy()
+            x[place] = values
+            return of.images(x, names if jacobian else None)
+
+        return images
 
     begins = [start] if brief else _starts(model, data, start, found)
     if "pinhole_um" in names and base[PLACE["pinhole_um"]] == 0:
         begins = [_with(x, {"pinhole_um": 5.0}) for x in begins]
     if "bandwidth_nm" in names and base[PLACE["bandwidth_nm"]] == 0:
         begins = [_with(x, {"bandwidth_nm": 0.5}) for x in begins]
-    short = Settings(iterations=3, step_tolerance=3.0)
-    tries = [leastsquares.fit(images, data, x[place], prior=prior, settings=short) for x in begins]
+    few = _few(model.setting)
+    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False)
+    part, seen = problem(model.only(few)), data.planes(few)
+    tries = [leastsquares.fit(part, seen, x[place], prior=prior, settings=short) for x in begins]
     best = min(tries, key=lambda t: t.merit)
-    return names, leastsquares.fit(images, data, best.value, prior=prior, settings=Settings(iterations=30))
+    settings = Settings(iterations=40, secant=True)
+    return names, leastsquares.fit(problem(model), data, best.value, prior=prior, settings=settings)
+
+
+def _few(setting: Setting) -> Array:
+    """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
+    chosen: list[int] = []
+    for angle in np.unique(setting.angle_rad, axis=0):
+        index = np.flatnonzero((setting.angle_rad == angle).all(1))
+        by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
+        chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
+    return np.unique(chosen)
 
 
 def _with(x: Array, values: dict[str, float]) -> Array:

@@ -1,7 +1,9 @@
 """Expected frames of an as-built lens on its bench, with derivatives by every parameter, on coarse nodes."""
 
+import copy
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +31,10 @@ GEOMETRY = (
 )
 PROCESS = ("height_nm", "index", "sidewall_deg")
 _SLOPE_TOLERANCE = 3e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
-_STEP = {"distance_um": 0.05, "wavelength_nm": 0.005}
+_STEP: dict[str, Callable[[Bench], float]] = {
+    "distance_um": lambda bench: bench.distance_um,
+    "wavelength_nm": lambda bench: bench.wavelength_um * 1e3,
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -105,6 +110,17 @@ class ForwardModel:
         _, maps = bias_um(np.zeros(len(NAMES)), reduced.u, reduced.v)
         return _Group(index, pillars, reduced, aberrations(reduced.u, reduced.v), maps)
 
+    def only(self, frames: Array) -> "ForwardModel":
+        """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
+        part, s = copy.copy(self), self.setting
+        part.setting = dataclasses.replace(
+            s, depth_um=s.depth_um[frames], angle_rad=s.angle_rad[frames], exposure=s.exposure[frames]
+        )
+        places = [np.flatnonzero(np.isin(frames, group.index)) for group in self.groups]
+        pairs = [(group, place) for group, place in zip(self.groups, places, strict=True) if len(place)]
+        part.groups = [dataclasses.replace(group, index=place) for group, place in pairs]
+        return part
+
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
         light, slopes = self._light(x, wanted)
@@ -174,29 +190,28 @@ class ForwardModel:
         growth = self._growth(x, group)
         conjugate = field.conj()
         lit = (pupil * phasor).astype(np.complex64)
+        short, power = phasor.astype(np.complex64), np.vdot(lit, lit)
 
-        def slope_field(change: Array) -> Array:
-            return operators.field(change.astype(np.complex64), tolerance=_SLOPE_TOLERANCE)
-
-        def sampled(change: Array) -> Array:
-            return self.grid.sample(2 * (conjugate * change).real, transfer)
+        def sampled(change: Array, more: Array | float = 0.0) -> Array:
+            """Derivative of the light; the part of a change that is the light itself needs no sum, nor loses digits."""
+            same = np.vdot(lit, change) / power
+            field = operators.field(change - same * lit, tolerance=_SLOPE_TOLERANCE) + more
+            return np.asarray(self.grid.sample(2 * (conjugate * field).real, transfer) + 2 * same.real * light)
 
         for name in names:
             if name in BIAS:
-                changed = by_bias * group.bias[BIAS.index(name)] * phasor
-                out[name] = sampled(slope_field(changed))
+                changed = (by_bias * group.bias[BIAS.index(name)]).astype(np.complex64) * short
+                out[name] = sampled(changed)
             elif name in PROCESS:
-                changed = by_process[PROCESS.index(name)] * phasor
-                out[name] = sampled(slope_field(changed))
+                changed = by_process[PROCESS.index(name)].astype(np.complex64) * short
+                out[name] = sampled(changed)
             elif name.removesuffix("_rad") in ABERRATIONS:
                 z = group.zernike[ABERRATIONS.index(name.removesuffix("_rad"))]
-                out[name] = sampled(slope_field(1j * z * lit))
+                out[name] = sampled((1j * z).astype(np.complex64) * lit)
             elif name in GEOMETRY:
                 turned = 1j * self._phase_slope(x, group, name)
-                change = slope_field(turned * lit)
-                if name in _STEP:
-                    change = change + self._by_operators(x, group, name, lit, field)
-                out[name] = sampled(change)
+                more = self._by_operators(x, group, name, lit, field) if name in _STEP else 0.0
+                out[name] = sampled(turned.astype(np.complex64) * lit, more)
                 if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
                     disc = blurs["pinhole_um"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
                     out[name] = out[name] + self.grid.sample(intensity, disc)
@@ -206,7 +221,7 @@ class ForwardModel:
 
     def _by_operators(self, x: Array, group: _Group, name: str, lit: Array, field: Array) -> Array:
         """Derivative of the field through the window operators, and of the pillars where the wavelength changes."""
-        step = _STEP[name]
+        step = group.reduced.small_change(self.grid.axes_um()) * _STEP[name](group.reduced.bench)
         up = x.copy()
         up[PLACE[name]] += step
         phasor = np.exp(1j * self._phase(x, group))

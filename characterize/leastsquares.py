@@ -62,11 +62,18 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """When to stop, and how far an outlier is (sigma)."""
+    """When to stop, and how far an outlier is (sigma).
+
+    secant: between exact Jacobians the last one is brought up to date by the images that each step gave (Broyden 1965);
+        steps that look final, and those that fail, are checked with an exact one.
+    finish: the Jacobian at the end is exact.
+    """
 
     iterations: int = 40
     step_tolerance: float = 0.02
     huber: float = 6.0
+    secant: bool = False
+    finish: bool = True
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -112,21 +119,34 @@ def fit(
     iteration = 0
     while iteration < settings.iterations:
         iteration += 1
-        step, damping, accepted = _step(model, data, state, prior, settings, damping)
-        if accepted:
-            state = _linearise(model, data, state.x + step, prior, settings)
+        step, image, damping, accepted = _step(model, data, state, prior, settings, damping)
         moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
-        if not accepted or moved < settings.step_tolerance * (1 + damping):
+        done = not accepted or moved < settings.step_tolerance * (1 + damping)
+        if done and not state.exact:
+            x = state.x + step if accepted else state.x
+            state, damping = _linearise(model, data, x, prior, settings), 1e-3
+            continue
+        if accepted and settings.secant:
+            state = _secant(data, state, step, image, prior, settings)
+        elif accepted:
+            state = _linearise(model, data, state.x + step, prior, settings)
+        if done:
             converged = moved < 10 * settings.step_tolerance
             reason = f"last step moved {moved:.2g} sigma" if converged else "no step lowers the misfit"
             break
+    if settings.finish and not state.exact:
+        state = _linearise(model, data, state.x, prior, settings)
     return _solution(data, state, prior, converged, reason, iteration)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _State:
+    """The problem about a point; exact: the Jacobian was computed here, not brought up to date from elsewhere."""
+
     x: Array
     image: Array
+    jacobian: Array
+    exact: bool
     residual: Array
     weight: Array
     gradient: Array
@@ -139,6 +159,22 @@ def _linearise(model: Model, data: Data, x: Array, prior: Prior, settings: Setti
     image, jacobian = model(x, True)
     if jacobian is None or not np.isfinite(image).all():
         raise FitError("the model is not finite at these parameters; bound them or correct the start")
+    return _state(data, (x, image, jacobian), prior, settings, exact=True)
+
+
+def _secant(data: Data, state: _State, step: Array, image: Array, prior: Prior, settings: Settings) -> _State:
+    """The problem after a step, with the least change of the Jacobian that explains how the images changed.
+
+    J + (dI - J s) sᵀC / (sᵀC s), where C, the curvature, is the natural measure of a step.
+    """
+    measure = state.curvature @ step
+    missed = (image - state.image) - np.tensordot(step, state.jacobian, 1)
+    jacobian = state.jacobian + np.multiply.outer(measure / max(float(step @ measure), 1e-300), missed)
+    return _state(data, (state.x + step, image, jacobian), prior, settings, exact=False)
+
+
+def _state(data: Data, at: tuple[Array, Array, Array], prior: Prior, settings: Settings, *, exact: bool) -> _State:
+    x, image, jacobian = at
     noise = np.sqrt(data.variance(image))
     residual = _residual(data, image, noise)
     weight = _robust(residual, settings.huber) * data.usable * ~(data.saturated & (residual == 0))
@@ -149,20 +185,20 @@ def _linearise(model: Model, data: Data, x: Array, prior: Prior, settings: Setti
     pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma**2, 0.0)
     gradient = -scaled @ (np.sqrt(weight) * residual).ravel()[keep] + pull
     curvature = information + np.diag(prior.sigma**-2.0)
-    return _State(x, image, residual, weight, gradient, curvature, information, noise)
+    return _State(x, image, jacobian, exact, residual, weight, gradient, curvature, information, noise)
 
 
 def _step(
     model: Model, data: Data, state: _State, prior: Prior, settings: Settings, damping: float
-) -> tuple[Array, float, bool]:
-    """A step that lowers the misfit at the weights of ``state``: (step, next damping, found)."""
+) -> tuple[Array, Array, float, bool]:
+    """A step that lowers the misfit at the weights of ``state``: (step, image there, next damping, found)."""
     before = _merit(data, state.image, state.x, state.noise, prior, settings)
     size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
     scaled = state.curvature / np.outer(size, size)
     blocked = ((state.x <= prior.low) & (state.gradient > 0)) | ((state.x >= prior.high) & (state.gradient < 0))
     free = np.flatnonzero(~blocked)
-    step = np.zeros_like(state.x)
-    for _ in range(10):
+    step, image = np.zeros_like(state.x), state.image
+    for _ in range(10 if state.exact else 2):
         matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
         step = np.zeros_like(state.x)
         step[free] = -np.linalg.lstsq(matrix, state.gradient[free] / size[free], rcond=1e-14)[0] / size[free]
@@ -171,9 +207,9 @@ def _step(
         if np.isfinite(image).all():
             after = _merit(data, image, state.x + step, state.noise, prior, settings)
             if after <= before * (1 + 1e-12):
-                return step, max(damping / 5, 1e-10), True
+                return step, image, max(damping / 5, 1e-10), True
         damping *= 6
-    return step, damping, False
+    return step, image, damping, False
 
 
 def _merit(data: Data, image: Array, x: Array, noise: Array, prior: Prior, settings: Settings) -> float:

@@ -17,6 +17,7 @@ from metalens.lens import Lens
 from metalens.proxy import Proxy
 from metalens.store import Array
 
+_ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
 CHANGES = ("height_um", "index", "sidewall_rad")
 
 
@@ -137,11 +138,17 @@ class Pillars:
         bias = self.nodes_um[:, None]
         return np.asarray((self.response.at(self.diameter_um + bias) * self.exact(bias, change)) @ self.basis.T)
 
-    def functions(self, diameter_um: Array) -> Array:
-        """(r, *shape) complex: the conjugate basis at designed diameters, 0 where there is no pillar."""
-        safe = np.where(diameter_um > 0, diameter_um, self.diameter_um[0])
-        place = (safe - self.diameter_um[0]) / (self.diameter_um[1] - self.diameter_um[0])
-        return np.stack([_cubic(row.conj(), place) * (diameter_um > 0) for row in self.basis])
+    def table(self) -> Array:
+        """(r, entries) complex64: the conjugate basis on a fine grid of diameters; the last entry is no pillar."""
+        place = np.linspace(0, len(self.diameter_um) - 1, _ENTRIES)
+        rows = [_cubic(row.conj(), place) for row in self.basis]
+        return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1).astype(np.complex64)
+
+    def place(self, diameter_um: Array) -> Array:
+        """Entry of :meth:`table` nearest to designed diameters (any shape)."""
+        low, high = self.diameter_um[0], self.diameter_um[-1]
+        entry = np.rint((diameter_um - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
+        return np.where(diameter_um > 0, entry, _ENTRIES)
 
     def weights(self, bias_um: Array) -> tuple[Array, Array]:
         """(b, *shape) Lagrange weights of the bias nodes at ``bias_um``, and their derivatives."""

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.pillars import Pillars
-from metalens import legendre
+from metalens import legendre, threads
 from metalens.errors import FitError
 from metalens.lens import Lens
 from metalens.store import Array
+
+_BESIDE = 0.1  # weight of directions that miss the lens when the low-rank terms are chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +48,19 @@ class Operators:
     remainder: Array
 
     def field(self, light: Array, *, tolerance: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) complex, in the precision of ``light``; fewer terms with a ``tolerance``."""
-        kind = light.dtype
-        out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), kind)
+        """(..., q, p) -> (..., Y, X) complex64; fewer terms with a ``tolerance``."""
+        out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), np.complex64)
         terms = max(1, int((self.remainder > tolerance).sum()))
-        for lens, window in zip(self.lens_terms[:terms], self.window_terms[:terms], strict=True):
-            part = self.along_y.astype(kind) @ (light * lens.astype(kind)) @ self.along_x.astype(kind)
-            out += part * window.astype(kind)
+        light = light.astype(np.complex64, copy=False)
+        flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
+
+        def some(first: int, last: int) -> None:
+            for lens, window in zip(self.lens_terms[:terms], self.window_terms[:terms], strict=True):
+                for i in range(first, last):
+                    result[i] += (self.along_y @ ((flat[i] * lens) @ self.along_x)) * window
+
+        with threads.one_blas_thread():
+            threads.split(len(flat), some)
         return out
 
 
@@ -105,16 +113,25 @@ class Reduced:
         d = lens.diameters
         x, y = d.x_um, d.y_um
         hy, hx = self.half_um
-        n = self.nodes + 6
-        across, along = legendre.interpolation(n, x / hx), legendre.interpolation(n, y / hy)
-        fields = np.zeros((len(pillars.basis), n, n), complex)
-        block = max(1, 400_000 // len(x))
-        for start in range(0, len(y), block):
-            rows = slice(start, start + block)
-            carrier = np.exp(1j * self.k * self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench))
-            part = pillars.functions(d.diameter_um[rows]) * carrier
-            fields += along[rows].T @ (part @ across)
-        return self._to_directions(fields, n)
+        n, r = self.nodes + 6, len(pillars.basis)
+        across, along = (legendre.interpolation(n, t).astype(np.float32) for t in (x / hx, y / hy))
+        table = pillars.table()
+        block = max(1, 200_000 // len(x))
+        parts = [slice(start, start + block) for start in range(0, len(y), block)]
+        sums = np.zeros((len(parts), r, n, n), np.complex64)
+
+        def some(first: int, last: int) -> None:
+            for i in range(first, last):
+                rows = parts[i]
+                path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
+                light = table[:, pillars.place(d.diameter_um[rows])] * _turns(self.k * path)
+                halves = np.concatenate([light.real, light.imag]).reshape(-1, len(x)) @ across
+                real, imaginary = along[rows].T @ halves.reshape(2, r, -1, n)
+                sums[i] = real + 1j * imaginary
+
+        with threads.one_blas_thread():
+            threads.split(len(parts), some)
+        return self._to_directions(sums.sum(0, dtype=complex), n)
 
     def _to_directions(self, fields: Array, n: int) -> Array:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
@@ -139,23 +156,39 @@ class Reduced:
         k, scale = 2 * math.pi / wavelength_um, self.bench.distance_um / distance_um
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
-        w = 11 + int(k * self.window_um**2 / self.bench.distance_um / 8)
+        w = 12 + int(k * max(wy, wx) ** 2 / self.bench.distance_um)
         m = 10 + int(16 * max(np.abs(self._p).max(), np.abs(self._q).max()))
         Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
         P, Q = np.meshgrid(legendre.mapped(m, *self._p), legendre.mapped(m, *self._q))
         table = self._rest(P.ravel(), Q.ravel(), X[None, :, None], Y[:, None, None], (k, distance_um, scale))
         table = table.reshape(w * w, m * m)
+        weight = np.where(np.hypot(*self._on_lens(P, Q)).ravel() < 1.03 * self.radius_um, 1.0, _BESIDE)
+        table = table * weight
         power, v = np.linalg.eigh(table.conj().T @ table)  # cheaper than an SVD, and 1e-8 is small enough
         power, v = np.maximum(power[::-1], 0), v[:, ::-1].conj().T
         remainder = np.sqrt(np.cumsum(power[::-1])[::-1] / power.sum())
         rank = max(1, int((remainder > self.tolerance).sum()))
+        lens_side = v[:rank].conj().T
         iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
-        window = np.einsum("Yj,jir,Xi->rYX", iy, (table @ v[:rank].conj().T).reshape(w, w, rank), ix, optimize=True)
+        window = np.einsum("Yj,jir,Xi->rYX", iy, (table @ lens_side).reshape(w, w, rank), ix, optimize=True)
+        v = v[:rank] / weight
         to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
-        lens = np.einsum("bq,rqp,ap->rba", to_p, v[:rank].reshape(rank, m, m), to_p, optimize=True)
+        lens = np.einsum("bq,rqp,ap->rba", to_p, v.reshape(rank, m, m), to_p, optimize=True)
         p, q = self.p[0], self.q[:, 0]
         along_y, along_x = np.exp(-1j * k * scale * y[:, None] * q), np.exp(-1j * k * scale * p[:, None] * x)
-        return Operators(along_y, along_x, lens * self.pitch_um**2, window, remainder[:rank])
+        ways, terms = (along_y, along_x), (lens * self.pitch_um**2, window)
+        a, b, c, d = (part.astype(np.complex64) for part in (*ways, *terms))
+        return Operators(a, b, c, d, remainder[:rank])
+
+    def small_change(self, axes_um: tuple[Array, Array]) -> float:
+        """Relative change of wavelength or distance that turns no path inside the window by more than 4 mrad."""
+        reach = max(float(np.abs(axis).max()) for axis in axes_um)
+        return 4e-3 / (self.k * reach * float(np.abs([self._p, self._q]).max()))
+
+    def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
+        """(x, y) on the lens of direction cosines seen from the window's centre."""
+        r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
+        return self.center_um[0] + r * p, self.center_um[1] + r * q
 
     def _rest(self, p: Array, q: Array, X: Array, Y: Array, at: tuple[float, float, float]) -> Array:
         """Kernel without exp(-ik s(pX + qY)) and without the path to the window's centre."""
@@ -184,6 +217,12 @@ def sensor_path(x: Array, y: Array, center_um: tuple[float, float], distance_um:
     r_0 = math.sqrt(cx * cx + cy * cy + distance_um**2)
     more = x * x + y * y - 2 * (x * cx + y * cy)
     return np.asarray(more / (np.sqrt(more + r_0**2) + r_0))
+
+
+def _turns(phase: Array) -> Array:
+    """exp(i phase) in single precision, the phase wrapped in double."""
+    small = np.remainder(phase, 2 * np.pi).astype(np.float32)
+    return np.asarray(np.cos(small) + 1j * np.sin(small))
 
 
 def _at(count: int, span: tuple[float, float], values: Array) -> Array:
