@@ -38,6 +38,9 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "fit": ("characterize.command_fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
     "codesign": ("codesign.command_codesign", "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together"),
+    "retrain": ("codesign.command_retrain", "RUN_DIR + asbuilt.h5 -> network for the lens as built, and the next mask"),
+    "budget": ("codesign.command_budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
+    "plan": ("codesign.command_plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
 }

@@ -1,0 +1,222 @@
+"""RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and the next mask's correction."""
+
+import json
+import shutil
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from safetensors.torch import save_file
+
+from characterize import asbuilt
+from characterize.bench import Truth
+from codesign import checkpoint, correction, retrain_report, retraining
+from codesign.built import MadeLens, posterior, psf_error
+from codesign.inner import Record, Trainer
+from codesign.retraining import Lenses, RetrainConfig, Source
+from codesign.run import RunConfig
+from codesign.subnet import Subnet
+from metalens import __version__, config, lens, store
+from metalens.commands import Common, Output
+from metalens.errors import ConfigError, TrainingError
+
+LOG, RECIPE, RESULT = "log.jsonl", "retrain.toml", "result.json"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens retrain``.
+
+    Attributes:
+        run_dir: folder of a finished ``metalens codesign``.
+        asbuilt: what ``metalens fit`` made of captures of the run's lens.h5.
+        output: folder for the retrained network, result.json, bias.toml, lens_corrected.h5 and report.html.
+        truth: TOML of the virtual bench; then the true lens judges, and a network is trained with it known.
+        process: PROCESS.toml that the mask was drawn with; its bias table is the one to be corrected.
+        settings: how to train on.
+        resume: go on from the folder's checkpoints, bit for bit.
+        insist: use a fit that failed its own checks.
+    """
+
+    run_dir: tyro.conf.Positional[Path]
+    asbuilt: Annotated[Path, tyro.conf.arg(aliases=["--optics"])]
+    output: Output
+    truth: Path | None = None
+    process: Path | None = None
+    settings: tyro.conf.OmitArgPrefixes[RetrainConfig] = field(default_factory=RetrainConfig)
+    resume: bool = False
+    insist: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a resume must find unchanged.
+
+    asbuilt, weights, truth: SHA-256 of the files; '' without one.
+    """
+
+    settings: RetrainConfig
+    asbuilt: str
+    weights: str
+    truth: str
+    run: RunConfig
+
+
+def run(options: Options) -> int:
+    """Train on, judge, correct, report; exit 0."""
+    console, folder = options.console, options.output
+    source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
+    result = asbuilt.load(options.asbuilt)
+    design = lens.load(options.run_dir / "lens.h5")
+    retraining.check_lens(design, result, insist=options.insist)
+    truth = config.load(options.truth, Truth) if options.truth else None
+    old = correction.present_bias(options.process)
+    recipe = _recipe(options, source)
+    _claim(folder, recipe, resume=options.resume, force=options.force)
+    made = MadeLens(design, source.settings.optics, response=result.response)
+    found = retraining.lenses(made, result, options.settings, truth)
+    trained = {name: _train(options, recipe, source, found, name) for name in retraining.jobs(found)}
+    outcome = retraining.outcome(source, options.settings, found, trained)
+    plan = correction.propose(design, result.parameters(), response=made.response, old=old)
+    true = (
+        truth.vector() if truth else list(posterior(result, options.settings.draws + 1, seed=options.settings.seed))[-1]
+    )
+    proposals = []
+    for state in correction.next_lenses(made, plan, result.parameters(), true):
+        error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,))
+        proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
+    apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
+    story = retrain_report.Story(
+        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found)
+    )
+    _keep(folder, source, trained["retrained"], story)
+    console.result(_values(story, folder), _text(story, folder))
+    return 0
+
+
+def _recipe(options: Options, source: Source) -> Recipe:
+    return Recipe(
+        options.settings,
+        store.sha256(options.asbuilt),
+        store.sha256(options.run_dir / "checkpoint.safetensors"),
+        store.sha256(options.truth) if options.truth else "",
+        source.settings,
+    )
+
+
+def _claim(folder: Path, recipe: Recipe, *, resume: bool, force: bool) -> None:
+    """A fresh folder, or one that a resume may go on with."""
+    text = config.dumps(recipe)
+    if resume:
+        if not (folder / RECIPE).is_file():
+            raise TrainingError(f"{folder}: no retraining to resume ({RECIPE} missing); start without --resume")
+        changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), text)
+        if changed:
+            raise TrainingError(f"{folder} belongs to other settings; start anew or undo the change:\n{changed}")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        if not force:
+            raise ConfigError(f"{folder} is not empty; give --resume to go on, or --force to start over")
+        if not (folder / RECIPE).is_file():
+            raise ConfigError(f"{folder} is no folder of a retraining: not overwritten; give another name")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    store.write_text(folder / RECIPE, text)
+
+
+def _train(options: Options, recipe: Recipe, source: Source, found: Lenses, name: str) -> Trainer:
+    """One job to its end, logged and kept; a resume drops log lines beyond its checkpoint."""
+    folder, console = options.output, options.console
+    going = retraining.job(source, options.settings, found, name)
+    path = folder / f"{name}.safetensors"
+    if path.is_file():
+        going.restore(checkpoint.load(path, settings=recipe)["trainer"])
+    _trim(folder, name, going.step)
+    records = retraining.train(going, path, recipe)
+    for record in console.track(records, total=going.inner.steps - going.step, label=f"training: {name}"):
+        _log(folder, name, record)
+    return going
+
+
+def _log(folder: Path, name: str, record: Record) -> None:
+    with open(folder / LOG, "a", encoding="utf-8") as file:
+        file.write(json.dumps({"job": name, **asdict(record)}) + "\n")
+
+
+def _trim(folder: Path, name: str, step: int) -> None:
+    kept = [e for e in _entries(folder) if e["job"] != name or e["step"] <= step]
+    store.write_text(folder / LOG, "".join(json.dumps(e) + "\n" for e in kept))
+
+
+def _entries(folder: Path) -> list[dict[str, Any]]:
+    lines = (folder / LOG).read_text("utf-8").splitlines() if (folder / LOG).is_file() else []
+    entries = []
+    for line in lines:
+        try:
+            entries.append(json.loads(line))
+        except json.JSONDecodeError:  # the line that was being written when the run was killed
+            continue
+    return entries
+
+
+def _curves(folder: Path, found: Lenses) -> dict[str, tuple[list[int], list[float]]]:
+    entries = _entries(folder)
+    return {
+        name: ([e["step"] for e in entries if e["job"] == name], [e["task"] for e in entries if e["job"] == name])
+        for name in retraining.jobs(found)
+    }
+
+
+def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
+    words = list(result.problems) + list(result.degeneracies)
+    release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
+    if release != __version__:
+        words.append(f"the as-built record was made by release {release}, this is {__version__}")
+    if not found.known:
+        words.append("the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance")
+    return words
+
+
+def _keep(folder: Path, source: Source, going: Trainer, story: retrain_report.Story) -> None:
+    retraining.judge(going, source, RetrainConfig(test_batches=2), story.lenses.drawn[:1])  # batch statistics
+    cut = Subnet(retraining.network(going), source.architecture)
+    with store.replacing(folder / "subnet_retrained.safetensors") as part:
+        save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})
+    correction.write(folder, story.plan)
+    retrain_report.write(folder / "report.html", story)
+    store.write_text(folder / RESULT, json.dumps(_values(story, folder), indent=1) + "\n")
+
+
+def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
+    o = story.outcome
+    states = [
+        {"name": p.name, "psf_error": error, "strehl": p.strehl, "light": p.light, "slip_mm": slip}
+        for p, error, slip in story.proposals
+    ]
+    return {
+        "folder": str(folder),
+        "cases": o.rows(),
+        "gap_mm": o.gap_mm,
+        "recovered": o.recovered if o.gap_mm > 0 else None,
+        "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
+        "truth_known": story.lenses.known,
+        "next_lens": states,
+    }
+
+
+def _text(story: retrain_report.Story, folder: Path) -> str:
+    o = story.outcome
+    lines = [f"{'case':<38}slippage error / mm        axial   IoU"]
+    for name, v in o.rows().items():
+        span = f"[{v['slip_low_mm']:.3f}, {v['slip_high_mm']:.3f}]"
+        lines.append(
+            f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} {v['axial_mm']:.3f}   {v['iou']:.3f}"
+        )
+    gap = f"gap {o.gap_mm:.3f} mm, " + (f"{o.recovered:.0%} won back" if o.gap_mm > 0 else "nothing to win back")
+    lines.append(gap)
+    for p, error, slip in story.proposals:
+        lines.append(
+            f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"
+        )
+    return "\n".join([*lines, f"open {folder / 'report.html'}"])

@@ -1,0 +1,110 @@
+"""A small lens, a fit of it written down by hand, and a finished run of it; shared by the tests beside it."""
+
+import functools
+import json
+import math
+
+import numpy as np
+
+from characterize.asbuilt import AsBuilt
+from characterize.parameters import NAMES
+from characterize.pillars import sensitivity
+from codesign import evolution, run
+from codesign.architecture import smallest
+from codesign.evolution import Candidate, Search
+from codesign.optics import OpticsConfig
+from metalens import design, lens
+from metalens.cell import Cell, Index
+from metalens.profiles import Focus
+from metalens.proxy import Proxy
+from metalens.store import Provenance
+
+# phase of 3 turns over the domain, with a wavelength so that a change of it is felt; |T| of 0.9 that varies a little
+PROXY = Proxy(np.array([[6.0, 3 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
+TRUE = {"bias_nm": 6.0, "bias_x_nm": 4.0, "bias_r_nm": 3.0, "height_nm": -8.0, "distance_um": 3.0, "coma_x_rad": 0.2}
+TINY = """
+preset = "smoke"
+validation_batches = 1
+test_batches = 1
+[scenes]
+pixels = 48
+margin = 4
+[inner]
+steps = 1
+batch = 2
+[inner.optics]
+rate = 0.0
+[search]
+population = 2
+tournament = 1
+rounds = 2
+[optics]
+aperture_mm = 0.12
+sensor_distance_mm = 0.3
+focus_mm = 3.0
+depths_mm = [2.0, 6.0]
+depth_count = 3
+sample_um = 3.0
+window_samples = 11
+polynomials = 0
+[space]
+widths = [0.25]
+depths = [2]
+[run]
+budgets_mmacs = [2.0]
+pitch_um = 3.0
+"""
+OPTICS = OpticsConfig(0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11)
+
+
+@functools.lru_cache
+def small() -> lens.Lens:
+    """A hyperbolic lens of 120 um."""
+    focus = Focus(0.85, 300.0, 3000.0)
+    phase = design.phase_of(None, focus, radius_um=60.0)
+    return design.make(phase, focus, aperture_um=120.0, cell=CELL, proxy=PROXY)[0]
+
+
+def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
+    """A fit that found TRUE; one frame of nothing stands in for the captures."""
+    names = tuple(name for name in NAMES if name in TRUE)
+    blank = np.zeros((1, 2, 2))
+    covariance = np.eye(len(names)) * sigma**2
+    return AsBuilt(
+        design=made or small(),
+        response=sensitivity(small()),
+        names=names,
+        value=np.array([TRUE[n] for n in names]),
+        covariance=covariance,
+        information=np.linalg.inv(covariance),
+        held={},
+        depth_um=np.array([3000.0]),
+        angle_rad=np.zeros((1, 2)),
+        pixel_um=3.0,
+        measured=blank,
+        predicted=blank,
+        nominal=blank,
+        residual_sigma=blank,
+        chi2_per_dof=1.0,
+        converged=True,
+        reason="by hand",
+        problems=tuple(problems),
+        provenance=Provenance(),
+    )
+
+
+def finished_run(folder):
+    """The files of a run whose search ended, its network untrained."""
+    folder.mkdir(parents=True)
+    (folder / "run.toml").write_text(TINY)
+    settings = run.load(folder / "run.toml")
+    going = run.start(settings)
+    chosen = smallest(settings.space)
+    going.searches = [Search((Candidate(chosen, 1.0, going.macs(chosen)),), {})]
+    run.save(folder / "checkpoint.safetensors", going)
+    row = {"budget_mmacs": 2.0, "mmacs": 1.0}
+    row["architecture"] = json.loads(evolution.dumps(going.searches[0]))["history"][0]
+    (folder / "result.json").write_text(json.dumps({"rows": [row]}))
+    lens.save(folder / "lens.h5", small())
+    return settings
