@@ -68,7 +68,7 @@ def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float)
 
         def at(diameter_um: float) -> Response:
             case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
-            made = evaluate(case, mesh.plan)
+            made = evaluate(case, mesh.plan, weak=rung.weak)
             shared = max(rung.choice(case.rho).thin, mesh.thin) + mesh.wide * case.rho**4
             error = rung.safety * made.spread + shared * made.drift + 1e-12
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])

@@ -1,7 +1,8 @@
 """Exact derivatives of t in diameter, height, index, absorption, wavelength and angle, on the mesh of the value.
 
-They are the derivatives of the number that ``solve`` returns (on the same rung of the ladder): shape derivatives move
-the mesh with the disc. Degenerate modes and resonances need no special case.
+They are the derivatives of the discrete t on the rung of the ladder that ``solve`` takes (which stops at a thousandth
+of its error estimate): shape derivatives move the mesh with the disc. Degenerate modes and resonances need no special
+case.
 """
 
 import math
@@ -53,8 +54,9 @@ def changes(case: Case, plan: MeshPlan, b: Basis, electric: bool) -> dict[str, C
     now = space(shape, electric=electric, half_phase_rad=phase)
     by_radius, by_phase = space_rates(shape, electric=electric, half_phase_rad=phase)
 
+    u, f = b.vector, b.scalar
+
     def change(s: Space, bloch: float) -> Change:
-        u, f = b.vector, b.scalar
         return Change(
             0.0,
             0.0,

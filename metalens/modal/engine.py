@@ -10,15 +10,19 @@ from metalens.cell import Cell
 from metalens.errors import CellError
 from metalens.materials import index
 from metalens.modal.assembly import Geometry, assemble
+from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import RUNGS, Rung, first_rung
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
-from metalens.modal.match import half_space, scattering, zero_order
+from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
+from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space
 from metalens.response import Response
 
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
+QUICK = 1e-10  # accuracies above it allow the quick way to the homogeneous modes
+QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
 MOST = 8  # and of the others at most so many, the least decaying
@@ -66,10 +70,14 @@ def geometry(rho: float, plan: MeshPlan) -> Geometry:
 
 
 @lru_cache(maxsize=4)
-def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float) -> Basis:
-    """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change."""
+def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False) -> Basis:
+    """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change.
+
+    quick: as in ``modes``; nearly uniform gradients then need no care until later.
+    """
     symmetry_class = space(geometry(rho, plan), electric=electric, half_phase_rad=bloch or None)
-    return modes(symmetry_class, careful=0 < bloch < CAREFUL_RAD)
+    careful = 0 < bloch < (QUICK_CAREFUL_RAD if quick else CAREFUL_RAD)
+    return modes(symmetry_class, careful=careful, quick=quick)
 
 
 def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -102,23 +110,39 @@ class Form:
     by_q: np.ndarray
 
 
-def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool) -> Form:
-    """One form on one mesh."""
+def layer_between(
+    b: Basis, case: Case, halves: tuple[HalfSpace, HalfSpace], *, magnetic: bool, weak: float
+) -> tuple[np.ndarray, Match, bool]:
+    """Axial wavenumbers of the carrying modes, the match, and whether it is that of the dual unknown.
+
+    Few modes where the layer is without loss and thick enough that few carry, else all.
+    """
+    medium = Medium(case.k0, case.disc, case.around)
+    if lossless(medium):
+        pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
+        modes = few_modes(pencil, case.height, weak=weak)
+        if modes is not None:
+            return modes.q, few_scattering(pencil, modes, case.height, *halves), magnetic
+    layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
+    match = scattering(layer, case.height, *halves)
+    return layer.q[match.carry], match, False
+
+
+def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY) -> Form:
+    """One form on one mesh; ``weak`` as in ``evaluate``."""
     # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
-    b = basis(case.rho, plan, case.p == magnetic if case.bloch else False, case.bloch)
+    b = basis(case.rho, plan, case.p == magnetic if case.bloch else False, case.bloch, weak > QUICK)
     te = case.p == magnetic if case.bloch else True
-    layer = (magnetic_modes if magnetic else electric_modes)(b, Medium(case.k0, case.disc, case.around))
     below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
-    match = scattering(layer, case.height, below, above)
+    q, match, dual = layer_between(b, case, (below, above), magnetic=magnetic, weak=weak)
     foot = zero_order(b, below, case.bloch, te=te)
     pair = (foot, len(below.ports) + zero_order(b, above, case.bloch, te=te))
-    q = layer.q[match.carry]
     travelling = np.flatnonzero(np.abs(match.travel) > SEEN)
     travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
     moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
     moved = moved[:0] if magnetic else moved
-    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic else np.ones((2, 2))
+    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic and not dual else np.ones((2, 2))
     return Form(
         matrix=match.matrix[np.ix_(pair, pair)] * sign,
         energy=float((np.abs(match.matrix[:, foot]) ** 2).sum()),
@@ -128,12 +152,14 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool) -> Form:
     )
 
 
-def evaluate(case: Case, plan: MeshPlan) -> Solution:
+def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
     """Both forms on one mesh.
 
+    weak: modes weaker than this over the height end at the interface they start from, and the matrix root of the
+    others is this accurate.
     Their difference is split into what the axial wavenumbers explain and the rest, so that the two cannot cancel.
     """
-    first, second = (solve_form(case, plan, magnetic=magnetic) for magnetic in (False, True))
+    first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
     m = min(len(first.q), len(second.q))
     explained = first.by_q[:m] * (first.q[:m] - second.q[:m])[:, None, None]
     rest = first.matrix - second.matrix - explained.sum(0)
@@ -164,7 +190,7 @@ def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate."""
     best: Climb | None = None
     for rung in RUNGS[first_rung(tolerance) :]:
-        solution = evaluate(case, rung.choice(case.rho).plan)
+        solution = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
         error = rung.error(solution.spread, solution.drift, case.rho)
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"

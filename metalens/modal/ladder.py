@@ -36,6 +36,11 @@ class Rung:
     safety: float
     usual: float
 
+    @property
+    def weak(self) -> float:
+        """Modes that carry less than this may be left out: far below the error of the mesh."""
+        return float(max(1e-13, 2e-4 * self.usual**1.25))
+
     def choice(self, rho: float) -> Choice:
         """The mesh for a disc of ``rho`` pitches."""
         return next(c for c in self.choices if rho <= c.up_to)

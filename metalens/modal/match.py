@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from metalens.modal.few_modes import FewModes
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import LayerModes, axial
+from metalens.modal.pencil import Pencil
 
 CARRY = 1e-13  # modes that decay below this over the height cannot change a result of double precision
 
@@ -54,31 +56,86 @@ class Interface:
 
 
 def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interface:
-    """Blocks at a half-space, from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports."""
+    """Blocks at a half-space, from all modes of the layer."""
     admittance, ports = half.admittance, half.ports
-    rate, c, m = 1j * layer.q, len(carry), len(carry) + len(ports)
+    rate, c = 1j * layer.q, len(carry)
     columns = np.concatenate([layer.partner[:, carry], np.eye(len(admittance))[:, ports]], 1)
-    norm = columns[:, :c].T @ layer.field[:, carry]
     real = np.isrealobj(layer.field)
     near_rate = -np.abs(rate) if real else rate
-    near = np.where(admittance.real == 0, -np.abs(admittance), admittance.real) if real else admittance
-    operator = layer.partner * near_rate + near[:, None] * layer.field
-    inward = np.linalg.solve(operator, columns)
-    green = columns.T @ (layer.field @ inward)
-    if real:
+    near = decaying(admittance) if real else admittance
+    inward = np.linalg.solve(layer.partner * near_rate + near[:, None] * layer.field, columns)
+    return mended(
+        columns.T @ (layer.field @ inward),
+        inward,
+        columns[:, :c].T @ layer.field[:, carry],
+        Rates(rate[carry], near_rate[carry], admittance[ports], near[ports]),
+    )
+
+
+def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface:
+    """Blocks at a half-space, from the modes that carry and the real admittance of all others."""
+    admittance = 1 / half.admittance if pencil.dual else half.admittance
+    near, ports = decaying(admittance, dual=pencil.dual), half.ports
+    a, c = len(pencil.te), len(modes.q)
+    operator = modes.near.copy()
+    operator[:a, :a] += pencil.te_turn.T @ (near[:a, None] * pencil.te_turn)
+    operator[a:, a:] += pencil.tm_turn.T @ (near[a:, None] * pencil.tm_turn)
+    fed = np.zeros((len(operator), len(ports)))
+    te = ports < a
+    fed[:a, te], fed[a:, ~te] = pencil.te_turn[ports[te]].T, pencil.tm_turn[ports[~te] - a].T
+    partner = modes.partner
+    parts = [partner.real, partner.imag] if np.iscomplexobj(partner) else [partner]
+    columns = np.concatenate([*parts, fed], 1)
+    found = np.linalg.solve(operator, columns)
+    green = columns.T @ found
+    if len(parts) == 2:
+        whole = np.zeros((2 * c + len(ports), c + len(ports)), complex)
+        whole[:c, :c], whole[c : 2 * c, :c], whole[2 * c :, c:] = np.eye(c), 1j * np.eye(c), np.eye(len(ports))
+        green, found = whole.T @ green @ whole, found @ whole
+    return mended(
+        green,
+        found,
+        partner.T @ modes.field,
+        Rates(1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]),
+    )
+
+
+def decaying(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
+    """Real stand-in: the admittances that decay, and for those that propagate their size with the sign that the
+    stand-in of a travelling layer mode has, so that the two cannot cancel: plus in the dual unknown, else minus."""
+    return np.where(admittance.real == 0, np.abs(admittance) * (1 if dual else -1), admittance.real)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rates:
+    """i q of the carrying modes and the admittances of the ports: true, and as the operator holds them."""
+
+    mode: np.ndarray
+    near_mode: np.ndarray
+    port: np.ndarray
+    near_port: np.ndarray
+
+
+def mended(green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: Rates) -> Interface:
+    """Blocks from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports, its stand-ins put right.
+
+    green: of partners and ports with the solution; inward: the solution; norm: partners with fields.
+    """
+    c, m = len(rates.mode), len(green)
+    if (rates.mode != rates.near_mode).any() or (rates.port != rates.near_port).any():
         correction = np.zeros((m, m), complex)
-        correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rate[carry] - near_rate[carry])).T
-        correction[c:, c:] = np.diag(admittance[ports] - near[ports])
+        correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rates.mode - rates.near_mode)).T
+        correction[c:, c:] = np.diag(rates.port - rates.near_port)
         mend = np.linalg.inv(np.eye(m) + correction @ green)
         green, inward = green @ mend, inward @ mend
-    root = np.sqrt(admittance[ports])
-    weight = 2 * np.concatenate([rate[carry], root])
+    root = np.sqrt(rates.port)
+    weight = 2 * np.concatenate([rates.mode, root])
     arrive = np.linalg.solve(norm, green[:c]) * weight
     return Interface(
         reflect=arrive[:, :c] - np.eye(c),
         enter=arrive[:, c:],
         leave=root[:, None] * green[c:, :c] * weight[:c],
-        back=root[:, None] * green[c:, c:] * weight[c:] - np.eye(len(ports)),
+        back=root[:, None] * green[c:, c:] * weight[c:] - np.eye(m - c),
         inward=inward * weight,
     )
 
@@ -121,13 +178,25 @@ def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def scattering(layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace) -> Match:
-    """Match both ends: the matrix is symmetric, and unitary where lossless."""
+    """Match both ends of all modes: the matrix is symmetric, and unitary where lossless."""
     travel = np.exp(1j * layer.q * height)
     carry = np.flatnonzero(np.abs(travel) > CARRY)
-    foot, top = interface(layer, carry, below), interface(layer, carry, above)
-    x, c, n = travel[carry], len(carry), len(below.ports)
+    return joined(interface(layer, carry, below), interface(layer, carry, above), carry, travel[carry])
+
+
+def few_scattering(pencil: Pencil, modes: FewModes, height: float, below: HalfSpace, above: HalfSpace) -> Match:
+    """As ``scattering``, from few modes; ``carry`` counts them, and ``inward`` is in the pencil's coordinates.
+    A dual unknown inverts the admittances of the half-spaces, and the reflection changes its sign.
+    """
+    foot, top = few_interface(pencil, modes, below), few_interface(pencil, modes, above)
+    return joined(foot, top, np.arange(len(modes.q)), np.exp(1j * modes.q * height))
+
+
+def joined(foot: Interface, top: Interface, carry: np.ndarray, x: np.ndarray) -> Match:
+    """Round trips of the carrying modes, with factors x, between both interfaces."""
+    c, n = len(carry), len(foot.back)
     round_trip = np.eye(2 * c) - swap(foot.reflect, top.reflect, x)
-    source = np.zeros((2 * c, n + len(above.ports)), complex)
+    source = np.zeros((2 * c, n + len(top.back)), complex)
     source[:c, :n], source[c:, n:] = foot.enter, top.enter
     amplitude = np.linalg.solve(round_trip, source)
     matrix = swap(foot.leave, top.leave, x) @ amplitude

@@ -8,91 +8,108 @@ of twice the size, also with absorption. At kx = 0 the two parts decouple; the i
 which is the case of light polarised along x at normal incidence.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import scipy.linalg as sl
 
-from metalens.modal.assembly import Geometry, Part, integrate
-from metalens.modal.mesh import X0, X1, Y0, Y1
+from metalens.modal.assembly import Geometry, Part, assemble, gradient, integrate
+from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build
+
+PHASE_STEP = 0.25  # rad: phases that share a choice of cotree
+TYPICAL = 0.5  # pitches: disc whose mass weighs the choice
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Selection:
     """Which quarter-cell functions carry the unknowns, for the real and the imaginary part.
 
-    real, imaginary: quarter-cell numbers. real_at, imaginary_at: the unknown each belongs to. real_weight,
-    imaginary_weight: its factor. size: of the unknowns.
+    order: quarter-cell numbers of the functions inside, at x = 0, and at x = pitch / 2, one after the other; inside,
+    start, end: how many of each. The unknowns are the real parts inside and at x = 0, the imaginary parts inside, and
+    the moduli at the end, where the real part is ``real`` times the modulus and the imaginary part ``imaginary`` times.
+    Without Bloch phase (``real`` = 0): the functions inside alone.
     """
 
-    real: np.ndarray
-    real_at: np.ndarray
-    real_weight: np.ndarray
-    imaginary: np.ndarray
-    imaginary_at: np.ndarray
-    imaginary_weight: np.ndarray
-    size: int
+    order: np.ndarray
+    inside: int
+    start: int
+    end: int
+    real: float
+    imaginary: float
+
+    @property
+    def size(self) -> int:
+        return 2 * self.inside + self.start + self.end if self.periodic else self.inside
+
+    @property
+    def periodic(self) -> bool:
+        return len(self.order) > self.inside
 
 
 def select(wall: np.ndarray, *, electric: bool, half_phase_rad: float | None) -> Selection:
     """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with electric x walls for None."""
     free = (wall & (Y0 | Y1)) == 0 if electric else np.ones(len(wall), bool)
-    start, end = (wall & X0) != 0, (wall & X1) != 0
-    inside = np.flatnonzero(free & ~start & ~end)
-    n = len(inside)
-    nothing = np.zeros(0, int)
+    at_start, at_end = (wall & X0) != 0, (wall & X1) != 0
+    inside = np.flatnonzero(free & ~at_start & ~at_end)
     if half_phase_rad is None:
-        return Selection(nothing, nothing, np.zeros(0), inside, np.arange(n), np.ones(n), n)
-    start, end = np.flatnonzero(free & start), np.flatnonzero(free & end)
-    ns, ne = len(start), len(end)
-    size = 2 * n + ns + ne
-    ends = np.arange(2 * n + ns, size)
+        return Selection(inside, len(inside), 0, 0, 0.0, 1.0)
+    start, end = np.flatnonzero(free & at_start), np.flatnonzero(free & at_end)
+    order = np.concatenate([inside, start, end])
     return Selection(
-        np.concatenate([inside, start, end]),
-        np.concatenate([np.arange(n + ns), ends]),
-        np.concatenate([np.ones(n + ns), np.full(ne, np.cos(half_phase_rad))]),
-        np.concatenate([inside, end]),
-        np.concatenate([np.arange(n + ns, 2 * n + ns), ends]),
-        np.concatenate([np.ones(n), np.full(ne, np.sin(half_phase_rad))]),
-        size,
+        order, len(inside), len(start), len(end), float(np.cos(half_phase_rad)), float(np.sin(half_phase_rad))
     )
 
 
-def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndarray:
-    """The quarter-cell matrix acting on the real and imaginary parts of the unknowns."""
+def restrict(matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: bool = False) -> np.ndarray:
+    """The quarter-cell matrix acting on the real and imaginary parts of the unknowns.
+
+    rate: its derivative in the half phase, which enters by the weights at x = pitch / 2.
+    """
+    picked = matrix[rows.order[:, None], columns.order]
+    if not rows.periodic:
+        return np.zeros_like(picked) if rate else picked
     out = np.zeros((rows.size, columns.size))
-    real = matrix[np.ix_(rows.real, columns.real)] * np.multiply.outer(rows.real_weight, columns.real_weight)
-    out[np.ix_(rows.real_at, columns.real_at)] = real
-    imaginary = matrix[np.ix_(rows.imaginary, columns.imaginary)]
-    imaginary = imaginary * np.multiply.outer(rows.imaginary_weight, columns.imaginary_weight)
-    out[np.ix_(rows.imaginary_at, columns.imaginary_at)] += imaginary
+    r, c = rows.inside, columns.inside
+    first, second = r + rows.start, c + columns.start
+    cos, sin = (-columns.imaginary, columns.real) if rate else (columns.real, columns.imaginary)
+    if not rate:
+        out[:first, :second] = picked[:first, :second]
+        out[first : first + r, second : second + c] = picked[:r, :c]
+        out[first + r :, second + c :] = picked[first:, second:]
+    out[:first, second + c :] = cos * picked[:first, second:]
+    out[first : first + r, second + c :] = sin * picked[:r, second:]
+    out[first + r :, :second] = cos * picked[first:, :second]
+    out[first + r :, second : second + c] = sin * picked[first:, :c]
     return out
-
-
-def restrict_rate(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndarray:
-    """Derivative of ``restrict`` in the half phase, which enters by the weights along x = pitch / 2."""
-    moving_rows, moving_columns = weight_rate(rows), weight_rate(columns)
-    rate: np.ndarray = restrict(matrix, moving_rows, columns) + restrict(matrix, rows, moving_columns)
-    return rate
-
-
-def weight_rate(selection: Selection) -> Selection:
-    """The selection with its weights replaced by their derivatives in the half phase."""
-    real, imaginary = np.zeros_like(selection.real_weight), np.zeros_like(selection.imaginary_weight)
-    shared = len(set(selection.real_at.tolist()) & set(selection.imaginary_at.tolist()))
-    if shared:
-        real[-shared:], imaginary[-shared:] = -selection.imaginary_weight[-shared:], selection.real_weight[-shared:]
-    return replace(selection, real_weight=real, imaginary_weight=imaginary)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Space:
-    """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch."""
+    """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch.
+
+    cotree: unknowns that with all gradients make a well-conditioned basis (those of the edges off a spanning tree).
+    """
 
     cell: Part
     disc: Part
     gradient: np.ndarray
     electric: bool
     half_phase_rad: float | None
+    cotree: np.ndarray
+
+
+@lru_cache(maxsize=32)
+def cotree(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> np.ndarray:
+    """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a phase."""
+    mesh = build(plan)
+    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
+    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
+    size = np.sqrt(np.diag(restrict(assemble(TYPICAL, plan).cell.mass, vectors, vectors)))
+    matrix = size[:, None] * restrict(gradient(plan), vectors, scalars)
+    pivots = sl.qr(matrix.T, mode="r", pivoting=True)[1]
+    return np.sort(pivots[scalars.size :])
 
 
 def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> Space:
@@ -106,8 +123,15 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
             restrict(p.mass, vectors, vectors), restrict(p.curl, vectors, vectors), restrict(p.scalar, scalars, scalars)
         )
 
-    gradient = restrict(geometry.gradient, vectors, scalars)
-    return Space(part(geometry.cell), part(geometry.disc), gradient, electric, half_phase_rad)
+    step = None if half_phase_rad is None else (math.floor(half_phase_rad / PHASE_STEP) + 0.5) * PHASE_STEP
+    return Space(
+        part(geometry.cell),
+        part(geometry.disc),
+        restrict(geometry.gradient, vectors, scalars),
+        electric,
+        half_phase_rad,
+        cotree(mesh.plan, electric, step),
+    )
 
 
 def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> tuple[Space, Space]:
@@ -123,15 +147,16 @@ def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | N
 
     def by_phase(p: Part) -> Part:
         return Part(
-            restrict_rate(p.mass, vectors, vectors),
-            restrict_rate(p.curl, vectors, vectors),
-            restrict_rate(p.scalar, scalars, scalars),
+            restrict(p.mass, vectors, vectors, rate=True),
+            restrict(p.curl, vectors, vectors, rate=True),
+            restrict(p.scalar, scalars, scalars, rate=True),
         )
 
     cell, disc = integrate(mesh, geometry.rho, rate=True)
     still = np.zeros((vectors.size, scalars.size))
-    turned = restrict_rate(geometry.gradient, vectors, scalars)
+    turned = restrict(geometry.gradient, vectors, scalars, rate=True)
+    none = np.zeros(0, int)
     return (
-        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad),
-        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad),
+        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, none),
+        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, none),
     )

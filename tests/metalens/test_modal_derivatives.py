@@ -10,7 +10,7 @@ from metalens import modal
 from metalens.cell import Cell, Index
 from metalens.modal.assembly import assemble
 from metalens.modal.derivatives import form_rates, mean_rate
-from metalens.modal.engine import case_of, geometric_mean
+from metalens.modal.engine import case_of, evaluate, geometric_mean
 from metalens.modal.homogeneous import modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import axial
@@ -30,8 +30,10 @@ def slope(function, reach, points=11):
     return np.polynomial.chebyshev.chebval(0, np.polynomial.chebyshev.chebder(fit)) / reach
 
 
-def value(cell=CELL, diameter=0.15, wavelength=0.85, **more):
-    return modal.solve(cell, diameter, wavelength, tolerance=ANY, **more).t
+def value(cell=CELL, diameter=0.15, wavelength=0.85, angle_rad=0.0, polarization="x"):
+    """t of the coarse mesh to all digits; ``solve`` stops at a thousandth of what the mesh is worth."""
+    case = case_of(cell, diameter, wavelength, angle_rad, 0.0, polarization)
+    return evaluate(case, RUNGS[0].choice(case.rho).plan).matrix[1, 0]
 
 
 OBLIQUE = {"angle_rad": 0.3, "polarization": "s"}
@@ -79,8 +81,8 @@ def test_index_derivatives_are_analytic():
 
 
 def test_value_is_that_of_solve():
-    got = modal.gradient(CELL, 0.2, 0.85)
-    assert abs(got.t - modal.solve(CELL, 0.2, 0.85).t) < 1e-14
+    got, solved = modal.gradient(CELL, 0.2, 0.85), modal.solve(CELL, 0.2, 0.85)
+    assert abs(got.t - solved.t) < 1e-3 * solved.t_error  # which leaves out what is worth less
 
 
 def test_steepest_flank_and_dip_have_finite_exact_slopes():

@@ -1,0 +1,178 @@
+"""Only the modes that carry: a few eigenvectors, and everything else in one matrix root.
+
+Between the ends of a layer travel the modes with |exp(i q h)| above a threshold, a dozen of hundreds. They are found
+by Rayleigh-Ritz in the low levels of the pencil, enlarged by residuals divided by the distance of the levels
+(Davidson 1975): the Ritz values of a symmetric pencil have the square of the error of the vectors.
+
+All others matter at the ends alone, by the admittance of a layer without end, Y = growth sqrt(growth⁻¹ stiffness).
+The modes that carry are first moved to a common level (deflated), which leaves a matrix X² = D² + R with D diagonal
+and R small beside it, so X = D + E by the fixed point E_ij = (R - E²)_ij / (D_i + D_j): products of matrices instead
+of a nonsymmetric eigenproblem, and no denominator near zero. Every iterate is symmetric with respect to growth: the
+scattering matrix is symmetric and unitary whatever the number of iterations.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.modal.layer import axial
+from metalens.modal.pencil import Pencil
+
+SPARE = 3.0  # low levels reach this many times the level of the weakest mode that carries
+EXTRA = 60.0  # and this much further
+ROUNDS = 6  # of enlarging the low levels, at most
+STEPS = 80  # of the fixed point, at most
+WHOLE = 2  # of them on all rows, before
+ROUNDING = 1e-14  # of the largest element
+SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
+SLOW = 4  # the rows of the lowest quarter of the levels go on alone
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FewModes:
+    """Modes that carry, in the coordinates y of the pencil, and the rest.
+
+    q: (c,) axial wavenumbers. field, partner: (n, c), partner = growth field. near: (n, n) real admittance of the
+    layer without end, with ``near_rate`` in place of i q for the modes that carry.
+    """
+
+    q: np.ndarray
+    field: np.ndarray
+    partner: np.ndarray
+    near: np.ndarray
+    near_rate: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Ritz:
+    """Orthonormal trial vectors (levels, vectors) of both blocks, and the signs of growth on them."""
+
+    te: np.ndarray
+    tm: np.ndarray
+    te_sign: np.ndarray
+    tm_sign: np.ndarray
+
+
+def solve_ritz(pencil: Pencil, trial: Ritz, height: float, weak: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels (-q²) and vectors (a, c), (b, c) of the modes stronger than ``weak`` over the height."""
+    k = trial.te.shape[1]
+    sign = np.concatenate([trial.te_sign, trial.tm_sign])
+    matrix = np.zeros((len(sign), len(sign)))
+    matrix[:k, :k] = (trial.te.T * (pencil.te * pencil.te_sign)) @ trial.te
+    matrix[k:, k:] = (trial.tm.T * (pencil.tm * pencil.tm_sign)) @ trial.tm
+    matrix[:k, k:] = trial.te.T @ (pencil.coupling @ trial.tm)
+    matrix[k:, :k] = matrix[:k, k:].T
+    level, vectors = np.linalg.eig(sign[:, None] * matrix)
+    carry = np.flatnonzero(np.abs(np.exp(1j * axial(-level) * height)) > weak)
+    return level[carry], trial.te @ vectors[:k, carry], trial.tm @ vectors[k:, carry]
+
+
+def enlarge(
+    trial: np.ndarray, sign: np.ndarray, low: np.ndarray, residual: np.ndarray, high: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Trial vectors and signs of one block with the directions of ``residual`` outside the low levels added.
+
+    high: sign of growth there.
+    """
+    real = np.concatenate([residual.real, residual.imag], 1) if np.iscomplexobj(residual) else residual.copy()
+    real[low] = 0.0
+    real -= trial @ (trial.T @ real)
+    left, value, _ = np.linalg.svd(real, full_matrices=False)
+    more = left[:, value > 1e-3 * value[0]] if value.size and value[0] > 0 else left[:, :0]
+    return np.concatenate([trial, more], 1), np.concatenate([sign, np.full(more.shape[1], high)])
+
+
+def carrying(pencil: Pencil, height: float, weak: float, accuracy: float) -> tuple[np.ndarray, ...] | None:
+    """Levels and vectors of the modes that carry, or None where they are too many to be few.
+
+    accuracy: of the vectors, relative.
+    """
+    reach = SPARE * (math.log(weak) / height) ** 2 + EXTRA
+    low_te, low_tm = pencil.te < reach, pencil.tm < reach
+    high_te, high_tm = ~low_te, ~low_tm
+    few = np.count_nonzero(low_te) + np.count_nonzero(low_tm)
+    if few > 0.5 * (len(pencil.te) + len(pencil.tm)) or (pencil.te_sign[~low_te] < 0).any():
+        return None
+    trial = Ritz(
+        np.eye(len(pencil.te))[:, low_te],
+        np.eye(len(pencil.tm))[:, low_tm],
+        pencil.te_sign[low_te],
+        pencil.tm_sign[low_tm],
+    )
+    for _ in range(ROUNDS):
+        level, te, tm = solve_ritz(pencil, trial, height, weak)
+        off_te, off_tm = np.zeros_like(te), np.zeros_like(tm)
+        pull = pencil.coupling[high_te] @ tm
+        off_te[high_te] = te[high_te] + pull / (pencil.te[high_te, None] - level)
+        pull = pencil.tm_sign[high_tm, None] * (pencil.coupling[:, high_tm].T @ te)
+        off_tm[high_tm] = tm[high_tm] + pull / (pencil.tm[high_tm, None] - level)
+        if max(np.abs(off_te).max(initial=0.0), np.abs(off_tm).max(initial=0.0)) < accuracy:
+            return level, te, tm
+        te_block = enlarge(trial.te, trial.te_sign, low_te, off_te, 1.0)
+        tm_block = enlarge(trial.tm, trial.tm_sign, low_tm, off_tm, -1.0)
+        trial = Ritz(te_block[0], tm_block[0], te_block[1], tm_block[1])
+        if len(trial.te_sign) + len(trial.tm_sign) > 0.7 * (len(pencil.te) + len(pencil.tm)):
+            return None
+    return None
+
+
+def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -> np.ndarray | None:
+    """X with X² = square and eigenvalues in the right half plane, near the root of its diagonal; None if it is not.
+
+    signs: of growth, with respect to which the square is symmetric. least: levels of the diagonal below it are
+    lifted to it. The rows of the lowest levels converge last: after the first steps they go on alone.
+    """
+    n = len(square)
+    diagonal = np.sqrt(np.maximum(np.diag(square), least))
+    weight = 1 / (diagonal[:, None] + diagonal)
+    rest = square * weight
+    rest.ravel()[:: n + 1] -= diagonal / 2
+    slow = np.argsort(diagonal)[: n // SLOW]
+    slow_rest, slow_weight, mirror = rest[slow], weight[slow], signs[slow] * signs[:, None]
+    aim = max(accuracy * diagonal.min(), ROUNDING * diagonal.max())
+    e, change, first, whole = rest, np.inf, np.inf, np.inf
+    for step in range(STEPS):
+        if step < WHOLE or change < max(aim, SETTLED * whole):
+            after = e @ e
+            after *= weight
+            np.subtract(rest, after, out=after)
+            whole = change = np.abs(after - e).max()
+            e = after
+            if change < aim:
+                e.ravel()[:: n + 1] += diagonal
+                return e
+        else:
+            rows = slow_rest - slow_weight * (e[slow] @ e)
+            change = np.abs(rows - e[slow]).max()
+            e[slow], e[:, slow] = rows, mirror * rows.T
+        first = change if step == 0 else first
+        if not change <= 2 * first:
+            return None
+    return None
+
+
+def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
+    """Modes stronger than ``weak`` over the height, and the admittance of the rest; None where they are not few.
+
+    weak: the accuracy asked for, relative.
+    """
+    found = carrying(pencil, height, weak, 0.1 * math.sqrt(weak))
+    if found is None:
+        return None
+    level, te, tm = found
+    a = len(pencil.te)
+    sign = np.concatenate([pencil.te_sign, pencil.tm_sign])
+    field = np.concatenate([te, tm])
+    partner = sign[:, None] * field
+    square = np.zeros((len(sign), len(sign)))
+    square.ravel()[:: len(sign) + 1] = np.concatenate([pencil.te, pencil.tm])
+    square[:a, a:] = pencil.te_sign[:, None] * pencil.coupling
+    square[a:, :a] = pencil.tm_sign[:, None] * pencil.coupling.T
+    common = max(float(np.abs(level).max(initial=0.0)), 1.0)
+    norm = np.einsum("ij,ij->j", partner, field)
+    square += ((field * ((common - level) / norm)) @ partner.T).real
+    near = root(square, sign, common, weak)
+    if near is None:
+        return None
+    return FewModes(axial(-level), field, partner, -sign[:, None] * near, -np.sqrt(common))
