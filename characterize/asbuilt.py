@@ -191,6 +191,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
         "converged": result.converged,
         "reason": result.reason,
         "response_center_um": result.response.center_um,
+        "response_error": result.response.error,
     }
     store.save(path, "asbuilt", arrays, attributes=about, provenance=result.provenance)
 
@@ -208,7 +209,7 @@ def load(path: str | Path) -> AsBuilt:
     fields |= {name: tuple(w for w in _text(a[name]) if w) for name in _WORDS}
     return AsBuilt(
         design=design,
-        response=Sensitivity(a["response/coefficients"], about["response_center_um"]),
+        response=Sensitivity(a["response/coefficients"], about["response_center_um"], about["response_error"]),
         psf=_psf(a),
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],

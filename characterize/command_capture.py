@@ -9,7 +9,7 @@ import tyro
 
 from characterize import bench
 from characterize.bench import Shots, Truth
-from characterize.pillars import sensitivity
+from characterize.slopes import slopes
 from metalens import config
 from metalens import lens as lenses
 from metalens.commands import Common, Output
@@ -43,7 +43,8 @@ def run(options: Options) -> int:
         raise ConfigError(f"{target}: folder {target.parent} does not exist")
     truth = config.load(options.truth, Truth)
     design = lenses.load(options.lens)
-    shots = bench.shoot(design, truth, sensitivity(design))
+    walls = any(k.name == "sidewall_deg" and k.value != 0 for k in truth.parameter)
+    shots = bench.shoot(design, truth, slopes(design, sidewall=walls))
     write(target, shots, truth, design)
     values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}
     options.console.result(values, f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons")

@@ -15,7 +15,8 @@ from characterize.clean import Frames, Gain, clean
 from characterize.forward import ForwardModel, Setting, true_depth
 from characterize.leastsquares import Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
-from characterize.pillars import Sensitivity, sensitivity
+from characterize.pillars import Sensitivity
+from characterize.slopes import slopes
 from metalens.errors import CaptureError, FitError
 from metalens.lens import Lens
 from metalens.psf_lens import View
@@ -48,7 +49,7 @@ def fit(
     """The as-built lens behind a capture.
 
     Args:
-        response: what height, index and sidewall do to the pillars; by effective index without it.
+        response: what height, index and sidewall do to the pillars; from the cell solvers without it.
 
     Raises:
         CaptureError: depths, pixel or wavelength missing, or frames unusable.
@@ -58,7 +59,7 @@ def fit(
     options = options or Options()
     frames = clean(capture)
     setting, window = _setting(capture, lens, options)
-    model = ForwardModel(lens, setting, response or sensitivity(lens))
+    model = ForwardModel(lens, setting, response or slopes(lens, sidewall=_fits(options, "sidewall_deg")))
     data = _data(frames, window)
     known = {k.name: k for k in (*_stated(capture, lens), *options.known)}
     start = vector({name: k.value for name, k in known.items()})
@@ -78,6 +79,10 @@ def fit(
     if result.problems and not options.insist:
         raise FitError("fit refused: " + "; ".join(result.problems))
     return result
+
+
+def _fits(options: Options, name: str) -> bool:
+    return name in options.free or any(k.name == name for k in options.known)
 
 
 def _setting(capture: Capture, lens: Lens, options: Options) -> tuple[Setting, tuple[slice, slice]]:

@@ -27,10 +27,12 @@ class Sensitivity:
 
     coefficients: (3, degree + 1) complex power series in (D - center_um) of d ln t / d(height_um, index of the
         pillar, sidewall_rad); a row of zeros switches a parameter off.
+    error: of the slopes, relative to their change across the lens; nan where not known.
     """
 
     coefficients: Array
     center_um: float
+    error: float = math.nan
 
     def at(self, diameter_um: Array) -> Array:
         """(3, *shape) derivatives of ln t."""
@@ -46,8 +48,8 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     D sqrt(n² - 1) alone (step-index fibre), d n_eff / dn = (b n + n D b' / 2) / n_eff. Pillars are measured at half
     height, so a sidewall acts in second order: k n_eff'' s h³ / 3 about the design's angle s.
 
-    Accuracy: of an effective index, about 10 % of the slopes; interference between foot and top is left out. A
-    library of other heights and indices gives better ones: pass its differences as :class:`Sensitivity`.
+    Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by index; interference between
+    foot and top is left out. :func:`characterize.slopes.slopes` asks the cell solvers and is better.
     """
     from metalens import materials
 
@@ -71,7 +73,7 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     by_index = (b * index + index * diameter * slope / 2) / n_eff
     by_wall = fit.deriv(2)(diameter - center) * cell.sidewall_rad * h**3 / 3
     rows = [np.polynomial.polynomial.polyfit(diameter - center, v, degree) for v in (n_eff, by_index * h, by_wall)]
-    return Sensitivity(1j * k * np.array(rows), center)
+    return Sensitivity(1j * k * np.array(rows), center, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
