@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from metalens.engines import Light
 from metalens.library import Sweep
@@ -13,15 +14,23 @@ ALL_UP_TO = 6  # values of an axis that are all solved
 NARROW_UM = 0.005  # half-width of a resonance that may lie between two nodes and show at neither
 MOVES_UM = 0.02  # how far it may move between two nodes
 FIRST = 5  # nodes to begin with where there are more
+NEIGHBOURS = 4  # diameters on either side whose changes count
+SAFETY = 3.0  # on the extrapolated error of a polynomial
 
 
 def picks(values: tuple[float, ...]) -> tuple[float, ...]:
-    """The values to solve first: all of a few, else five at the places of Chebyshev's extrema."""
+    """The values to solve first: all of a few, else five Leja points.
+
+    Each is where the product of the distances to those before it is largest, which keeps that product, the factor of
+    the error of the polynomial through them, small everywhere.
+    """
     if len(values) <= ALL_UP_TO:
         return values
-    places = (1 - np.cos(np.pi * np.arange(FIRST) / (FIRST - 1))) / 2
-    wanted = values[0] + places * (values[-1] - values[0])
-    return tuple(values[i] for i in sorted({int(np.argmin(np.abs(np.array(values) - w))) for w in wanted}))
+    x = np.array(values)
+    chosen = [0, len(x) - 1]
+    while len(chosen) < FIRST:
+        chosen.append(int(np.argmax(np.prod(np.abs(x[:, None] - x[chosen]), axis=1))))
+    return tuple(values[i] for i in sorted(chosen))
 
 
 def lights(sweep: Sweep, wavelengths_um: tuple[float, ...], angles_deg: tuple[float, ...]) -> list[Light]:
@@ -83,19 +92,26 @@ def _passed(first: Array, second: Array, diameters: Array) -> Array:
 def between(nodes: Array, table: Array, x: float) -> Array:
     """(3, diameter) row at ``x`` by the polynomial through all nodes.
 
-    The error is the largest change when one node is left out (the error of the next lower degree, far above that of
-    the polynomial itself where they converge), and the errors of the nodes as they enter.
+    The error is extrapolated. Leaving out one node changes the row by the error of the next lower degree, leaving out
+    two by that of the degree below; where the second is less than the first by some factor, the polynomial through
+    all nodes is better by that factor again. Changes are taken as the largest of neighbouring diameters, as any one
+    may vanish by chance; the result is trebled, and the errors of the nodes are added as they enter.
 
     nodes: (m,). table: (m, 3, diameter).
     """
     weights = lagrange(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
-    change = np.zeros(table.shape[2])
+    one, two = np.zeros(table.shape[2]), np.zeros(table.shape[2])
     for k in range(len(nodes)):
         keep = np.arange(len(nodes)) != k
-        without = np.tensordot(lagrange(nodes[keep], x), table[keep, :2], 1)
-        change = np.maximum(change, np.abs(without[0] - row[0]))
-    row[2] = change + np.abs(weights) @ table[:, 2].real
+        without = np.tensordot(lagrange(nodes[keep], x), table[keep, 0], 1)
+        one = np.maximum(one, np.abs(without - row[0]))
+        for j in range(k):
+            fewer = keep & (np.arange(len(nodes)) != j)
+            two = np.maximum(two, np.abs(np.tensordot(lagrange(nodes[fewer], x), table[fewer, 0], 1) - without))
+    one, two = (maximum_filter1d(change, 2 * NEIGHBOURS + 1) for change in (one, two))
+    gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
+    row[2] = SAFETY * gain * one + np.abs(weights) @ table[:, 2].real
     return row
 
 

@@ -80,6 +80,15 @@ RUNGS = (
         1.2,
         1e-3,
     ),
+    Rung(
+        "even",
+        (
+            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 5e-7, 2e-6),
+            Choice(MeshPlan(5, 5, 5, BOTH), 1.0, 1e-7),
+        ),
+        0.6,
+        2.5e-4,
+    ),
     Rung("good", (Choice(MeshPlan(5, 5, 5, BOTH), 1.0, 1e-7),), 0.5, 1e-4),
     Rung("fine", (Choice(FINE, 1.0, 5e-8),), 0.5, 2.5e-5),
     Rung("finer", (Choice(FINER, 1.0, 2e-8),), 0.4, 8e-6),
