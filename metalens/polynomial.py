@@ -78,6 +78,21 @@ def slope(p: Curve, diameter: Array) -> Array:
     return over_chunks(lambda d: slope_of(p, d), diameter)
 
 
+def pulled_back(p: Curve, diameter: Array, weight: Array) -> Array:
+    """``weight`` times dp/dD in one pass; the diameters were checked before, the weight may be broadcast."""
+
+    def part(start: int, d: Array) -> Array:
+        rise = slope_of(p, d)
+        rise *= weight if weight.ndim == 0 else weight[start : start + len(d)]
+        return rise
+
+    if weight.ndim and not any(weight.strides):
+        weight = weight[(0,) * weight.ndim]
+    if weight.ndim:
+        weight = np.ascontiguousarray(weight).reshape(-1)
+    return over_chunks(part, diameter, places=True)
+
+
 def check(p: Curve, diameter: Any) -> None:
     """Refuse diameters (numpy or torch) outside the domain of ``p``."""
     if 0 in diameter.shape:
@@ -117,15 +132,23 @@ def horner(monomials: tuple[float, ...], x: Array) -> Array:
     return total
 
 
-def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
-    """``work`` elementwise over an array in cache-sized chunks, on all cores that the process may use."""
+def over_chunks(work: Callable[..., Array], values: Array, *, places: bool = False) -> Array:
+    """``work`` elementwise over an array in cache-sized chunks, on all cores that the process may use.
+
+    places: ``work`` also takes, first, where the chunk starts.
+    """
     flat = np.ascontiguousarray(values).reshape(-1)
+
+    def made(start: int) -> Array:
+        chunk = flat[start : start + CHUNK]
+        return work(start, chunk) if places else work(chunk)
+
     if flat.size <= CHUNK:
-        return work(flat).reshape(values.shape)
+        return made(0).reshape(values.shape)
     out = np.empty_like(flat)
 
     def run(start: int) -> None:
-        out[start : start + CHUNK] = work(flat[start : start + CHUNK])
+        out[start : start + CHUNK] = made(start)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
         list(pool.map(run, range(0, flat.size, CHUNK)))

@@ -48,7 +48,12 @@ class _Polynomial(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
         (diameter,) = ctx.saved_tensors
-        return gradients[0] * (_bend if ctx.order else slope)(ctx.curve, diameter), None, None
+        weight = gradients[0]
+        plain = not (ctx.order or torch.is_grad_enabled() or torch._C._functorch.maybe_current_level())
+        if plain and diameter.device.type == "cpu" and weight.dtype == diameter.dtype:
+            fused = polynomial.pulled_back(ctx.curve, diameter.detach().numpy(), weight.detach().numpy())
+            return torch.from_numpy(fused), None, None
+        return weight * (_bend if ctx.order else slope)(ctx.curve, diameter), None, None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:

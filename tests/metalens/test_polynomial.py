@@ -96,3 +96,16 @@ def test_tensors_stay_on_their_device():
     assert torch.allclose(d.grad.cpu(), polynomial_torch.slope(p, host), rtol=1e-12)
     with pytest.raises(DomainError):
         polynomial_torch.value(p, 2 * d.detach())
+
+
+@pytest.mark.parametrize("size", [5, 200_000])
+def test_backward_in_one_pass_is_the_slope_times_the_weight(size):
+    p = polynomial.curve(np.array([0.3, 1.0, -0.2, 0.1]), (0.06, 0.2), 2)
+    d = np.linspace(0.06, 0.2, size)
+    weight = np.linspace(-1, 2, size)
+    want = polynomial.slope(p, d)
+    assert np.array_equal(polynomial.pulled_back(p, d, weight), want * weight)
+    assert np.array_equal(polynomial.pulled_back(p, d, np.broadcast_to(np.array(2.0), d.shape)), 2 * want)
+    leaf = torch.from_numpy(d).requires_grad_()
+    (once,) = torch.autograd.grad((torch.from_numpy(weight) * polynomial_torch.value(p, leaf)).sum(), leaf)
+    assert np.array_equal(once.numpy(), want * weight)
