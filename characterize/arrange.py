@@ -24,7 +24,7 @@ class Arrangement:
     order: (n,) frame that fits the i-th stated depth best; reordered: whether it clearly differs from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the stated one beyond doubt.
-    orientation_seen: whether the nominal images change under turns and mirrors at all.
+    alike: turns (1 to 7) under which the nominal images do not change: these cannot be told from the chosen one.
     """
 
     stage_zero_um: float
@@ -35,7 +35,7 @@ class Arrangement:
     order_seen: bool
     orientation: int
     clearly: bool
-    orientation_seen: bool
+    alike: tuple[int, ...]
 
     @property
     def words(self) -> str:
@@ -68,7 +68,8 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
     found = _compare(light, expected, noise)
     order, reordered, seen = _order(light, expected, noise, model)
     orientation, clearly = _orientation(light, expected, noise)
-    turned = [np.mean([s for s, _ in _compare(turn(expected, k), expected, 0 * noise)]) for k in range(0, 8, 2)]
+    possible = [k for k in range(1, 8) if k % 2 == 0 or expected.shape[1] == expected.shape[2]]
+    turned = {k: np.mean([s for s, _ in _compare(turn(expected, k), expected, 0 * noise)]) for k in possible}
     shift = np.median([s for _, s in found], axis=0)
     return Arrangement(
         stage_zero_um=float(zeros[best]),
@@ -79,7 +80,7 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
         order_seen=seen,
         orientation=orientation,
         clearly=clearly,
-        orientation_seen=bool(max(turned[1:]) < 0.997),
+        alike=tuple(k for k, likeness in turned.items() if likeness >= 0.997),
     )
 
 
@@ -128,7 +129,7 @@ def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool
             continue
         turned = turn(light, orientation)
         scores.append(float(np.mean([score for score, _ in _compare(turned, expected, noise)])))
-    best = int(np.argmax(scores))
+    best = int(np.flatnonzero(np.array(scores) > max(scores) - 2e-3)[0])  # of equals the plainest turn
     return best, best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02
 
 

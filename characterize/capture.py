@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import struct
 import warnings
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize import stage
+from characterize import stage, tiff_tags
 from metalens.errors import CaptureError
 from metalens.store import Array
 
@@ -71,8 +72,9 @@ def load(path: str | Path) -> Capture:
     """Read a capture: a TIFF, PNG or HDF5 file, or a folder of them.
 
     A folder holds frames (named in ``stage.csv`` or ``stage.json``, else every image that is not dark or flat, in
-    the order of their names), and may hold ``dark.tif``, ``flat.tif`` and ``capture.toml`` (pixel_um,
-    wavelength_um, bits, and what else is known).
+    the order of their names, numbers counted), and may hold ``dark.tif``, ``flat.tif`` and ``capture.toml`` or
+    ``capture.json`` (pixel_um, step_um, wavelength_um, bits, and what else is known; ``voxel_um`` as z, y, x). A single
+    file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its ImageJ or OME tags.
 
     Raises:
         CaptureError: nothing there, lossy or truncated images, frames of different size, non-finite values,
@@ -117,7 +119,7 @@ def right_align(images: Array, bits: int | None, where: str) -> tuple[Array, int
     Raises:
         CaptureError: the counts do not fit into the stated bits, shifted or not.
     """
-    if images.dtype.kind == "f":
+    if images.dtype.kind == "f" or images.min() < 0:
         return images, bits or 16, "counts are real numbers: taken as they are"
     used = int(np.bitwise_or.reduce(images.astype(np.int64), axis=None))
     shift = (used & -used).bit_length() - 1 if used else 0
@@ -138,25 +140,31 @@ def right_align(images: Array, bits: int | None, where: str) -> tuple[Array, int
 
 
 def _load_file(path: Path) -> Capture:
-    images, bits, note = right_align(read_images(path), None, str(path))
+    about, images = stage.read_beside(path), read_images(path)
+    tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
+    images, bits, note = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
-    rows = _tags(path)
-    position = rows if len(rows) == n else np.full(n, np.nan)
+    step = about.get("step_um", math.nan)
+    position = np.arange(n) * step if math.isfinite(step) else tags.position_um
+    notes = [note, *tags.notes]
     return Capture(
         images,
-        position,
+        position if len(position) == n else np.full(n, np.nan),
         np.zeros((n, 2)),
         np.full(n, np.nan),
         tuple(f"{path.name}[{i}]" for i in range(n)),
         bits,
-        corrections=(note,),
+        pixel_um=about.pop("pixel_um", tags.pixel_um),
+        wavelength_um=about.pop("wavelength_um", math.nan),
+        about=about,
+        corrections=tuple(notes),
     )
 
 
 def _load_folder(folder: Path) -> Capture:
     about = stage.read_about(folder)
     rows = stage.read_stage(folder)
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
+    files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
     if rows is None:
@@ -167,6 +175,8 @@ def _load_folder(folder: Path) -> Capture:
     stacks = {name: read_images(p) for name, p in special.items()}
     bits = about.pop("bits", None)
     frames, depth, note = right_align(frames, bits, str(folder))
+    if "step_um" in about and not np.isfinite(rows.position_um).any():
+        rows = dataclasses.replace(rows, position_um=np.arange(len(frames)) * float(about["step_um"]))
     extra = {name: right_align(s, depth, str(special[name]))[0] for name, s in stacks.items()}
     return Capture(
         frames,
@@ -209,6 +219,11 @@ def _listed_frames(folder: Path, rows: stage.Rows) -> Array:
             raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
         images.append(stack[page][None])
     return _join(images, [folder / name for name in rows.files])
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key that counts: frame_2 before frame_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
 
 
 def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
@@ -275,21 +290,6 @@ def _check_values(images: Array, path: Path) -> None:
     if images.dtype.kind == "f" and not np.isfinite(images).all():
         frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
         raise CaptureError(f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}")
-
-
-def _tags(path: Path) -> Array:
-    """Stage positions from the tags of a TIFF written by ImageJ (spacing) or OME (PositionZ); empty if none."""
-    if path.suffix.lower() not in TIFF:
-        return np.empty(0)
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
-        if file.is_imagej and file.imagej_metadata and "spacing" in file.imagej_metadata:
-            unit = {"nm": 1e-3, "mm": 1e3, "cm": 1e4}.get(str(file.imagej_metadata.get("unit", "um")), 1.0)
-            return np.arange(len(file.pages)) * float(file.imagej_metadata["spacing"]) * unit
-        if file.is_ome and file.ome_metadata:
-            return stage.ome_positions(file.ome_metadata)
-    return np.empty(0)
 
 
 def describe(capture: Capture, **known: Any) -> Capture:

@@ -8,16 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize import knowable, leastsquares, made
-from characterize.arrange import Arrangement, arrange, rearranged
+from characterize.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
 from characterize.asbuilt import AsBuilt
 from characterize.capture import Capture
-from characterize.clean import Frames, Gain, clean
+from characterize.clean import Gain, clean
 from characterize.forward import ForwardModel, Setting, true_depth
 from characterize.leastsquares import Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Sensitivity
+from characterize.prepare import data_of, merged, setting_of, stated
 from characterize.slopes import slopes
-from metalens.errors import CaptureError, FitError
+from metalens.errors import FitError
 from metalens.lens import Lens
 from metalens.psf_lens import View
 from metalens.psf_record import PsfStack
@@ -57,11 +58,11 @@ def fit(
             bound, no convergence.
     """
     options = options or Options()
-    frames = clean(capture)
-    setting, window = _setting(capture, lens, options)
+    capture, frames = merged(capture, clean(capture))
+    setting, window = setting_of(capture, options.window)
     model = ForwardModel(lens, setting, response or slopes(lens, sidewall=_fits(options, "sidewall_deg")))
-    data = _data(frames, window)
-    known = {k.name: k for k in (*_stated(capture, lens), *options.known)}
+    data = data_of(frames, window)
+    known = {k.name: k for k in (*stated(capture, lens), *options.known)}
     start = vector({name: k.value for name, k in known.items()})
     scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
     found = arrange(model, data, scan_um=scan, start=start)
@@ -85,59 +86,6 @@ def _fits(options: Options, name: str) -> bool:
     return name in options.free or any(k.name == name for k in options.known)
 
 
-def _setting(capture: Capture, lens: Lens, options: Options) -> tuple[Setting, tuple[slice, slice]]:
-    if not np.isfinite(capture.position_um).all():
-        raise CaptureError("source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)")
-    if math.isnan(capture.pixel_um):
-        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
-    if math.isnan(capture.wavelength_um):
-        raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
-    window = _window(capture, options.window)
-    exposure = capture.exposure_s / np.nanmax(capture.exposure_s) if np.isfinite(capture.exposure_s).all() else 1.0
-    n = len(capture.frames)
-    rows, columns = (s.stop - s.start for s in window)
-    return Setting(
-        np.asarray(capture.position_um, float),
-        np.asarray(capture.angle_rad, float),
-        np.broadcast_to(np.asarray(exposure, float), n).copy(),
-        capture.pixel_um,
-        rows,
-        columns,
-    ), window
-
-
-def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
-    """The whole frame if small, else a square about the light's centre."""
-    frames = np.asarray(capture.frames, float)
-    light = np.median(frames, axis=0) - np.median(frames)
-    light = np.maximum(light - 0.2 * np.percentile(light, 99.9), 0)
-    total = max(light.sum(), 1e-9)
-    slices = []
-    for axis, size in enumerate(light.shape):
-        side = min(size, largest)
-        place = (light.sum(1 - axis) * np.arange(size)).sum() / total
-        first = int(np.clip(round(place) - side // 2, 0, size - side))
-        slices.append(slice(first, first + side))
-    return slices[0], slices[1]
-
-
-def _data(frames: Frames, window: tuple[slice, slice]) -> Data:
-    shape = frames.electrons.shape
-    cut = (slice(None), *window)
-    floor, scale = (np.broadcast_to(a, shape)[cut] for a in (frames.variance_e2, frames.scale))
-    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale)
-
-
-def _stated(capture: Capture, lens: Lens) -> list[Known]:
-    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole."""
-    offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
-    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
-    if "pinhole_um" in capture.about:
-        size = float(capture.about["pinhole_um"])
-        known.append(Known("pinhole_um", size, 0.0))
-    return known
-
-
 def _check_likeness(found: Arrangement, lens: Lens) -> None:
     if found.likeness < LIKENESS:
         raise FitError(
@@ -152,10 +100,11 @@ def _arranged_words(found: Arrangement) -> list[str]:
         words.append(f"frames fit the design only {found.words}: used so")
     if found.reordered:
         words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
-    if not found.orientation_seen:
+    if found.alike:
+        which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
         words.append(
-            "the design looks the same turned or mirrored: the orientation of the frames cannot be seen; gradients, "
-            "coma, astigmatism, trefoil and decentre are along the camera's axes"
+            f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
+            "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
         )
     if not found.order_seen:
         words.append(
@@ -287,6 +236,10 @@ def _result(
     prior = prior_of(names, known)
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
     bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
+    problems = _problems(names, solution, prior, gain.known)
+    clipped = float(data.saturated.mean())
+    if problems and clipped > 0.1:
+        problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
     held = {name: float(start[PLACE[name]]) for name in NAMES if name not in fitted}
     return AsBuilt(
         design=lens,
@@ -310,7 +263,7 @@ def _result(
         identifiable=tuple(knowable.identifiable(names, solution.information, prior.sigma)),
         degeneracies=tuple(knowable.degeneracies(names, solution.covariance, prior.sigma)),
         cautions=tuple(cautions),
-        problems=tuple(_problems(names, solution, prior, gain.known)),
+        problems=tuple(problems),
     )
 
 

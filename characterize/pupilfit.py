@@ -71,8 +71,8 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True)
     position = _positions(capture, spec)
     if len(position) < 3:
         raise FitError(f"{len(position)} planes: a pupil needs three or more through focus")
-    data, background = _crop(frames, spec)
-    held_out = _judge(spec, position, data, background) if judge and len(position) >= 6 else None
+    data, background, notes = _crop(frames, spec)
+    held_out = _judge(spec, position, data, background) if judge and len(position) >= 5 else None
     model, solution = _fit(spec, position, data)
     phase, amplitude = _maps(model, solution.value)
     return PupilFit(
@@ -91,7 +91,7 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True)
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        cautions=(*frames.corrections, *_cautions(spec, solution)),
+        cautions=(*frames.corrections, *notes, *_cautions(spec, solution)),
     )
 
 
@@ -146,7 +146,7 @@ def _complete(spec: PupilSpec, capture: captures.Capture) -> PupilSpec:
 def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
     """Stage positions about the sharpest plane, from the capture or from step_um."""
     stated = capture.position_um
-    if not np.isfinite(stated).all():
+    if not math.isnan(spec.step_um) or not np.isfinite(stated).all():
         stated = np.arange(len(capture.frames)) * spec.step_um
     frames = np.asarray(capture.frames, float)
     sharp = frames.max((1, 2)) - np.median(frames, axis=(1, 2))
@@ -154,23 +154,43 @@ def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
     return np.asarray(stated - (weight * stated).sum() / weight.sum())
 
 
-def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float]:
-    """The window about the bead, and the background level around it."""
+def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
+    """The window about the bead, moved inwards where it would reach over the edge; the background level; notes."""
     total = np.where(frames.usable, frames.electrons, np.nan)
     background = float(np.nanmedian(total))
     row, column = spec.center or _find(frames, background)
-    half = spec.window // 2
-    y, x = slice(row - half, row - half + spec.window), slice(column - half, column - half + spec.window)
-    inside = y.start >= 0 and y.stop <= total.shape[1] and x.start >= 0 and x.stop <= total.shape[2]
-    if not inside:
-        raise FitError(
-            f"bead at row {row}, column {column}: a window of {spec.window} pixels reaches over the frame's edge "
-            f"({total.shape[1]} x {total.shape[2]}); take a smaller window or another bead (center)"
-        )
-    cut = (slice(None), y, x)
+    sides = zip((row, column), total.shape[1:], strict=True)
+    first = [int(np.clip(place - spec.window // 2, 0, side - spec.window)) for place, side in sides]
+    notes = []
+    if first != [row - spec.window // 2, column - spec.window // 2]:
+        notes.append(f"the bead at row {row}, column {column} is near the edge: the window is not centred on it")
+    cut = (slice(None), *(slice(f, f + spec.window) for f in first))
     floor, scale = (np.broadcast_to(a, total.shape)[cut] for a in (frames.variance_e2, frames.scale))
-    data = Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale, spec.model_error)
-    return data, background
+    plane = _plane(total[cut])
+    seen = total[cut] - background
+    if np.ptp(plane) > 0.02 * np.nanmax(seen):
+        notes.append(f"a background plane of {np.ptp(plane):.3g} e across the window was taken off")
+    else:
+        plane = np.zeros_like(plane)
+    electrons = frames.electrons[cut] - plane
+    data = Data(electrons, frames.usable[cut], frames.saturated[cut], floor, scale, spec.model_error)
+    return data, background, notes
+
+
+def _plane(frames: Array) -> Array:
+    """(y, x) tilt of the background, of mean 0: least squares on the rim of the median plane, without its outliers."""
+    level = np.nanmedian(frames, axis=0)
+    ny, nx = level.shape
+    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
+    rim = np.isfinite(level) & ((np.abs(x) > 0.8) | (np.abs(y) > 0.8))
+    design = np.stack([np.ones(ny * nx), x.ravel(), y.ravel()], 1)
+    keep = rim.ravel()
+    for _ in range(3):
+        found = np.linalg.lstsq(design[keep], level.ravel()[keep], rcond=None)[0]
+        rest = level.ravel() - design @ found
+        spread = 1.4826 * np.median(np.abs(rest[keep]))
+        keep = rim.ravel() & (np.abs(rest) <= 3 * max(spread, 1e-9))
+    return np.asarray(found[1] * x + found[2] * y)
 
 
 def _find(frames: Frames, background: float) -> tuple[int, int]:
@@ -215,6 +235,9 @@ def _start(model: PupilModel, data: Data, spherical: float) -> Array:
     x = np.zeros(layout.size)
     x[model.phase_indices.index((4, 0))] = spherical
     x[layout.size - 2 * layout.frames - 1] = 0.5 * model.spec.pixel_um
+    shift = _offset(data) * model.spec.pixel_um
+    first = layout.phase + layout.amplitude
+    x[[first, first + layout.drift]] = shift[::-1]
     edge = np.concatenate([data.electrons[:, 0], data.electrons[:, -1]], axis=1)
     level = np.percentile(edge, 20, axis=1)
     light = (data.electrons - level[:, None, None]).sum((1, 2)).max()
@@ -223,6 +246,14 @@ def _start(model: PupilModel, data: Data, spherical: float) -> Array:
     x[-2 * layout.frames : -layout.frames] = math.log(light)
     x[-layout.frames :] = level
     return x
+
+
+def _offset(data: Data) -> Array:
+    """(y, x) pixels from the window's centre to the bead, where it is more than a quarter of the window; else 0."""
+    light = np.where(data.usable, data.electrons, np.nanmedian(data.electrons))
+    peak = ndimage.gaussian_filter(light, (0, 1, 1)).max(0)
+    place = np.array(np.unravel_index(int(peak.argmax()), peak.shape)) - np.array(peak.shape) // 2
+    return np.asarray(place * (np.abs(place).max() > peak.shape[0] / 8), float)
 
 
 def _grow(value: Array, small: PupilModel, large: PupilModel) -> Array:
@@ -243,6 +274,7 @@ def _prior(model: PupilModel, start: Array) -> Prior:
     drift = slice(layout.phase + layout.amplitude, blur)
     sigma[drift] = 10 * model.spec.pixel_um
     mean = np.zeros(layout.size)
+    mean[drift] = start[drift]
     mean[blur:] = start[blur:]
     sigma[blur + 1 :][: layout.frames] = 0.3
     low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)

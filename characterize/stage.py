@@ -1,4 +1,4 @@
-"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml with what else is known."""
+"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or .json with what else is known."""
 
 import csv
 import json
@@ -17,6 +17,17 @@ from metalens.store import Array
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3}
 _POSITIONS = {f"{name}_{unit}": scale for name in ("depth", "z", "position") for unit, scale in _LENGTHS.items()}
 _ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
+_ALIASES = {
+    f"{name}_{unit}": (entry, scale)
+    for entry, names in {
+        "pixel_um": ("pixel", "pixel_size"),
+        "step_um": ("step", "z_step"),
+        "wavelength_um": ("wavelength", "emission"),
+    }.items()
+    for name in names
+    for unit, scale in (("um", 1.0), ("nm", 1e-3))
+    if f"{name}_{unit}" != entry
+}
 _COLUMNS = {"file", "page", "exposure_s", "angle_y_deg", "angle_y_rad"} | set(_POSITIONS) | set(_ANGLES)
 
 
@@ -58,21 +69,48 @@ def read_stage(folder: Path) -> Rows | None:
 
 
 def read_about(folder: Path) -> dict[str, Any]:
-    """Entries of ``capture.toml`` in a capture folder; empty where there is none.
+    """Entries of ``capture.toml`` or ``capture.json`` in a capture folder; empty where there is none.
 
     Raises:
-        CaptureError: not TOML, or a number that must be above 0 is not.
+        CaptureError: not TOML or JSON, or a number that must be above 0 is not.
     """
-    path = folder / "capture.toml"
-    if not path.is_file():
+    paths = [folder / "capture.toml", folder / "capture.json"]
+    return _about(next((path for path in paths if path.is_file()), None))
+
+
+def read_beside(path: Path) -> dict[str, Any]:
+    """Entries of the TOML or JSON file of the same name beside an image file; empty where there is none.
+
+    Raises:
+        CaptureError: as :func:`read_about`.
+    """
+    paths = [path.with_suffix(suffix) for suffix in (".toml", ".json")]
+    return _about(next((p for p in paths if p.is_file()), None))
+
+
+def _about(path: Path | None) -> dict[str, Any]:
+    if path is None:
         return {}
     try:
-        about = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not valid TOML: {error}") from None
-    for name in ("pixel_um", "wavelength_um", "bits"):
+        text = path.read_text(encoding="utf-8")
+        about = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
+    if not isinstance(about, dict):
+        raise CaptureError(f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)")
+    for name, (entry, scale) in _ALIASES.items():
+        if name in about and entry not in about:
+            value = about.pop(name)
+            about[entry] = value * scale if isinstance(value, int | float) else value
+    if "voxel_um" in about:
+        voxel = about.pop("voxel_um")
+        if not isinstance(voxel, list) or len(voxel) != 3:
+            raise CaptureError(f"{path}: voxel_um = {voxel!r}, need [z, y, x]")
+        about = {"step_um": voxel[0], "pixel_um": voxel[2]} | about
+    for name in ("pixel_um", "wavelength_um", "bits", "step_um"):
         value = about.get(name, 1)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0 < (abs(value) if name == "step_um" else value) < math.inf:
             raise CaptureError(f"{path}: {name} = {value!r}, need a number above 0")
     return about
 

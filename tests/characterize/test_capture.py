@@ -124,3 +124,42 @@ def test_colour_and_foreign_files_are_refused(tmp_path):
         capture.load(tmp_path / "a.txt")
     with pytest.raises(CaptureError, match="no such file"):
         capture.load(tmp_path / "b.tif")
+
+
+def test_imagej_tags_tell_pixel_and_step(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 900, (5, 20, 31), dtype=np.uint16)
+    about = {"spacing": 0.25, "unit": "um", "axes": "ZYX"}
+    tifffile.imwrite(tmp_path / "a.tif", frames, imagej=True, resolution=(1 / 0.13, 1 / 0.13), metadata=about)
+    shots = capture.load(tmp_path / "a.tif")
+    assert np.allclose(shots.position_um, np.arange(5) * 0.25)
+    assert abs(shots.pixel_um - 0.13) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        '{"voxel_um": [0.3, 0.13, 0.13], "emission_nm": 520}',
+        '{"z_step_nm": 300, "pixel_nm": 130, "wavelength_um": 0.52}',
+    ],
+)
+def test_sizes_beside_a_file_or_in_a_folder_of_numbered_frames(tmp_path, words):
+    """Numbers count: z10 comes after z9; NAME.json beside a stack and capture.json in a folder say the same."""
+    frames = np.random.default_rng(0).integers(0, 250, (12, 9, 11), dtype=np.uint8)
+    folder = tmp_path / "planes"
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        tifffile.imwrite(folder / f"z{i}.tif", frame, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "stack.tif", frames, photometric="minisblack")
+    (folder / "capture.json").write_text(words)
+    (tmp_path / "stack.json").write_text(words)
+    for shots in (capture.load(folder), capture.load(tmp_path / "stack.tif")):
+        assert np.array_equal(shots.frames, frames)
+        assert np.allclose(shots.position_um, np.arange(12) * 0.3)
+        assert (round(shots.pixel_um, 9), round(shots.wavelength_um, 9)) == (0.13, 0.52)
+
+
+def test_several_channels_are_refused(tmp_path):
+    frames = np.zeros((4, 2, 9, 11), np.uint16)
+    tifffile.imwrite(tmp_path / "c.tif", frames, imagej=True, metadata={"axes": "ZCYX", "channels": 2})
+    with pytest.raises(CaptureError, match="2 channels"):
+        capture.load(tmp_path / "c.tif")
