@@ -12,7 +12,7 @@ import torch
 from codesign.dataset import ambiguity_pairs
 from codesign.eye import States
 from codesign.eye_scenes import EyeScenes, as_batch, decoupled
-from codesign.inner import Batch
+from codesign.inner_batch import Batch
 from codesign.renderer import Labels, render
 from metalens.errors import TrainingError
 

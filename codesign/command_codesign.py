@@ -11,7 +11,7 @@ import tyro
 from safetensors.torch import save_file
 
 from codesign import optics as trained
-from codesign import pictures
+from codesign import parallel, pictures
 from codesign import run as runs
 from codesign.baselines import Baseline
 from codesign.evolution import best, pareto
@@ -51,7 +51,11 @@ def run(options: Options) -> int:
     """Train, search, finish; exit 0."""
     settings = _frozen(runs.load(options.config), options.freeze)
     folder, console = options.output, options.console
+    parallel.join()
+    if parallel.rank():
+        return _assist(folder, settings)
     going = _resume(folder, settings) if options.resume else _start(folder, settings, force=options.force)
+    parallel.wait()
     journal = Journal(folder) if options.events else None
     for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
         _log(folder, {"kind": "step", **asdict(record)})
@@ -62,6 +66,7 @@ def run(options: Options) -> int:
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
+    parallel.leave()
     for budget, born in runs.search(going, folder / CHECKPOINT):
         _log(folder, {"kind": "birth", "budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6})
         console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
@@ -69,6 +74,16 @@ def run(options: Options) -> int:
     rows = [row for row, _ in ends]
     _keep(folder, going, ends)
     console.result({"rows": rows, "folder": str(folder)}, _table(rows))
+    return 0
+
+
+def _assist(folder: Path, settings: RunConfig) -> int:
+    """Another process of ``torchrun``: trains along from the same checkpoint, writes nothing."""
+    parallel.wait()
+    going = runs.resume(folder / CHECKPOINT, settings)
+    for _ in runs.train(going, folder / CHECKPOINT):
+        pass
+    parallel.leave()
     return 0
 
 

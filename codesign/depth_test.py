@@ -9,7 +9,8 @@ from codesign import assess
 from codesign.architecture import Architecture
 from codesign.baselines import Baseline
 from codesign.flat import Flat
-from codesign.inner import Batch, Scenes, Trainer
+from codesign.inner import Scenes, Trainer
+from codesign.inner_batch import Batch
 from codesign.optics import Stack
 from codesign.supernet import Supernet
 from metalens.scene import Frames

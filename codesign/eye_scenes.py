@@ -8,7 +8,7 @@ import torch
 
 from codesign import eye
 from codesign.eye import POPULATION, Motion, Rig, States
-from codesign.inner import Batch
+from codesign.inner_batch import Batch
 from codesign.renderer import Camera, Rendered, render
 from metalens.errors import ConfigError
 from metalens.scene import Frames

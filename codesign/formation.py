@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from codesign import cost
+from codesign import cost, parallel
 from codesign.architecture import Architecture
 from codesign.baselines import Baseline
 from codesign.optics import OpticsConfig, Stack
@@ -43,7 +43,9 @@ def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None) -> 
     """Electrons of mean and variance as :func:`metalens.sensor.expose`, up to the full well, from one normal draw."""
     well = sensor.full_well_e * float(camera.kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = mean.clamp(max=well)
-    noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
+    share, size = parallel.ranks(), len(mean)  # the noise of the whole batch, whoever takes which part of it
+    noise = torch.randn((share * size, *mean.shape[1:]), generator=generator, dtype=mean.dtype, device=mean.device)
+    noise = noise[parallel.rank() * size : (parallel.rank() + 1) * size]
     return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 + 1e-6)
 
 

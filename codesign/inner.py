@@ -14,30 +14,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign import losses
+from codesign import losses, parallel
 from codesign import optics as lens
 from codesign.architecture import Architecture, Space, largest, sample, smallest
 from codesign.baselines import Baseline, Name, make
 from codesign.flat import Flat, irradiance, samples
 from codesign.formation import depth_loss, network_macs, read_out
+from codesign.inner_batch import Batch
 from codesign.optics import OpticsConfig, Stack
 from codesign.supernet import Supernet
 from metalens.errors import ConfigError, TrainingError
 from metalens.scene import Frames, Imager
 from metalens.sensor import Sensor
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Batch:
-    """Rendered frames with what is true of them.
-
-    frames: on the image grid, ``margin`` samples wider on every side.
-    mask: (batch, y, x) pupil coverage without the margin. slip_mm: (batch, 3).
-    """
-
-    frames: Frames | Flat
-    mask: Tensor
-    slip_mm: Tensor
 
 
 class Scenes(Protocol):
@@ -231,15 +219,15 @@ class Trainer:
         if self.inner.budget_mmacs:
             total = total + self.inner.budget_weight * losses.over_budget(macs, self.inner.budget_mmacs * 1e6)
         total.backward()  # type: ignore[no-untyped-call]
-        self._apply(rates, finite=bool(torch.isfinite(total)) and self._finite())
+        parallel.average(p for _, ps in self.groups.values() for p in ps)
+        self._apply(rates, finite=math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite())
         self.step += 1
-        loss, task_loss, optics_value, pitch_um, mmacs = (
-            float(v.detach()) for v in (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
-        )
+        values = (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
+        loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of([float(v.detach()) for v in values])
         return Record(self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped)
 
     def _losses(self, *, live: bool, pitch_moves: bool) -> tuple[Tensor, Tensor, Tensor]:
-        batch = self.scenes.batch(self.step, self.inner.batch)
+        batch = parallel.part_of(self.scenes.batch(self.step, self.inner.batch))
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(batch.frames, live)
             light = irradiance(batch.frames, optics, margin=self.scenes.margin)
@@ -322,3 +310,6 @@ class Trainer:
             if any(p.grad is not None and not bool(torch.isfinite(p.grad).all()) for p in parameters)
         ]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
+
+
+__all__ = ["Batch", "InnerConfig", "Model", "Record", "Scenes", "Schedule", "Trainer", "model"]

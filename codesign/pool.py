@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from codesign.eye_scenes import EyeScenes, decoupled
 from codesign.flat import Array, Flat, flattened
-from codesign.inner import Batch
+from codesign.inner_batch import Batch
 from metalens import store
 from metalens.errors import TrainingError
 

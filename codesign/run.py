@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from codesign import assess, checkpoint, cost, evolution
+from codesign import assess, checkpoint, cost, evolution, parallel
 from codesign.architecture import Architecture, Space
 from codesign.baselines import Name
 from codesign.evolution import Candidate, Plan, Search
@@ -143,6 +143,8 @@ def start(settings: RunConfig) -> Run:
     scenes: Scenes = fresh
     if settings.scenes.pool:
         scenes = PoolScenes(fill(fresh, settings.scenes.pool), fresh.margin, settings.scenes.scale, seed)
+    if parallel.ranks() > 1 and settings.network != "supernet":
+        raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
     run = Run(settings, Trainer(inner, settings.optics, settings.sensor, scenes, made), [])
     if settings.network == "supernet" and inner.pitch.rate == 0:
         evolution.affordable(settings.space, run.macs, min(settings.run.budgets_mmacs) * 1e6)
@@ -150,7 +152,9 @@ def start(settings: RunConfig) -> Run:
 
 
 def save(path: Path, run: Run) -> None:
-    """Checkpoint: training state and the searches so far."""
+    """Checkpoint: training state and the searches so far; written by one process alone."""
+    if parallel.rank():
+        return
     state = {"trainer": run.trainer.state(), "searches": [evolution.dumps(s) for s in run.searches]}
     checkpoint.save(path, state, settings=run.settings)
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from codesign import parallel
 from codesign.architecture import Architecture, Block, Space, blocks, largest, stem_channels
 from codesign.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
 from metalens.errors import TrainingError
@@ -53,6 +54,8 @@ class SlicedNorm(nn.Module):
         weight, bias = self.weight[:count], self.bias[:count]
         if self.measuring:
             self._measure(x)
+        if self.training and not self.measuring and parallel.ranks() > 1:
+            return parallel.batch_norm(x, weight, bias)
         if self.training or self.measuring:
             return F.batch_norm(x, None, None, weight, bias, training=True)
         return F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias)

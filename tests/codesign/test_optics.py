@@ -153,8 +153,8 @@ def test_lens_errors_have_the_covariance_that_was_asked_for():
     scale = np.outer(spread.deviations, spread.deviations) + 1e-12
     assert np.abs((np.cov(drawn.T) - spread.covariance) / np.sqrt(np.outer(*[np.diag(scale)] * 2))).max() < 0.06
     assert Spread().draw(generator) is None
+    bad = np.full((5, 5), -0.9) + 1.9 * np.eye(5)
     with pytest.raises(ConfigError, match="positive semi-definite"):
-        bad = np.full((5, 5), -0.9) + 1.9 * np.eye(5)
         Spread(correlation=tuple(bad.ravel()))
 
 

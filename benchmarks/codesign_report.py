@@ -1,0 +1,157 @@
+"""Tables and figures of the co-design study: paired bootstrap over test scenes and over runs.
+
+python -m benchmarks.codesign_report --work DIR        # writes benchmarks/results and docs/codesign
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens import report, store
+
+ROOT = Path(__file__).parents[1]
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Runs:
+    """All runs of one lens under one set of conditions.
+
+    lines: of the study, by seed. errors: {test: (seeds, frames, 3)} absolute slippage errors, mm.
+    """
+
+    lens: str
+    lines: list[dict[str, Any]]
+    errors: dict[str, Array]
+
+    def axial(self, test: str = "ambiguous") -> Array:
+        """(seeds, frames) mm."""
+        return self.errors[test][..., 2]
+
+
+def load(work: Path) -> dict[str, dict[str, Runs]]:
+    """{case: {lens: runs}} of the lines there are."""
+    lines: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for text in (work / "runs.jsonl").read_text(encoding="utf-8").splitlines():
+        line = json.loads(text)
+        if not line.get("skipped"):
+            case, lens, _ = line["run"].split("/")
+            lines[case, lens].append(line)
+    found: dict[str, dict[str, Runs]] = defaultdict(dict)
+    for (case, lens), mine in lines.items():
+        mine.sort(key=lambda line: int(line["run"].rsplit("/", 1)[1]))
+        kept = [np.load(work / (line["run"].replace("/", "-") + ".npz")) for line in mine]
+        errors = {test: np.stack([k[test] for k in kept]) for test in ("ambiguous", "natural")}
+        found[case][lens] = Runs(lens, mine, errors)
+    return found
+
+
+def ratio(one: Array, other: Array, *, draws: int = 4000, seed: int = 0) -> tuple[float, float, float]:
+    """Ratio of mean errors with its 95 % interval; scenes (in pairs that share a pupil) and runs drawn anew.
+
+    Scenes are the same for both lenses, so they are drawn together; so are runs, as far as both have the same seeds.
+
+    Args:
+        one, other: (seeds, frames), the same frames.
+    """
+    generator = np.random.default_rng(seed)
+    both = min(len(one), len(other))
+    one, other = one[:both], other[:both]
+    a, b = (e.reshape(both, -1, 2).mean(-1) for e in (one, other))  # pairs of frames are no two scenes
+    values = np.empty(draws)
+    for i in range(draws):
+        runs = generator.integers(0, both, both)
+        scenes = generator.integers(0, a.shape[1], a.shape[1])
+        values[i] = a[runs][:, scenes].mean() / b[runs][:, scenes].mean()
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(one.mean() / other.mean()), float(low), float(high)
+
+
+def best_focus(runs: dict[str, Runs]) -> str:
+    """The hyperbolic lens of least axial error on natural frames: the ambiguous ones do not choose it."""
+    fixed = [name for name in runs if name.startswith("hyper")]
+    return min(fixed, key=lambda name: float(runs[name].axial("natural").mean()))
+
+
+def rows(runs: dict[str, Runs]) -> list[dict[str, Any]]:
+    """One row a lens, least axial error first."""
+    best, out = best_focus(runs), []
+    for lens, mine in runs.items():
+        row: dict[str, Any] = {"lens": lens, "seeds": len(mine.lines), "frames": mine.lines[0]["frames"]}
+        row |= {"mmacs": mine.lines[0]["mmacs"], "axial_mm": float(mine.axial().mean())}
+        row["axial_by_seed_mm"] = [round(float(e), 4) for e in mine.axial().mean(1)]
+        row["lateral_mm"] = float(mine.errors["ambiguous"][..., :2].mean())
+        row["natural_axial_mm"] = float(mine.axial("natural").mean())
+        row["iou"] = float(np.mean([line["ambiguous"]["iou"] for line in mine.lines]))
+        row["response_mm_per_mm"] = float(np.mean([line["depth_response"]["mm_per_mm"] for line in mine.lines]))
+        for name, reference in (("mid_range", "hyper20"), ("best_focus", best)):
+            if reference in runs and lens != reference:
+                row[f"to_{name}"] = ratio(mine.axial(), runs[reference].axial())
+        out.append(row)
+    return sorted(out, key=lambda row: float(row["axial_mm"]))
+
+
+def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs]]) -> str:
+    """Markdown."""
+    parts = []
+    for case, mine in found.items():
+        line = f"## {case}: {mine[0]['mmacs']:.1f} MMACs, {mine[0]['frames']} training frames a run, best focus: "
+        parts.append(line + f"`{best_focus(runs[case])}`\n")
+        parts.append(
+            "| lens | seeds | axial / mm | to mid-range (20 mm) | to best focus | lateral / mm | IoU | mm per mm of "
+            "PSF depth |\n|---|---|---|---|---|---|---|---|"
+        )
+        for row in mine:
+            ratios = [_interval(row.get(key)) for key in ("to_mid_range", "to_best_focus")]
+            parts.append(
+                f"| {row['lens']} | {row['seeds']} | {row['axial_mm']:.3f} | {ratios[0]} | {ratios[1]} | "
+                f"{row['lateral_mm']:.3f} | {row['iou']:.3f} | {row['response_mm_per_mm']:.2f} |"
+            )
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _interval(value: tuple[float, float, float] | None) -> str:
+    return "1" if value is None else f"{value[0]:.3f} [{value[1]:.3f}, {value[2]:.3f}]"
+
+
+def figure(found: dict[str, list[dict[str, Any]]]) -> bytes:
+    """Axial error of every lens, a dot a seed."""
+    canvas, _ = report.canvas(size=(4.5 * len(found), 3.6))
+    canvas.clear()
+    for k, (case, mine) in enumerate(found.items()):
+        axes = canvas.add_subplot(1, len(found), k + 1)
+        for i, row in enumerate(mine):
+            values = row["axial_by_seed_mm"]
+            axes.plot(values, [i] * len(values), "o", alpha=0.5, color="C0")
+            axes.plot([row["axial_mm"]], [i], "|", markersize=18, color="k")
+        axes.set_yticks(range(len(mine)), [row["lens"] for row in mine])
+        axes.set(xlabel="axial slippage error / mm (ambiguity set)", title=case, xlim=(0, None))
+        axes.invert_yaxis()
+    canvas.tight_layout()
+    return report.png(canvas)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True)
+    options = parser.parse_args()
+    runs = load(options.work)
+    found = {case: rows(mine) for case, mine in runs.items()}
+    folder = ROOT / "docs" / "codesign"
+    folder.mkdir(parents=True, exist_ok=True)
+    content = table(found, runs)
+    store.write_text(ROOT / "benchmarks" / "results" / "codesign_study.json", json.dumps(found, indent=1) + "\n")
+    store.write_text(folder / "results.md", "# Results of the study\n\n" + content)
+    store.write_bytes(folder / "study.png", figure(found))
+    print(content)
+
+
+if __name__ == "__main__":
+    main()
