@@ -17,6 +17,8 @@ from metalens.errors import StoreError
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Attribute = str | int | float | bool
+_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
+_SEAL, _BLOCK = b"metalens-toolchain sha256 ", 512  # the user block that HDF5 leaves to its writer
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 
@@ -110,15 +112,17 @@ def save(
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    with replacing(path) as part, h5py.File(part, "w", track_order=False) as file:
-        file.attrs["kind"] = kind
-        file.attrs["version"] = version
-        file.attrs["units"] = "um, rad"
-        for name, value in sorted((attributes or {}).items()):
-            file.attrs[name] = value
-        for name in sorted(arrays):
-            _write_array(file, name, np.asarray(arrays[name]), compress)
-        _write_provenance(file, provenance or Provenance())
+    with replacing(path) as part:
+        with h5py.File(part, "w", track_order=False, userblock_size=_BLOCK) as file:
+            file.attrs["kind"] = kind
+            file.attrs["version"] = version
+            file.attrs["units"] = "um, rad"
+            for name, value in sorted((attributes or {}).items()):
+                file.attrs[name] = value
+            for name in sorted(arrays):
+                _write_array(file, name, np.asarray(arrays[name]), compress)
+            _write_provenance(file, provenance or Provenance())
+        _seal(part)
 
 
 def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stored:
@@ -127,16 +131,22 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stor
     Args:
         kind: the kind that is needed; None takes any (``metalens info``).
 
+    What was written is checked against its checksum: a file that changed since is refused, not read wrongly.
+
     Raises:
-        StoreError: no such file, not HDF5, truncated, or of another kind or version.
+        StoreError: no such file, not HDF5, truncated, damaged, or of another kind or version; also where an entry
+            that is asked for later is not in the file.
     """
     path = Path(path)
     if not path.is_file():
         raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
     try:
+        _check_seal(path)
         with h5py.File(path, "r") as file:
             return _read(path, file, kind, version)
-    except (OSError, KeyError, RuntimeError) as error:
+    except StoreError:
+        raise
+    except _DAMAGE as error:
         raise StoreError(f"{path}: truncated or not an HDF5 file of this toolchain ({error})") from error
 
 
@@ -149,7 +159,7 @@ def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored
             f"{path} holds {found!r} version {int(file.attrs['version'])}, need {kind!r} version {version}; "
             "make it again with this release or give another file"
         )
-    arrays: dict[str, Array] = {}
+    arrays: dict[str, Array] = _Held(path)
     file.visititems(
         lambda name, item: (
             arrays.__setitem__(name, item[...])
@@ -157,8 +167,44 @@ def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored
             else None
         )
     )
-    attributes = {k: _plain(v) for k, v in file.attrs.items() if k not in ("kind", "version", "units")}
+    attributes: dict[str, Any] = _Held(path)
+    attributes |= {k: _plain(v) for k, v in file.attrs.items() if k not in ("kind", "version", "units")}
     return Stored(str(found), int(file.attrs["version"]), arrays, attributes, _read_provenance(file))
+
+
+class _Held(dict[str, Any]):
+    """Entries of a file; one that is not there is a refusal that names the file."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def __missing__(self, name: str) -> Any:
+        raise StoreError(f"{self.path}: holds no {name!r}; made by another release or damaged: make it again")
+
+
+def _seal(path: Path) -> None:
+    """Put the SHA-256 of everything behind the user block into it."""
+    digest = _digest(path)
+    with open(path, "rb+") as file:
+        file.write((_SEAL + digest.encode() + b"\n").ljust(_BLOCK, b"\0"))
+
+
+def _check_seal(path: Path) -> None:
+    """Refuse a sealed file that changed; files without a seal (of other programs) are left to the HDF5 library."""
+    with open(path, "rb") as file:
+        head = file.read(_BLOCK)
+    if head.startswith(_SEAL) and head[len(_SEAL) : len(_SEAL) + 64] != _digest(path).encode():
+        raise StoreError(f"{path}: truncated or damaged: it does not match its own checksum; copy or make it again")
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        file.seek(_BLOCK)
+        total = hashlib.sha256()
+        while part := file.read(1 << 20):
+            total.update(part)
+    return total.hexdigest()
 
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:

@@ -1,0 +1,139 @@
+"""Damaged artefacts: every kind of HDF5 file, truncated or with flipped bits, is refused by type or read as it was."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from characterize import asbuilt
+from characterize.pillars import Sensitivity
+from codesign import command_budget, dataset
+from codesign.budget import Entry
+from metalens import lens, library, psf, store
+from metalens.cell import Cell, Index
+from metalens.errors import MetalensError
+from metalens.lens import DiameterMap, Lens
+from metalens.library import PillarLibrary, Sweep
+from metalens.proxy import Proxy
+from metalens.psf import PsfStack
+
+CELL = Cell(pitch_um=0.30, pillar=Index(3.6))
+PROXY = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+RESPONSE = Sensitivity(np.zeros((3, 6)), 0.15)
+
+
+def _lens():
+    diameters = np.linspace(0.08, 0.21, 36, dtype=np.float32).reshape(6, 6)
+    return Lens(DiameterMap(diameters, 0.3), CELL, PROXY, 0.85, 2000.0, 20_000.0, "map")
+
+
+def _library():
+    d = np.linspace(0.08, 0.21, 20)
+    t = (0.9 * np.exp(55j * d))[None, None, None]
+    parts = (np.zeros(1), np.array([0.85]), d, t, t, np.full(t.shape, 1e-4), np.ones(t.shape), np.zeros((0, 5)))
+    return PillarLibrary(CELL, Sweep(), ("x",), *parts, "modal", 20, PROXY)
+
+
+def _psf():
+    axis = (np.array([2e4]), np.zeros((1, 2)), np.array([0.85]), np.ones(1))
+    return PsfStack(
+        np.full((1, 1, 4, 4), 1 / 16), np.ones((1, 1)), *axis, 0.75, np.zeros((1, 2)), 2000.0, 1e-4, 1e-5, "x"
+    )
+
+
+def _asbuilt():
+    one = np.ones(2)
+    frames = np.ones((2, 4, 4))
+    return asbuilt.AsBuilt(
+        design=_lens(), response=RESPONSE, names=("bias_nm", "height_nm"), value=one, covariance=np.eye(2), information=np.eye(2),
+        held={"index": 0.0}, depth_um=one, angle_rad=np.zeros((2, 2)), pixel_um=3.0, measured=frames, predicted=frames,
+        nominal=frames, residual_sigma=frames, chi2_per_dof=1.0, converged=True, reason="made up",
+    )  # fmt: skip
+
+
+def _budget_rows():
+    return [Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"), Entry("all links", 0.1, math.nan, 1e-3, "sum")]
+
+
+KINDS = {
+    "lens": (lambda p: lens.save(p, _lens()), lens.load),
+    "library": (lambda p: library.save(p, _library()), library.load),
+    "psf": (lambda p: psf.save(p, _psf()), psf.load),
+    "asbuilt": (lambda p: asbuilt.save(p, _asbuilt()), asbuilt.load),
+    "budget": (lambda p: command_budget.save(p, _budget_rows(), store.Provenance()), command_budget.load),
+}
+
+
+def _same(one, other):
+    """Whether two records hold the same numbers, whatever their type."""
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, np.asarray(other), equal_nan=one.dtype.kind in "fc")
+    if dataclasses.is_dataclass(one):
+        names = [f.name for f in dataclasses.fields(one) if f.name != "provenance"]
+        return all(_same(getattr(one, n), getattr(other, n)) for n in names)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(_same(a, b) for a, b in zip(one, other, strict=True))
+    return one == other or str(one) == str(other)
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_artefacts_are_refused_or_read_as_they_were(tmp_path_factory, kind, data):
+    path = tmp_path_factory.mktemp("fuzz") / "file.h5"
+    write, read = KINDS[kind]
+    write(path)
+    want = read(path)
+    whole = bytearray(path.read_bytes())
+    if data.draw(st.booleans(), label="truncate"):
+        whole = whole[: data.draw(st.integers(0, len(whole) - 1), label="length")]
+    else:
+        for _ in range(data.draw(st.integers(1, 3), label="flips")):
+            at = data.draw(st.integers(0, len(whole) - 1), label="byte")
+            whole[at] ^= 1 << data.draw(st.integers(0, 7), label="bit")
+    path.write_bytes(bytes(whole))
+    found, said = want, str(path)
+    try:
+        found = read(path)
+    except MetalensError as refusal:
+        said = str(refusal)
+    assert _same(want, found)
+    assert str(path) in said
+
+
+def test_a_changed_number_is_found_out(tmp_path):
+    import h5py
+
+    lens.save(tmp_path / "l.h5", _lens())
+    with h5py.File(tmp_path / "l.h5", "r+") as file:
+        file["diameter_um"][2, 3] = 0.1
+    with pytest.raises(store.StoreError, match="checksum"):
+        lens.load(tmp_path / "l.h5")
+
+
+def test_a_missing_entry_is_named(tmp_path):
+    store.save(tmp_path / "l.h5", "lens", {"other": np.ones(3)})
+    with pytest.raises(store.StoreError, match="holds no"):
+        lens.load(tmp_path / "l.h5")
+
+
+def test_another_version_is_named_with_what_to_do(tmp_path):
+    store.save(tmp_path / "l.h5", "lens", {"x": np.ones(3)}, version=99)
+    with pytest.raises(store.StoreError, match="version 99, need 'lens' version 1; make it again"):
+        lens.load(tmp_path / "l.h5")
+
+
+def test_every_kind_that_is_fuzzed_is_the_kind_it_says(tmp_path):
+    for kind, (write, _) in KINDS.items():
+        write(tmp_path / "f.h5")
+        assert store.load(tmp_path / "f.h5").kind == kind
+
+
+def test_scene_shards_survive_or_are_refused(tmp_path):
+    arrays = {"radiance": np.zeros((1, 2, 4, 4), np.uint8), "coverage": np.zeros((1, 4, 4), np.uint8)}
+    store.save(tmp_path / "s.h5", "scene", arrays)
+    with pytest.raises(store.StoreError, match="holds no"):
+        dataset.read_shard(tmp_path / "s.h5")
