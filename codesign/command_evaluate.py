@@ -6,4 +6,9 @@ PARTS: dict[str, tuple[str, str]] = {
         "codesign.command_evaluate_optics",
         "LENS... -> axial information, PSF slices and scene sensitivity of lenses (Tables 1 and 3, Figs. 5 and 7)",
     ),
+    "experiment": (
+        "codesign.command_experiment",
+        "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 9 to 11)",
+    ),
+    "paper": ("codesign.command_paper", "RUN_DIR... -> every table and figure of the paper beside ours"),
 }

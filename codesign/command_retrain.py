@@ -179,7 +179,7 @@ def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
 
 
 def _keep(folder: Path, source: Source, going: Trainer, story: retrain_report.Story) -> None:
-    retraining.judge(going, source, RetrainConfig(test_batches=2), story.lenses.drawn[:1])  # batch statistics
+    retraining.settle(going, source)
     cut = Subnet(retraining.network(going), source.architecture)
     with store.replacing(folder / "subnet_retrained.safetensors") as part:
         save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})

@@ -1,43 +1,14 @@
-"""What one network says of frames, frame by frame: slippage, pupil centre and mask, for errors with intervals."""
+"""Errors of what a network said, frame by frame, so that they come with intervals."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from codesign import losses
-from codesign.architecture import Architecture
-from codesign.assess import Seen
-from codesign.supernet import Supernet, recalibrate
+from codesign.assess import Answers, Seen
 from metalens.store import Array
 
 Tensor = torch.Tensor
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Readings:
-    """slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,) of the pupil's mask."""
-
-    slip_mm: Tensor
-    centre: Tensor
-    iou: Tensor
-
-
-@torch.no_grad()
-def read(net: Supernet, architecture: Architecture, seen: Seen, scale_mm: tuple[float, float, float]) -> Readings:
-    """Read all frames, with batch statistics of the architecture measured on the first half of them.
-
-    Labels are not used but for the overlap of the masks.
-    """
-    parts = [seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)]
-    recalibrate(net, architecture, parts[: max(1, len(parts) // 2)])
-    found = [net(part, architecture) for part in parts]
-    net.train()
-    return Readings(
-        torch.cat([f.slip for f in found]) * torch.tensor(scale_mm),
-        torch.cat([f.centre for f in found]),
-        losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask),
-    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,9 +54,9 @@ class Accuracy:
         }
 
 
-def accuracy(readings: Readings, seen: Seen) -> Accuracy:
-    """Errors of readings against the truth of their frames."""
-    return Accuracy((readings.slip_mm - seen.slip_mm).abs(), readings.iou)
+def accuracy(answers: Answers, seen: Seen) -> Accuracy:
+    """Errors of answers against the truth of their frames."""
+    return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou)
 
 
 def bootstrap(values: Array, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:

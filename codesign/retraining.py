@@ -21,11 +21,11 @@ from codesign import run as runs
 from codesign.architecture import Architecture, check
 from codesign.built import MadeLens
 from codesign.eye_scenes import TEST
-from codesign.inner import InnerConfig, Record, Schedule, Trainer
+from codesign.inner import Batch, InnerConfig, Record, Scenes, Schedule, Trainer
 from codesign.optics import Stack
 from codesign.reading import Accuracy
 from codesign.run import Run, RunConfig
-from codesign.supernet import Supernet
+from codesign.supernet import Supernet, recalibrate
 from metalens.errors import ConfigError, FitError, TrainingError
 from metalens.lens import Lens
 
@@ -131,7 +131,7 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
         )
     settings = runs.load(folder / "run.toml")
     made = runs.resume(folder / "checkpoint.safetensors", settings)
-    rows = _rows(folder / "result.json")
+    rows = rows_of(folder)
     found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
     if not found:
         have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
@@ -139,7 +139,15 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     return Source(made, _architecture(found[0]["architecture"], made, folder), found[0])
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    """Rows of result.json, least budget first.
+
+    Raises:
+        TrainingError: the file is missing, cut short or of another version.
+    """
+    path = folder / "result.json"
+    if not path.is_file():
+        raise TrainingError(f"{path} is missing: no finished run; resume the run")
     try:
         rows: list[dict[str, Any]] = sorted(
             json.loads(path.read_text("utf-8"))["rows"], key=lambda r: r["budget_mmacs"]
@@ -253,15 +261,44 @@ def train(going: Trainer, path: Path, settings: object, *, every: int = 50) -> I
             checkpoint.save(path, {"trainer": going.state()}, settings=settings)
 
 
+def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
+    """Measure the batch statistics on training frames through the lenses that the network was trained for.
+
+    Never on frames that judge: a network that nobody warned of the made lens knows none of its images.
+    """
+    frames = []
+    for number in range(batches):
+        made = going.stacks[number % len(going.stacks)]
+        step = _Step(going.scenes, number)
+        frames.append(assess.frames(going, step, 1, stack=made).frames)
+    recalibrate(network(going), source.architecture, frames)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One batch of scenes."""
+
+    scenes: Scenes
+    number: int
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frames."""
+        return self.scenes.margin
+
+    def batch(self, step: int, size: int) -> Batch:
+        """The batch, whatever ``step``."""
+        return self.scenes.batch(self.number, size)
+
+
 def judge(going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Accuracy:
     """Errors on test frames through these lenses, all of them together."""
+    settle(going, source)
     parts = []
-    for number, made in enumerate(stacks):
+    for made in stacks[: config.judge]:
         seen = assess.frames(going, source.run.scenes(TEST), config.test_batches, stack=made)
-        found = reading.read(network(going), source.architecture, seen, going.inner.slip_scale_mm)
-        parts.append(reading.accuracy(found, seen))
-        if number + 1 >= config.judge:
-            break
+        answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
+        parts.append(reading.accuracy(answers, seen))
     return Accuracy(torch.cat([p.error_mm for p in parts]), torch.cat([p.iou for p in parts]))
 
 

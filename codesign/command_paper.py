@@ -1,0 +1,130 @@
+"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import tyro
+
+from codesign import command_evaluate_optics, command_experiment, paper, retraining
+from codesign.experiment import ExperimentConfig
+from codesign.paper import ROLES, Line, Measured
+from metalens import report, store
+from metalens.commands import Common, Output
+from metalens.errors import ConfigError
+
+JSON, PAGE = "paper.json", "report.html"
+DIM_DB = 15.0
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate paper``.
+
+    Attributes:
+        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
+            far as there are; without any, the claims are listed with the commands that measure them.
+        output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
+        subjects: of the experiment.
+        scenes: of Table 1.
+        measure: measure what is not in the folder yet; without it only what is there is used.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    output: Output = Path("paper")
+    subjects: int = 20
+    scenes: int = 24
+    measure: bool = True
+
+
+def run(options: Options) -> int:
+    """Measure what is missing, compare, write; exit 0."""
+    if len(options.runs) > len(ROLES):
+        raise ConfigError(f"{len(options.runs)} runs; give at most {len(ROLES)}: {', '.join(ROLES)}")
+    folder = options.output
+    if (folder / JSON).is_file() and not options.force:
+        raise ConfigError(f"{folder / JSON} exists; give --force to write it again from the measurements beside it")
+    folder.mkdir(parents=True, exist_ok=True)
+    if options.runs and options.measure:
+        _measure(options, folder)
+    found = collect(folder, dict(zip(ROLES, options.runs, strict=False)))
+    told = paper.lines(found, folder)
+    _write(folder, told)
+    values = [{**asdict(t.claim), "ours": asdict(t.ours) if t.ours else None, "picture": t.picture} for t in told]
+    store.write_text(folder / JSON, json.dumps(values, indent=1, default=float) + "\n")
+    options.console.result({"lines": values, "folder": str(folder)}, f"{table(told)}\nopen {folder / PAGE}")
+    return 0
+
+
+def collect(folder: Path, runs: dict[str, Path]) -> dict[str, Measured]:
+    """Everything that was measured into ``folder``, and the rows of the runs.
+
+    Raises:
+        StoreError, TrainingError: a measurement or a run is damaged or of another version.
+    """
+    found: dict[str, Measured] = {}
+    experiment, dim, optics = (
+        folder / name / f"{file}.json"
+        for name, file in (("experiment", "experiment"), ("dim", "experiment"), ("optics", "optics"))
+    )
+    if experiment.is_file():
+        found |= paper.of_experiment(experiment)
+    if experiment.is_file() and dim.is_file():
+        found |= paper.of_dim(experiment, dim)
+    if optics.is_file():
+        found |= paper.of_optics(optics)
+    return found | paper.of_runs({role: retraining.rows_of(path) for role, path in runs.items()})
+
+
+def _measure(options: Options, folder: Path) -> None:
+    names = ROLES[: len(options.runs)]
+    config = ExperimentConfig(subjects=options.subjects)
+    for name, settings in (("experiment", config), ("dim", replace(config, snr_db=DIM_DB))):
+        if not (folder / name / "experiment.json").is_file():
+            options.console.say(f"measuring: {name}")
+            asked = command_experiment.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
+            command_experiment.run(asked)
+    if not (folder / "optics" / "optics.json").is_file():
+        options.console.say("measuring: optics")
+        order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
+        lenses = tuple(_named(folder, name, path) for name, path in order)
+        optics = command_evaluate_optics.Options(
+            lenses=lenses, output=folder / "optics", scenes=options.scenes, quiet=True, force=True
+        )
+        command_evaluate_optics.run(optics)
+
+
+def _named(folder: Path, name: str, run_dir: Path) -> Path:
+    """The run's lens under its role's name, by which the tables know it."""
+    kept = folder / "lenses"
+    kept.mkdir(exist_ok=True)
+    store.write_bytes(kept / f"{name}.h5", (run_dir / "lens.h5").read_bytes())
+    return kept / f"{name}.h5"
+
+
+def table(told: list[Line]) -> str:
+    """The lines as text."""
+    rows = [("place", "what", "paper", "ours", "ratio", "conditions"), *(t.words() for t in told)]
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+    return "\n".join(
+        "  ".join([*(c.ljust(w) for c, w in zip(row, widths, strict=False)), row[5]]).rstrip() for row in rows
+    )
+
+
+def _write(folder: Path, told: list[Line]) -> None:
+    places = list(dict.fromkeys(t.claim.place for t in told))
+    head = ("what", "paper", "ours", "ratio", "conditions")
+    sections = []
+    for place in places:
+        mine = [t for t in told if t.claim.place == place]
+        items: list[report.Figure | report.Table] = (
+            [report.Table(head, [t.words()[1:] for t in mine if not t.picture])]
+            if any(not t.picture for t in mine)
+            else []
+        )
+        items += [report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True) for t in mine if t.picture]
+        sections.append(report.Section(place, items=items))
+    done = sum(t.ours is not None or bool(t.picture) for t in told)
+    keys = [report.KeyFigure("claims of the paper", str(len(told))), report.KeyFigure("measured here", str(done))]
+    lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
+    report.write(folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys)
