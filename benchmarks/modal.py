@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,20 @@ from metalens.modal.ladder import RUNGS
 WAVELENGTH_UM = 0.85
 CELL = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
 REFERENCES = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
-GOALS = {5e-3: "5e-3 in 5 ms, goal 2 ms", 1e-3: "1.2e-3 in 10 ms", 1e-5: "1e-6 in 1 s"}
+DIAMETERS = np.unique(np.round(np.concatenate([np.linspace(0.08, 0.32, 25), [0.1925, 0.1937, 0.301, 0.3035]]), 4))
+GOALS = {
+    "coarse": "5e-3 at 50 times fmmax N = 7, goal 150",
+    "fair": "1.2e-3 in 10 ms",
+    "finer": "1e-6 in 1 s",
+}
+
+
+@cache
+def dense() -> dict[float, complex]:
+    """t over 80-320 nm, the dip and the flank with it, on the fine mesh: 6e-6 off the references."""
+    rung = next(rung for rung in RUNGS if rung.name == "fine")
+    cases = {float(d): case_of(CELL, float(d), WAVELENGTH_UM, 0.0, 0.0, "x") for d in DIAMETERS}
+    return {d: complex(evaluate(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0]) for d, c in cases.items()}
 
 
 def references(angle_deg: float) -> dict[tuple[float, str], complex]:
@@ -40,37 +54,44 @@ def forget() -> None:
 
 
 def normal(tolerance: float) -> Row:
-    """Fresh diameters at normal incidence: nothing is shared between the solves."""
-    wanted = references(0.0)
-    found = {d: solve(CELL, d, WAVELENGTH_UM, tolerance=tolerance) for d, _ in wanted}
-    error = max(abs(found[d].t - t) for (d, _), t in wanted.items())
-    claimed = max(response.t_error for response in found.values())
+    """Fresh diameters at normal incidence, each refined to the tolerance: nothing is shared between the solves."""
+    wanted = dense()
+    found = {d: solve(CELL, d, WAVELENGTH_UM, tolerance=tolerance) for d in wanted}
+    errors = np.array([abs(found[d].t - t) for d, t in wanted.items()])
+    claimed = np.array([response.t_error for response in found.values()])
 
     def work() -> None:
         forget()
-        for d, _ in wanted:
+        for d in wanted:
             solve(CELL, d, WAVELENGTH_UM, tolerance=tolerance)
 
-    seconds = fastest(work) / len(wanted)
-    goal = f"{GOALS.get(tolerance, '')}; claimed {claimed:.1e}".lstrip("; ")
-    return Row("80-320 nm, per solve", f"tolerance {tolerance:g}", seconds, error, "max |dt| to reference", goal=goal)
+    seconds = fastest(work, repeats=1) / len(wanted)
+    goal = f"claimed {claimed.max():.1e}, median {np.median(claimed / errors):.1f} times the error"
+    case = f"{len(wanted)} diameters 80-320 nm, per solve"
+    return Row(case, f"tolerance {tolerance:g}", seconds, float(errors.max()), "max |dt| to the fine mesh", goal=goal)
 
 
-def mesh(index: int) -> Row:
-    """One rung of the ladder, whatever its estimate."""
-    wanted, rung = references(0.0), RUNGS[index]
-    cases = {d: case_of(CELL, d, WAVELENGTH_UM, 0.0, 0.0, "x") for d, _ in wanted}
-    error = max(
-        abs(evaluate(cases[d], rung.choice(cases[d].rho).plan).matrix[1, 0] - t) for (d, _), t in wanted.items()
-    )
+def mesh(name: str) -> Row:
+    """One rung of the ladder, whatever its estimate; the finest ones against the committed references."""
+    rung = next(rung for rung in RUNGS if rung.name == name)
+    rough = rung.usual > 5e-5
+    wanted = dense() if rough else {d: t for (d, _), t in references(0.0).items()}
+    cases = {d: case_of(CELL, d, WAVELENGTH_UM, 0.0, 0.0, "x") for d in wanted}
+
+    def one(d: float) -> complex:
+        return complex(evaluate(cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak).matrix[1, 0])
+
+    error = max(abs(one(d) - t) for d, t in wanted.items())
 
     def work() -> None:
         forget()
-        for case in cases.values():
-            evaluate(case, rung.choice(case.rho).plan)
+        for d in cases:
+            one(d)
 
-    seconds = fastest(work) / len(cases)
-    return Row("80-320 nm, per solve", f"{rung.name} mesh", seconds, error, "max |dt| to reference")
+    seconds = fastest(work, repeats=3 if rough else 1) / len(cases)
+    against = "max |dt| to the fine mesh" if rough else "max |dt| to reference"
+    case = f"{len(cases)} diameters 80-320 nm, per solve"
+    return Row(case, f"{rung.name} mesh", seconds, error, against, goal=GOALS.get(name, ""))
 
 
 def oblique(tolerance: float) -> Row:
@@ -119,8 +140,8 @@ def slopes() -> Row:
 
 def rows() -> list[Row]:
     return [
-        *(normal(tolerance) for tolerance in (5e-3, 1e-3, 1e-4, 1e-5)),
-        *(mesh(i) for i in range(5)),
+        *(mesh(name) for name in ("coarse", "fair", "even", "good", "fine", "finer")),
+        *(normal(tolerance) for tolerance in (5e-3, 1e-3, 1e-4)),
         oblique(1e-2),
         oblique(1e-3),
         sweep(),

@@ -51,7 +51,7 @@ def smooth(
         return precise(cell, light, tolerance=tolerance, engine=engine)
     make = _modal_levels if engine == "modal" else _rcwa_levels
     levels = make(cell, light, span_um[1], tolerance)
-    probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 0.97)]
+    probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 1.0)]
     for at in levels[:-1]:
         if all(at(d).converged for d in probes):
             return at

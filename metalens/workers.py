@@ -129,8 +129,11 @@ def serve() -> None:
             result = work(json.loads(line))
         except MetalensError as error:
             result = {"refused": type(error).__name__, "message": str(error)}
-        sys.stdout.write(json.dumps(result) + "\n")
-        sys.stdout.flush()
+        try:
+            sys.stdout.write(json.dumps(result) + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:  # whoever asked was killed: nobody is left to tell
+            os._exit(1)
 
 
 def _task(kind: str, cell: Cell, light: Light, tolerance: float, engine: str) -> Task:
