@@ -1,5 +1,6 @@
 """Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least coefficients in tolerance."""
 
+import contextlib
 import math
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from metalens import polynomial
+from metalens.errors import DomainError
 from metalens.library import PillarLibrary
 from metalens.proxy import Proxy
 from metalens.smooth import Stretch, stretch
@@ -100,7 +102,8 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         terms += 2
         kept, proxy = _longest(data, wanted, terms)
     counts = range(4, max(18, 2 * terms + 5), 2)
-    table = tuple(_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
+    trials = (_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
+    table = tuple(trial for trial in trials if trial is not None)
     return ProxyFit(proxy, _notes(smooth, data, kept, terms), table, _turns(kept), smooth.polarization_spread)
 
 
@@ -108,10 +111,15 @@ def _longest(data: _Data, wanted: Wanted, terms: int) -> tuple[_Data, Proxy]:
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the tolerances."""
     good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
     best = _best(_head(data, good), wanted, terms)
+    if best is None:
+        raise DomainError(
+            f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
+            f"{data.diameter[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+        )
     while bad - good > 1:
         middle = (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
         trial = _best(_head(data, middle), wanted, terms)
-        if _meets(trial, wanted):
+        if trial is not None and _meets(trial, wanted):
             good, best = middle, trial
         else:
             bad = middle
@@ -122,9 +130,14 @@ def _meets(proxy: Proxy, wanted: Wanted) -> bool:
     return _cost(proxy, wanted) <= 1
 
 
-def _best(data: _Data, wanted: Wanted, terms: int) -> Proxy:
-    """Of the powers of the diameter, the one with the least error in units of the tolerances."""
-    return min((fit_terms(data, power, terms) for power in POWERS), key=lambda proxy: _cost(proxy, wanted))
+def _best(data: _Data, wanted: Wanted, terms: int) -> Proxy | None:
+    """Of the powers of the diameter, the one with the least error in units of the tolerances; None where each takes
+    |T| below 0 between the entries."""
+    found = []
+    for power in POWERS:
+        with contextlib.suppress(DomainError):
+            found.append(fit_terms(data, power, terms))
+    return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
 
 
 def _cost(proxy: Proxy, wanted: Wanted) -> float:
@@ -211,8 +224,12 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     return best
 
 
-def _trial(data: _Data, power: int, coefficients: int) -> Trial:
-    proxy = fit_terms(data, power, coefficients // 2)
+def _trial(data: _Data, power: int, coefficients: int) -> Trial | None:
+    """One line of the table; None where |T| falls below 0 between the entries."""
+    try:
+        proxy = fit_terms(data, power, coefficients // 2)
+    except DomainError:
+        return None
     return Trial(coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error)
 
 

@@ -166,3 +166,14 @@ def test_default_cell_meets_its_numbers():
     assert p.max_transmission_error <= 1e-3
     assert p.monotone(0.85)
     assert p.coverage_rad(0.85, within_um=(0.08, p.domain_um[1])) >= TURN  # printable pillars cover a full turn
+
+
+def test_a_candidate_that_turns_negative_between_entries_is_passed_over():
+    # entries so few that high degrees swing between them: those fits are no proxies, the next shorter domain may be
+    made = synthetic(factor=lambda d: 1 - 0.85 * np.exp(-(((d - 0.2) / 0.002) ** 2)), samples=60)
+    try:
+        found = proxy_fit.fit(made, Wanted(least_transmission=0.05)).proxy
+    except DomainError as refused:
+        assert "fit it again" not in str(refused)  # what the proxy says of its own coefficients is no advice to a user
+    else:
+        assert found.transmission(np.linspace(*found.domain_um, 1000), 0.85).min() >= 0
