@@ -138,5 +138,5 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
     made = plan(case(phase.shape, **geometry), tolerance, phase.dtype, phase.device)
-    field, _ = field_windowed(phase, level, made)
+    field, _, _ = field_windowed(phase, level, made)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

@@ -4,7 +4,8 @@ Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor 
 A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray meets the sensor at (d·tx, d·ty).
 """
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,34 @@ def sensor_path(x: Any, y: Any, centre: Any, distance: Any) -> Any:
     r0 = (cx * cx + cy * cy + distance * distance) ** 0.5
     q = x * x + y * y - 2 * (x * cx + y * cy)
     return q / ((q + r0 * r0) ** 0.5 + r0)
+
+
+def windows(case: Case, parts: int) -> tuple[tuple[Case, ...], ...]:
+    """The window cut into rows of parts, at most ``parts`` along each axis, equal to within one sample."""
+    rows, columns = (_cut(count, min(parts, count)) for count in case.samples)
+    return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+
+
+def tiles(case: Case, parts: int) -> tuple[tuple[list[int], list[int]], tuple[tuple[Case, ...], ...]]:
+    """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size: neighbours may overlap."""
+    firsts, sizes = [], []
+    for count in case.samples:
+        number = min(parts, count)
+        sizes.append(-(-count // number))
+        firsts.append([i * (count - sizes[-1]) // max(number - 1, 1) for i in range(number)])
+    rows, columns = ([(a, a + size) for a in first] for first, size in zip(firsts, sizes, strict=True))
+    return (firsts[0], firsts[1]), tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+
+
+def _part(case: Case, row: tuple[int, int], column: tuple[int, int]) -> Case:
+    """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
+    (my, mx), (x, y) = case.samples, case.centre_um
+    centre = x + (sum(column) - mx) / 2 * case.step_um, y + (sum(row) - my) / 2 * case.step_um
+    return replace(case, centre_um=centre, samples=(row[1] - row[0], column[1] - column[0]))
+
+
+def _cut(count: int, parts: int) -> list[tuple[int, int]]:
+    return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
 
 
 def chief_path(case: Case) -> float:

@@ -1,10 +1,11 @@
-"""From millions of pillars to a few thousand Legendre moments, with the known phase taken off in float64.
+"""From millions of pillars to a few thousand Legendre moments, with the known phase taken off.
 
 M_mn = Σ_ij P̂_m(y_i) P̂_n(x_j) T_ij exp(i(φ_ij + k·carrier_ij)), the carrier being source path plus sensor path of a
-reference. Rows are handled in blocks that stay in cache; columns are folded about the lens axis, since
-P̂_n(-x) = (-1)ⁿ P̂_n(x).
+reference. Pillars are first gathered at the nodes of small blocks (:mod:`metalens.propagate_blocks`), and the
+polynomials are taken there: the moments stand for those nodes, which give the same light on the window.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,180 +13,198 @@ import numpy as np
 import torch
 
 from metalens import legendre
+from metalens.propagate_blocks import CHUNK, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
 from metalens.propagate_case import Case
-from metalens.propagate_kernels import Carrier, carrier, carrier_turns, fill, outermost, pull
+from metalens.propagate_kernels import gather, spread
+from metalens.store import Array
 from metalens.threads import split
 
-ROWS = 64
-KEEP_BYTES = 16e6
+KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once
+DEVICE_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moments:
     """How pillars are reduced.
 
-    carrier: the phase that is taken off; table: its polynomials, where they are small enough to be kept.
-    rows: (y, m) polynomials at the pillar rows.
-    folds: even and odd polynomials at the columns x >= 0, (half, n_even) and (half, n_odd).
+    blocks: of rows and columns; carrier: the phase that is taken off; table: its polynomials, where they are small
+    enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks (on other devices than the
+    processor: at the pillars).
     """
 
+    blocks: tuple[Blocks, Blocks]
     carrier: Carrier
-    table: torch.Tensor | None
+    table: Any
     rows: torch.Tensor
-    folds: tuple[torch.Tensor, torch.Tensor]
+    columns: torch.Tensor
 
     @property
     def counts(self) -> tuple[int, int]:
         """(m, n) numbers of moments."""
-        return self.rows.shape[1], self.folds[0].shape[1] + self.folds[1].shape[1]
+        return self.rows.shape[1], self.columns.shape[1]
+
+    @property
+    def panels(self) -> list[slice]:
+        """Block rows that are handled at once, so that their nodes stay below ``KEEP_BYTES``."""
+        rows, columns = self.blocks
+        bytes_each = 2 * rows.nodes * columns.count * columns.nodes * self.rows.element_size()
+        step = max(4, int(KEEP_BYTES / bytes_each))
+        return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
 
-def moments(case: Case, reference: float, counts: tuple[int, int], dtype: torch.dtype) -> Moments:
-    """Polynomials for ``counts`` = (m, n) moments."""
-    (y, x), (high_y, high_x) = case.pillars_um, case.half_size_um
-    rows = legendre.values(counts[0], y / high_y)
-    half = legendre.values(counts[1], x[case.shape[1] // 2 :] / high_x)
-    folds = tuple(torch.tensor(np.ascontiguousarray(half[:, p::2]), dtype=dtype) for p in (0, 1))
-    wave = carrier(case, reference, folds[0].element_size())
-    size = case.shape[0] * -(-case.shape[1] // wave.width) * wave.order * 8
-    table = torch.tensor(wave.table(0, case.shape[0])) if size <= KEEP_BYTES else None
-    return Moments(wave, table, torch.tensor(rows, dtype=dtype), (folds[0], folds[1]))
+def moments(
+    case: Case,
+    reference: float,
+    counts: tuple[int, int],
+    kernel: Kernel,
+    *,
+    tolerance: float,
+    dtype: torch.dtype,
+    device: torch.device | None = None,
+) -> Moments:
+    """Blocks and polynomials for ``counts`` = (m, n) moments; ``kernel`` as :func:`propagate_blocks.choose`."""
+    itemsize = torch.finfo(dtype).bits // 8
+    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize)
+    rows, columns = blocks
+    width = columns.length
+    wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
+    places = (rows.nodes_um(case.pitch_um), columns.nodes_um(case.pitch_um))
+    table = None
+    if device is not None and device.type != "cpu":
+        places = case.pillars_um
+    elif case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
+        table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
+    found = [legendre.values(n, p / h) for n, p, h in zip(counts, places, case.half_size_um, strict=True)]
+    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found]
+    return Moments(blocks, wave, table, polynomials[0], polynomials[1])
 
 
-def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> torch.Tensor:
-    """(m, n) complex moments of a lens; differentiable in phase and transmission, (y, x) real of the plan's dtype.
+def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """(m, n) complex moments of a lens, and the sum of squares of its transmission.
 
-    Accuracy: float32 4e-7, float64 1e-15 of the root sum of squares of the pillars, incoherent.
+    Differentiable in phase and transmission, (y, x) real of the plan's dtype. Values that are not finite give moments
+    or a sum that is not; closed pillars are passed over where a whole tile is closed.
+
+    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars, incoherent, and the interpolation
+    inside blocks that the plan allows.
     """
-    parts = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
-    return torch.complex(parts[0], parts[1])
+    parts, power = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
+    return torch.complex(parts[0], parts[1]), float(power)
 
 
 class _Reduce(torch.autograd.Function):
     """Moments (2, m, n); the backward pass forms the phasors again rather than keep them."""
 
     @staticmethod
-    def forward(ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> torch.Tensor:
+    def forward(ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.save_for_backward(phase, level)
         ctx.plan = plan
-        counts = plan.counts
-        sums = torch.zeros((phase.shape[0], 2, counts[1]), dtype=plan.rows.dtype, device=phase.device)
-        for rows, reach, buffer in _blocks(phase, level, plan):
-            _phasors(phase[rows], level[rows], plan, rows.start, buffer)
-            for parity in (0, 1):
-                part = buffer[parity].flatten(0, 1) @ plan.folds[parity][:reach]
-                sums[rows, :, parity::2] = part.view(buffer.shape[1], 2, -1)
-        return (plan.rows.T @ sums.flatten(1)).view(counts[0], 2, counts[1]).movedim(1, 0).contiguous()
+        gathered = _gather if phase.device.type == "cpu" else _gather_plain
+        out, power = gathered(phase, level, plan)
+        total = torch.tensor(power, dtype=torch.float64)
+        ctx.mark_non_differentiable(total)
+        return out, total
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
         phase, level = ctx.saved_tensors
-        plan: Moments = ctx.plan
         need = ctx.needs_input_grad
-        out_phase = torch.zeros_like(phase) if need[0] else None
-        out_level = torch.zeros_like(level) if need[1] else None
-        m, n = plan.counts
-        sums = (plan.rows @ grads[0].movedim(0, 1).reshape(m, 2 * n)).view(-1, 2, n)
-        folds = [sums[:, :, parity::2].contiguous() for parity in (0, 1)]
-        for rows, reach, buffer in _blocks(phase, level, plan, everything=need[1]):
-            for parity in (0, 1):
-                part = folds[parity][rows].flatten(0, 1)
-                torch.mm(part, plan.folds[parity][:reach].T, out=buffer[parity].flatten(0, 1))
-            targets = tuple(None if t is None else t[rows] for t in (out_phase, out_level))
-            _pull(phase[rows], level[rows], plan, rows.start, buffer, targets)
+        out_phase = torch.empty_like(phase) if need[0] else None
+        out_level = torch.empty_like(level) if need[1] else None
+        spread_out = _spread if phase.device.type == "cpu" else _spread_plain
+        spread_out((phase, level), ctx.plan, grads[0], (out_phase, out_level))
         return out_phase, out_level, None
 
 
-def _blocks(phase: torch.Tensor, level: torch.Tensor, plan: Moments, everything: bool = False) -> Any:
-    """(rows, reach, buffer) of every block with light: folded columns, buffer (parity, row, re/im, column)."""
-    ny, nx = phase.shape
-    half = (nx + 1) // 2
-    store = torch.empty(2 * 2 * ROWS * half, dtype=plan.rows.dtype, device=phase.device)
-    for start in range(0, ny, ROWS):
-        rows = slice(start, min(start + ROWS, ny))
-        reach = half if everything else _reach(level[rows], half)
-        if reach:
-            count = rows.stop - start
-            yield rows, reach, store[: 4 * count * reach].view(2, count, 2, reach)
+def _table(plan: Moments, panel: slice, dtype: Any) -> Any:
+    """Carrier polynomials of a panel."""
+    return plan.carrier.table(panel.start, panel.stop, dtype) if plan.table is None else plan.table[panel]
 
 
-def _reach(level: torch.Tensor, half: int) -> int:
-    """Folded columns up to the outermost open pillar of a block."""
-    if level.device.type != "cpu":
-        return half
-    measure: Any = outermost
-    return half - int(measure(level.detach().numpy(), half))
+def _fixed(plan: Moments, dtype: Any) -> tuple[Array, Any, Any]:
+    """What both loops know of the blocks: positions of the rows, shares of the nodes, first pillars."""
+    rows, columns = plan.blocks
+    return rows.along.astype(dtype), tuple(b.weights.astype(dtype) for b in plan.blocks), (rows.bases, columns.bases)
 
 
-def _table(plan: Moments, start: int, stop: int) -> Any:
-    """Carrier polynomials of rows start to stop."""
-    return plan.carrier.table(start, stop) if plan.table is None else plan.table.numpy()[start:stop]
+def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """Moments by the compiled loops."""
+    maps = phase.detach().numpy(), level.detach().numpy()
+    (rows, columns), (m, n) = plan.blocks, plan.counts
+    out = torch.zeros((m, 2 * n), dtype=phase.dtype)
+    kernel: Any = gather
+    powers: list[float] = []
+    fixed = _fixed(plan, maps[0].dtype)
+    for panel in plan.panels:
+        table = _table(plan, panel, maps[0].dtype)
+        count = panel.stop - panel.start
+        nodes = torch.zeros((count * rows.nodes, 2, columns.count * columns.nodes), dtype=phase.dtype)
+        view = nodes.numpy()
+
+        def work(a: int, b: int, table: Any = table, view: Any = view, panel: slice = panel) -> None:
+            part = view[a * rows.nodes : b * rows.nodes]
+            powers.append(kernel(*maps, table[a:b], *fixed, panel.start + a, part))
+
+        split(count, work)
+        sums = (nodes.flatten(0, 1) @ plan.columns).view(-1, 2 * n)
+        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
+        out = torch.addmm(out, plan.rows[at].T, sums)
+    return out.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(powers)
 
 
-def _phasors(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int, buffer: torch.Tensor) -> None:
-    """Fill the buffer with the folded phasors of a block of rows."""
-    if phase.device.type != "cpu":
-        light = _light(phase, level, plan, start)
-        _fold(light, buffer)
-        return
-    kernel: Any = fill
-    u = plan.carrier.positions
-    phases, levels, out = phase.detach().numpy(), level.detach().numpy(), buffer.numpy()
+def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]) -> None:
+    """Gradients of the moments to those of phase and transmission by the compiled loops."""
+    phase, level = (m.detach().numpy() for m in maps)
+    none = np.empty((0, 0), phase.dtype)
+    targets = tuple(none if t is None else t.numpy() for t in out)
+    (rows, columns), (m, n) = plan.blocks, plan.counts
+    inner = grad.movedim(0, 1).reshape(m, 2 * n)
+    kernel: Any = spread
+    fixed = _fixed(plan, phase.dtype)
+    for panel in plan.panels:
+        table = _table(plan, panel, phase.dtype)
+        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
+        nodes = (
+            ((plan.rows[at] @ inner).view(-1, n) @ plan.columns.T).view(-1, 2, columns.count * columns.nodes).numpy()
+        )
 
-    def work(a: int, b: int) -> None:
-        kernel(phases[a:b], levels[a:b], _table(plan, start + a, start + b), u, out[:, a:b])
+        def work(a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel) -> None:
+            part = nodes[a * rows.nodes : b * rows.nodes]
+            kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
 
-    split(phase.shape[0], work)
-
-
-def _pull(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int, buffer: torch.Tensor, out: Any) -> None:
-    """Turn gradients of the folded phasors into gradients of phase and transmission."""
-    if phase.device.type != "cpu":
-        turn = _light(phase, torch.ones_like(level), plan, start)
-        grad = _unfold(buffer, phase.shape[1])
-        if out[0] is not None:
-            out[0].copy_((grad[:, 1] * turn.real - grad[:, 0] * turn.imag) * level)
-        if out[1] is not None:
-            out[1].copy_(grad[:, 0] * turn.real + grad[:, 1] * turn.imag)
-        return
-    kernel: Any = pull
-    u = plan.carrier.positions
-    none = np.empty((0, 0), phase.detach().numpy().dtype)
-    arrays = [phase.detach().numpy(), level.detach().numpy(), *(none if t is None else t.numpy() for t in out)]
-    pulled = buffer.numpy()
-
-    def work(a: int, b: int) -> None:
-        kernel(*(v[a:b] for v in arrays), _table(plan, start + a, start + b), u, pulled[:, a:b])
-
-    split(phase.shape[0], work)
+        split(panel.stop - panel.start, work)
 
 
-def _light(phase: torch.Tensor, level: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
-    """(y, x) complex phasors of a block, for devices without compiled loops."""
-    case = plan.carrier.case
-    y, x = (torch.tensor(v, device=phase.device) for v in case.pillars_um)
+def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
+    """(y, x) complex phasors of some rows, for devices without compiled loops."""
+    wave = plan.carrier
+    y, x = (torch.tensor(v, device=phase.device) for v in wave.case.pillars_um)
     y = y[start : start + phase.shape[0], None]
-    turns = phase.double() / (2 * torch.pi) + carrier_turns(case, plan.carrier.reference, x, y)
-    angle = ((turns - turns.round()) * 2 * torch.pi).to(plan.rows.dtype)
-    return torch.complex(level * torch.cos(angle), level * torch.sin(angle))
+    turns = phase.double() / (2 * torch.pi) + carrier_turns(wave.case, wave.reference, x, y)
+    angle = ((turns - turns.round()) * 2 * torch.pi).to(phase.dtype)
+    return torch.complex(torch.cos(angle), torch.sin(angle))
 
 
-def _fold(light: torch.Tensor, buffer: torch.Tensor) -> None:
-    """(y, x) complex into (parity, y, re/im, folded column); the axis column of an odd grid counts once."""
-    nx = light.shape[1]
-    reach = buffer.shape[-1]
-    right = torch.view_as_real(light[:, nx // 2 :])[:, :reach].movedim(-1, 1)
-    left = torch.view_as_real(light.flip(-1)[:, nx // 2 :])[:, :reach].movedim(-1, 1)
-    buffer[0], buffer[1] = right + left, right - left
-    if nx % 2:
-        buffer[0, :, :, 0] = right[:, :, 0]
+def _gather_plain(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """Moments by plain tensor operations, for devices without compiled loops: every pillar is a node."""
+    out = torch.zeros(plan.counts, dtype=torch.complex(phase[0, 0], phase[0, 0]).dtype, device=phase.device)
+    for start in range(0, phase.shape[0], DEVICE_ROWS):
+        rows = slice(start, start + DEVICE_ROWS)
+        light = level[rows] * _phasors(phase[rows], plan, start)
+        out = out + plan.rows[rows].T.to(light.dtype) @ (light @ plan.columns.to(light.dtype))
+    return torch.stack([out.real, out.imag]), float((level.double() ** 2).sum())
 
 
-def _unfold(buffer: torch.Tensor, nx: int) -> torch.Tensor:
-    """Adjoint of :func:`_fold`: (y, re/im, x)."""
-    reach = buffer.shape[-1]
-    out = buffer.new_zeros((buffer.shape[1], 2, nx))
-    half = (nx + 1) // 2
-    out[:, :, half - reach : half] = (buffer[0] - buffer[1]).flip(-1)
-    out[:, :, nx // 2 : nx // 2 + reach] = buffer[0] + buffer[1]
-    return out
+def _spread_plain(
+    maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]
+) -> None:
+    """Gradients by plain tensor operations."""
+    both = torch.complex(grad[0], grad[1])
+    for start in range(0, maps[0].shape[0], DEVICE_ROWS):
+        rows = slice(start, start + DEVICE_ROWS)
+        at = plan.rows[rows].to(both.dtype) @ both @ plan.columns.T.to(both.dtype)
+        turned = at * _phasors(maps[0][rows], plan, start).conj()  # its real part: along the phasor
+        if out[0] is not None:
+            out[0][rows] = turned.imag * maps[1][rows]
+        if out[1] is not None:
+            out[1][rows] = turned.real

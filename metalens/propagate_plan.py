@@ -3,7 +3,8 @@
 The kernel from a pillar to a window sample, carrier removed, is
 K = d/(2πr²)(1/r - ik) exp(ik(r - r_w)) exp(ik(s_z - s_ref)).
 It is smooth in everything, so each of its dependencies is sampled just finely enough: every count below is the least
-whose Legendre tail on probing lines is under the tolerance.
+whose Legendre tail on probing lines is under the tolerance. The smaller the window, the smoother the kernel: so the
+light on the nodes of the whole window is passed on to the fewer nodes of its tiles.
 """
 
 import functools
@@ -15,11 +16,12 @@ import numpy as np
 
 from metalens import legendre
 from metalens.errors import PropagationError
-from metalens.propagate_case import Case, chief_path, source_path
+from metalens.propagate_case import Case, chief_path, source_path, tiles
 from metalens.store import Array
 
-MOST_NODES = 1500
-MOST_USEFUL_NODES = 400
+MOST_NODES = 400
+MOST_TABLE = 4e6
+PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,31 +38,48 @@ class Sizes:
     lens: tuple[int, int]
 
     @property
-    def practical(self) -> bool:
-        """Whether the operators stay within some 100 MB."""
-        table = self.window[0] * self.window[1] * self.lens[0] * self.lens[1]
-        return max(self.nodes) <= MOST_USEFUL_NODES and table <= 4e6
+    def table(self) -> int:
+        """Size of the table of the correction."""
+        return self.window[0] * self.window[1] * self.lens[0] * self.lens[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis; sizes: of every tile;
+    seconds: expected for all tiles on one core."""
+
+    nodes: tuple[int, int]
+    parts: int
+    sizes: Sizes
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Depths:
+    """Fields on the lens nodes that span the curvatures of all depths.
+
+    basis: (b, e, x); coefficients: (depth, b); strength: (b,).
+    """
+
+    basis: Array
+    coefficients: Array
+    strength: Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Operators:
-    """Arrays of a plan, complex128 and float64; e = lens row nodes, x = lens column nodes, p = directions.
+    """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column nodes, p = directions.
 
-    basis: (b, e, x) depth basis; coefficients: (depth, b); pairs: (2, n) which (r, b) products are kept.
     to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
-    lens_terms: (r, p, e), window_terms: (r, Y, X) of the correction.
+    lens_terms: (p, e, r), window_terms: (X, Y, r) of the correction; strength: (r,).
     """
 
-    sizes: Sizes
-    reference: float
-    basis: Array
-    coefficients: Array
-    pairs: Array
     to_directions: Array
     along_y: Array
     along_x: Array
     lens_terms: Array
     window_terms: Array
+    strength: Array
 
 
 def reference_depth(case: Case) -> float:
@@ -69,18 +88,61 @@ def reference_depth(case: Case) -> float:
     return (min(inverse) + max(inverse)) / 2
 
 
-@functools.lru_cache(maxsize=32)
-def sizes(case: Case, tolerance: float) -> Sizes:
-    """The counts that a case needs.
+@functools.lru_cache(maxsize=64)
+def layout(case: Case, tolerance: float) -> Layout | None:
+    """How the window is cut so that it costs least; None where no cut brings the tables down to some 100 MB.
 
     Raises:
-        PropagationError: more than 1500 nodes would be needed; the window is too large for this method.
+        PropagationError: more than 400 nodes would be needed; the window is too large for this method.
+    """
+    nodes = lens_nodes(case, tolerance / 4)
+    best = None
+    for parts in PARTS:
+        if parts > max(case.samples):
+            break
+        rows = tiles(case, parts)[1]
+        found = _largest([sizes(tile, tolerance) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])])
+        passed_on = nodes[0] * nodes[1] * (1e-8 + 2e-10 * found.nodes[0])
+        each = _seconds(rows[0][0], found, len(case.inverse_depths_per_um)) + passed_on
+        seconds = 1e-3 + each * sum(map(len, rows))
+        if found.table <= MOST_TABLE and (best is None or seconds < best.seconds):
+            best = Layout(nodes, parts, found, seconds)
+        elif best is not None:
+            break
+    return best
+
+
+def _largest(found: list[Sizes]) -> Sizes:
+    """Counts that do for all."""
+    pairs = [tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1)) for name in ("nodes", "window", "lens")]
+    return Sizes(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
+
+
+def _seconds(case: Case, found: Sizes, depths: int) -> float:
+    """Expected time of one tile on one core: light on its own nodes, products along y and x."""
+    (my, mx), (ny, nx), b = case.samples, found.nodes, min(depths, 14)
+    fields = 0.75 * b * max(found.window)
+    products = found.directions * fields * (ny * (4e-9 + 1.8e-10 * my) + 1.5e-10 * mx * my)
+    return 2e-5 + products + 5e-9 * b * ny * nx
+
+
+def lens_nodes(case: Case, tolerance: float) -> tuple[int, int]:
+    """(y, x) nodes over the lens that the kernel needs."""
+    high_y, high_x = case.half_size_um
+    rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
+    return rows, _count(lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns")
+
+
+def sizes(case: Case, tolerance: float) -> Sizes:
+    """The counts that a tile needs.
+
+    Raises:
+        PropagationError: more than 400 nodes would be needed.
     """
     share = tolerance / 4
-    high_y, high_x = case.half_size_um
-    nodes_x = _count(lambda t: _over_lens(case, t * high_x, None), share, "lens columns")
-    nodes_y = _count(lambda t: _over_lens(case, None, t * high_y), share, "lens rows")
-    low, high = direction_range(case, legendre.mapped(nodes_y, -high_y, high_y))
+    high_y = case.half_size_um[0]
+    nodes = lens_nodes(case, share)
+    low, high = direction_range(case, legendre.mapped(nodes[0], -high_y, high_y))
     middle, reach = (low + high) / 2, (high - low) / 2
     directions = _count(lambda t: _over_directions(case, middle + reach * t), share, "directions")
     wy, wx = case.half_window_um
@@ -88,14 +150,14 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     window_y = _count(lambda t: _over_window(case, (low, high), Y=t * wy), share, "window rows")
     lens_p = _count(lambda t: _over_window(case, (low, high), p=middle + reach * t), share, "correction directions")
     lens_e = _count(lambda t: _over_window(case, (low, high), e=t * high_y), share, "correction rows")
-    return Sizes((nodes_y, nodes_x), directions, (window_y, window_x), (lens_e, lens_p))
+    return Sizes(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
 def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
     count = 32
-    while count <= 2 * MOST_NODES:
+    while count <= 1.5 * MOST_NODES:
         found = legendre.needed(lines(legendre.nodes(count)[0]), tolerance)
-        if found <= count:
+        if found <= min(count, MOST_NODES):
             return max(found, 2)
         count *= 2
     raise PropagationError(
@@ -200,11 +262,16 @@ def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
     return out
 
 
-def operators(
-    case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None, moving: bool = False
-) -> Operators:
-    """All arrays of a plan; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y
-    instead; ``moving``: the depth basis also spans the derivatives in source position."""
+def over_blocks(case: Case) -> Callable[[Any, Any], Array]:
+    """The kernel at (y, x) of the lens for the corners and the middle of the window and the extreme depths."""
+    wy, wx = case.half_window_um
+    inverse = np.array([min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)])
+    X, Y, v = (g.reshape(-1, 1, 1, 1) for g in np.meshgrid(_probe() * wx, _probe() * wy, inverse, indexing="ij"))
+    return lambda y, x: kernel(case, x, y, X, Y, v)
+
+
+def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None) -> Operators:
+    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y instead."""
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um
     e, x = legendre.mapped(ny, -high_y, high_y), legendre.mapped(nx, -high_x, high_x)
@@ -213,23 +280,17 @@ def operators(
     far = (e - case.centre_um[1])[:, None]
     across = x - case.centre_um[0]
     cosines = across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
-    to_directions = legendre.interpolation(m, (2 * cosines - low - high) / (high - low))
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = _cosine_y(case, p[:, None], e[None, :])
     lens_terms, window_terms, strength = _low_rank(case, chosen, tolerance / 2, (low, high), slope)
-    basis, coefficients, size = depth_basis(case, (e, x), tolerance / 2, moving=moving)
     return Operators(
-        sizes=chosen,
-        reference=reference_depth(case),
-        basis=basis,
-        coefficients=coefficients * np.exp(1j * k * chief_path(case)),
-        pairs=_pairs(strength, size, tolerance / 2),
-        to_directions=to_directions,
+        to_directions=legendre.interpolation(m, (2 * cosines - low - high) / (high - low)),
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
         along_x=np.exp(-1j * k * x_um[:, None] * p),
         lens_terms=lens_terms,
-        window_terms=window_terms,
+        window_terms=window_terms * np.exp(1j * k * chief_path(case)),
+        strength=strength,
     )
 
 
@@ -239,10 +300,8 @@ def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> An
     return case.wavenumber * (source_path(x, e, tangents, inverse) - reference)
 
 
-def depth_basis(
-    case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False
-) -> tuple[Array, Array, Array]:
-    """Few fields that span the curvatures of all depths: (b, e, x), (depth, b), and their strengths (b,).
+def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False) -> Depths:
+    """Few fields that span the curvatures of all depths.
 
     With ``moving`` they also span the derivatives in inverse depth and tangents. Orthonormal under the quadrature of
     the nodes; truncated at ``tolerance`` root mean square.
@@ -265,7 +324,7 @@ def depth_basis(
         part = inverse[start : start + 16, None, None]
         fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
         coefficients[start : start + 16] = fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
-    return np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
+    return Depths(np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0]))
 
 
 def _tangents(case: Case, e: Array, x: Array, inverse: Array, fields: Array) -> list[Array]:
@@ -282,7 +341,7 @@ def _tangents(case: Case, e: Array, x: Array, inverse: Array, fields: Array) -> 
     return out
 
 
-def _pairs(strength: Array, size: Array, tolerance: float) -> Array:
+def pairs(strength: Array, size: Array, tolerance: float) -> Array:
     """(2, n) pairs (correction term, depth field) whose joint strength matters; the rest sums below tolerance."""
     joint = (np.outer(strength, size) ** 2).ravel()
     order = np.argsort(joint)
@@ -294,7 +353,7 @@ def _pairs(strength: Array, size: Array, tolerance: float) -> Array:
 def _low_rank(
     case: Case, chosen: Sizes, tolerance: float, span: tuple[float, float], slope: int | None
 ) -> tuple[Array, Array, Array]:
-    """Correction as Σ_r lens_terms[r, p, e] window_terms[r, Y, X], pillar area included; and strengths (r,)."""
+    """Correction as Σ_r lens_terms[p, e, r] window_terms[X, Y, r], pillar area included; and strengths (r,)."""
     (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
     (my, mx), (me, mp) = chosen.window, chosen.lens
     Y, X = legendre.mapped(my, -wy, wy), legendre.mapped(mx, -wx, wx)
@@ -306,11 +365,11 @@ def _low_rank(
     left, right = _factors(table.reshape(my * mx, mp * me) * case.pitch_um**2, tolerance)
     y_um, x_um = case.window_um
     Iy, Ix = legendre.interpolation(my, y_um / wy), legendre.interpolation(mx, x_um / wx)
-    window_terms = np.einsum("Yj,jir,Xi->rYX", Iy, left.reshape(my, mx, -1), Ix, optimize=True)
+    window_terms = np.einsum("Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True)
     e_um = legendre.nodes(chosen.nodes[0])[0]
     p_um = legendre.nodes(chosen.directions)[0]
     Ie, Ip = legendre.interpolation(me, e_um), legendre.interpolation(mp, p_um)
-    lens_terms = np.einsum("Pp,rpe,Ee->rPE", Ip, right.reshape(-1, mp, me), Ie, optimize=True)
+    lens_terms = np.einsum("Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True)
     return lens_terms, window_terms, np.linalg.norm(left, axis=0)
 
 

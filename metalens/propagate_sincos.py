@@ -46,7 +46,7 @@ def turns64(t):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def turns32(t):  # type: ignore[no-untyped-def]
-    """(cos 2πt, sin 2πt) in float32 for float64 t in [-1/2, 1/2]."""
+    """(cos 2πt, sin 2πt) in float32 for t in [-1/2, 1/2]."""
     x = np.float32(t)
     u = x * x
     s = x * (_S4[0] + u * (_S4[1] + u * (_S4[2] + u * (_S4[3] + u * (_S4[4] + u * _S4[5])))))

@@ -7,28 +7,46 @@ import numpy as np
 import torch
 
 from metalens import legendre
-from metalens.propagate_case import Case, chief_path
+from metalens.errors import PropagationError
+from metalens.propagate_case import Case, sensor_path, tiles
 from metalens.propagate_estimate import MORE
 from metalens.propagate_pillars import Moments, moments, reduce
-from metalens.propagate_plan import Operators, depth_factors, operators, sizes
+from metalens.propagate_plan import (
+    Depths,
+    Layout,
+    depth_basis,
+    depth_factors,
+    layout,
+    operators,
+    over_blocks,
+    pairs,
+    reference_depth,
+)
 from metalens.store import Array
 
-BUDGET_BYTES = 48e6
+BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
     """Everything that depends on the geometry alone, ready for many lenses.
 
-    operators hold the float64 arrays; tensors the same in the dtype and on the device in use. The moments go
-    ``MORE`` orders beyond what the method uses, for the error estimate.
+    The moments go ``MORE`` orders beyond what the method uses, for the error estimate. tensors: the operators in the
+    dtype and on the device in use, those of the tiles stacked (tile, …); ``turn`` (tile, e, x) is the phase from the
+    window's centre to the tile's own on the nodes of the whole window.
     """
 
     case: Case
     tolerance: float
-    operators: Operators
+    layout: Layout
+    depths: Depths
     moments: Moments
     tensors: dict[str, torch.Tensor]
+
+    @property
+    def nodes_um(self) -> tuple[Array, Array]:
+        """(e,), (x,) positions of the lens nodes of the tiles."""
+        return _nodes_um(self.case, self.layout.sizes.nodes)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,88 +67,157 @@ def plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device,
     Raises:
         PropagationError: the window is too large for the method.
     """
-    found = operators(case, sizes(case, tolerance), tolerance, moving=moving)
-    ny, nx = found.sizes.nodes
-    pillars = moments(case, found.reference, (ny + MORE, nx + MORE), dtype)
-    folds = pillars.folds[0].to(device), pillars.folds[1].to(device)
-    pillars = Moments(pillars.carrier, pillars.table, pillars.rows.to(device), folds)
-    return Plan(case, tolerance, found, pillars, _tensors(found, dtype, device))
+    found = layout(case, tolerance)
+    if found is None:
+        raise PropagationError("the window is too large for one plan; see propagate.choose, or make it smaller")
+    ny, nx = found.nodes
+    reference = reference_depth(case)
+    pillars = moments(
+        case,
+        reference,
+        (ny + MORE, nx + MORE),
+        over_blocks(case),
+        tolerance=tolerance,
+        dtype=dtype,
+        device=device,
+    )
+    depths = depth_basis(case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving)
+    tensors = _shared(case, found, depths, dtype, device) | _stacked(case, found, depths, tolerance, (dtype, device))
+    return Plan(case, tolerance, found, depths, pillars, tensors)
+
+
+def _complex(dtype: torch.dtype) -> torch.dtype:
+    return torch.complex64 if dtype == torch.float32 else torch.complex128
+
+
+def _nodes_um(case: Case, counts: tuple[int, int]) -> tuple[Array, Array]:
+    hy, hx = case.half_size_um
+    return np.asarray(legendre.mapped(counts[0], -hy, hy)), np.asarray(legendre.mapped(counts[1], -hx, hx))
+
+
+def _shared(
+    case: Case, found: Layout, depths: Depths, dtype: torch.dtype, device: torch.device
+) -> dict[str, torch.Tensor]:
+    """Moments to the nodes of the window, those to the nodes of the tiles, and the depths."""
+    arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
+    for name, all_, few in zip(("rows", "columns"), found.nodes, found.sizes.nodes, strict=True):
+        arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
+        arrays[f"{name}_to_tile"] = legendre.interpolation(few, legendre.nodes(all_)[0])
+    e, x = _nodes_um(case, found.nodes)
+    parts = [part for row in tiles(case, found.parts)[1] for part in row]
+    away = [sensor_path(x, e[:, None], c.centre_um, c.sensor_distance_um) for c in (case, *parts)]
+    arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
+    return {name: torch.tensor(a, dtype=_complex(dtype), device=device) for name, a in arrays.items()}
+
+
+def _stacked(
+    case: Case,
+    found: Layout,
+    depths: Depths,
+    tolerance: float,
+    kind: tuple[torch.dtype, torch.device],
+    slope: int | None = None,
+) -> dict[str, torch.Tensor]:
+    """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any of them needs; ``fields`` are
+    the depth fields of the pairs."""
+    parts = [part for row in tiles(case, found.parts)[1] for part in row]
+    made = [operators(part, found.sizes, tolerance, slope=slope) for part in parts]
+    most = max(len(one.strength) for one in made)
+    strength = np.max([_padded(one.strength, most) for one in made], axis=0)
+    kept = pairs(strength, depths.strength, tolerance / 2)
+    arrays = {name: np.stack([getattr(one, name) for one in made]) for name in ("along_y", "along_x")}
+    for name in ("lens_terms", "window_terms"):
+        arrays[name] = np.stack([_padded(getattr(one, name), most)[..., kept[0]] for one in made])
+    out = {name: torch.tensor(a, dtype=_complex(kind[0]), device=kind[1]) for name, a in arrays.items()}
+    directions = np.concatenate([one.to_directions for one in made])
+    out["to_directions"] = torch.tensor(directions, dtype=kind[0], device=kind[1])
+    out["fields"] = torch.tensor(kept[1], device=kind[1])
+    return out
+
+
+def _padded(array: Array, count: int) -> Array:
+    """With zeros to ``count`` along the last axis."""
+    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
 @functools.lru_cache(maxsize=12)
 def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
     """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2)."""
-    found = operators(plan.case, plan.operators.sizes, plan.tolerance, slope=axis, moving=True)
-    return _tensors(found, plan.moments.rows.dtype, plan.moments.rows.device)
-
-
-def _tensors(found: Operators, dtype: torch.dtype, device: torch.device) -> dict[str, torch.Tensor]:
-    complex_dtype = torch.complex64 if dtype == torch.float32 else torch.complex128
-    names = ("basis", "coefficients", "along_y", "along_x", "lens_terms", "window_terms")
-    out = {name: torch.tensor(getattr(found, name), dtype=complex_dtype, device=device) for name in names}
-    out["pairs"] = torch.tensor(found.pairs, device=device)
-    out["to_directions"] = torch.tensor(found.to_directions, dtype=dtype, device=device)
-    ny, nx = found.sizes.nodes
-    out["rows_to_nodes"] = torch.tensor(legendre.to_nodes(ny), dtype=complex_dtype, device=device)
-    out["columns_to_nodes"] = torch.tensor(legendre.to_nodes(nx), dtype=complex_dtype, device=device)
-    return out
+    rows = plan.moments.rows
+    return _stacked(plan.case, plan.layout, plan.depths, plan.tolerance, (rows.dtype, rows.device), axis)
 
 
 def field_windowed(
     phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Plan, moving: Moving | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Field on the window, (depth, y, x) complex, and the moments of the lens that :mod:`propagate_estimate` needs.
+) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of squares of its transmission.
 
     Differentiable in phase and transmission (y, x), and in ``moving`` where given (first derivatives).
     """
-    gathered = reduce(phase_rad, transmission, plan.moments)
+    gathered, power = reduce(phase_rad, transmission, plan.moments)
+    return from_moments(gathered, plan, moving), gathered.detach(), power
+
+
+def from_moments(gathered: torch.Tensor, plan: Plan, moving: Moving | None = None) -> torch.Tensor:
+    """(depth, y, x) field on the window from the moments of a lens."""
     t = plan.tensors
-    ny, nx = plan.operators.sizes.nodes
-    light = t["rows_to_nodes"].T @ gathered[:ny, :nx] @ t["columns_to_nodes"] * t["basis"]
+    ny, nx = plan.layout.nodes
+    light = t["rows_to_nodes"].T @ gathered[:ny, :nx] @ t["columns_to_nodes"]
+    fewer = t["rows_to_tile"].T @ (light * t["turn"]) @ t["columns_to_tile"]
     coefficients = t["coefficients"] if moving is None else _coefficients(plan, moving)
-    field = coefficients @ zoom(light, t).flatten(1)
+    given = fewer[:, None] * t["basis"]
+    field = _at_depths(zoom(given, t), coefficients)
     if moving is not None:
         for axis, value in enumerate((moving.distance, moving.centre[0], moving.centre[1])):
             if value.requires_grad:
-                rate = coefficients @ zoom(light, _slope(plan, axis)).flatten(1)
+                rate = _at_depths(zoom(given, _slope(plan, axis)), coefficients)
                 field = field + (value - value.detach()) * rate  # adds nothing but the derivative
-    return field.view(-1, *plan.case.samples), gathered.detach()
+    return _joined(field, plan)
+
+
+def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+    """(tile, depth, Y, X) from fields of the depth basis (tile, X, Y, b)."""
+    return (fields @ coefficients.T).permute(0, 3, 2, 1)
+
+
+def _joined(field: torch.Tensor, plan: Plan) -> torch.Tensor:
+    """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where the next one begins."""
+    (rows, columns), _ = tiles(plan.case, plan.layout.parts)
+    (my, mx), n = plan.case.samples, len(columns)
+    heights, widths = np.diff([*rows, my]).tolist(), np.diff([*columns, mx]).tolist()
+    bands = [
+        torch.cat([field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1)
+        for i, height in enumerate(heights)
+    ]
+    return torch.cat(bands, -2)
 
 
 def _coefficients(plan: Plan, moving: Moving) -> torch.Tensor:
     """(depth, b) of the depth basis, differentiable in the source's position."""
     device = moving.tangents.device
-    e, x = (torch.tensor(v, device=device) for v in node_positions(plan.operators, plan.case))
-    ny, nx = plan.operators.sizes.nodes
+    e, x = (torch.tensor(v, device=device) for v in plan.nodes_um)
+    ny, nx = plan.layout.sizes.nodes
     inverse = moving.inverse_depths[:, None, None]
     angle = depth_factors(plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse)
     weight = torch.tensor(np.outer(legendre.nodes(ny)[1], legendre.nodes(nx)[1]), device=device)
-    basis = torch.tensor(plan.operators.basis, device=device)
-    fields = torch.exp(1j * angle) * weight
-    found = fields.flatten(1) @ basis.flatten(1).conj().T
-    turn = np.exp(1j * plan.case.wavenumber * chief_path(plan.case))
-    return (found * complex(turn)).to(plan.tensors["coefficients"].dtype)
+    basis = torch.tensor(plan.depths.basis, device=device)
+    found = (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
+    return found.to(plan.tensors["coefficients"].dtype)
 
 
 def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Light on lens nodes, one field per basis function (b, e, x), to the window (b, Y, X)."""
-    b, e, _ = light.shape
-    p = t["to_directions"].shape[2]
-    real = torch.view_as_real(light).permute(1, 0, 3, 2).reshape(e, 2 * b, -1)
-    cosines = torch.bmm(real, t["to_directions"]).view(e, b, 2, p).permute(3, 0, 1, 2).contiguous()
+    """Light on the lens nodes, a field for every tile and basis function (tile, b, e, x), to (tile, X, Y, b)."""
+    count, b, e, _ = light.shape
+    p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]
+    real = torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
+    cosines = torch.bmm(real, t["to_directions"]).view(count, e, b, 2, p).permute(0, 4, 1, 2, 3).contiguous()
     spread = torch.view_as_complex(cosines)
-    _, Y, X = t["window_terms"].shape
-    out = light.new_zeros((X * Y, b))
-    count = max(1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size())))
-    for r, i in zip(*(torch.split(index, count) for index in t["pairs"]), strict=True):
-        terms = t["lens_terms"][r].permute(1, 2, 0) * spread[:, :, i]
-        columns = torch.bmm(t["along_y"], terms)
-        window = (t["along_x"] @ columns.view(p, -1)).view(X * Y, -1)
-        out = out.index_add(1, i, window * t["window_terms"][r].permute(2, 1, 0).reshape(X * Y, -1))
-    return out.view(X, Y, b).permute(2, 1, 0)
-
-
-def node_positions(found: Operators, case: Case) -> tuple[Array, Array]:
-    """(e,), (x,) positions of the lens nodes, um."""
-    (hy, hx), (ny, nx) = case.half_size_um, found.sizes.nodes
-    return np.asarray(legendre.mapped(ny, -hy, hy)), np.asarray(legendre.mapped(nx, -hx, hx))
+    out = light.new_zeros((count, X, Y, b))
+    most = max(1, int(BUDGET_BYTES / (count * p * (Y + e) * light.element_size())))
+    for start in range(0, len(t["fields"]), most):
+        some = slice(start, start + most)
+        terms = t["lens_terms"][..., some] * spread.index_select(3, t["fields"][some])
+        columns = t["along_y"].flatten(0, 1) @ terms.flatten(0, 1)
+        window = (t["along_x"] @ columns.view(count, p, -1)).view(count, X, Y, -1)
+        out = out.index_add(3, t["fields"][some], window * t["window_terms"][..., some])
+    return out

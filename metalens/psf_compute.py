@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from metalens.errors import PropagationError
-from metalens.propagate_case import Case, chief_path
-from metalens.propagate_choose import choose
+from metalens.propagate_case import Case, check_aperture, chief_path
+from metalens.propagate_choose import Choice, choose
 from metalens.propagate_estimate import Sample, relative_error
 from metalens.propagate_exact import field_exact
 from metalens.propagate_window import Moving, field_windowed, plan
@@ -72,25 +72,22 @@ def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights:
 def _windowed(
     maps: tuple[torch.Tensor, torch.Tensor], cases: list[Case], weights: list[float], tolerance: float, moving: Any
 ) -> Result:
-    """One try: every wavelength and tile, then the estimate from all of them."""
-    phase, level = maps
+    """One try: every wavelength and window, then the estimate from all of them."""
     choice = choose(cases[0], tolerance, differentiable=True)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
     total: Any = 0
-    for p, t, case, weight in zip(phase, level, cases, weights, strict=True):
-        noise = ROUNDING[p.dtype] * _incoherent(t.detach(), case)
-        tiles = choice.tiles if case is cases[0] else choose(case, tolerance, differentiable=True).tiles
-        if [len(row) for row in tiles] != [len(row) for row in choice.tiles]:
-            tiles = tuple(tuple(_like(tile, case) for tile in row) for row in choice.tiles)
+    for p, t, case, weight in zip(*maps, cases, weights, strict=True):
         rows, index = [], 0
-        for row in tiles:
+        for row in _windows(case, choice, tolerance):
             parts = []
-            for tile in row:
-                made = plan(tile, tolerance, p.dtype, p.device, moving is not None)
-                field, gathered = field_windowed(p, t, made, _shifted(moving, case, tile))
-                parts.append(field)
+            for window in row:
+                made = plan(window, tolerance, p.dtype, p.device, moving is not None)
+                field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
+                _check(p, t, case, power, gathered)
+                noise = ROUNDING[p.dtype] * _incoherent(power, case)
                 values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
-                samples[index].append(Sample(tile, weight, *values, noise))
+                samples[index].append(Sample(window, weight, *values, noise, made.layout.parts))
+                parts.append(field)
                 index += 1
             rows.append(torch.cat(parts, -1))
         field = torch.cat(rows, -2)
@@ -100,9 +97,25 @@ def _windowed(
     return Result(total, relative_error(samples), choice.reason)
 
 
-def _like(tile: Case, case: Case) -> Case:
-    """The tile at another wavelength."""
-    return replace(tile, wavelength_um=case.wavelength_um)
+def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:
+    """Windows of a wavelength that are computed apart: cut as at the first wavelength."""
+    found = choose(case, tolerance, differentiable=True).tiles
+    if [len(row) for row in found] == [len(row) for row in choice.tiles]:
+        return found
+    return tuple(tuple(replace(w, wavelength_um=case.wavelength_um) for w in row) for row in choice.tiles)
+
+
+def _check(phase: torch.Tensor, level: torch.Tensor, case: Case, power: float, moments: torch.Tensor) -> None:
+    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars tell.
+
+    Raises:
+        PropagationError: naming row and column.
+    """
+    if power > 0 and math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all()):
+        return
+    check_aperture(phase.detach().cpu().numpy(), level.detach().cpu().numpy(), case)
+    if not (math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())):
+        raise PropagationError("phase or transmission is too large for its dtype; use float64, or wrap the phase")
 
 
 def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
@@ -113,7 +126,7 @@ def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
     return replace(moving, centre=moving.centre + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device))
 
 
-def _incoherent(level: torch.Tensor, case: Case) -> float:
+def _incoherent(power: float, case: Case) -> float:
     """Magnitude of the field at the window centre if all pillars added with random phases."""
-    total = math.sqrt(sum(float((rows * rows).sum()) for rows in torch.split(level, 256)))
-    return total * case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
+    area = case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
+    return math.sqrt(power) * area

@@ -8,7 +8,7 @@ import torch
 
 from metalens import propagate
 from metalens.errors import PropagationError
-from metalens.propagate_case import Case, check_aperture
+from metalens.propagate_case import Case
 from metalens.propagate_window import Moving
 from metalens.psf_compute import Result, intensity
 from metalens.psf_record import PsfStack
@@ -80,7 +80,6 @@ def _direction(
     """(…, depth, y, x) intensity of every lens in one direction, and the results it is made of."""
     shape = maps[0].shape
     lenses = [m.reshape(-1, *shape[-3:]) for m in maps]
-    _check(lenses, cases[0])
     found = [intensity(p, t, cases, weights, tolerance=tolerance, moving=moving) for p, t in zip(*lenses, strict=True)]
     light = torch.stack([result.intensity for result in found])
     return light.view(*shape[:-3], *light.shape[1:]), found
@@ -105,16 +104,6 @@ def _record(
         error=worst.error,
         reason=worst.reason,
     )
-
-
-def _check(lenses: list[torch.Tensor], case: Case) -> None:
-    """Refuse maps with NaN, or a lens that is closed everywhere."""
-    if lenses[0].device.type != "cpu":
-        fine = torch.isfinite(lenses[0]).all() & torch.isfinite(lenses[1]).all()
-        if bool(fine & (lenses[1] != 0).flatten(-2).any(-1).all()):
-            return
-    for phase, level in zip(*(m.detach().cpu().reshape(-1, *case.shape).numpy() for m in lenses), strict=True):
-        check_aperture(phase, level, case)
 
 
 def _value(argument: Any) -> Any:

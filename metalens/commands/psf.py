@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from metalens import config, lens, propagate, psf, psf_plots, spectrum, store
+from metalens import config, lens, propagate, psf, psf_export, psf_plots, spectrum, store
 from metalens.commands import Common, Output
 from metalens.errors import ConfigError
 from metalens.report import Figure, KeyFigure, Section, Table, write
@@ -71,7 +71,8 @@ class Options(Common):
 
     Attributes:
         lens: lens.h5.
-        output: the PSF file to write; plots are written beside it as NAME_xz.png and so on.
+        output: the PSF file to write, .h5 (which all other commands read), .tif or .mat; plots are written beside it as
+            NAME_xz.png and so on.
         config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance; without
             it 16 to 26 mm in steps of 0.5 mm at 0, 10 and 20 degrees.
         tolerance: relative L2 error, in place of the one in the settings.
@@ -91,11 +92,12 @@ def run(options: Options) -> int:
     if options.tolerance is not None:
         settings = replace(settings, tolerance=options.tolerance)
     made = lens.load(options.lens)
+    psf_export.check(options.output)
     target = options.claim(options.output)
     nodes = _spectrum(made, settings)
     provenance = Provenance(config.dumps(settings), {options.lens.name: store.sha256(options.lens)})
     stack = psf.from_lens(made, settings.view, tolerance=settings.tolerance, spectrum=nodes, provenance=provenance)
-    psf.save(target, stack)
+    psf_export.write(target, stack)
     pictures = psf_plots.pictures(stack)
     for name, image in pictures.items():
         write_bytes(target.with_name(f"{target.stem}_{name}.png"), image)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens import propagate, psf
+from metalens import legendre, propagate, psf
 from metalens.errors import PropagationError
 
 WAVELENGTH, PITCH = 0.85, 0.4
@@ -160,8 +160,10 @@ def test_maps_that_are_not_square(shape):
     check(*lens(shape, kind="noisy"), angle_rad=(0.1, 0.2))
 
 
-def test_a_window_too_large_for_one_plan_is_cut_into_tiles():
-    stack = check(*lens((64, 64), distance=20.0), sensor_distance_um=20.0, window_um=30.0, samples=16, tolerance=1e-4)
+@pytest.mark.slow
+def test_a_window_too_large_for_one_plan_is_computed_in_parts():
+    geometry = dict(pitch_um=3.0, sensor_distance_um=3000.0, window_um=800.0, samples=6)
+    stack = check(*lens((300, 300), distance=3000.0, pitch=3.0), tolerance=1e-4, **geometry)
     assert "tiles" in stack.reason
 
 
@@ -212,15 +214,18 @@ def score(phase, level, **geometry):
 
 def test_gradcheck_of_the_moments_and_of_the_window():
     from metalens.propagate_pillars import moments, reduce
+    from metalens.propagate_plan import over_blocks
     from metalens.propagate_window import plan, zoom
 
-    case = propagate.case((5, 4), **GEOMETRY | dict(samples=3))
-    made = moments(case, 1e-3, (3, 4), torch.float64)
-    maps = [torch.tensor(m).requires_grad_() for m in lens((5, 4), kind="noisy")]
-    assert torch.autograd.gradcheck(lambda p, t: torch.view_as_real(reduce(p, t, made)), maps)
-    tensors = plan(case, 1e-4, torch.float64, torch.device("cpu")).tensors
-    light = torch.randn(tensors["basis"].shape, dtype=torch.complex128, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(zoom(v, tensors)), light)
+    case = propagate.case((9, 70), **GEOMETRY | dict(samples=3))
+    made = moments(case, 1e-3, (3, 4), over_blocks(case), tolerance=1e-9, dtype=torch.float64)
+    assert made.blocks[1].nodes < made.blocks[1].length  # light is moved to fewer nodes than pillars
+    maps = [torch.tensor(m).requires_grad_() for m in lens((9, 70), kind="noisy")]
+    assert torch.autograd.gradcheck(lambda p, t: torch.view_as_real(reduce(p, t, made)[0]), maps)
+    found = plan(case, 1e-4, torch.float64, torch.device("cpu"))
+    count = found.tensors["turn"].shape[0]
+    light = torch.randn(count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(zoom(v, found.tensors)), light)
 
 
 def test_directional_derivatives_in_phase_and_transmission():
@@ -281,25 +286,29 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
         assert got == pytest.approx(want, rel=2e-6), name  # finite differences: 1e-9 of the value over the step
 
 
-def test_torch_path_for_other_devices_equals_the_compiled_loops():
-    from metalens.propagate_kernels import fill, pull
-    from metalens.propagate_pillars import _fold, _light, _unfold, moments
+@pytest.mark.parametrize("shape", [(6, 9), (70, 130)])
+def test_torch_path_for_other_devices_equals_the_compiled_loops(shape):
+    """Field on the window and gradients: pillars themselves as nodes, against nodes of blocks."""
+    from metalens import propagate_pillars as pillars
+    from metalens.propagate_window import from_moments, plan
 
-    for shape in ((6, 9), (5, 8)):
-        case = propagate.case(shape, **GEOMETRY)
-        plan = moments(case, 1e-3, (4, 5), torch.float64)
-        phase, level = (torch.tensor(m) for m in lens(shape, kind="noisy"))
-        half = (shape[1] + 1) // 2
-        table, u = plan.table.numpy(), plan.carrier.positions
-        compiled, plain = (torch.zeros(2, shape[0], 2, half, dtype=torch.float64) for _ in range(2))
-        fill(phase.numpy(), level.numpy(), table, u, compiled.numpy())
-        _fold(_light(phase, level, plan, 0), plain)
-        assert torch.allclose(compiled, plain, atol=1e-10)
-        plain[1, :, :, 0] *= 1 - shape[1] % 2  # odd polynomials vanish on the axis column
-        out = torch.zeros(2, *shape, dtype=torch.float64)
-        pull(phase.numpy(), level.numpy(), out[0].numpy(), out[1].numpy(), table, u, plain.numpy())
-        turn, grad = _light(phase, torch.ones_like(level), plan, 0), _unfold(plain, shape[1])
-        assert torch.allclose(out[1], grad[:, 0] * turn.real + grad[:, 1] * turn.imag, atol=1e-10)
+    made = plan(propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu"))
+    blocks, case = made.moments, made.case
+    places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)
+    at_pillars = [torch.tensor(legendre.values(n, p / h)) for n, p, h in places]
+    plain = dataclasses.replace(blocks, rows=at_pillars[0], columns=at_pillars[1])
+    maps = tuple(torch.tensor(m) for m in lens(shape, kind="noisy"))
+    (first, power), (second, same) = pillars._gather(*maps, blocks), pillars._gather_plain(*maps, plain)
+    assert power == pytest.approx(same, rel=1e-12)
+    fields = [from_moments(torch.complex(m[0], m[1]), made) for m in (first, second)]
+    assert (fields[0] - fields[1]).norm() < 1e-10 * fields[1].norm()
+    second.requires_grad_()
+    weight = torch.linspace(-1, 1, fields[1].numel(), dtype=torch.float64).view(fields[1].shape)
+    (from_moments(torch.complex(second[0], second[1]), made).abs() ** 2 * weight).sum().backward()
+    out = torch.zeros(2, 2, *shape, dtype=torch.float64)
+    pillars._spread(maps, blocks, second.grad, tuple(out[0]))
+    pillars._spread_plain(maps, plain, second.grad, tuple(out[1]))
+    assert (out[0] - out[1]).norm() < 1e-9 * out[1].norm()
 
 
 def test_choose_takes_the_exact_sum_for_few_pillars_and_says_why():
