@@ -2,7 +2,7 @@
 
     python -m benchmarks.codesign_study run --work DIR             # every run of the plan that has no line yet
     python -m benchmarks.codesign_study run --work DIR --only p18/hyper33/0
-    python -m benchmarks.codesign_study report --work DIR          # JSON, table and figures from the lines there are
+    python -m benchmarks.codesign_report --work DIR                # JSON, table and figures from the lines there are
 
 Every run draws the same number of frames from one pool, with the same network, noise and schedule; the lens alone
 differs. One JSON line a run, errors of every test frame beside it; a stopped study goes on where it was.
@@ -176,7 +176,7 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("verb", choices=["run", "report"])
+    parser.add_argument("verb", choices=["run"])
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=None)
     options = parser.parse_args()
@@ -190,8 +190,12 @@ def main() -> None:
             print(json.dumps({k: v for k, v in line.items() if k != "coefficients_rad"}), flush=True)
 
 
-LENSES = ("hyper33", "joint33", "hyper20", "hyper28", "joint20", "hyper40", "helix2", "hyper24", "helix3", "hyper50")
-PLAN = [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
+LENSES = ("hyper33", "joint33", "joint20", "hyper20", "helix2")
+PLAN = [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
+PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+PLAN += [f"{case}/{lens}/{seed}" for case in ("p18dim", "p18small") for seed in range(5) for lens in LENSES[:2]]
 
 
 def done(work: Path) -> set[str]:

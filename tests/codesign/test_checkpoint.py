@@ -89,3 +89,24 @@ def test_what_cannot_be_kept_is_named(tmp_path):
     with pytest.raises(TrainingError, match="entry /bad is a object"):
         checkpoint.save(tmp_path / "c", {"bad": object()}, settings=Settings())
     assert not (tmp_path / "c").exists()
+
+
+def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(tmp_path):
+    """A file-size limit stands for the disk: the write fails part-way, as on a full one."""
+    import resource
+    import signal
+
+    path = tmp_path / "c"
+    checkpoint.save(path, {"w": torch.ones(4)}, settings=Settings())
+    before = path.read_bytes()
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"cannot write|File too large"):
+            checkpoint.save(path, {"w": torch.ones(100_000)}, settings=Settings())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]

@@ -149,3 +149,40 @@ def test_impossible_schedules_are_refused():
         Schedule(0.1, 0.8, 0.2)
     with pytest.raises(ConfigError, match="need 1 or more"):
         InnerConfig(steps=0)
+
+
+class Hard(Discs):
+    """Frames whose pupil is hidden by a blink, or cut by the border of the frame."""
+
+    def __init__(self, kind):
+        self.kind = kind
+
+    def batch(self, step, size):
+        plain = super().batch(step, size)
+        mask = torch.zeros_like(plain.mask)
+        if self.kind == "border":
+            mask[:, :3, :2] = 1.0
+        return replace(plain, mask=mask)
+
+
+@pytest.mark.parametrize("kind", ["blink", "border"])
+def test_batches_of_blinks_and_pupils_at_the_border_train_on(kind):
+    config = InnerConfig(steps=2, batch=2, subnets=0, optics=Schedule(0.02, 0.0, 1.0), patience=1)
+    made = inner.model(OPTICS, pitch_um=9.0, seed=0)
+    records = list(Trainer(config, OPTICS, SENSOR, Hard(kind), made, architecture=smallest(Space())).run())
+    assert records[-1].skipped == 0
+    assert all(math.isfinite(r.loss) for r in records)
+    assert float(made.coefficients_rad.detach().abs().max()) > 0
+
+
+def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
+    """Labels a million times too large for one batch: Adam's step after it is no longer than the learning rate."""
+    trainer = _trainer(InnerConfig(steps=6, batch=2), architecture=smallest(Space()))
+    list(trainer.run(until=2))
+    before = [p.detach().clone() for p in trainer.model.net.parameters()]
+    plain = trainer.scenes.batch
+    trainer.scenes.batch = lambda step, size: replace(plain(step, size), slip_mm=1e6 * plain(step, size).slip_mm)
+    record = next(trainer.run())
+    assert record.loss > 1e4
+    largest_step = max(float((a - b).abs().max()) for a, b in zip(before, trainer.model.net.parameters(), strict=True))
+    assert largest_step < 10 * trainer.inner.weights.rate

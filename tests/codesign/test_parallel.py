@@ -9,6 +9,7 @@ import torch
 
 from codesign import parallel
 from codesign.inner_batch import Batch
+from metalens.errors import TrainingError
 from metalens.scene import Frames
 
 WORKER = """
@@ -75,3 +76,19 @@ def test_normalisation_over_processes_is_that_of_torch_in_one(monkeypatch):
     loss = torch.randn(want.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (a,), (b,) = (torch.autograd.grad((y * loss).sum(), x, retain_graph=True) for y in (want, got))
     torch.testing.assert_close(b, a)
+
+
+def test_a_lost_process_is_named_with_the_way_on(monkeypatch):
+    def broken(value):
+        raise RuntimeError("Connection closed by peer")
+
+    monkeypatch.setattr(parallel.dist, "all_reduce", broken)
+    with pytest.raises(TrainingError, match=r"another process of this run was lost .* --resume"):
+        parallel._reduced(torch.zeros(1))
+
+
+def test_an_uneven_share_of_a_batch_is_refused(monkeypatch):
+    monkeypatch.setattr(parallel, "ranks", lambda: 2)
+    frames = Frames(*(torch.rand(3, 2, 4, 4) for _ in range(3)))
+    with pytest.raises(TrainingError, match="a batch of 3 frames on 2 processes"):
+        parallel.part_of(Batch(frames, torch.zeros(3, 4, 4), torch.zeros(3, 3)))

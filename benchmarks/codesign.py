@@ -1,0 +1,205 @@
+"""Co-design: frames a second by multiply-accumulates and where the time goes, beside the error of every shortcut."""
+
+import math
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks import Row, fastest
+from codesign import architecture, baselines, cost, inner, losses, optics, pool
+from codesign.architecture import Architecture, Space
+from codesign.baselines import Name
+from codesign.eye_scenes import EyeScenes, SceneConfig
+from codesign.flat import flattened, irradiance
+from codesign.formation import read_out
+from codesign.inner import InnerConfig, Schedule, Trainer
+from codesign.optics import OpticsConfig
+from codesign.pool import PoolScenes
+from codesign.supernet import Supernet
+from metalens.pupil import psf
+from metalens.sensor import Sensor
+
+NONE, BATCH = float("nan"), 32
+SCENES = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
+OPTICS = OpticsConfig(focus_mm=33.0, depth_count=20)
+SENSOR = Sensor(9.0, 9.0, 2000.0, 0.0, 4000.0, 5.0, 10)
+SPACE = Space(widths=(0.25, 0.5, 0.75), depths=(2, 3), expansions=(3, 4), kernels=(3, 5), resolution=(0.5, 1.0))
+SIZES = ((0.25, 2), (0.5, 2), (0.5, 3), (0.75, 3))  # width, depth
+
+
+def rows() -> list[Row]:
+    """Rows of this topic."""
+    threads = torch.get_num_threads()
+    made = pool.fill(SCENES, 2 * BATCH)
+    return [*_counts(), *_optics(threads), *_stages(threads, made), *_training(threads, made), *_compiled(threads)]
+
+
+def _member(width: float, depth: int) -> Architecture:
+    return Architecture((depth,) * 5, (5,) * SPACE.slots, (3,) * SPACE.slots, width, 1.0)
+
+
+def _counts() -> list[Row]:
+    generator, space, worst = np.random.default_rng(0), Space(), 0.0
+    net = Supernet(space).eval()
+    for _ in range(40):
+        member = architecture.sample(space, generator)
+        size = round(128 * member.resolution)
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            net(torch.zeros(1, 1, size, size), replace(member, resolution=1.0))
+        worst = max(worst, abs(float(cost.network(space, member).at(size)) * 2 / counter.get_total_flops() - 1))
+    seconds = fastest(lambda: cost.macs(member, 9.0, window_um=1152.0))
+    out = [Row("MACs of 40 random subnets", "Eq. 9", seconds, worst, "PyTorch's flop counter", goal="asked 1e-3")]
+    for variant, published in (("small", 56.5e6), ("large", 216.6e6)):
+        error = abs(cost.mobilenet_v3(variant) / published - 1)
+        out.append(Row(f"MobileNetV3 {variant} at 224²", "Eq. 9", NONE, error, "56.5 / 216.6 M as published"))
+    member = _member(0.5, 2)
+    pitch = torch.tensor(9.25, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(cost.macs(member, pitch, window_um=1152.0, space=SPACE), pitch)
+    step = 1e-5
+    ahead, behind = (float(cost.macs(member, 9.25 + s, window_um=1152.0, space=SPACE)) for s in (step, -step))
+    error = abs(float(slope) / ((ahead - behind) / (2 * step)) - 1)
+    return [*out, Row("d MACs / d pitch", "autograd", NONE, error, "central difference", goal="asked 1e-4")]
+
+
+def _optics(threads: int) -> list[Row]:
+    generator = torch.Generator().manual_seed(0)
+    phase = (0.5 * torch.randn(35, generator=generator, dtype=torch.float64)).requires_grad_()
+    weight = torch.randn(20, 33, 33, generator=generator)
+
+    def gradient() -> torch.Tensor:
+        return torch.autograd.grad((optics.stack(OPTICS, phase).intensity * weight).sum(), phase)[0]
+
+    quick = optics.stack(OPTICS, phase).intensity.detach()
+    error = float((quick - _slow_stack(phase.detach())).norm() / quick.norm())
+    way = torch.randn(35, generator=generator, dtype=torch.float64)
+    step = 1e-3
+    with torch.no_grad():
+        ends = [(optics.stack(OPTICS, phase + s * way).intensity.double() * weight).sum() for s in (step, -step)]
+    slope = float(ends[0] - ends[1]) / (2 * step)
+    wrong = abs(float(gradient() @ way) / slope - 1)
+    case = "20 PSFs of 33² samples, 35 polynomials"
+    forward = fastest(lambda: optics.stack(OPTICS, phase.detach()))
+    return [
+        Row(case, "pupil autocorrelation", forward, error, "fine intensity, low-passed: relative L2", threads),
+        Row(case, "with gradient", fastest(gradient), wrong, "central difference along a direction", threads),
+    ]
+
+
+def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
+    """The same light from the finely sampled intensity, integrated over samples and low-passed by plain sums."""
+    fine, size, step = OPTICS.fine, OPTICS.window_samples, OPTICS.sample_um
+    bright = psf(
+        optics.added_phase(OPTICS, phase), OPTICS.pupil, depths_um=OPTICS.depths_um,
+        focus_um=OPTICS.focus_mm * 1e3, sample_um=step / fine, samples=size * fine,
+    )  # fmt: skip
+    period = OPTICS.pupil.period_um
+    top = math.floor(period / (2 * step))
+    frequency = torch.arange(-top, top + 1, dtype=torch.float64) / period
+    from_x = (torch.arange(size * fine, dtype=torch.float64) - (size * fine - 1) / 2) * step / fine
+    to_x = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
+    waves = torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
+    taps = (torch.sinc(frequency * step) * waves).sum(-1) * step / period
+    return (taps @ bright.double() @ taps.mT).float()
+
+
+def _stages(threads: int, made: pool.Pool) -> list[Row]:
+    lens = optics.prepared(OPTICS, optics.stack(OPTICS, torch.zeros(35)), 160, margin=16)
+    sheets, scale = SCENES.rendered(0, 8).frames, SCENES.states(0, 8).scale
+    exact, quick = irradiance(sheets, lens, margin=16), irradiance(flattened(sheets, scale), lens, margin=16)
+    error = float((quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm())
+    batch = PoolScenes(made, 16, 0.2, 0).batch(0, BATCH)
+    light = irradiance(batch.frames, lens, margin=16)
+    pitch, noise = torch.tensor(9.0, dtype=torch.float64), torch.Generator().manual_seed(0)
+
+    def sensor(exact: bool) -> torch.Tensor:
+        return read_out(light, 9.0, pitch, SENSOR, generator=noise, exact=exact)
+
+    render = fastest(lambda: SCENES.rendered(1, 8)) / 8
+    one, two = (
+        fastest(lambda f=f: irradiance(f, lens, margin=16)) / n for f, n in ((batch.frames, BATCH), (sheets, 8))
+    )
+    fast, slow = (fastest(lambda e=e: sensor(e)) / BATCH for e in (False, True))
+    return [
+        Row("a frame of 160²: render", "once for a pool", render, NONE, "see topic scene", threads, goal=_rate(render)),
+        Row("a frame: optics", "two sheets", two, 0.0, "itself", threads, goal=_rate(two)),
+        Row("a frame: optics", "flat", one, error, "two sheets, of the contrast", threads, goal=_rate(one)),
+        Row("a frame: sensor", "Poisson", slow, 0.0, "itself", threads, goal=_rate(slow)),
+        Row("a frame: sensor", "normal", fast, NONE, "mean and variance are exact", threads, goal=_rate(fast)),
+    ]
+
+
+def _rate(seconds: float) -> str:
+    return f"{1 / seconds:.0f} frames/s"
+
+
+def _trainer(made: pool.Pool, member: Architecture | None, *, live: bool, network: Name = "supernet") -> Trainer:
+    settings = InnerConfig(
+        steps=10_000, batch=BATCH, optics=Schedule(0.02 if live else 0.0, 0.0, 0.9), optics_weight=0.0
+    )
+    fresh = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE, network=network)
+    return Trainer(settings, OPTICS, SENSOR, PoolScenes(made, 16, 0.2, 0), fresh, architecture=member)
+
+
+def _training(threads: int, made: pool.Pool) -> list[Row]:
+    """Whole steps, the lens fixed and moving, and the network alone: the rest of a step is data generation."""
+    out = []
+    for width, depth in SIZES:
+        member = _member(width, depth)
+        macs = float(cost.macs(member, 9.0, window_um=1152.0, space=SPACE)) / 1e6
+        frozen, moving = (_trainer(made, member, live=live).run() for live in (False, True))
+        fixed, joint = (fastest(lambda s=steps: next(s), repeats=4) / BATCH for steps in (frozen, moving))
+        alone, forward = _network_times(made, member)
+        share = 1 - alone / fixed
+        case = f"{macs:.1f} MMACs"
+        goal = f"{_rate(fixed)}; data generation {share:.0%} of a step; asked 50 % at 20 MMACs"
+        out += [
+            Row(case, "network, forward", forward, NONE, "-", threads, goal=_rate(forward)),
+            Row(case, "training step, lens fixed", fixed, NONE, "-", threads, goal=goal),
+            Row(case, "training step, lens moving", joint, NONE, "-", threads, goal=_rate(joint)),
+        ]
+    for name in ("nvgaze", "popovic", "de2gaze"):
+        net = baselines.make(name)  # type: ignore[arg-type]
+        macs = float(net.counts(_member(0.5, 2), np.array([128]))[0]) / 1e6
+        steps = _trainer(made, None, live=False, network=name).run()  # type: ignore[arg-type]
+        seconds = fastest(lambda s=steps: next(s)) / BATCH
+        out.append(Row(f"{name}, {macs:.1f} MMACs", "training step", seconds, NONE, "-", threads, goal=_rate(seconds)))
+    return out
+
+
+def _network_times(made: pool.Pool, member: Architecture) -> tuple[float, float]:
+    batch = PoolScenes(made, 16, 0.2, 0).batch(0, BATCH)
+    net = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.train()
+    frames = torch.randn(BATCH, 1, 128, 128).contiguous(memory_format=torch.channels_last)
+    scale = torch.ones(3)
+
+    def step() -> None:
+        losses.task(net(frames, member), batch.mask, batch.slip_mm, scale).backward()  # type: ignore[no-untyped-call]
+
+    def look() -> None:
+        with torch.no_grad():
+            net(frames, member)
+
+    return fastest(step, repeats=4) / BATCH, fastest(look, repeats=4) / BATCH
+
+
+def _compiled(threads: int) -> list[Row]:
+    """The network's forward pass through torch.compile, where a compiler is found."""
+    if shutil.which("g++") is None:
+        return [Row("network compiled", "torch.compile", NONE, NONE, "no compiler found", threads)]
+    member, frames = _member(0.5, 2), torch.randn(8, 1, 128, 128)
+    net = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.eval()
+    quick = torch.compile(lambda x: net(x, member).slip)
+    with torch.no_grad():
+        error = float((quick(frames) - net(frames, member).slip).abs().max())
+        eager, compiled = (
+            fastest(lambda f=f: f(frames), repeats=5) / 8 for f in (lambda x: net(x, member).slip, quick)
+        )
+    return [
+        Row("17 MMACs, forward", "eager", eager, 0.0, "itself", threads, goal=_rate(eager)),
+        Row(
+            "17 MMACs, forward", "compiled", compiled, error, "eager, largest difference", threads, goal=_rate(compiled)
+        ),
+    ]

@@ -1,0 +1,113 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation: {extension: .py, format_name: percent}
+# ---
+
+# %% [markdown]
+# # Co-design in ten minutes
+# A lens and a small network learn together to tell how far an eye has slipped towards or away from the camera. The
+# frames hold no other cue than blur: every time a frame is drawn, its depth is scaled to one that has nothing to do
+# with its picture. Everything here is small enough to run while you read; `metalens codesign RUN.toml` does the same
+# with checkpoints, a search over networks and a lens file at the end.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+from codesign import assess, cost, inner, optics, pool
+from codesign.architecture import Architecture, Space
+from codesign.depth_test import depth_response
+from codesign.eye_scenes import TEST, EyeScenes, SceneConfig
+from codesign.inner import InnerConfig, Schedule, Trainer
+from codesign.optics import OpticsConfig
+from codesign.pool import PoolScenes
+from codesign.supernet import recalibrate
+from metalens.sensor import Sensor
+
+# %% [markdown]
+# ## Eyes
+# A pool of frames is rendered once. `slip_mm` is the label; `pool.light` is what a pinhole would see.
+
+# %%
+settings = SceneConfig(pixels=64, margin=8)
+scenes = EyeScenes(settings, 18.0, 2000.0, seed=0)
+frames = pool.fill(scenes, 768)
+batches = PoolScenes(frames, settings.margin, settings.scale, seed=0)
+figure, axes = plt.subplots(1, 5, figsize=(9, 2))
+for image, panel in zip(frames.light, axes, strict=False):
+    panel.imshow(image, cmap="gray")
+    panel.set_axis_off()
+
+# %% [markdown]
+# ## What a network costs
+# Multiply-accumulates are a smooth function of the pixel pitch (Eq. 9), so the pitch can be trained too.
+
+# %%
+space = Space(widths=(0.25, 0.5), depths=(2,), expansions=(3,), kernels=(5,), resolution=(1.0, 1.0))
+member = Architecture((2,) * 5, (5,) * 10, (3,) * 10, 0.25, 1.0)
+for pitch in (12.0, 18.0, 24.0):
+    macs = cost.macs(member, pitch, window_um=64 * 18.0, space=space)
+    print(f"pitch {pitch:.0f} um: {float(macs) / 1e6:.2f} MMACs")
+
+# %% [markdown]
+# ## Two lenses, equal training
+# One keeps its focus at 33 mm, behind the eye, where blur grows one way with depth. The other starts there and moves:
+# 20 polynomials of phase, with their own learning rate, from a tenth of the run to four fifths of it.
+
+# %%
+sensor = Sensor(18.0, 18.0, 4000.0, 0.0, 8000.0, 5.0, 10)
+
+
+def train(polynomials, steps=160):
+    lens = OpticsConfig(focus_mm=33.0, polynomials=polynomials, sample_um=18.0, window_samples=17, depth_count=14)
+    moving = Schedule(0.03 if polynomials else 0.0, 0.1, 0.8)
+    config = InnerConfig(steps=steps, batch=32, optics=moving, optics_weight=0.0)
+    made = inner.model(lens, pitch_um=18.0, seed=0, space=space)
+    trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
+    losses = [record.task for record in trainer.run()]
+    seen = assess.frames(trainer, batches, 6)
+    recalibrate(made.net, member, assess.parts(seen))
+    return trainer, losses
+
+
+runs = {"fixed": train(0), "joint": train(20)}
+plt.figure(figsize=(5, 3))
+for name, (_, losses) in runs.items():
+    plt.plot(np.convolve(losses, np.ones(20) / 20, "valid"), label=name)
+plt.xlabel("step")
+plt.ylabel("task loss")
+plt.legend()
+
+# %% [markdown]
+# ## What they reach, and whether they read the optics
+# The last column moves the depth of the PSFs alone by 1 mm, geometry unchanged: a network that measures by blur follows,
+# one that guesses from sizes answers 0. 160 steps are few (the study in `docs/codesign` takes 800 and five seeds): expect
+# a first sign of life here, no ranking.
+
+# %%
+test = EyeScenes(settings, 18.0, 2000.0, seed=0, stream=TEST)
+for name, (trainer, _) in runs.items():
+    net = trainer.model.net
+    seen = assess.frames(trainer, test, 6)
+    error = (assess.predict(net, member, seen, trainer.inner).slip_mm - seen.slip_mm).abs().mean(0)
+    response = depth_response(trainer, test, net, member, batches=4)
+    print(
+        f"{name}: axial {error[2]:.2f} mm, lateral {error[:2].mean():.2f} mm, {response.mean:.2f} mm per mm of PSF depth"
+    )
+
+# %% [markdown]
+# ## The lens that was found
+
+# %%
+trainer = runs["joint"][0]
+found = trainer.model.coefficients_rad.detach()
+figure, axes = plt.subplots(2, 5, figsize=(9, 3.8))
+for row, phase in zip(axes, (0 * found, found), strict=True):
+    stack = optics.stack(trainer.optics, phase)
+    for panel, index in zip(row, np.linspace(0, 13, 5).astype(int), strict=True):
+        panel.imshow(stack.intensity[index].clamp_min(0).sqrt(), cmap="magma")
+        panel.set_title(f"{float(stack.depths_um[index]) * 1e-3:.0f} mm", fontsize=8)
+        panel.set_axis_off()
+print("root-mean-square phase added:", round(float(torch.linalg.vector_norm(found)), 2), "rad")
