@@ -83,7 +83,7 @@ RUNGS = (
     Rung(
         "even",
         (
-            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 5e-7, 2e-6),
+            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 1e-6, 1.5e-5),
             Choice(MeshPlan(5, 5, 5, BOTH), 1.0, 1e-7),
         ),
         0.6,
