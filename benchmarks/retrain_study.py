@@ -6,8 +6,9 @@
     python -m benchmarks.retrain_study report --work DIR             # the table, kept in benchmarks/results
 
 A hidden lens is drawn from the spread of process and assembly. A *complete* case takes captures of it on the virtual
-bench and fits them. A *quick* case draws the result of that fit from the truth and the covariance of a complete one;
-the complete ones tell whether that is fair. One JSON line a case; a stopped study goes on where it was.
+bench and fits them. A *quick* case draws the result of that fit from the truth and a covariance: that of the first
+complete case, or the Cramer-Rao bound of the bench before there is one; the complete ones tell whether that is fair.
+One JSON line a case; a stopped study goes on where it was.
 """
 
 import argparse
@@ -24,13 +25,13 @@ from characterize import asbuilt, bench, capture, command_capture
 from characterize.asbuilt import AsBuilt
 from characterize.bench import Camera, Truth
 from characterize.estimate import Options, fit
-from characterize.parameters import Known, vector
+from characterize.parameters import PARAMETERS, Known, vector
 from characterize.pillars import sensitivity
 from codesign import evolution, retraining
 from codesign import optics as trained
 from codesign import run as runs
 from codesign.architecture import largest
-from codesign.built import MadeLens, psf_error
+from codesign.built import OF_LENS, MadeLens, psf_error
 from codesign.evolution import Candidate, Search
 from codesign.retraining import Lenses, RetrainConfig, Source
 from metalens import design, lens, library, store
@@ -63,6 +64,7 @@ SPREAD = {"bias_nm": 4.0, "bias_x_nm": 3.0, "bias_y_nm": 3.0, "bias_r_nm": 2.0, 
 SPREAD |= {f"{name}_rad": 0.1 for name in ("astigmatism", "oblique_astigmatism", "coma_x", "coma_y", "spherical")}
 DEPTHS_UM = (12e3, 15e3, 19e3, 24e3, 31e3, 42e3, 60e3)
 CONFIG = RetrainConfig(steps=150, rate=1.5e-3, draws=6, judge=1, test_batches=16)
+PEAK_E = 8000.0
 LINES, RESULT = "cases.jsonl", Path(__file__).parent / "results" / "retrain_study.json"
 
 
@@ -119,19 +121,70 @@ def captured(work: Path, made: lens.Lens, case: int) -> AsBuilt:
     return asbuilt.load(path)
 
 
+def expected(design_lens: lens.Lens) -> AsBuilt:
+    """What a fit can know of this lens at most: the Cramer-Rao bound of its frames on the bench, with the usual priors.
+
+    For quick cases before there is a complete one. Frames have ``PEAK_E`` electrons; gain, background, decentre, stage
+    and crosstalk are unknown too, and marginalised.
+    """
+    settings = trained.OpticsConfig(
+        focus_mm=28.0, polynomials=0, sample_um=3.0, window_samples=49, depths_mm=(12.0, 60.0), depth_count=7
+    )
+    ready = MadeLens(design_lens, settings)
+    light = ready.stack().intensity.double().numpy()
+    depths = settings.depths_um.numpy()
+    slopes = {}
+    for name in (*SPREAD, "trefoil_x_rad", "trefoil_y_rad"):
+        step = 0.02 if name.endswith("rad") else 1.0
+        moved = [ready.stack(vector({name: sign * step})).intensity.double().numpy() for sign in (1, -1)]
+        slopes[name] = (moved[0] - moved[1]) / (2 * step)
+    near = replace(settings, depths_mm=(12.1, 60.1))
+    by_depth = MadeLens(design_lens, near).stack().intensity.double().numpy() - light
+    by_depth /= (near.depths_um.numpy() - depths)[:, None, None]
+    slopes["stage_zero_um"] = by_depth
+    slopes["stage_scale"] = by_depth * (depths - depths.mean())[:, None, None]
+    slopes["decentre_x_um"], slopes["decentre_y_um"] = (np.gradient(light, 3.0, axis=a) for a in (2, 1))
+    slopes["crosstalk_px"] = 0.2 * (
+        np.gradient(np.gradient(light, axis=1), axis=1) + np.gradient(np.gradient(light, axis=2), axis=2)
+    )
+    slopes["log_gain"] = light
+    scale = PEAK_E / light.max()
+    slopes["background_e"] = np.ones_like(light) / scale
+    names = tuple(slopes)
+    table = np.stack([slopes[n].ravel() * scale for n in names])
+    information = (table / (light.ravel() * scale + 10.0 + 4.0)) @ table.T
+    prior = np.array([next(p.sigma for p in PARAMETERS if p.name == n) for n in names])
+    covariance = np.linalg.inv(information + np.diag(1 / prior**2))
+    keep = [i for i, n in enumerate(names) if n in OF_LENS]
+    part, blank = covariance[np.ix_(keep, keep)], np.zeros((1, 2, 2))
+    return AsBuilt(
+        design_lens, sensitivity(design_lens), tuple(names[i] for i in keep), np.zeros(len(keep)), part,
+        np.linalg.inv(part), {}, depths[:1], np.zeros((1, 2)), 3.0, blank, blank, blank, blank, 1.0, True,
+        "Cramer-Rao bound",
+    )  # fmt: skip
+
+
+def template(work: Path, design_lens: lens.Lens) -> AsBuilt:
+    """The fit whose covariance quick cases draw from: that of complete case 1000 where it is there, else the bound."""
+    path = work / "asbuilt_1000.h5"
+    return asbuilt.load(path) if path.exists() else expected(design_lens)
+
+
 def quick(template: AsBuilt, case: int) -> AsBuilt:
     """What a fit of this case may say: the truth, off by a draw from the covariance."""
     true = hidden(case)
     rng = np.random.default_rng([case, 7])
     off = np.linalg.cholesky(template.covariance) @ rng.standard_normal(len(template.names))
-    middle = np.array([true.get(n, v) for n, v in zip(template.names, template.value, strict=True)])
+    middle = np.array([true.get(n, 0.0) for n in template.names])
     return replace(template, value=middle + off, problems=())
 
 
-def one(source: Source, made: MadeLens, nominal: Lenses, work: Path, case: int, *, complete: bool) -> dict[str, object]:
+def one(
+    source: Source, made: MadeLens, nominal: Lenses, work: Path, case: int, *, model: AsBuilt | None
+) -> dict[str, object]:
     """One case: errors before and after, and with the truth known where the case's number is even or complete."""
-    start = time.process_time()
-    result = captured(work, made.design, case) if complete else quick(captured(work, made.design, 0), case)
+    start, complete = time.process_time(), model is None
+    result = captured(work, made.design, case) if model is None else quick(model, case)
     config = replace(CONFIG, seed=case)
     true = made.stack(vector(hidden(case)))
     drawn = tuple(made.stack(result.parameters(row)) for row in result.samples(config.draws, seed=case))
@@ -179,9 +232,11 @@ def run(work: Path, cases: int, complete: int, minutes: float) -> None:
     stack = made.stack()
     nominal = Lenses(stack, stack, (), (), True)
     done = {entry["case"] for entry in _lines(work)}
-    end = time.monotonic() + minutes * 60
+    end, model = time.monotonic() + minutes * 60, None
     for case in [c for c in (*range(1000, 1000 + complete), *range(cases)) if c not in done]:
-        entry = one(source, made, nominal, work, case, complete=case >= 1000)
+        if case < 1000 and model is None:
+            model = template(work, made.design)
+        entry = one(source, made, nominal, work, case, model=None if case >= 1000 else model)
         with open(work / LINES, "a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
         print(case, f"{recovered(entry):.2f}", f"{entry['cpu_s']:.0f} s", flush=True)
