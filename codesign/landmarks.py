@@ -9,6 +9,7 @@ NAMES = (
     "medial canthus", "lateral canthus", "upper margin", "lower margin",
     "limbus right", "limbus down", "limbus left", "limbus up", "corneal apex",
 )  # fmt: skip
+SETTLED_UM = 1e-6  # from the wanted point on the iris: 1e-9 of a tangent
 NEAREST_UM = 500.0  # points closer than this, or behind the camera, are projected as if they were this far
 
 
@@ -74,6 +75,8 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
     t, h = straight, 1e-6
     for _ in range(steps):
         miss = land(t) - iris_um
+        if not t.requires_grad and float(miss.abs().max()) < SETTLED_UM:
+            break
         along_x = (land(t + torch.tensor([h, 0.0])) - land(t - torch.tensor([h, 0.0]))) / (2 * h)
         along_y = (land(t + torch.tensor([0.0, h])) - land(t - torch.tensor([0.0, h]))) / (2 * h)
         det = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]

@@ -160,10 +160,42 @@ def _sample(bank: Any, index: Any, u: Any, v: Any) -> Any:
 
 
 _s = _compiled(_scalar_operations())
-_s_ray, _s_lids, _s_skin, _s_eye = _s["ray"], _s["lids"], _s["skin"], _s["eye"]
+_s_ray, _s_lids, _s_skin = _s["ray"], _s["lids"], _s["skin"]
 _d = _compiled(_dual_operations())
-_d_ray, _d_lids, _d_skin, _d_eye = _d["ray"], _d["lids"], _d["skin"], _d["eye"]
-_d_mul, _d_sub = _d["mul"], _d["sub"]
+_d_ray, _d_lids, _d_skin = _d["ray"], _d["lids"], _d["skin"]
+_d_add, _d_mul, _d_sub = _d["add"], _d["mul"], _d["sub"]
+_s_globe, _s_cornea, _s_iris, _s_sclera, _s_shade = (_s[k] for k in ("globe", "cornea", "iris", "sclera", "shade"))
+_d_globe, _d_cornea, _d_iris, _d_sclera, _d_shade = (_d[k] for k in ("globe", "cornea", "iris", "sclera", "shade"))
+
+
+@_jit  # type: ignore[untyped-decorator]
+def _s_eye(p: Any, t: Any, gx: Any, gy: Any, upper: Any, lower: Any, dx: Any, dy: Any, dz: Any) -> Any:
+    """The model's ``eye``, without the iris where no cornea is met, and without the sclera where the iris hides it."""
+    ts, mx, my, mz = _s_globe(p, dx, dy, dz)
+    tc, cx, cy, cz, inside = _s_cornea(p, dx, dy, dz)
+    disc = pupil = brown = virtual = white = r = f32(0)
+    if inside > f32(0):
+        disc, pupil, r, brown, virtual = _s_iris(p, t, tc, cx, cy, cz, inside, dx, dy, dz)
+    if disc < f32(1):
+        white = _s_sclera(p, t, gx, gy, lower, mx, my, mz, r, inside)
+    light = _s_shade(p, white, brown, disc, pupil, inside, upper, lower, ts, mx, my, mz, tc, cx, cy, cz, dx, dy, dz)
+    return light, ts + disc * (tc + virtual - ts), pupil
+
+
+@_jit  # type: ignore[untyped-decorator]
+def _d_eye(p: Any, t: Any, gx: Any, gy: Any, upper: Any, lower: Any, dx: Any, dy: Any, dz: Any) -> Any:
+    """As :func:`_s_eye`, for dual numbers: shares of exactly 0 or 1 have no slope."""
+    zero = (f32(0), f32(0), f32(0))
+    ts, mx, my, mz = _d_globe(p, dx, dy, dz)
+    tc, cx, cy, cz, inside = _d_cornea(p, dx, dy, dz)
+    disc, pupil, brown, virtual, white, r = zero, zero, zero, zero, zero, zero
+    if inside[0] > f32(0):
+        disc, pupil, r, brown, virtual = _d_iris(p, t, tc, cx, cy, cz, inside, dx, dy, dz)
+    if disc[0] < f32(1):
+        white = _d_sclera(p, t, gx, gy, lower, mx, my, mz, r, inside)
+    light = _d_shade(p, white, brown, disc, pupil, inside, upper, lower, ts, mx, my, mz, tc, cx, cy, cz, dx, dy, dz)
+    behind = _d_mul(disc, _d_sub(_d_add(tc, virtual), ts))
+    return light, _d_add(ts, behind), pupil
 
 
 def _kernels(stamp: int) -> tuple[Any, Any]:

@@ -89,10 +89,8 @@ def skin(
     return albedo * light * p[GAIN]
 
 
-def eye(
-    p: Real, t: Real, gx: Real, gy: Real, upper: Real, lower: Real, dx: Real, dy: Real, dz: Real
-) -> tuple[Real, Real, Real]:
-    """Radiance of the eye along a ray, distance of what is seen (the iris at its virtual image), share of pupil."""
+def globe(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real]:
+    """Distance and normal where the ray meets the sclera's sphere."""
     b = p[CENTRE] * dx + p[CENTRE + 1] * dy + p[CENTRE + 2] * dz
     ex = p[CENTRE] - b * dx
     ey = p[CENTRE + 1] - b * dy
@@ -101,12 +99,35 @@ def eye(
     mx = (ts * dx - p[CENTRE]) / p[SCLERA_R]
     my = (ts * dy - p[CENTRE + 1]) / p[SCLERA_R]
     mz = (ts * dz - p[CENTRE + 2]) / p[SCLERA_R]
-    tc, cx, cy, cz, inside = cornea(p, dx, dy, dz)
+    return ts, mx, my, mz
+
+
+def iris(
+    p: Real, t: Real, tc: Real, cx: Real, cy: Real, cz: Real, inside: Real, dx: Real, dy: Real, dz: Real
+) -> tuple[Real, Real, Real, Real, Real]:  # fmt: skip
+    """Share of iris and of pupil, distance from the axis, albedo, and distance behind the cornea of the virtual image.
+
+    Without cornea on the ray (``inside`` 0) both shares are 0.
+    """
     x, y, path = refract(p, tc, cx, cy, cz, dx, dy, dz)
     r = sqrt(x * x + y * y + 1.0)
     disc = inside * step((p[LIMBUS_R] - r) / (3.0 * p[EDGE] + 120.0))
     pupil = disc * step((p[PUPIL_R] - r) / p[EDGE])
+    span = unit((r - p[PUPIL_R]) / above(p[LIMBUS_R] - p[PUPIL_R], 300.0))
+    place = (40.0 + 84.0 * span) / r
+    tu = x * place
+    tv = y * place
+    figure = tex(t, p[T_IRIS], 128.0 + p[TURN_X] * tu - p[TURN_Y] * tv, 128.0 + p[TURN_Y] * tu + p[TURN_X] * tv)
+    brown = p[IRIS] * (1.0 + p[IRIS_CONTRAST] * figure)
+    brown = brown * (1.0 - 0.45 * step((span - 0.94) * 9.0)) * (1.0 - 0.35 * step((0.03 - span) * 25.0))
+    virtual = path / (p[INDEX] - (p[INDEX] - 1.0) * path / p[CORNEA_R])
+    return disc, pupil, r, brown, virtual
 
+
+def sclera(
+    p: Real, t: Real, gx: Real, gy: Real, lower: Real, mx: Real, my: Real, mz: Real, r: Real, inside: Real
+) -> Real:  # fmt: skip
+    """Albedo of sclera, vessels, limbal ring, caruncle and tear film; ``r`` is from the axis in the iris plane."""
     su = mx * p[IRIS_X] + my * p[IRIS_X + 1] + mz * p[IRIS_X + 2]
     sv = mx * p[IRIS_Y] + my * p[IRIS_Y + 1] + mz * p[IRIS_Y + 2]
     vein = tex(t, p[T_VEIN], su * 190.0 + p[OFFSET_X], sv * 190.0 + p[OFFSET_Y])
@@ -115,16 +136,14 @@ def eye(
     flesh = ((gx - p[CARUNCLE]) * (gx - p[CARUNCLE]) + (gy - 500.0) * (gy - 500.0)) / 3.2e6
     white = white + (0.8 * p[SKIN] * (1.0 + 0.3 * vein) - white) / (1.0 + flesh * flesh * flesh)
     tear = (lower - 120.0) / 150.0
-    white = white + 0.12 / (1.0 + tear * tear * tear * tear)
+    return white + 0.12 / (1.0 + tear * tear * tear * tear)
 
-    span = unit((r - p[PUPIL_R]) / above(p[LIMBUS_R] - p[PUPIL_R], 300.0))
-    place = (40.0 + 84.0 * span) / r
-    tu = x * place
-    tv = y * place
-    figure = tex(t, p[T_IRIS], 128.0 + p[TURN_X] * tu - p[TURN_Y] * tv, 128.0 + p[TURN_Y] * tu + p[TURN_X] * tv)
-    brown = p[IRIS] * (1.0 + p[IRIS_CONTRAST] * figure)
-    brown = brown * (1.0 - 0.45 * step((span - 0.94) * 9.0)) * (1.0 - 0.35 * step((0.03 - span) * 25.0))
 
+def shade(
+    p: Real, white: Real, brown: Real, disc: Real, pupil: Real, inside: Real, upper: Real, lower: Real,
+    ts: Real, mx: Real, my: Real, mz: Real, tc: Real, cx: Real, cy: Real, cz: Real, dx: Real, dy: Real, dz: Real,
+) -> Real:  # fmt: skip
+    """Radiance of the eye from its albedos and shares, under the lamps and below the lids."""
     near = ts + inside * (tc - ts)
     nx = mx + inside * (cx - mx)
     ny = my + inside * (cy - my)
@@ -132,12 +151,24 @@ def eye(
     sharp = 250.0 + 1750.0 * inside
     outer, inner, shine = wet_lamps(p, near * dx, near * dy, near * dz, nx, ny, nz, dx, dy, dz, sharp)
     lid = above(upper, 0.0) / 900.0
-    shade = 1.0 - 0.50 / ((1.0 + lid) * (1.0 + lid)) - 0.15 / (1.0 + above(lower, 0.0) / 500.0)
+    dim = 1.0 - 0.50 / ((1.0 + lid) * (1.0 + lid)) - 0.15 / (1.0 + above(lower, 0.0) / 500.0)
     lit = white * outer * (1.0 - disc) + disc * (brown * inner * (1.0 - pupil / above(disc, 1e-3)))
-    lit = (lit + p[PUPIL] * pupil) * shade
-    virtual = path / (p[INDEX] - (p[INDEX] - 1.0) * path / p[CORNEA_R])
-    depth = ts + disc * (tc + virtual - ts)
-    return (lit + p[GLINT] * shine) * p[GAIN], depth, pupil
+    lit = (lit + p[PUPIL] * pupil) * dim
+    return (lit + p[GLINT] * shine) * p[GAIN]
+
+
+def eye(
+    p: Real, t: Real, gx: Real, gy: Real, upper: Real, lower: Real, dx: Real, dy: Real, dz: Real
+) -> tuple[Real, Real, Real]:
+    """Radiance of the eye along a ray, distance of what is seen (the iris at its virtual image), share of pupil."""
+    ts, mx, my, mz = globe(p, dx, dy, dz)
+    tc, cx, cy, cz, inside = cornea(p, dx, dy, dz)
+    disc, pupil, r, brown, virtual = iris(p, t, tc, cx, cy, cz, inside, dx, dy, dz)
+    white = sclera(p, t, gx, gy, lower, mx, my, mz, r, inside)
+    light = shade(
+        p, white, brown, disc, pupil, inside, upper, lower, ts, mx, my, mz, tc, cx, cy, cz, dx, dy, dz
+    )  # fmt: skip
+    return light, ts + disc * (tc + virtual - ts), pupil
 
 
 def cornea(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real, Real]:

@@ -120,13 +120,14 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
     optic, visual = directions(states, rig)
     here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
-    outline = camera.position_px(iris_to_camera(p, _rim(p)), rig)
-    x, y = outline.unbind(-1)
+    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
+    middle = middle_and_rim[:, 0]
+    x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
-    weight = mask.double().sum((1, 2))
+    rows, columns = mask.sum(2).double(), mask.sum(1).double()
+    weight = rows.sum(1)
     grid = torch.arange(camera.pixels, dtype=torch.float64)
-    middle = camera.position_px(iris_to_camera(p, torch.zeros(len(p), 1, 2, dtype=torch.float64))[:, 0], rig)
-    sums = [(mask.double().sum(axis) * grid).sum(1) / weight.clamp_min(1e-9) for axis in (1, 2)]
+    sums = [(line * grid).sum(1) / weight.clamp_min(1e-9) for line in (columns, rows)]
     centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return Labels(
         slip_um=scale * (here + states.slip_um) - here,
@@ -141,9 +142,11 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
     )
 
 
-def _rim(p: Tensor, points: int = 24) -> Tensor:
-    turn = torch.arange(points, dtype=torch.float64) * (2 * torch.pi / points)
-    return p[:, model.PUPIL_R, None, None] * torch.stack([torch.cos(turn), torch.sin(turn)], 1)
+def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
+    """(n, 1 + rim, 2) centre and rim of the pupil in the plane of the iris."""
+    turn = torch.arange(rim, dtype=torch.float64) * (2 * torch.pi / rim)
+    circle = torch.cat([torch.zeros(1, 2, dtype=torch.float64), torch.stack([torch.cos(turn), torch.sin(turn)], 1)])
+    return p[:, model.PUPIL_R, None, None] * circle
 
 
 @dataclass(frozen=True, eq=False, slots=True)

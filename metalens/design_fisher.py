@@ -23,6 +23,7 @@ from metalens.store import Array
 
 Tensor = torch.Tensor
 RATE = 0.15  # first step of Adam, rad
+NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
 CHECKS = 20  # iterations between two honest looks
 __all__ = ["Fisher", "FisherPhase", "Score", "fisher_profile", "optimise", "phase_on", "score", "spline", "vortices"]
 
@@ -31,7 +32,8 @@ __all__ = ["Fisher", "FisherPhase", "Score", "fisher_profile", "optimise", "phas
 class FisherPhase:
     """A designed phase.
 
-    controls: (n, n) spline coefficients in rad. focus_um: source distance of the hyperbolic part.
+    controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every node of the pupil.
+    focus_um: source distance of the hyperbolic part.
     zones: rings of the double helix below, 0 for none.
     score: of this phase. starts: (information, least encircled energy) that each start reached.
     converged: whether the encircled energy is kept at every depth. reason: in words.
@@ -40,6 +42,7 @@ class FisherPhase:
     controls: Tensor
     focus_um: float
     zones: int
+    cells: bool
     score: Score
     starts: tuple[tuple[float, float], ...]
     converged: bool
@@ -57,14 +60,31 @@ def fisher_profile(
     pupil = design_pupil(focus, radius_um)
     found = optimise(pupil, settings, objective=objective)
     base = Focus(focus.wavelength_um, focus.sensor_distance_um, found.focus_um)
-    controls = found.controls.numpy()
+    extra = free_form(found.controls.numpy(), pupil, cells=found.cells)
 
     def phase(x_um: Array, y_um: Array) -> Array:
-        across, down = (spline(a / radius_um, len(controls)) for a in (x_um, y_um))
-        smooth = hyperbolic(x_um, y_um[:, None], base) + down @ controls @ across.T
+        smooth = hyperbolic(x_um, y_um[:, None], base) + extra(x_um, y_um)
         return np.asarray(smooth + vortices(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones))
 
     return phase, found
+
+
+def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
+    """The free-form part as a function of position: a spline of its controls, or one value a node of the pupil."""
+
+    def smooth(x_um: Array, y_um: Array) -> Array:
+        across, down = (spline(a / pupil.radius_um, len(controls)) for a in (x_um, y_um))
+        return np.asarray(down @ controls @ across.T)
+
+    def stepped(x_um: Array, y_um: Array) -> Array:
+        path = np.sqrt(x_um**2 + y_um[:, None] ** 2 + pupil.sensor_distance_um**2)
+        scale, middle, last = pupil.nodes / (2 * pupil.edge), (pupil.nodes - 1) / 2, pupil.nodes - 1
+        row, column = (
+            np.clip(np.rint(a / path * scale + middle), 0, last).astype(np.intp) for a in (y_um[:, None], x_um)
+        )
+        return np.asarray(controls[row, column])
+
+    return stepped if cells else smooth
 
 
 def design_pupil(focus: Focus, radius_um: float) -> Pupil:
@@ -108,7 +128,7 @@ def optimise(pupil: Pupil, settings: Fisher, *, objective: Objective | None = No
 
 def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
     """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus."""
-    return _Phase(pupil, len(made.controls), made.zones)(made.controls)
+    return _Phase(pupil, 0 if made.cells else len(made.controls), made.zones)(made.controls)
 
 
 def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
@@ -158,7 +178,11 @@ def _climb(
     total, done, margin = settings.iterations, 0, 0.01
     best = _Best(objective, settings, focus_um)
     for grid, count in zip(settings.grids, _shares(settings), strict=True):
-        controls = (_refined(controls, grid) if len(controls) != grid else controls).requires_grad_(True)
+        if grid == 0:
+            controls = _Phase(pupil, len(controls), 0)(controls)
+        elif len(controls) != grid:
+            controls = _refined(controls, grid)
+        controls = controls.detach().requires_grad_(True)
         build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=RATE, betas=(0.9, 0.99))
         for _ in range(count):
             for group in step.param_groups:
@@ -182,22 +206,25 @@ def _climb(
     if best.controls is None or best.score is None:
         raise ConfigError("no iterate was judged")
     reason = "encircled energy kept at every depth" if best.rank[0] else "encircled energy missed: raise iterations"
-    return FisherPhase(best.controls, focus_um, zones, best.score, (), best.rank[0], reason)
+    return FisherPhase(best.controls, focus_um, zones, settings.grids[-1] == 0, best.score, (), best.rank[0], reason)
 
 
 def _shares(settings: Fisher) -> list[int]:
     """Iterations of every stage: in proportion to its grid, at least one."""
-    whole = sum(settings.grids)
+    whole = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
     early = [max(1, settings.iterations * grid // whole) for grid in settings.grids[:-1]]
     return [*early, max(1, settings.iterations - sum(early))]
 
 
 class _Phase:
-    """Spline coefficients to the phase on the pupil's nodes, a sparse product."""
+    """Controls to the phase on the pupil's nodes: a sparse product for a spline, themselves for a grid of 0."""
 
     def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:
         px, py = (a.numpy() for a in pupils.coordinates(pupil))
         self.base = torch.from_numpy(vortices(px, py, radius_um=pupil.radius_um, zones=zones))
+        self.matrix: Tensor | None = None
+        if grid == 0:
+            return
         x, y = px.ravel() / pupil.radius_um, py.ravel() / pupil.radius_um
         across, down = spline(x, grid), spline(y, grid)
         rows, columns, values = [], [], []
@@ -211,6 +238,8 @@ class _Phase:
         self.matrix = torch.sparse_coo_tensor(index, entries, (len(x), grid * grid), check_invariants=True)
 
     def __call__(self, controls: Tensor) -> Tensor:
+        if self.matrix is None:
+            return self.base + controls
         phase: Tensor = torch.sparse.mm(self.matrix, controls.reshape(-1, 1)).reshape(self.base.shape)
         return self.base + phase
 

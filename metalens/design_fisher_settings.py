@@ -35,8 +35,9 @@ class Fisher:
         pitch for 2 x 2 or 3 x 3 binning.
     encircled: least share of the light inside ``radius_um`` of the axis, at every depth; 0 leaves it free.
     focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread between them.
-    grids: control points across the aperture, stage by stage. iterations: of all stages, shared in proportion to their
-        grids. starts: tried.
+    grids: control points across the aperture, stage by stage; 0 as the last for one free value a node of the pupil
+        (cells of about 6 um), which sends light away best where the energy allows it.
+    iterations: of all stages, shared in proportion to their grids. starts: tried.
     zones: rings of the double helix that the starts begin from, in turn; 0 for none.
     spread_rad: deviation of the random start (a tenth of it on a double helix).
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth), 0 the logarithm of its mean.
@@ -53,7 +54,7 @@ class Fisher:
     encircled: float = 0.5
     radius_um: float = 18.0
     focus_mm: tuple[float, float] = (18.0, 22.0)
-    grids: tuple[int, ...] = (10, 24, 64)
+    grids: tuple[int, ...] = (10, 0)
     iterations: int = 400
     starts: int = 2
     zones: tuple[int, ...] = (0, 2)
@@ -74,9 +75,11 @@ class Fisher:
                 f"encircled = {self.encircled}, radius_um = {self.radius_um}, pixel_um = {self.pixel_um}: need a share "
                 f"below 1, a radius above 0, and pixels of at least {3 * SAMPLE_UM} um"
             )
-        if self.starts < 1 or self.iterations < 1 or not self.grids or min(self.grids) < 4:
+        fine = (*self.grids[:-1], self.grids[-1] or 4) if len(self.grids) > 1 else self.grids
+        if self.starts < 1 or self.iterations < 1 or not fine or min(fine) < 4:
             raise ConfigError(
-                f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids of 4 or more"
+                f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids = {self.grids}: need 4 "
+                "or more each, or 0 as the last of several"
             )
         if self.refine < 0 or self.scenes < 1 or self.orthogonality < 0 or not self.zones:
             raise ConfigError(

@@ -5,7 +5,7 @@ A scene is two opaque sheets, each a surface of varying depth: the near sheet (l
 coverage, and the far one is continued behind it. Weights are divided by their sum, so constant radiance stays constant.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import scipy.fft
 import torch
@@ -202,6 +202,29 @@ def image(frames: Frames, optics: Imager, *, margin: int = 0, chunk: int = 2) ->
         blurred = blurred[..., margin : size[0] - margin, margin : size[1] - margin]
         out.append(_over(blurred[:, 0], blurred[:, 1]))
     return torch.cat(out)
+
+
+def spectra(frames: Frames, optics: Imager) -> Tensor:
+    """(rank, frames, light and coverage, sheets, Y, X // 2 + 1) spectra of the frames, weighted for every kernel.
+
+    They do not change with the kernels: for many images of the same frames, as in a design, see :func:`with_kernels`.
+    """
+    weights = weight_maps(optics.psf, frames.depth_um)
+    pair = torch.stack([frames.radiance, frames.coverage], 1)
+    spectrum: Tensor = torch.fft.rfft2(_padded(weights[:, :, None] * pair, optics.shape))
+    return spectrum
+
+
+def with_kernels(optics: Imager, kernels: Tensor) -> Imager:
+    """The same imager with other kernels (rank, h, w), differentiable in them."""
+    return Imager(replace(optics.psf, kernels=kernels), _transfer(kernels, optics.shape), optics.shape)
+
+
+def image_spectra(source: Tensor, optics: Imager, size: tuple[int, int]) -> Tensor:
+    """(frames, y, x) the image that :func:`image` gives, from :func:`spectra` of frames of ``size`` = (y, x) pixels."""
+    mixed = (source * optics.transfer[:, None, None, None]).sum(0)
+    blurred = torch.fft.irfft2(mixed, s=optics.shape)[..., : size[0], : size[1]]
+    return _over(blurred[:, 0], blurred[:, 1])
 
 
 def image_layers(layers: Layers, psfs: Tensor, *, margin: int = 0) -> Tensor:

@@ -1,9 +1,10 @@
 """DESIGN.toml to lens.h5: a hyperbolic, double-helix, cubic, Fisher or own phase made of printable pillars."""
 
+import importlib
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -121,9 +122,11 @@ def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf,
     if wanted.profile == "fisher":
         from metalens.design_fisher import fisher_profile
 
-        phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=wanted.fisher)
+        objective = _scene_objective(wanted, radius_um) if wanted.fisher.objective == "scenes" else None
+        phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=wanted.fisher, objective=objective)
         least, mean = float(found.score.encircled.min()), float(found.score.information.mean())
-        options.console.say(f"free form: I(z) {mean:.3f} /mm², encircled energy {least:.2f} or more; {found.reason}")
+        figure = f"I(z) {mean:.3f} /mm²" if objective is None else f"Eq. 6 {-mean:.3f} (0 without blur)"
+        options.console.say(f"free form: {figure}, encircled energy {least:.2f} or more; {found.reason}")
         return phase, replace(wanted.focus, source_distance_um=found.focus_um)
     shape: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
         "double-helix": wanted.double_helix,
@@ -131,6 +134,14 @@ def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf,
         "map": _located(wanted, options.config),
     }
     return design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um), wanted.focus
+
+
+def _scene_objective(wanted: Design, radius_um: float) -> Any:
+    """Eq. 6 on rendered eyes: named here, as the verbs are, and loaded only when asked for."""
+    from metalens.design_fisher import design_pupil
+
+    module = importlib.import_module("codesign.design_scenes")
+    return module.SceneObjective(design_pupil(wanted.focus, radius_um), wanted.fisher)
 
 
 def _pillars(wanted: Design, where: Path, console: Console) -> tuple[Cell, Proxy, dict[str, str]]:
