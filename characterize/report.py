@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from characterize.asbuilt import AsBuilt
+from characterize.leastsquares import invert
 from characterize.parameters import PARAMETERS, PLACE
 from characterize.pupilfit import PupilFit
 from metalens import report, store
@@ -102,7 +103,7 @@ def _intervals(result: AsBuilt) -> bytes:
     names = [result.names[i] for i in shown]
     unit = np.array([scale(name) for name in names])
     value, sigma = result.value[shown] / unit, result.sigma[shown] / unit
-    told = np.diag(np.linalg.pinv(result.covariance) - result.information)[shown]
+    told = np.diag(invert(result.covariance) - result.information)[shown]
     prior = np.maximum(told, 1e-12) ** -0.5 / unit
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()

@@ -21,6 +21,14 @@ def fit(shots, strength_rad=0.0, options=USUAL):
     return characterize.fit(shots, b.lens(strength_rad), options, response=b.RESPONSE)
 
 
+def fit_or_cause(shots):
+    """The fit, or the words of its refusal."""
+    try:
+        return fit(shots)
+    except FitError as refusal:
+        return str(refusal)
+
+
 def right(result, **more):
     """All fitted parameters within 4.5 sigma of the truth, and 2 sigma in the mean."""
     truth = b.VALUES | more
@@ -94,3 +102,88 @@ def test_a_repeated_frame_is_refused():
     shots = b.capture(b.electrons())
     with pytest.raises(FitError, match="repeated frame"):
         fit(frames_of(shots, shots.frames[[0, 1, 1, 3, 4]]))
+
+
+@pytest.mark.slow
+def test_a_frame_shifted_by_a_pixel_is_refused():
+    shots = b.capture(b.electrons())
+    moved = shots.frames.copy()
+    moved[2] = np.roll(moved[2], 1, 1)
+    with pytest.raises(FitError, match="shifted or repeated frame"):
+        fit(frames_of(shots, moved))
+
+
+@pytest.mark.slow
+def test_a_fifth_of_the_pixels_saturated_is_right_or_refused_by_name():
+    bright = b.electrons()
+    found = fit_or_cause(b.capture(bright, full_well=np.quantile(bright, 0.8)))
+    assert "of the pixels are saturated" in found if isinstance(found, str) else right(found)
+
+
+@pytest.mark.slow
+def test_turned_frames_of_an_asymmetric_lens_are_turned_back():
+    """x³ + y³ is the same after swapping x and y: a quarter turn is undone, a mirror image only said to be possible."""
+    shots = b.capture(b.electrons(strength_rad=8.0))
+    found = fit(frames_of(shots, np.rot90(shots.frames, 1, axes=(1, 2))), 8.0)
+    assert any("frames fit the design only turned by 270" in words for words in found.cautions)
+    assert any("mirrored" in words and "cannot be seen" in words for words in found.cautions)
+    assert right(found)
+
+
+@pytest.mark.slow
+def test_turned_frames_of_a_round_lens_are_declared():
+    shots = b.capture(b.electrons())
+    found = fit(frames_of(shots, np.rot90(shots.frames, 1, axes=(1, 2))))
+    assert any("turned by 90" in words and "cannot be seen" in words for words in found.cautions)
+
+
+@pytest.mark.slow
+def test_light_of_ten_nanometres_is_right_or_refused():
+    found = fit_or_cause(b.capture(b.electrons(bandwidth_nm=4.2)))  # 10 nm at half height
+    assert "chi-square" in found if isinstance(found, str) else right(found, bandwidth_nm=4.2)
+
+
+@pytest.mark.slow
+def test_psf_cropped_at_half_width_is_right():
+    shots = b.capture(b.electrons())
+    found = fit(frames_of(shots, shots.frames[:, :, 4:12]))
+    edges = {"background_x_e": 0.5 * b.VALUES["background_x_e"]}  # of the narrower window
+    assert right(found, **edges)
+
+
+@pytest.mark.slow
+def test_frames_of_a_cubic_lens_are_refused_for_a_plain_one():
+    with pytest.raises(FitError, match="another lens"):
+        fit(b.capture(b.electrons(strength_rad=8.0)))
+
+
+@pytest.mark.slow
+def test_a_ghost_is_refused():
+    bright = b.electrons()
+    with pytest.raises(FitError, match="ghost"):
+        fit(b.capture(bright + 0.08 * np.roll(bright - 20, (4, 3), (1, 2))))
+
+
+@pytest.mark.slow
+def test_a_pinhole_four_times_as_stated_is_right_or_refused():
+    shots = b.capture(b.electrons(pinhole_um=40.0))
+    found = fit_or_cause(dataclasses.replace(shots, about=shots.about | {"pinhole_um": 10.0}))
+    assert "chi-square" in found if isinstance(found, str) else right(found, pinhole_um=40.0)
+
+
+def test_exposures_of_one_depth_are_merged():
+    """A long exposure that clips and a short one of the same depth, stated as such, give what one good frame would."""
+    bright = b.electrons()
+    long, short = (b.capture(bright * time, seed=i, full_well=5000.0) for i, time in ((1, 2.0), (2, 0.5)))
+    shots = dataclasses.replace(
+        long,
+        frames=np.concatenate([long.frames, short.frames]),
+        position_um=np.tile(b.DEPTHS, 2),
+        angle_rad=np.zeros((10, 2)),
+        exposure_s=np.repeat([2.0, 0.5], 5),
+        names=tuple(f"{i}" for i in range(10)),
+    )
+    found = fit(shots)
+    assert len(found.measured) == 5
+    assert any("10 exposures merged to 5 frames" in words for words in found.cautions)
+    assert right(found, background_e=40.0, background_x_e=6.0)
