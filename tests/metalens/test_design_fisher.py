@@ -8,7 +8,12 @@ import torch
 
 from metalens import config
 from metalens import design_fisher as free
+from metalens import pupil as pupils
+from metalens.design_coarse import coarse_climb
 from metalens.design_fisher import Fisher
+from metalens.design_fisher_settings import Variation
+from metalens.design_mma import refine
+from metalens.design_objective import AxialObjective, Robust
 from metalens.errors import ConfigError
 from metalens.profiles import Focus
 from metalens.pupil import Pupil
@@ -59,6 +64,49 @@ def test_the_lens_phase_is_the_designed_one():
     extra = phase(x, x) - hyperbolic(x, x[:, None], Focus(0.85, 2000.0, found.focus_um))
     weights = free.spline(x / 300.0, 5)
     assert np.abs(extra - weights @ found.controls.numpy() @ weights.T).max() < 1e-9
+
+
+def test_the_phase_of_cells_is_that_of_the_nearest_node():
+    brief = Fisher(grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0)
+    found = free.optimise(SMALL, brief)
+    assert found.cells
+    x, y = (c.numpy() for c in pupils.coordinates(SMALL))
+    there = free.free_form(found.controls.numpy(), SMALL, cells=True)(x[20, 10:15] + 0.5, y[20:21, 12] - 0.5)
+    assert np.array_equal(there[0], found.controls.numpy()[20, 10:15])
+    assert torch.equal(free.phase_on(SMALL, found), found.controls)
+
+
+def test_nlopt_lowers_the_loss_and_holds_the_energy():
+    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12)
+    objective = AxialObjective(SMALL, settings)
+    build = free._Phase(SMALL, 6, 0)
+    start = 0.3 * torch.randn(6, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    better = refine(start, build, objective, settings, 20e3)
+    before, after = (objective.loss(build(c), 20e3, None) for c in (start, better))
+    assert float(after[0]) < float(before[0]) - 0.02
+    assert float(after[1].min()) > 0.6 - 2e-3
+    assert float(before[1].min()) > 0.6
+
+
+def test_a_design_for_the_process_judges_its_worst_lens():
+    settings = Fisher(encircled=0.0)
+    plain = AxialObjective(SMALL, settings)
+    flat = torch.zeros(136, 136, dtype=torch.float64)
+    still = Robust(plain, SMALL, Variation()).judge(flat, 20e3)
+    assert torch.allclose(still.information, plain.judge(flat, 20e3).information, rtol=1e-4)
+    moved = Robust(plain, SMALL, Variation(distance_um=40.0)).judge(flat, 20e3)
+    nominal = plain.judge(flat, 20e3)
+    assert bool((moved.encircled <= nominal.encircled + 1e-6).all())
+    # a sensor 40 um further off is in focus for nearer sources: 1/z = 1/f - 1/d puts 20 mm at 16.7 mm, and 25 mm
+    shifted = [plain.judge(flat, focus).encircled for focus in (20e3 / (1 + 0.2), 20e3 / (1 - 0.2))]
+    worst = torch.minimum(nominal.encircled, torch.minimum(*shifted))
+    assert float((moved.encircled - worst).abs().max()) < 0.08  # d changes by 2 %, and with it the blur's scale
+
+
+def test_coarse_sampling_at_one_position_claims_what_is_not_there():
+    """Read every 3 um at one position, a climb reaches three times the information that the lens really has."""
+    gain = coarse_climb(SMALL, iterations=40)
+    assert gain.claimed > 2.0 * gain.honest
 
 
 def test_impossible_wishes_are_refused():
