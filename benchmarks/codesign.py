@@ -3,6 +3,8 @@
 import math
 import shutil
 from dataclasses import replace
+from functools import partial
+from typing import get_args
 
 import numpy as np
 import torch
@@ -118,10 +120,8 @@ def _stages(threads: int, made: pool.Pool) -> list[Row]:
         return read_out(light, 9.0, pitch, SENSOR, generator=noise, exact=exact)
 
     render = fastest(lambda: SCENES.rendered(1, 8)) / 8
-    one, two = (
-        fastest(lambda f=f: irradiance(f, lens, margin=16)) / n for f, n in ((batch.frames, BATCH), (sheets, 8))
-    )
-    fast, slow = (fastest(lambda e=e: sensor(e)) / BATCH for e in (False, True))
+    one, two = (fastest(partial(irradiance, f, lens, margin=16)) / n for f, n in ((batch.frames, BATCH), (sheets, 8)))
+    fast, slow = (fastest(partial(sensor, e)) / BATCH for e in (False, True))
     return [
         Row("a frame of 160²: render", "once for a pool", render, NONE, "see topic scene", threads, goal=_rate(render)),
         Row("a frame: optics", "two sheets", two, 0.0, "itself", threads, goal=_rate(two)),
@@ -150,7 +150,7 @@ def _training(threads: int, made: pool.Pool) -> list[Row]:
         member = _member(width, depth)
         macs = float(cost.macs(member, 9.0, window_um=1152.0, space=SPACE)) / 1e6
         frozen, moving = (_trainer(made, member, live=live).run() for live in (False, True))
-        fixed, joint = (fastest(lambda s=steps: next(s), repeats=4) / BATCH for steps in (frozen, moving))
+        fixed, joint = (fastest(partial(next, steps), repeats=4) / BATCH for steps in (frozen, moving))
         alone, forward = _network_times(made, member)
         share = 1 - alone / fixed
         case = f"{macs:.1f} MMACs"
@@ -160,11 +160,11 @@ def _training(threads: int, made: pool.Pool) -> list[Row]:
             Row(case, "training step, lens fixed", fixed, NONE, "-", threads, goal=goal),
             Row(case, "training step, lens moving", joint, NONE, "-", threads, goal=_rate(joint)),
         ]
-    for name in ("nvgaze", "popovic", "de2gaze"):
-        net = baselines.make(name)  # type: ignore[arg-type]
+    for name in get_args(Name)[1:]:
+        net = baselines.make(name)
         macs = float(net.counts(_member(0.5, 2), np.array([128]))[0]) / 1e6
-        steps = _trainer(made, None, live=False, network=name).run()  # type: ignore[arg-type]
-        seconds = fastest(lambda s=steps: next(s)) / BATCH
+        steps = _trainer(made, None, live=False, network=name).run()
+        seconds = fastest(partial(next, steps)) / BATCH
         out.append(Row(f"{name}, {macs:.1f} MMACs", "training step", seconds, NONE, "-", threads, goal=_rate(seconds)))
     return out
 
@@ -194,9 +194,7 @@ def _compiled(threads: int) -> list[Row]:
     quick = torch.compile(lambda x: net(x, member).slip)
     with torch.no_grad():
         error = float((quick(frames) - net(frames, member).slip).abs().max())
-        eager, compiled = (
-            fastest(lambda f=f: f(frames), repeats=5) / 8 for f in (lambda x: net(x, member).slip, quick)
-        )
+        eager, compiled = (fastest(partial(f, frames), repeats=5) / 8 for f in (lambda x: net(x, member).slip, quick))
     return [
         Row("17 MMACs, forward", "eager", eager, 0.0, "itself", threads, goal=_rate(eager)),
         Row(

@@ -16,6 +16,23 @@ from metalens import report, store
 
 ROOT = Path(__file__).parents[1]
 Array = np.ndarray[Any, np.dtype[Any]]
+HEAD = """# Results of the study
+
+Mean absolute error of the axial slippage on 512 test frames in 256 pairs that share a pupil position. The depth of
+each frame is scaled to one that has nothing to do with its picture (by a factor within 1 +- 0.2); knowing nothing
+scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
+
+- `hyperF`: hyperbolic, focused at F mm (20 is mid-range). `helixN`: double helix of N zones, focused at 20 mm.
+- `jointF`, `swiftF`: trained with the network from `hyperF`, at two learning rates of the phase.
+- `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18dim`: 100. `p18small`: half the width.
+
+Ratios with 95 % intervals of a paired bootstrap over pairs of frames and over runs; with one seed, over frames alone.
+The best focus is the fixed hyperbolic lens of least error on natural frames. Made by
+`python -m benchmarks.codesign_study run --work DIR` and `python -m benchmarks.codesign_report --work DIR`.
+
+![axial error of every run](study.png)
+
+"""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -133,7 +150,6 @@ def figure(found: dict[str, list[dict[str, Any]]]) -> bytes:
         axes.set_yticks(range(len(mine)), [row["lens"] for row in mine])
         axes.set(xlabel="axial slippage error / mm (ambiguity set)", title=case, xlim=(0, None))
         axes.invert_yaxis()
-    canvas.tight_layout()
     return report.png(canvas)
 
 
@@ -148,7 +164,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     content = table(found, runs)
     store.write_text(ROOT / "benchmarks" / "results" / "codesign_study.json", json.dumps(found, indent=1) + "\n")
-    store.write_text(folder / "results.md", "# Results of the study\n\n" + content)
+    store.write_text(folder / "results.md", HEAD + content)
     store.write_bytes(folder / "study.png", figure(found))
     print(content)
 

@@ -13,7 +13,8 @@ from metalens import config
 from metalens.errors import TrainingError
 from metalens.store import replacing
 
-VERSION = 1
+VERSION = 2
+ABOUT = "about"
 _TENSOR = "\0tensor"
 
 
@@ -30,12 +31,8 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
     """
     tensors: dict[str, Tensor] = {}
     tree = _split(state, "", tensors)
-    metadata = {
-        "kind": "checkpoint",
-        "version": str(VERSION),
-        "state": json.dumps(tree),
-        "settings": config.dumps(settings),
-    }
+    about = {"kind": "checkpoint", "version": VERSION, "state": tree, "settings": config.dumps(settings)}
+    metadata = {ABOUT: json.dumps(about)}  # one entry: the file format does not keep the order of several
     with replacing(path) as part:
         try:
             save_file(tensors, str(part), metadata=metadata)
@@ -55,12 +52,12 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
         raise TrainingError(f"{path}: no checkpoint to resume from; start without --resume")
     try:
         with safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-            _check(path, metadata, settings)
+            about = _about(file.metadata() or {})
+            _check(path, about, settings)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError) as error:
         raise TrainingError(f"{path}: truncated or not a checkpoint ({error})") from error
-    merged: dict[str, Any] = _merge(json.loads(metadata["state"]), tensors)
+    merged: dict[str, Any] = _merge(about["state"], tensors)
     return merged
 
 
@@ -72,8 +69,16 @@ def difference(old: str, new: str) -> str:
     return "\n".join(f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed)
 
 
-def _check(path: Path, metadata: dict[str, str], settings: object) -> None:
-    if metadata.get("kind") != "checkpoint" or metadata.get("version") != str(VERSION):
+def _about(metadata: dict[str, str]) -> dict[str, Any]:
+    try:
+        about: dict[str, Any] = json.loads(metadata.get(ABOUT, "{}"))
+    except json.JSONDecodeError:
+        return {}
+    return about
+
+
+def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
+    if metadata.get("kind") != "checkpoint" or metadata.get("version") != VERSION:
         found = metadata.get("kind", "no kind"), metadata.get("version", "no version")
         raise TrainingError(f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}")
     changed = difference(metadata["settings"], config.dumps(settings))

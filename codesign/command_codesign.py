@@ -156,7 +156,7 @@ def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) ->
         name = settings.network if row["budget_mmacs"] is None else f"subnet_{row['budget_mmacs']:g}"
         with store.replacing(folder / f"{name}.safetensors") as part:
             tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
-            save_file(tensors, str(part), metadata={"kind": "subnet", "version": "1"})
+            save_file(tensors, str(part), metadata={"kind": "subnet"})
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [row for row, _ in ends]
     found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}

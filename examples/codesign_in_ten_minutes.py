@@ -46,7 +46,7 @@ for image, panel in zip(frames.light, axes, strict=False):
 
 # %%
 space = Space(widths=(0.25, 0.5), depths=(2,), expansions=(3,), kernels=(5,), resolution=(1.0, 1.0))
-member = Architecture((2,) * 5, (5,) * 10, (3,) * 10, 0.25, 1.0)
+member = Architecture((2,) * 5, (5,) * 10, (3,) * 10, 0.5, 1.0)
 for pitch in (12.0, 18.0, 24.0):
     macs = cost.macs(member, pitch, window_um=64 * 18.0, space=space)
     print(f"pitch {pitch:.0f} um: {float(macs) / 1e6:.2f} MMACs")
@@ -60,10 +60,10 @@ for pitch in (12.0, 18.0, 24.0):
 sensor = Sensor(18.0, 18.0, 4000.0, 0.0, 8000.0, 5.0, 10)
 
 
-def train(polynomials, steps=160):
+def train(polynomials, steps=320):
     lens = OpticsConfig(focus_mm=33.0, polynomials=polynomials, sample_um=18.0, window_samples=17, depth_count=14)
     moving = Schedule(0.03 if polynomials else 0.0, 0.1, 0.8)
-    config = InnerConfig(steps=steps, batch=32, optics=moving, optics_weight=0.0)
+    config = InnerConfig(steps=steps, batch=24, optics=moving, optics_weight=0.0)
     made = inner.model(lens, pitch_um=18.0, seed=0, space=space)
     trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
     losses = [record.task for record in trainer.run()]
@@ -83,7 +83,7 @@ plt.legend()
 # %% [markdown]
 # ## What they reach, and whether they read the optics
 # The last column moves the depth of the PSFs alone by 1 mm, geometry unchanged: a network that measures by blur follows,
-# one that guesses from sizes answers 0. 160 steps are few (the study in `docs/codesign` takes 800 and five seeds): expect
+# one that guesses from sizes answers 0. 320 steps are few (the study in `docs/codesign` takes 800 and five seeds): expect
 # a first sign of life here, no ranking.
 
 # %%

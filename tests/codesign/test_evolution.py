@@ -108,3 +108,18 @@ def test_the_uniform_network_fits_its_budget():
     for budget in (1e7, 5e7, 2e8):
         assert _count(evolution.within(SPACE, _count, budget)) <= budget
     assert dataclasses.replace(evolution.within(SPACE, _count, 1e12), width=1.0) == arch.largest(SPACE)
+
+
+def test_a_whole_search_is_the_end_of_its_states_and_public():
+    import codesign
+
+    plan = Plan(4, 2, 12)
+    assert codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1) == _run(plan)[-1].history
+
+
+def test_a_uniform_start_is_the_largest_uniform_network_within_the_budget():
+    budget = 20 * _count(arch.smallest(SPACE))
+    states = list(evolution.evolve(SPACE, Plan(1, 1, 1), _distance, _count, budget=budget, seed=1, uniform=True))
+    (only,) = states[-1].history
+    assert only.architecture == evolution.within(SPACE, _count, budget)
+    assert len(set(only.architecture.kernels)) == 1

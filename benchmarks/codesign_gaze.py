@@ -1,0 +1,88 @@
+"""Gaze of the runs of the co-design study: population eye, own eye, personal calibration on 20 % of the points.
+
+python -m benchmarks.codesign_gaze --work DIR [--case p9]      # writes benchmarks/results/codesign_gaze.json
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+
+from benchmarks.codesign_study import CASES, SCENES, SPACE, architecture_of, optics_of, scenes_of
+from codesign import assess, gaze_test, inner
+from codesign.eye_scenes import TEST
+from codesign.flat import flattened
+from codesign.gaze_test import People
+from codesign.inner import InnerConfig, Trainer
+from codesign.inner_batch import Batch
+from metalens.sensor import Sensor
+
+ROOT = Path(__file__).parents[1]
+PEOPLE, EACH, BATCH = 16, 40, 32
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rendered:
+    """The frames of the people as one surface each, rendered once."""
+
+    batches: list[Batch]
+    margin: int = SCENES.margin
+    stream: int = 7
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Frames of a step."""
+        return self.batches[step]
+
+
+def rendered(test: People) -> Rendered:
+    """All frames of the people."""
+    out = []
+    for step in range(PEOPLE * EACH // BATCH):
+        batch = test.batch(step, BATCH)
+        one = flattened(batch.frames, torch.ones(BATCH))  # type: ignore[arg-type]
+        out.append(Batch(one, batch.mask, batch.slip_mm))
+    return Rendered(out)
+
+
+def gaze_of(work: Path, name: str, coefficients: list[float], test: People, frames: Rendered) -> dict[str, Any]:
+    """Gaze errors of one run of the study."""
+    case_name, lens, _ = name.split("/")
+    case, (optics, _) = CASES[case_name], optics_of(lens)
+    made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE)
+    made.net.load_state_dict(load_file(work / (name.replace("/", "-") + ".safetensors")))
+    with torch.no_grad():
+        made.coefficients_rad.copy_(torch.tensor(coefficients, dtype=torch.float64))
+    sensor = Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
+    trainer = Trainer(InnerConfig(batch=BATCH), optics, sensor, frames, made)
+    seen = assess.frames(trainer, frames, len(frames.batches))
+    answers = assess.predict(made.net, architecture_of(case.width), seen, trainer.inner)
+    return {"run": name, **asdict(gaze_test.gaze_errors(test, answers.centre, answers.slip_mm))}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--case", default="p9")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    test = gaze_test.people(scenes_of(TEST), PEOPLE, EACH, seed=5)
+    frames = rendered(test)
+    rows = []
+    for text in (options.work / "runs.jsonl").read_text(encoding="utf-8").splitlines():
+        line = json.loads(text)
+        if line["run"].startswith(options.case + "/") and not line.get("skipped"):
+            rows.append(gaze_of(options.work, line["run"], line["coefficients_rad"], test, frames))
+            print(json.dumps(rows[-1]), flush=True)
+    target = ROOT / "benchmarks" / "results" / "codesign_gaze.json"
+    target.write_text(
+        json.dumps({"people": PEOPLE, "frames_each": EACH, "rows": rows}, indent=1) + "\n", encoding="utf-8"
+    )
+
+
+if __name__ == "__main__":
+    main()
