@@ -18,7 +18,8 @@ from metalens.errors import StoreError
 Array = np.ndarray[Any, np.dtype[Any]]
 Attribute = str | int | float | bool
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
-_SEAL, _BLOCK = b"metalens-toolchain sha256 ", 512  # the user block that HDF5 leaves to its writer
+_FORMAT = ("v110", "v110")  # of HDF5: every block of metadata carries a checksum, files can still be edited
+_SMALL = 4096  # bytes of an array that is kept in its header, under the checksum of the header
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 
@@ -113,16 +114,10 @@ def save(
         OSError: the target cannot be written (the old file stays).
     """
     with replacing(path) as part:
-        with h5py.File(part, "w", track_order=False, userblock_size=_BLOCK) as file:
-            file.attrs["kind"] = kind
-            file.attrs["version"] = version
-            file.attrs["units"] = "um, rad"
-            for name, value in sorted((attributes or {}).items()):
-                file.attrs[name] = value
-            for name in sorted(arrays):
-                _write_array(file, name, np.asarray(arrays[name]), compress)
-            _write_provenance(file, provenance or Provenance())
-        _seal(part)
+        try:
+            _write(part, kind, version, attributes or {}, arrays, provenance or Provenance(), compress)
+        except RuntimeError as error:  # the HDF5 library, when a full disk shows only at the closing of the file
+            raise OSError(f"{path}: cannot be written: {error}") from error
 
 
 def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stored:
@@ -131,7 +126,8 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stor
     Args:
         kind: the kind that is needed; None takes any (``metalens info``).
 
-    What was written is checked against its checksum: a file that changed since is refused, not read wrongly.
+    Arrays and header are under checksums of HDF5: a file that was cut or damaged is refused, not read wrongly, and one
+    that was edited with an HDF5 library is read as it now stands.
 
     Raises:
         StoreError: no such file, not HDF5, truncated, damaged, or of another kind or version; also where an entry
@@ -141,7 +137,6 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stor
     if not path.is_file():
         raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
     try:
-        _check_seal(path)
         with h5py.File(path, "r") as file:
             return _read(path, file, kind, version)
     except StoreError:
@@ -151,7 +146,7 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stor
 
 
 def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored:
-    found = file.attrs.get("kind")
+    found = _plain(file.attrs.get("kind"))
     if found is None:
         raise StoreError(f"{path}: an HDF5 file without 'kind', not made by this toolchain")
     if kind is not None and (found != kind or int(file.attrs["version"]) != version):
@@ -183,56 +178,68 @@ class _Held(dict[str, Any]):
         raise StoreError(f"{self.path}: holds no {name!r}; made by another release or damaged: make it again")
 
 
-def _seal(path: Path) -> None:
-    """Put the SHA-256 of everything behind the user block into it."""
-    digest = _digest(path)
-    with open(path, "rb+") as file:
-        file.write((_SEAL + digest.encode() + b"\n").ljust(_BLOCK, b"\0"))
-
-
-def _check_seal(path: Path) -> None:
-    """Refuse a sealed file that changed; files without a seal (of other programs) are left to the HDF5 library."""
-    with open(path, "rb") as file:
-        head = file.read(_BLOCK)
-    if head.startswith(_SEAL) and head[len(_SEAL) : len(_SEAL) + 64] != _digest(path).encode():
-        raise StoreError(f"{path}: truncated or damaged: it does not match its own checksum; copy or make it again")
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        file.seek(_BLOCK)
-        total = hashlib.sha256()
-        while part := file.read(1 << 20):
-            total.update(part)
-    return total.hexdigest()
+def _write(
+    path: Path,
+    kind: str,
+    version: int,
+    attributes: Mapping[str, Attribute],
+    arrays: Mapping[str, Array],
+    provenance: Provenance,
+    compress: bool,
+) -> None:
+    with h5py.File(path, "w", track_order=False, libver=_FORMAT) as file:
+        header: dict[str, Attribute] = {"kind": kind, "version": version, "units": "um, rad"}
+        for name, value in (header | dict(sorted(attributes.items()))).items():
+            _write_attribute(file, name, value)
+        for name in sorted(arrays):
+            _write_array(file, name, np.asarray(arrays[name]), compress)
+        _write_provenance(file, provenance)
 
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
     if array.dtype.kind == "U":
-        file.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype(), track_times=False)
-    elif compress and array.nbytes > 65536:
-        file.create_dataset(name, data=array, track_times=False, compression="gzip", compression_opts=1, shuffle=True)
+        encoded = np.char.encode(array, "utf-8")
+        array = encoded.astype(h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1)))
+    if array.nbytes <= _SMALL:
+        inside = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        inside.set_layout(h5py.h5d.COMPACT)
+        file.create_dataset(name, data=array, track_times=False, dcpl=inside)
+        return
+    packing = (
+        {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compress and array.nbytes > 65536 else {}
+    )
+    file.create_dataset(name, data=array, track_times=False, chunks=True, fletcher32=True, **packing)
+
+
+def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
+    """Text goes in at its own length, inside the header; text of any length would lie apart, without a checksum."""
+    if isinstance(value, str):
+        encoded = value.encode()
+        item.attrs.create(name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1)))
     else:
-        file.create_dataset(name, data=array, track_times=False)
+        item.attrs[name] = value
 
 
 def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
     group = file.create_group("provenance")
-    group.attrs["config"] = provenance.config
-    group.attrs["seed"] = provenance.seed
+    _write_attribute(group, "config", provenance.config)
+    _write_attribute(group, "seed", provenance.seed)
     for part in ("inputs", "versions"):
         entries = group.create_group(part)
         for name, value in sorted(getattr(provenance, part).items()):
-            entries.attrs[name] = value
+            _write_attribute(entries, name, value)
 
 
 def _read_provenance(file: h5py.File) -> Provenance:
     group = file["provenance"]
-    inputs, versions = ({k: str(v) for k, v in group[part].attrs.items()} for part in ("inputs", "versions"))
-    return Provenance(str(group.attrs["config"]), inputs, int(group.attrs["seed"]), versions)
+    inputs, versions = ({k: str(_plain(v)) for k, v in group[p].attrs.items()} for p in ("inputs", "versions"))
+    return Provenance(str(_plain(group.attrs["config"])), inputs, int(group.attrs["seed"]), versions)
 
 
 def _plain(value: Any) -> Any:
+    """A number or text of Python."""
+    if isinstance(value, bytes):
+        return value.decode()
     return value.item() if isinstance(value, np.generic) else value
 
 
