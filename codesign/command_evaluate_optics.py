@@ -12,10 +12,14 @@ import tyro
 from codesign import evaluate_optics, evaluate_plots, evaluate_tables
 from codesign.dataset import states_at
 from codesign.evaluate_optics import Scenes, Setting
-from metalens import config, store
+from metalens import baselines, config, design, store
 from metalens import lens as lenses
 from metalens.commands import Common, Output
+from metalens.design_fisher import design_pupil
+from metalens.design_fisher_settings import Fisher
 from metalens.errors import ConfigError
+from metalens.lens import Lens
+from metalens.profiles import Focus
 from metalens.report import Figure, Markup, Section, write
 
 
@@ -39,12 +43,15 @@ class Options(Common):
         output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
         config: OPTICS.toml with the tables [axial] and [scenes]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.
+        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
+            and at the aperture of the first lens; tuned on axis for the finest binning.
     """
 
     lenses: tyro.conf.Positional[tuple[Path, ...]]
     output: Output = Path("optics")
     config: Path | None = None
     scenes: int | None = None
+    baselines: bool = False
 
 
 def run(options: Options) -> int:
@@ -57,6 +64,10 @@ def run(options: Options) -> int:
     made = [lenses.load(path) for path in options.lenses]
     names = distinct([path.stem for path in options.lenses])
     folder = options.claim(options.output)
+    if options.baselines:
+        for name, lens in tuned_like(made[0], settings.axial):
+            names.append(name)
+            made.append(lens)
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
     axial = {name: evaluate_optics.axial(lens, settings.axial) for name, lens in pairs}
@@ -81,6 +92,27 @@ def run(options: Options) -> int:
     )
     options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html")
     return 0
+
+
+def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
+    """The tuned hyperbolic lens and double helix, of the pillars and aperture of a lens, with their names."""
+    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
+    wanted = Fisher(
+        depths_mm=setting.depths_mm,
+        pixel_um=setting.pixel_um * min(setting.binnings),
+        radius_um=setting.radius_um,
+        normalisation="sum" if setting.normalisation == "sum" else "l2",
+    )
+    out = []
+    for found in baselines.tuned_pair(design_pupil(focus, radius), wanted):
+        phase, mine = found.phase(focus, radius_um=radius)
+        kind = "double-helix" if found.zones else "hyperbolic"
+        simple, _ = design.make(
+            phase, mine, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind
+        )  # fmt: skip
+        out.append((found.name, simple))
+    return out
 
 
 def distinct(names: list[str]) -> list[str]:
