@@ -62,6 +62,16 @@ def test_preset_fills_what_the_file_leaves_out(settings):
     assert settings.inner.weights.rate == 4e-3  # default
 
 
+@pytest.mark.parametrize("name", ["smoke", "laptop", "paper"])
+def test_every_preset_is_a_valid_run_whose_psfs_fit_its_margin(tmp_path, name):
+    (tmp_path / "run.toml").write_text(f'preset = "{name}"')
+    found = run.load(tmp_path / "run.toml")
+    assert found.preset == name
+    assert found.scenes.margin >= found.optics.window_samples // 2
+    side = found.scenes.pixels + 2 * found.scenes.margin
+    assert found.scenes.pool * side**2 * 3 < 4e9  # bytes of the pool
+
+
 def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(settings, tmp_path):
     whole = run.start(settings)
     rows = _end(whole, tmp_path / "whole")
