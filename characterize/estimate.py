@@ -68,6 +68,8 @@ def fit(
     found = arrange(model, data, scan_um=scan, start=start)
     _check_likeness(found, lens)
     cautions = [*frames.corrections, *_arranged_words(found)]
+    if model.response.error > 0.1:
+        cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     data = _rearranged(data, found)
     names, solution = _search(model, data, start, known, found, options)
     if not _explained(solution) and not set(MORE) <= set(names):

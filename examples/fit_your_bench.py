@@ -19,7 +19,7 @@ from characterize.bench import Camera, Truth
 from characterize.capture import Capture
 from characterize.estimate import Options, fit
 from characterize.parameters import Known
-from characterize.pillars import sensitivity
+from characterize.slopes import slopes
 from metalens import design, profiles
 from metalens.cell import Cell
 from metalens.proxy import Proxy
@@ -47,7 +47,7 @@ truth = Truth(
     parameter=tuple(Known(name, value) for name, value in hidden.items()),
     camera=Camera(pixel_um=1.5, pixels=16),
 )
-shots = bench.shoot(lens, truth, sensitivity(lens))
+shots = bench.shoot(lens, truth, slopes(lens))
 depths, angles = truth.stated
 unknown = np.full(len(depths), np.nan)
 names = tuple(f"frame {i}" for i in range(len(depths)))
