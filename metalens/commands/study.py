@@ -27,8 +27,9 @@ class Options(Common):
 def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
     study = Study() if options.config is None else config.load(options.config, Study)
-    if (options.output / "cell_study.json").exists() and not options.force:
-        raise ConfigError(f"{options.output} holds a study; give --force to overwrite it")
+    target = options.output
+    if target.exists() and (not target.is_dir() or any(target.iterdir())) and not options.force:
+        raise ConfigError(f"{target} is not empty; give --force to overwrite what it holds")
     if not options.output.parent.is_dir():
         raise ConfigError(f"{options.output}: folder {options.output.parent} does not exist")
     verdicts = cell_study.run(study, options.console)
