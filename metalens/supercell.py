@@ -229,7 +229,7 @@ class Neighbours:
         return np.asarray(1 + self.a * s + self.b * s**2)
 
 
-def neighbours(lens: Lens, *, counts: tuple[int, ...] = (8, 6, 5), harmonics: int = 3) -> Neighbours:
+def neighbours(lens: Lens, *, counts: tuple[int, ...] = (6, 5), harmonics: int = 3) -> Neighbours:
     """How far unlike neighbours change the pillars of this lens: blazed rows of its own pillars, both polarisations.
 
     A row of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N pitch), as the lens does where
