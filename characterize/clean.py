@@ -121,6 +121,7 @@ def saturation_level(capture: Capture) -> float:
     plateau = int((frames == frames.max()).sum())
     near = int((frames >= 0.98 * highest).sum())
     clipped = plateau >= 4 and plateau > 0.5 * near and highest > float(np.median(frames)) + 16
+    clipped |= plateau > 0.05 * frames.size and highest > float(np.median(frames)) + 2  # no light is so even
     return highest if clipped else float(capture.full_scale)
 
 
