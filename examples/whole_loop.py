@@ -1,0 +1,137 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation: {extension: .py, format_name: percent}
+# ---
+
+# %% [markdown]
+# # The whole loop on a small lens
+# Design a lens and a network that reads the eye through it; draw the mask; let a virtual fab make it wrong; measure it
+# on a virtual bench; fit what was made; train the network on for it; and correct the next mask. Every step is a command
+# with the same name; here they are called as functions, on a lens of 0.2 mm so that it takes a minute or two.
+
+# %%
+import tempfile
+import tomllib
+from pathlib import Path
+
+from IPython.display import Image, display
+
+from characterize import asbuilt, bench, command_capture
+from characterize import capture as captures
+from characterize.bench import Camera, Truth
+from characterize.estimate import Options, fit
+from characterize.parameters import Known
+from characterize.pillars import sensitivity
+from codesign import built, correction, retrain_report, retraining
+from codesign.retraining import RetrainConfig
+from metalens import lens as lenses
+from metalens.cli import main
+
+work = Path(tempfile.mkdtemp())
+
+# %% [markdown]
+# ## 1. Co-design
+# A run file over the preset `smoke`: one small network before a hyperbolic lens. (A minute of training reads the pupil and the sideways slip; the distance takes some twenty
+# minutes: see the preset `laptop`.)
+
+# %%
+(work / "run.toml").write_text("""
+preset = "smoke"
+checkpoint_every = 100
+test_batches = 4
+[scenes]
+pixels = 48
+margin = 4
+pool = 256
+[optics]
+aperture_mm = 0.2
+sensor_distance_mm = 1.0
+sample_um = 12.0
+polynomials = 0
+depth_count = 6
+window_samples = 9
+[space]
+widths = [0.25]
+expansions = [3]
+kernels = [3]
+resolution = [1.0, 1.0]
+[inner]
+steps = 60
+[search]
+population = 2
+tournament = 1
+rounds = 2
+[run]
+pitch_um = 12.0
+budgets_mmacs = [4.0]
+""")
+main(["codesign", str(work / "run.toml"), "-o", str(work / "run"), "--quiet"])
+design = lenses.load(work / "run" / "lens.h5")
+print(f"{(design.diameters.diameter_um > 0).sum():,} pillars")
+
+# %% [markdown]
+# ## 2. The mask
+# Written, checked against the design rules and read back.
+
+# %%
+process = Path("process.toml").resolve()
+main(["layout", str(work / "run" / "lens.h5"), "--process", str(process), "-o", str(work / "mask"), "--oasis"])
+
+# %% [markdown]
+# ## 3. What the fab made, and its captures
+# Pillars 5 nm too wide, more so at the rim; some coma; the sensor 12 um too far away. The fit knows none of this.
+
+# %%
+hidden = {"bias_nm": 5.0, "bias_r_nm": 3.0, "coma_x_rad": 0.3, "distance_um": 12.0}
+truth = Truth(
+    (2500.0, 3200.0, 4200.0, 6000.0, 10e3, 20e3),
+    parameter=tuple(Known(name, value) for name, value in hidden.items()),
+    camera=Camera(pixel_um=2.0, pixels=32),
+)
+shots = bench.shoot(design, truth, sensitivity(design))
+command_capture.write(work / "captures", shots, truth, design)
+
+# %% [markdown]
+# ## 4. The lens as built
+# With intervals, and with what cannot be told apart.
+
+# %%
+made = fit(captures.load(work / "captures"), design, Options())
+for name in hidden:
+    low, high = made.interval(name)
+    print(f"{name:<14} true {hidden[name]:6.2f}   fitted {low:7.2f} to {high:7.2f}")
+print("\n".join(made.degeneracies))
+asbuilt.save(work / "asbuilt.h5", made)
+
+# %% [markdown]
+# ## 5. The network trained on for it
+# Training draws lenses from the posterior of the fit. `before` is the network that nobody warned.
+
+# %%
+told = retraining.retrain(
+    work / "run", made, config=RetrainConfig(steps=20, draws=3, judge=1, test_batches=4), truth=truth
+)
+for name, row in told.rows().items():
+    print(
+        f"{retrain_report.CASES[name]:<38} {row['slip_mm']:.3f} mm  [{row['slip_low_mm']:.3f}, {row['slip_high_mm']:.3f}]"
+    )
+display(Image(retrain_report.bars(told)))
+
+# %% [markdown]
+# ## 6. The next mask
+# A new bias table and a corrected map, and what they would gain on the true lens.
+
+# %%
+settings = retraining.load(work / "run").settings
+engine = built.MadeLens(design, settings.optics)
+plan = correction.propose(design, made.parameters(), response=engine.response, old=correction.present_bias(process))
+correction.write(work, plan)
+print(tomllib.loads((work / "bias.toml").read_text())["bias"]["table_nm"][::4])
+goal = engine.stack()
+for state in correction.next_lenses(engine, plan, made.parameters(), truth.vector()):
+    print(f"{state.name:<26} PSF error {built.psf_error(state.stack, goal):.3f}   Strehl {state.strehl:.3f}")
+
+# %% [markdown]
+# From the shell, the last two steps are one command, with its own report:
+# `metalens retrain run --asbuilt asbuilt.h5 --truth truth.toml --process process.toml -o retrained`
