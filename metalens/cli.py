@@ -1,7 +1,8 @@
 """The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails its own check, 2 on bad input.
 
 A verb lives beside its stage, as a frozen dataclass of its options and a function ``run(options) -> int``; only
-the verb that is asked for is imported. A module with a table ``PARTS`` in place of them has verbs of its own.
+the verb that is asked for is imported. A module with a table ``PARTS`` in place of them has verbs of its own; its
+``part_of(word)`` may name the one that a path is meant for.
 """
 
 import importlib
@@ -77,10 +78,11 @@ def _dispatch(verb: str, words: list[str]) -> int:
         if not words or words[0] in ("-h", "--help"):
             sys.stdout.write(_help(parts, f"metalens {verb}"))
             return SUCCESS if words else BAD_INPUT
-        if words[0] not in parts:
+        meant = words[0] if words[0] in parts else module.part_of(words[0])
+        if meant is None:
             return _refuse(f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}")
-        module = importlib.import_module(parts[words[0]][0])
-        verb, words = f"{verb} {words[0]}", words[1:]
+        module = importlib.import_module(parts[meant][0])
+        verb, words = f"{verb} {meant}", words[words[0] in parts :]
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
     return int(module.run(options))
 

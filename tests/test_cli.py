@@ -45,6 +45,14 @@ def test_verb_with_verbs_of_its_own_lists_them():
     assert "did you mean 'optics'?" in run("evaluate", "opticz").stderr
 
 
+def test_evaluate_takes_lens_files_and_run_folders_as_they_are(tmp_path):
+    lens = run("evaluate", str(tmp_path / "absent.h5"))
+    assert (lens.returncode, "no such file" in lens.stderr) == (cli.BAD_INPUT, True)
+    folder = run("evaluate", str(tmp_path), "-o", str(tmp_path / "out"))
+    assert folder.returncode == cli.BAD_INPUT
+    assert str(tmp_path) in folder.stderr
+
+
 def test_version():
     assert run("--version").stdout.startswith("metalens ")
 
