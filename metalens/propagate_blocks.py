@@ -21,6 +21,8 @@ LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  #
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
 ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding of the path itself
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
+PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
+TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
 CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 
 
@@ -99,9 +101,10 @@ def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float
     bases = Blocks(case.shape[axis], length, length).middles_um(case.pitch_um)
     middles = bases[[0, len(bases) // 2, -1], None, None]
     across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
-    line = middles + legendre.nodes(48)[0] * (length - 1) / 2 * case.pitch_um
+    line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * case.pitch_um
     values = kernel(line, across) if axis == 0 else kernel(across, line)
-    return Blocks(case.shape[axis], length, min(max(legendre.needed(values, tolerance), 2), length))
+    count = max(legendre.needed(values, tolerance), 2)
+    return Blocks(case.shape[axis], length, length if count > PROBES else min(count, length))
 
 
 def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
@@ -150,12 +153,22 @@ class Carrier:
 
     def table(self, start: int, stop: int, dtype: Any) -> Array:
         """(block, chunk, order, column) coefficients of block rows start to stop; whole turns are left out."""
-        middles = self.rows.middles_um(self.case.pitch_um)[start:stop, None, None]
+        order, columns = ORDER[np.dtype(dtype).itemsize], self.case.shape[1]
+        chunks = -(-columns // self.chunk)
+        out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
+        for first in range(start, stop, TABLE_ROWS):
+            some = slice(first, min(first + TABLE_ROWS, stop))
+            found = self._coefficients(some, order)
+            padded = np.zeros((*found.shape[:2], chunks * self.chunk), dtype)
+            padded[..., :columns] = found
+            parts = padded.reshape(*found.shape[:2], chunks, self.chunk)
+            out[some.start - start : some.stop - start] = parts.swapaxes(1, 2)
+        return out
+
+    def _coefficients(self, some: slice, order: int) -> Array:
+        """(block, order, column) float64 of some block rows."""
+        middles = self.rows.middles_um(self.case.pitch_um)[some, None, None]
         half = (self.rows.length - 1) / 2 * self.case.pitch_um
-        order, x = ORDER[np.dtype(dtype).itemsize], self.case.pillars_um[1]
-        found = _powers(self.case, self.reference, (middles, half), x, order)
+        found = _powers(self.case, self.reference, (middles, half), self.case.pillars_um[1], order)
         found[:, 0] -= np.rint(found[:, 0])
-        chunks = -(-self.case.shape[1] // self.chunk)
-        padded = np.zeros((*found.shape[:2], chunks * self.chunk), dtype)
-        padded[..., : found.shape[2]] = found
-        return np.ascontiguousarray(padded.reshape(*found.shape[:2], chunks, self.chunk).swapaxes(1, 2))
+        return found

@@ -2,8 +2,8 @@
 
 The moments of the lens are taken to a few orders more than the method uses. From those, the field at sampled points is
 summed directly over lens nodes in float64, without depth basis, directions or correction terms; the difference in
-intensity is the error of everything but rounding at the pillars, which is modelled, and the interpolation inside
-blocks of pillars, which is kept far below the tolerance. Points are drawn by intensity and by its root, more at the
+intensity is the error of everything but rounding at the pillars and the interpolation inside blocks of pillars, which
+are modelled as noise of the pillars. Points are drawn by intensity and by its root, more at the
 edges of tiles.
 """
 
@@ -32,7 +32,7 @@ class Sample:
     """One wavelength of a result to be judged.
 
     weight: of its intensity; field: (depth, y, x) complex; moments: (m + MORE, n + MORE) complex128 of the lens;
-    noise: standard deviation of the field from rounding at the pillars; parts: tiles along each axis.
+    noise: standard deviation of the field from rounding and interpolation at the pillars; parts: tiles along each axis.
     """
 
     case: Case

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from metalens import legendre
-from metalens.propagate_blocks import CHUNK, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
+from metalens.propagate_blocks import CHUNK, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
 from metalens.propagate_case import Case
 from metalens.propagate_kernels import gather, spread
 from metalens.store import Array
@@ -45,10 +45,11 @@ class Moments:
 
     @property
     def panels(self) -> list[slice]:
-        """Block rows that are handled at once, so that their nodes stay below ``KEEP_BYTES``."""
+        """Block rows that are handled at once, so that their nodes and their carrier stay below ``KEEP_BYTES``."""
         rows, columns = self.blocks
-        bytes_each = 2 * rows.nodes * columns.count * columns.nodes * self.rows.element_size()
-        step = max(4, int(KEEP_BYTES / bytes_each))
+        itemsize = self.rows.element_size()
+        nodes, carrier = 2 * rows.nodes * columns.count * columns.nodes, ORDER[itemsize] * self.carrier.case.shape[1]
+        step = max(4, int(KEEP_BYTES / ((nodes + carrier) * itemsize)))
         return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
 

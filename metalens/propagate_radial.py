@@ -78,9 +78,10 @@ def _converged(lens: Radial, case: Case, reach: float, tolerance: float) -> tupl
 
 
 def _band(lens: Radial, case: Case, reach: float) -> float:
-    """Largest spatial frequency that reaches the window, cycles per um, with a margin of a third."""
+    """Twice the largest spatial frequency of rays to the window, cycles per um: what a hard rim scatters further out is
+    felt where the band ends."""
     sine = (lens.radius_um + reach) / np.hypot(lens.radius_um + reach, case.sensor_distance_um)
-    return float(min(1.33 * sine + 0.02, 1.0) / case.wavelength_um)
+    return float(min(2 * sine + 0.02, 1.0) / case.wavelength_um)
 
 
 def _hankel(lens: Radial, case: Case, counts: tuple[int, int], rho: tuple[float, int], band: float) -> Array:

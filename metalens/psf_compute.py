@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from metalens.errors import PropagationError
+from metalens.propagate_blocks import SHARE
 from metalens.propagate_case import Case, check_aperture, chief_path
 from metalens.propagate_choose import Choice, choose
 from metalens.propagate_estimate import Sample, relative_error
@@ -84,7 +85,7 @@ def _windowed(
                 made = plan(window, tolerance, p.dtype, p.device, moving is not None)
                 field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
                 _check(p, t, case, power, gathered)
-                noise = ROUNDING[p.dtype] * _incoherent(power, case)
+                noise = math.hypot(ROUNDING[p.dtype], tolerance / SHARE) * _incoherent(power, case)
                 values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
                 samples[index].append(Sample(window, weight, *values, noise, made.layout.parts))
                 parts.append(field)

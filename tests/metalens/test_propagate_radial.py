@@ -37,6 +37,32 @@ def test_agrees_with_the_pixelated_lens_and_says_how_well(n):
     assert error < got.error < 5 * error  # a rough rim of 350 cells, judged at a few samples
 
 
+@pytest.mark.parametrize(
+    ("radius", "n", "depths_um", "distance"),
+    [(50.0, 252, [2500.0, np.inf], 200.0), (50.0, 252, [2500.0, np.inf], 120.0), (100.0, 502, [2500.0, np.inf], 400.0)],
+)
+@pytest.mark.parametrize("samples", [16, 32])
+def test_the_estimate_is_never_below_the_error_where_the_rim_scatters_beyond_the_band(
+    radius, n, depths_um, distance, samples
+):
+    """Depths out of focus, whose light lies far from the axis: what the rim scatters counts most."""
+    lens = radial(radius, distance, 2000.0)
+    case = propagate.case(
+        (n, n),
+        pitch_um=0.4,
+        wavelength_um=0.85,
+        sensor_distance_um=distance,
+        depths_um=depths_um,
+        window_um=20,
+        samples=samples,
+    )
+    got = field_radial(lens, case, 1e-5)
+    a, b = (np.abs(f) ** 2 for f in (got.field, propagate.field_exact(*lens.maps(case.shape, 0.4), case)))
+    a, b = (i / i.sum((1, 2), keepdims=True) for i in (a, b))
+    error = np.linalg.norm(a - b) / np.linalg.norm(b)
+    assert error <= got.error <= 3 * error
+
+
 def test_a_soft_rim_agrees_far_better():
     """With the light gone at the rim, what is left is the method's own tolerance."""
     lens = radial(45.0, 200.0, 2000.0, taper=12.0)

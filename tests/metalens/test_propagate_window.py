@@ -11,6 +11,7 @@ import torch
 
 from metalens import legendre, propagate, psf
 from metalens.errors import PropagationError
+from metalens.propagate_plan import layout
 
 WAVELENGTH, PITCH = 0.85, 0.4
 K = 2 * np.pi / WAVELENGTH
@@ -158,6 +159,13 @@ def test_nan_is_refused_with_its_place():
 @pytest.mark.parametrize("shape", [(40, 120), (120, 40)])
 def test_maps_that_are_not_square(shape):
     check(*lens(shape, kind="noisy"), angle_rad=(0.1, 0.2))
+
+
+def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
+    geometry = dict(sensor_distance_um=20.0, window_um=30.0, samples=16)
+    check(*lens((64, 64), distance=20.0), tolerance=1e-4, **geometry)
+    case = propagate.case((64, 64), **GEOMETRY | geometry)
+    assert layout(case, 1e-4).parts > 1
 
 
 @pytest.mark.slow
