@@ -21,6 +21,7 @@ from metalens.store import Array
 
 MOST_NODES = 400
 MOST_TABLE = 4e6
+EDGE = 8  # by which the error of a truncated series at the corner of a tile, where a PSF may lie, exceeds its mean
 PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
 
 
@@ -146,10 +147,11 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     middle, reach = (low + high) / 2, (high - low) / 2
     directions = _count(lambda t: _over_directions(case, middle + reach * t), share, "directions")
     wy, wx = case.half_window_um
-    window_x = _count(lambda t: _over_window(case, (low, high), X=t * wx), share, "window columns")
-    window_y = _count(lambda t: _over_window(case, (low, high), Y=t * wy), share, "window rows")
-    lens_p = _count(lambda t: _over_window(case, (low, high), p=middle + reach * t), share, "correction directions")
-    lens_e = _count(lambda t: _over_window(case, (low, high), e=t * high_y), share, "correction rows")
+    edge = max(share / EDGE, min(share, 1e-13))  # rounding leaves no smaller tails
+    window_x = _count(lambda t: _over_window(case, (low, high), X=t * wx), edge, "window columns")
+    window_y = _count(lambda t: _over_window(case, (low, high), Y=t * wy), edge, "window rows")
+    lens_p = _count(lambda t: _over_window(case, (low, high), p=middle + reach * t), edge, "correction directions")
+    lens_e = _count(lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows")
     return Sizes(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
