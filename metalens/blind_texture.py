@@ -3,7 +3,8 @@
 A network that never saw the surface before cannot tell blur from texture at one frequency, but it knows how the
 spectra of surfaces fall, S ~ 1/f² (Field, J. Opt. Soc. Am. A 4, 2379, 1987). The image of such a texture has the
 power P(f, z) = |OTF(f, z)|² S(f) + N, aliases folded, and the Fisher information of its Gaussian likelihood
-(Whittle, Ark. Mat. 2, 423, 1953) is J(z) = 1/2 sum over f of (d ln P / dz)².
+(Whittle, Ark. Mat. 2, 423, 1953) is J(z) = 1/2 sum over f of (d ln P / dz)². For images on their own grid and any
+spectrum see :func:`metalens.fisher.texture_information`.
 """
 
 import math

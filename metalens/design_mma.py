@@ -38,9 +38,10 @@ def refine(
             slope = torch.autograd.grad(loss, point, retain_graph=True)[0]
             rows = [torch.autograd.grad(e, point, retain_graph=True)[0].numpy().ravel() for e in energy]
             missing = settings.encircled + 1e-3 - energy.detach().double().numpy()
-            known[key] = (float(loss), slope.numpy().ravel(), missing, -np.stack(rows))
-            if missing.max() <= 1e-3 and float(loss) < best[0]:
-                best = (float(loss), x.copy())
+            value = float(loss.detach())
+            known[key] = (value, slope.numpy().ravel(), missing, -np.stack(rows))
+            if missing.max() <= 1e-3 and value < best[0]:
+                best = (value, x.copy())
         return known[key]
 
     def value(x: np.ndarray[Any, Any], gradient: np.ndarray[Any, Any]) -> float:
