@@ -19,6 +19,7 @@ import torch
 
 from metalens import baselines, design, design_fisher
 from metalens.design_fisher import Fisher
+from metalens.profiles import Focus
 from metalens.pupil import Pupil
 
 PUPIL = Pupil(nodes=160)
@@ -98,14 +99,14 @@ def pillars(folder: Path, lens_file: str) -> None:
     from metalens import lens
 
     like = lens.load(lens_file)
-    setting = Setting(count=6, window_um=144.0)
-    focus = design.Focus(like.wavelength_um, like.sensor_distance_um, 20e3)
+    setting = Setting(count=6, window_um=144.0, angles_deg=(0.0, 5.0, 10.0, 20.0))
+    focus = Focus(like.wavelength_um, like.sensor_distance_um, 20e3)
     phases = {}
     for binning in (1, 2, 3):
         path = folder / f"b{binning}_0.50.npz"
         if path.exists():
             phases[path.stem] = phase_of(path, focus)
-    for zones, depth_um in ((0, 20e3), (0, 28e3), (2, 19.1e3), (1, 19.8e3)):
+    for zones, depth_um in ((0, 20e3), (2, 19.1e3), (1, 19.8e3), (1, 14.4e3)):
         simple = baselines.Baseline(zones, depth_um, 0.0, 0.0)
         phases[simple.name] = simple.phase(focus, radius_um=PUPIL.radius_um)
     for name, (phase, at) in phases.items():
@@ -125,7 +126,7 @@ def pillars(folder: Path, lens_file: str) -> None:
         print(name, values, flush=True)
 
 
-def phase_of(path: Path, focus: design.Focus) -> tuple[design.PhaseOf, design.Focus]:
+def phase_of(path: Path, focus: Focus) -> tuple[design.PhaseOf, Focus]:
     """A saved design as a function of position."""
     held = np.load(path)
     controls, mine = held["controls"], replace(focus, source_distance_um=float(held["focus_um"]))
@@ -137,7 +138,6 @@ def phase_of(path: Path, focus: design.Focus) -> tuple[design.PhaseOf, design.Fo
 def collect(folder: Path) -> None:
     """Everything that is there, as JSON and picture."""
     known = {path.stem: json.loads(str(np.load(path)["made"])) for path in sorted(folder.glob("b*_*.npz"))}
-    known |= {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("b*_*.json"))}
     on_pillars = {p.stem.removeprefix("pillars "): json.loads(p.read_text()) for p in sorted(folder.glob("pillars *"))}
     kept = folder / "baselines.json"
     if not kept.exists():
