@@ -269,6 +269,19 @@ def test_gradient_against_the_exact_sum():
     assert np.linalg.norm(got - want) < 2e-4 * np.linalg.norm(want)
 
 
+@pytest.mark.parametrize("merit", [lambda light: (light**2).sum(), lambda light: light[1, 9:11, 9:11].sum()])
+def test_gradient_at_a_focus_where_it_nearly_vanishes(merit):
+    """A lens in focus with all its light on the window: what is left of the gradient is small beside its parts."""
+    phase, level = (torch.tensor(m) for m in lens((128, 128)))
+    grads = []
+    for tolerance in (1e-4, 1e-10):
+        given = phase.clone().requires_grad_()
+        stack = psf.psf_stack(given, level, tolerance=tolerance, **GEOMETRY | dict(window_um=32.0))
+        merit(stack.intensity).backward()
+        grads.append(given.grad)
+    assert (grads[0] - grads[1]).norm() < 2e-4 * grads[1].norm()
+
+
 def test_derivatives_in_sensor_distance_angle_offset_and_depth():
     phase, level = (torch.tensor(m) for m in lens((40, 40), kind="noisy"))
     at = {
