@@ -185,6 +185,7 @@ def _keep(folder: Path, source: Source, going: Trainer, story: retrain_report.St
         save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})
     correction.write(folder, story.plan)
     retrain_report.write(folder / "report.html", story)
+    store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
     store.write_text(folder / RESULT, json.dumps(_values(story, folder), indent=1) + "\n")
 
 
@@ -196,6 +197,8 @@ def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
     ]
     return {
         "folder": str(folder),
+        "rows": [{"case": retrain_report.CASES[name], **row} for name, row in o.rows().items()],
+        "slip_mm": o.rows()["after"]["slip_mm"],
         "cases": o.rows(),
         "gap_mm": o.gap_mm,
         "recovered": o.recovered if o.gap_mm > 0 else None,

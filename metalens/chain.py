@@ -9,7 +9,7 @@ from typing import Any
 from metalens import config, store
 from metalens.errors import ConfigError
 
-SHIPPED = ("cell", "design", "process", "bench_design", "bench_truth", "bench_metrology")
+SHIPPED = ("cell", "design", "process", "run", "bench_truth")
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,8 +17,9 @@ class ChainFiles:
     """CHAIN.toml: settings files, relative to it; a stage whose file is left out is not run.
 
     cell, design, process: of library, lens and mask. psf: of the PSF stack; its defaults without it.
-    bench_design, bench_truth, bench_metrology: lens, hidden errors and other measurements of a virtual bench.
-    run: of a co-design run. budget: whether the error budget is computed.
+    run: of a co-design run. bench_truth, bench_metrology: hidden errors and other measurements of a virtual bench; it
+        measures the lens of the run, which is then retrained for, or without a run the one of bench_design.
+    budget: whether the error budget is computed.
     """
 
     cell: Path
@@ -32,8 +33,12 @@ class ChainFiles:
     budget: bool = True
 
     def __post_init__(self) -> None:
-        if (self.bench_design is None) != (self.bench_truth is None):
-            raise ConfigError("bench_design and bench_truth belong together: give both or none")
+        if self.bench_design is not None and (self.bench_truth is None or self.run is not None):
+            raise ConfigError(
+                "bench_design belongs to a bench_truth without a run: a run's bench measures its own lens"
+            )
+        if self.bench_truth is not None and self.bench_design is None and self.run is None:
+            raise ConfigError("bench_truth has no lens to measure: give a run or a bench_design")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +58,7 @@ class Stage:
 
 def shipped() -> ChainFiles:
     """The demo's own settings, as names of files that :func:`lay_out` writes."""
-    return _named(SHIPPED, budget=False)  # a minute or more: asked for with a CHAIN.toml, or metalens budget
+    return _named(SHIPPED)
 
 
 def load(path: Path) -> ChainFiles:
@@ -106,10 +111,12 @@ def stages(files: ChainFiles) -> Iterator[Stage]:
     yield from _making(files)
     if files.budget:
         yield _budget(files)
-    if files.bench_design and files.bench_truth:
-        yield from _bench(files)
     if files.run:
         yield _codesign()
+    if files.bench_truth:
+        yield from _bench(files)
+        if files.run:
+            yield _retrain()
 
 
 def _making(files: ChainFiles) -> Iterator[Stage]:
@@ -170,23 +177,25 @@ def _budget(files: ChainFiles) -> Stage:
 
 def _bench(files: ChainFiles) -> Iterator[Stage]:
     metrology = ("--metrology", "bench_metrology.toml") if files.bench_metrology else ()
-    yield Stage(
-        "A lens for the bench",
-        "A small sister of the lens, of the same pillars, to be made wrong in hidden ways and measured.",
-        ("design", "bench_design.toml", "-o", "bench_lens.h5"),
-        ("max_phase_error_rad", "rad between wanted and made phase"),
-    )
+    if files.bench_design:
+        yield Stage(
+            "A lens for the bench",
+            "A small sister of the lens, of the same pillars, to be made wrong in hidden ways and measured.",
+            ("design", "bench_design.toml", "-o", "bench_lens.h5"),
+            ("max_phase_error_rad", "rad between wanted and made phase"),
+        )
+    measured = "bench_lens.h5" if files.bench_design else "run/lens.h5"
     yield Stage(
         "Captures",
         "A virtual bench: the lens is made with errors that the fit never sees, and shot through focus with the noise "
         "of a real sensor.",
-        ("capture", "bench_lens.h5", "--truth", "bench_truth.toml", "-o", "captures"),
+        ("capture", measured, "--truth", "bench_truth.toml", "-o", "captures"),
         ("peak_e", "electrons in the brightest pixel"),
     )
     yield Stage(
         "The lens as built",
         "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
-        ("fit", "captures", "--design", "bench_lens.h5", *metrology, "-o", "asbuilt.h5"),
+        ("fit", "captures", "--design", measured, *metrology, "-o", "asbuilt.h5"),
         ("chi2_per_dof", "chi² per degree of freedom, 1 where model and noise explain the frames"),
         (
             ("asbuilt_frames.png", "As designed, measured, as built, and the residual in standard deviations."),
@@ -202,4 +211,16 @@ def _codesign() -> Stage:
         ("codesign", "run.toml", "-o", "run"),
         ("error", "see the rows"),
         (("run/pareto.png", "Accuracy against compute."),),
+    )
+
+
+def _retrain() -> Stage:
+    words = ("retrain", "run", "--optics", "asbuilt.h5", "--truth", "bench_truth.toml", "--process", "process.toml")
+    return Stage(
+        "Before and after retraining",
+        "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
+        "made. Seconds of training read the pupil and the sideways slippage; the distance takes the preset `laptop`.",
+        (*words, "-o", "retrained"),
+        ("slip_mm", "mm of slippage error after retraining"),
+        (("retrained/cases.png", "Slippage error with the lens as designed, as made, and after retraining."),),
     )

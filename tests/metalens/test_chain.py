@@ -17,10 +17,13 @@ def _verbs(files):
     return [stage.words[0] for stage in chain.stages(files)]
 
 
-def test_the_shipped_chain_runs_from_cell_to_as_built_lens():
+def test_the_shipped_chain_runs_from_cell_to_retrained_network():
     assert _verbs(chain.shipped()) == [
-        "library", "design", "psf", "layout", "design", "capture", "fit",
+        "library", "design", "psf", "layout", "budget", "codesign", "capture", "fit", "retrain",
     ]  # fmt: skip
+    assert {w for s in chain.stages(chain.shipped()) for w in s.words if w.endswith("lens.h5")} == {
+        "lens.h5", "run/lens.h5",
+    }  # fmt: skip
     names = [demo._name(stage) for stage in chain.stages(chain.shipped())]
     assert len(set(names)) == len(names)
 
@@ -33,6 +36,10 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
     assert _verbs(chain.load(tmp_path / "chain.toml")) == ["library", "design", "psf", "layout"]
     (tmp_path / "chain.toml").write_text(text + 'run = "r.toml"\npsf = "p.toml"\n')
     stages = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    (tmp_path / "chain.toml").write_text(text + 'bench_design = "d.toml"\nbench_truth = "r.toml"\n')
+    own = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    assert [s.words[0] for s in own[-3:]] == ["design", "capture", "fit"]
+    assert "bench_lens.h5" in own[-1].words
     assert stages[-1].words[0] == "codesign"
     assert "--config" in stages[2].words
 
@@ -42,7 +49,11 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
     [
         ('cell = "c.toml"\n', "missing key"),
         ('cell = "absent.toml"\ndesign = "c.toml"\nprocess = "c.toml"\n', "no such file"),
-        ('cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_design = "c.toml"\n', "belong together"),
+        (
+            'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_design = "c.toml"\n',
+            "belongs to a bench_truth",
+        ),
+        ('cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_truth = "c.toml"\n', "no lens to measure"),
         ('cell = "c.toml"\ndesin = "c.toml"\n', "did you mean 'design'"),
     ],
 )
