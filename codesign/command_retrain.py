@@ -201,7 +201,8 @@ def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
         "slip_mm": o.rows()["after"]["slip_mm"],
         "cases": o.rows(),
         "gap_mm": o.gap_mm,
-        "recovered": o.recovered if o.gap_mm > 0 else None,
+        "gap_sigma_mm": o.gap_sigma_mm,
+        "recovered": o.recovered,
         "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
         "truth_known": story.lenses.known,
         "next_lens": states,
@@ -216,8 +217,8 @@ def _text(story: retrain_report.Story, folder: Path) -> str:
         lines.append(
             f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} {v['axial_mm']:.3f}   {v['iou']:.3f}"
         )
-    gap = f"gap {o.gap_mm:.3f} mm, " + (f"{o.recovered:.0%} won back" if o.gap_mm > 0 else "nothing to win back")
-    lines.append(gap)
+    won = "nothing to win back beyond chance" if o.recovered is None else f"{o.recovered:.0%} won back"
+    lines.append(f"gap {o.gap_mm:.3f} +- {o.gap_sigma_mm:.3f} mm, {won}")
     for p, error, slip in story.proposals:
         lines.append(
             f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"

@@ -6,6 +6,7 @@ a virtual bench, a network that was trained with the truth known.
 """
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -105,9 +106,17 @@ class Outcome:
         return self.before.slip_mm - self.nominal.slip_mm
 
     @property
-    def recovered(self) -> float:
-        """Share of the gap that retraining wins back; nan where there is no gap."""
-        return (self.before.slip_mm - self.after.slip_mm) / self.gap_mm if self.gap_mm > 0 else float("nan")
+    def gap_sigma_mm(self) -> float:
+        """Standard error of the gap over the frames, which both cases share."""
+        apart = (self.before.error_mm - self.nominal.error_mm).mean(1)
+        return float(apart.std()) / math.sqrt(len(apart))
+
+    @property
+    def recovered(self) -> float | None:
+        """Share of the gap that retraining wins back; None where the gap is within two of its standard errors."""
+        if self.gap_mm <= 2 * self.gap_sigma_mm:
+            return None
+        return (self.before.slip_mm - self.after.slip_mm) / self.gap_mm
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Numbers by name of the case."""

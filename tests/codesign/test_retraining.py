@@ -46,7 +46,10 @@ def test_share_won_back_is_that_of_the_gap():
     told = Outcome(*cases)
     assert told.gap_mm == pytest.approx(0.5)
     assert told.recovered == pytest.approx(0.9)
-    assert np.isnan(replace(told, before=_accuracy(0.4)).recovered)
+    assert replace(told, before=_accuracy(0.4)).recovered is None
+    scattered = Accuracy(0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50))
+    assert replace(told, before=scattered).gap_mm > 0
+    assert replace(told, before=scattered).recovered is None  # a gap of 2.0 um, with a standard error of 2.4 um
     assert list(told.rows()) == ["designed", "nominal", "before", "after", "known"]
     assert list(replace(told, known=None).rows()) == ["designed", "nominal", "before", "after"]
 
