@@ -19,7 +19,7 @@ demo: setup
 	$(BIN)/metalens demo $(OUT) --force
 
 test: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not peers'
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not peers'
 
 test-slow: setup
 	$(BIN)/python -m pytest -m 'slow and not peers'

@@ -311,15 +311,19 @@ def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, 
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(np.outer(legendre.nodes(len(e))[1], legendre.nodes(len(x))[1]))
     inverse = np.array(case.inverse_depths_per_um)
-    training = inverse
-    if len(inverse) > 48:
-        training = np.clip(legendre.mapped(48, inverse.min(), inverse.max()), 0, None)
-    fields = np.exp(1j * depth_factors(case, e, x, case.tangents, training[:, None, None])) * weight
-    if moving:
-        fields = np.concatenate([fields, *_tangents(case, e, x, training[:, None, None], fields)])
-    _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
-    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
-    rank = int(max(1, (tail > tolerance).sum()))
+    count = 48
+    while True:  # until the rank says that no depth lies between the nodes: they need pi a period, the fields two
+        few = len(inverse) > count
+        training = np.clip(legendre.mapped(count, inverse.min(), inverse.max()), 0, None) if few else inverse
+        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, training[:, None, None])) * weight
+        if moving:
+            fields = np.concatenate([fields, *_tangents(case, e, x, training[:, None, None], fields)])
+        _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
+        tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+        rank = int(max(1, (tail > tolerance).sum()))
+        if not few or rank <= 2 / np.pi * count:
+            break
+        count *= 2
     basis = v[:rank].reshape(rank, len(e), len(x))
     coefficients = np.empty((len(inverse), rank), complex)
     for start in range(0, len(inverse), 16):

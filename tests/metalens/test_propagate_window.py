@@ -11,7 +11,7 @@ import torch
 
 from metalens import legendre, propagate, psf
 from metalens.errors import PropagationError
-from metalens.propagate_plan import layout
+from metalens.propagate_plan import depth_basis, depth_factors, layout
 
 WAVELENGTH, PITCH = 0.85, 0.4
 K = 2 * np.pi / WAVELENGTH
@@ -347,3 +347,19 @@ def test_settings_that_cannot_be_met_are_reported_not_hidden():
     assert not stack.converged
     assert error < 1e-9
     assert dataclasses.replace(stack, tolerance=1e-9).converged
+
+
+def test_many_depths_of_a_fast_lens_are_spanned_by_the_basis():
+    """Depths that differ by many turns at the rim need more training fields than the first few."""
+    many = propagate.case((512, 512), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=200.0, window_um=12.0,
+                          samples=12, depths_um=np.linspace(120.0, 900.0, 150))  # fmt: skip
+    x = legendre.mapped(64, -102.4, 102.4)
+    basis = depth_basis(many, (x, x), 1e-5)
+    weight = np.outer(legendre.nodes(64)[1], legendre.nodes(64)[1])
+    want = np.exp(
+        1j * depth_factors(many, x[:, None], x, many.tangents, np.array(many.inverse_depths_per_um)[:, None, None])
+    )
+    got = np.einsum("db,byx->dyx", basis.coefficients, basis.basis)
+    error = np.sqrt((weight * np.abs(got - want) ** 2).sum() / (weight * np.abs(want) ** 2).sum())
+    assert len(basis.strength) > 48
+    assert error < 3e-5
