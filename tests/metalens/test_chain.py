@@ -19,7 +19,7 @@ def _verbs(files):
 
 def test_the_shipped_chain_runs_from_cell_to_retrained_network():
     assert _verbs(chain.shipped()) == [
-        "library", "design", "psf", "layout", "budget", "codesign", "capture", "fit", "retrain",
+        "library", "design", "psf", "layout", "codesign", "capture", "fit", "retrain",
     ]  # fmt: skip
     assert {w for s in chain.stages(chain.shipped()) for w in s.words if w.endswith("lens.h5")} == {
         "lens.h5", "run/lens.h5",
