@@ -257,13 +257,7 @@ def jobs(found: Lenses) -> tuple[str, ...]:
 
 
 def train(going: Trainer, path: Path, settings: object, *, every: int = 50) -> Iterator[Record]:
-    """Run one job to its end with checkpoints, from its checkpoint where one is there; a record a step.
-
-    Raises:
-        TrainingError: the checkpoint is damaged or of other settings (the difference is named).
-    """
-    if path.is_file():
-        going.restore(checkpoint.load(path, settings=settings)["trainer"])
+    """Run one job to its end, from where it stands, with checkpoints in ``path``; a record a step."""
     for record in going.run():
         yield record
         if record.step % every == 0 or record.step == going.inner.steps:
