@@ -1,7 +1,7 @@
 """The virtual experiment of the paper's Sec. 5 on three lenses of one network: jointly trained, mid-range, best focus.
 
     python -m benchmarks.experiment train NAME --work DIR      # NAME: codesigned, midrange or bestfocus; resumes
-    python -m benchmarks.experiment run --work DIR             # the experiment, kept in benchmarks/results
+    python -m benchmarks.experiment run --work DIR             # of the lenses there are, kept in benchmarks/results
 
 ``python -m benchmarks experiment`` shows what was kept, and times the experiment itself on small untrained networks.
 """
@@ -10,61 +10,35 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from benchmarks import Row
-from benchmarks.retrain_study import base
+from benchmarks.loop_runs import Recipe, finished
 from codesign import retraining
 from codesign.experiment import ExperimentConfig, experiment
 from metalens import store
 
-RESULT = Path(__file__).parent / "results" / "experiment.json"
-COMMON = """
-preset = "smoke"
-checkpoint_every = 100
-[scenes]
-pixels = 64
-margin = 8
-pool = 4096
-slip_mm = [5.0, 1.0, 5.5]
-gaze_deg = [24.0, 16.0]
-[space]
-widths = [0.35]
-depths = [2]
-expansions = [3]
-kernels = [5]
-resolution = [1.0, 1.0]
-[run]
-pitch_um = 18.0
-budgets_mmacs = [8.0]
-[inner]
-steps = {steps}
-batch = 32
-slip_scale_mm = [2.9, 0.6, 3.2]
-[inner.optics]
-rate = {rate}
-start = 0.12
-end = 0.8
-[optics]
-depth_count = 16
-focus_mm = {focus}
-polynomials = {polynomials}
-"""
-LENSES = {"codesigned": (33.0, 35, 0.02), "midrange": (20.0, 0, 0.0), "bestfocus": (33.0, 0, 0.0)}
-
-
-def settings_of(name: str, steps: int = 1500) -> str:
-    """RUN.toml of a lens."""
-    focus, polynomials, rate = LENSES[name]
-    return COMMON.format(focus=focus, polynomials=polynomials, rate=rate, steps=steps)
+RESULT = Path(__file__).parent / "results" / "experiment_study.json"
+WIDE = {
+    "pitch_um": 12.0,
+    "steps": 1200,
+    "slip_mm": (5.0, 1.0, 5.5),
+    "gaze_deg": (24.0, 16.0),
+}  # the reach of the experiment itself
+LENSES = {
+    "codesigned": Recipe(33.0, moves=True, **WIDE),  # type: ignore[arg-type]
+    "midrange": Recipe(20.0, **WIDE),  # type: ignore[arg-type]
+    "bestfocus": Recipe(33.0, **WIDE),  # type: ignore[arg-type]
+}
 
 
 def rows() -> list[Row]:
     """Time of the experiment on untrained networks, and the kept result of trained ones."""
     with tempfile.TemporaryDirectory() as folder:
-        base(Path(folder) / "run", settings_of("midrange", 1).replace("pool = 4096", "pool = 64"))
+        finished(Path(folder) / "run", replace(LENSES["midrange"], steps=1, pool=64))
         source = retraining.load(Path(folder) / "run")
         config = ExperimentConfig()
         start = time.perf_counter()
@@ -74,7 +48,7 @@ def rows() -> list[Row]:
     case = f"{config.frames} frames: render, image, read, calibrate"
     out = [
         Row(
-            case, f"{source.row['mmacs']:.1f} MMACs, 64 x 64 pixels", seconds, float("nan"), "untrained", goal="1-2 min"
+            case, f"{source.row['mmacs']:.1f} MMACs, 96 x 96 pixels", seconds, float("nan"), "untrained", goal="1-2 min"
         )
     ]
     if RESULT.is_file():
@@ -92,16 +66,17 @@ def main() -> None:
     parser.add_argument("what", choices=("train", "run"))
     parser.add_argument("name", nargs="?", choices=tuple(LENSES))
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=1200)
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.what == "train":
-        base(given.work / given.name, settings_of(given.name, given.steps))
+        finished(given.work / given.name, replace(LENSES[given.name], steps=given.steps))
         return
     from codesign import command_experiment
 
-    folders = tuple(given.work / name for name in LENSES)
-    options = command_experiment.Options(folders, given.work / "experiment", names=tuple(LENSES), force=True)
+    names = tuple(name for name in LENSES if (given.work / name / "result.json").is_file())
+    folders = tuple(given.work / name for name in names)
+    options = command_experiment.Options(folders, given.work / "experiment", names=names, force=True)
     command_experiment.run(options)
     store.write_text(RESULT, (given.work / "experiment" / "experiment.json").read_text("utf-8"))
 

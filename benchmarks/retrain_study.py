@@ -15,86 +15,36 @@ import argparse
 import json
 import math
 import time
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from benchmarks.loop_runs import Recipe, finished
 from characterize import asbuilt, bench, capture, command_capture
 from characterize.asbuilt import AsBuilt
 from characterize.bench import Camera, Truth
 from characterize.estimate import Options, fit
 from characterize.parameters import PARAMETERS, Known, vector
 from characterize.pillars import sensitivity
-from codesign import evolution, retraining
 from codesign import optics as trained
-from codesign import run as runs
-from codesign.architecture import largest
+from codesign import retraining
 from codesign.built import OF_LENS, MadeLens, psf_error
-from codesign.evolution import Candidate, Search
-from codesign.retraining import Lenses, RetrainConfig, Source
-from metalens import design, lens, library, store
+from codesign.optics import Stack
+from codesign.retraining import Held, Lenses, RetrainConfig, Source
+from metalens import lens, store
 
-BASE = """
-preset = "smoke"
-checkpoint_every = 100
-[scenes]
-pixels = 64
-margin = 8
-pool = 4096
-[optics]
-focus_mm = 28.0
-depth_count = 16
-polynomials = 0
-[space]
-widths = [0.35]
-depths = [2]
-expansions = [3]
-kernels = [5]
-resolution = [1.0, 1.0]
-[inner]
-steps = 1500
-batch = 32
-[run]
-pitch_um = 18.0
-budgets_mmacs = [8.0]
-"""
+BASE = Recipe(33.0, moves=True, steps=3000)
 SPREAD = {"bias_nm": 4.0, "bias_x_nm": 3.0, "bias_y_nm": 3.0, "bias_r_nm": 2.0, "height_nm": 7.0, "distance_um": 15.0}
 SPREAD |= {f"{name}_rad": 0.1 for name in ("astigmatism", "oblique_astigmatism", "coma_x", "coma_y", "spherical")}
 DEPTHS_UM = (12e3, 15e3, 19e3, 24e3, 31e3, 42e3, 60e3)
-CONFIG = RetrainConfig(steps=150, rate=1.5e-3, draws=6, judge=1, test_batches=16)
+CONFIG = RetrainConfig(steps=200, rate=1.5e-3, draws=6, judge=1, test_batches=16)
+KNOWN_EVERY = 5
 PEAK_E = 8000.0
 LINES, RESULT = "cases.jsonl", Path(__file__).parent / "results" / "retrain_study.json"
-
-
-def base(folder: Path, text: str) -> None:
-    """A run folder of these settings, trained with its largest architecture alone; goes on where it stopped."""
-    folder.mkdir(parents=True, exist_ok=True)
-    store.write_text(folder / "run.toml", text)
-    settings = runs.load(folder / "run.toml")
-    path = folder / "checkpoint.safetensors"
-    going = runs.resume(path, settings) if path.exists() else runs.start(settings)
-    chosen = largest(settings.space)
-    going.trainer.architecture = chosen
-    for record in runs.train(going, path):
-        if record.step % 50 == 0:
-            print(record.step, f"{record.task:.3f}", flush=True)
-    going.searches = [Search((Candidate(chosen, 0.0, going.macs(chosen)),), {})]
-    runs.save(path, going)
-    row = {"budget_mmacs": 8.0, "mmacs": going.macs(chosen) / 1e6}
-    row["architecture"] = json.loads(evolution.dumps(going.searches[0]))["history"][0]
-    if not (folder / "lens.h5").exists():
-        _design(folder / "lens.h5", settings, runs.coefficients(going).numpy())
-    store.write_text(folder / "result.json", json.dumps({"rows": [row]}))
-
-
-def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> None:
-    made = library.sweep(library.DEFAULT_CELL, wavelengths_um=(0.85,))
-    phase = trained.phase_of(settings.optics, coefficients)
-    aperture = settings.optics.aperture_mm * 1e3
-    shape = settings.optics.focus
-    lens.save(path, design.make(phase, shape, aperture_um=aperture, cell=made.cell, proxy=library.proxy_of(made))[0])
 
 
 def hidden(case: int) -> dict[str, float]:
@@ -179,64 +129,81 @@ def quick(template: AsBuilt, case: int) -> AsBuilt:
     return replace(template, value=middle + off, problems=())
 
 
-def one(
-    source: Source, made: MadeLens, nominal: Lenses, work: Path, case: int, *, model: AsBuilt | None
-) -> dict[str, object]:
-    """One case: errors before and after, and with the truth known where the case's number is even or complete."""
-    start, complete = time.process_time(), model is None
-    result = captured(work, made.design, case) if model is None else quick(model, case)
-    config = replace(CONFIG, seed=case)
-    true = made.stack(vector(hidden(case)))
-    drawn = tuple(made.stack(result.parameters(row)) for row in result.samples(config.draws, seed=case))
-    found = Lenses(nominal.nominal, made.stack(result.parameters()), drawn, (true,), True)
-    base_net = retraining.job(source, config, found, "nominal")
-    base_net.restore({**_kept(work, source), "counters": [config.steps, 0, 0]})
-    cases = {"nominal": retraining.judge(base_net, source, config, (found.nominal,))}
-    cases["before"] = retraining.judge(base_net, source, config, found.judges)
-    for name in ("retrained", "known") if complete or case % 4 == 0 else ("retrained",):
-        going = retraining.job(source, config, found, name)
-        for _ in going.run():
-            pass
-        cases[name] = retraining.judge(going, source, config, found.judges)
-    numbers = {name: value.values() for name, value in cases.items()}
-    error = {"fitted": psf_error(found.best, true), "nominal": psf_error(nominal.nominal, true)}
-    seconds = time.process_time() - start
-    return {
-        "case": case,
-        "complete": complete,
-        "psf_error": error,
-        "cpu_s": seconds,
-        "trusted": result.trusted,
-        **numbers,
-    }
+@dataclass(frozen=True, eq=False, slots=True)
+class Ground:
+    """What all cases share: the run, its lens, the frames that judge, the network trained on for the design."""
+
+    work: Path
+    source: Source
+    made: MadeLens
+    nominal: Stack
+    frames: Held
+    state: dict[str, Any]
 
 
-def _kept(work: Path, source: Source) -> dict[str, object]:
-    """State of the network that was trained on for the nominal lens, once for all cases."""
-    path = work / "nominal.pt"
+def ground(work: Path) -> Ground:
+    """Read or make it; the network that was trained on for the nominal lens is kept in ``nominal.pt``."""
+    source, path = retraining.load(work / "run"), work / "nominal.pt"
+    made = MadeLens(lens.load(work / "run" / "lens.h5"), source.settings.optics)
+    stack = made.stack()
     if not path.exists():
-        made = MadeLens(lens.load(work / "run" / "lens.h5"), source.settings.optics)
-        stack = made.stack()
         going = retraining.job(source, CONFIG, Lenses(stack, stack, (stack,), (stack,), True), "nominal")
         for _ in going.run():
             pass
         torch.save(going.state(), path)
-    state: dict[str, object] = torch.load(path, weights_only=True)
-    return state
+    return Ground(work, source, made, stack, retraining.held(source, CONFIG), torch.load(path, weights_only=True))
+
+
+def one(on: Ground, case: int, *, model: AsBuilt | None) -> dict[str, Any]:
+    """One case: errors before and after, and with the truth known where the case's number is even or complete."""
+    start, complete = time.process_time(), model is None
+    result = captured(on.work, on.made.design, case) if model is None else quick(model, case)
+    config, true = replace(CONFIG, seed=case), on.made.stack(vector(hidden(case)))
+    drawn = tuple(on.made.stack(result.parameters(row)) for row in result.samples(config.draws, seed=case))
+    found = Lenses(on.nominal, on.made.stack(result.parameters()), drawn, (true,), True)
+    unwarned = retraining.job(on.source, config, found, "nominal")
+    unwarned.restore(on.state)
+    numbers = {
+        name: retraining.judge(unwarned, on.source, config, stacks, frames=on.frames)
+        for name, stacks in (("nominal", (found.nominal,)), ("before", found.judges))
+    }
+    for name in ("retrained", "known") if complete or case % KNOWN_EVERY == 0 else ("retrained",):
+        going = retraining.job(on.source, config, found, name)
+        for _ in going.run():
+            pass
+        numbers[name] = retraining.judge(going, on.source, config, found.judges, frames=on.frames)
+    gap = (numbers["before"].error_mm - numbers["nominal"].error_mm).mean(1)
+    return {
+        "case": case,
+        "complete": complete,
+        "psf_error": {"fitted": psf_error(found.best, true), "nominal": psf_error(on.nominal, true)},
+        "gap_sigma_mm": float(gap.std()) / math.sqrt(len(gap)),
+        "z": z_scores(result, case),
+        "cpu_s": time.process_time() - start,
+        "trusted": result.trusted,
+        **{name: value.values() for name, value in numbers.items()},
+    }
+
+
+def z_scores(result: AsBuilt, case: int) -> dict[str, float]:
+    """Error of every hidden parameter in its own standard deviations."""
+    true = hidden(case)
+    rows = [i for i, name in enumerate(result.names) if name in true]
+    return {
+        result.names[i]: float((result.value[i] - true[result.names[i]]) / math.sqrt(result.covariance[i, i]))
+        for i in rows
+    }
 
 
 def run(work: Path, cases: int, complete: int, minutes: float) -> None:
     """Cases without a line, until the time is up; quick ones from 0, complete ones from 1000."""
-    source = retraining.load(work / "run")
-    made = MadeLens(lens.load(work / "run" / "lens.h5"), source.settings.optics)
-    stack = made.stack()
-    nominal = Lenses(stack, stack, (), (), True)
+    on = ground(work)
     done = {entry["case"] for entry in _lines(work)}
     end, model = time.monotonic() + minutes * 60, None
     for case in [c for c in (*range(1000, 1000 + complete), *range(cases)) if c not in done]:
         if case < 1000 and model is None:
-            model = template(work, made.design)
-        entry = one(source, made, nominal, work, case, model=None if case >= 1000 else model)
+            model = template(work, on.made.design)
+        entry = one(on, case, model=None if case >= 1000 else model)
         with open(work / LINES, "a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
         print(case, f"{recovered(entry):.2f}", f"{entry['cpu_s']:.0f} s", flush=True)
@@ -244,44 +211,67 @@ def run(work: Path, cases: int, complete: int, minutes: float) -> None:
             break
 
 
-def _lines(work: Path) -> list[dict[str, object]]:
+def _lines(work: Path) -> list[dict[str, Any]]:
     path = work / LINES
     return [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
 
 
-def recovered(entry: dict[str, object], to: str = "nominal") -> float:
-    """Share of the gap between the made and the nominal lens (or the network that knew the truth) that was won back."""
-    error = {name: entry[name]["slip_mm"] for name in ("before", "retrained", to)}  # type: ignore[index]
-    gap = error["before"] - error[to]
-    return (error["before"] - error["retrained"]) / gap if gap > 0 else math.nan
+def _slip(entries: Sequence[dict[str, Any]], name: str) -> np.ndarray:
+    return np.array([e[name]["slip_mm"] for e in entries])
 
 
-def summary(entries: list[dict[str, object]]) -> dict[str, object]:
-    """Counts, medians and the worst tenth, for quick and complete cases, and for gaps that are above the noise."""
-    out: dict[str, object] = {}
-    for kind in (False, True):
-        mine = [e for e in entries if e["complete"] == kind]
-        gaps = [e["before"]["slip_mm"] - e["nominal"]["slip_mm"] for e in mine]  # type: ignore[index]
-        shares = np.array([recovered(e) for e, gap in zip(mine, gaps, strict=True) if gap > 0.02])
-        known = np.array(
-            [recovered(e, "known") for e, gap in zip(mine, gaps, strict=True) if "known" in e and gap > 0.02]
-        )
-        if not len(mine):
-            continue
-        out["complete" if kind else "quick"] = {
-            "cases": len(mine),
-            "with_a_gap_above_0.02_mm": len(shares),
-            "median_gap_mm": float(np.median(gaps)),
-            "median_recovered": float(np.median(shares)) if len(shares) else None,
-            "worst_tenth_recovered": float(np.quantile(shares, 0.1)) if len(shares) else None,
-            "median_of_what_the_truth_wins": float(np.median(known)) if len(known) else None,
-            "median_psf_error_nominal": float(np.median([e["psf_error"]["nominal"] for e in mine])),  # type: ignore[index]
-            "median_psf_error_fitted": float(np.median([e["psf_error"]["fitted"] for e in mine])),  # type: ignore[index]
-            "median_before_mm": float(np.median([e["before"]["slip_mm"] for e in mine])),  # type: ignore[index]
-            "median_after_mm": float(np.median([e["retrained"]["slip_mm"] for e in mine])),  # type: ignore[index]
-            "nominal_mm": float(np.median([e["nominal"]["slip_mm"] for e in mine])),  # type: ignore[index]
-        }
+def recovered(entry: dict[str, Any], to: str = "nominal") -> float:
+    """Share of the gap to the nominal lens (or to the network that knew the truth) that was won back; nan without one.
+
+    A gap within two of its own standard errors over the frames is none.
+    """
+    before, after, goal = (_slip([entry], name)[0] for name in ("before", "retrained", to))
+    gap = before - goal
+    return float((before - after) / gap) if gap > 2 * entry["gap_sigma_mm"] else math.nan
+
+
+def summary(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """Counts, medians and the worst tenth, for quick and complete cases, over the lenses that have a gap."""
+    out: dict[str, Any] = {}
+    for kind, chosen in (("quick", False), ("complete", True)):
+        mine = [e for e in entries if e["complete"] == chosen]
+        if mine:
+            out[kind] = _summary(mine)
     return out
+
+
+def _summary(mine: list[dict[str, Any]]) -> dict[str, Any]:
+    told = {name: _slip(mine, name) for name in ("nominal", "before", "retrained")}
+    shares = np.array([recovered(e) for e in mine])
+    with_gap = np.isfinite(shares)
+    knowing = [e for e in mine if "known" in e]
+    won = (told["before"] - told["retrained"])[with_gap]
+    gap = (told["before"] - told["nominal"])[with_gap]
+    rows = np.random.default_rng(0).integers(0, max(1, len(gap)), (2000, len(gap)))
+    pooled = won[rows].sum(1) / gap[rows].sum(1) if len(gap) else np.full(1, math.nan)
+    out = {
+        "cases": len(mine),
+        "with_a_gap": int(with_gap.sum()),
+        "median_gap_mm": _middle(told["before"] - told["nominal"]),
+        "median_recovered": _middle(shares),
+        "worst_tenth_recovered": float(np.nanquantile(shares, 0.1)) if with_gap.any() else None,
+        "pooled_recovered": float(won.sum() / gap.sum()) if len(gap) else None,
+        "pooled_interval": [float(v) for v in np.quantile(pooled, [0.025, 0.975])],
+        "median_recovered_of_what_the_truth_wins": _middle(np.array([recovered(e, "known") for e in knowing])),
+        **{f"median_{name}_mm": _middle(value) for name, value in told.items()},
+        **{
+            f"median_psf_error_{name}": _middle(np.array([e["psf_error"][name] for e in mine]))
+            for name in ("nominal", "fitted")
+        },
+    }
+    if mine[0]["complete"]:  # the draws of quick cases cover by construction
+        z = np.abs([v for e in mine for v in e["z"].values()])
+        out |= {"covered_95": float((z < 1.959964).mean()), "within_3_sigma": float((z < 3).mean())}
+    return out
+
+
+def _middle(values: np.ndarray) -> float | None:
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else None
 
 
 def report(work: Path) -> None:
@@ -302,7 +292,7 @@ def main() -> None:
     torch.set_num_threads(1)
     given.work.mkdir(parents=True, exist_ok=True)
     if given.what == "base":
-        base(given.work / "run", BASE)
+        finished(given.work / "run", BASE)
     elif given.what == "run":
         run(given.work, given.cases, given.complete, given.minutes)
     else:

@@ -1,0 +1,113 @@
+"""Small finished runs for the studies of the closing loop: one network, trained with one lens, as a run folder.
+
+The settings of every study are made here, from one text over the preset ``smoke``.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from codesign import evolution
+from codesign import optics as trained
+from codesign import run as runs
+from codesign.architecture import largest
+from codesign.evolution import Candidate, Search
+from metalens import design, lens, library, store
+
+TEXT = """
+preset = "smoke"
+checkpoint_every = 100
+[scenes]
+pixels = {pixels}
+margin = {margin}
+pool = {pool}
+slip_mm = {slip_mm}
+gaze_deg = {gaze_deg}
+[space]
+widths = [{width}]
+depths = [2]
+expansions = [3]
+kernels = [5]
+resolution = [1.0, 1.0]
+[run]
+pitch_um = {pitch_um}
+budgets_mmacs = [{budget}]
+[inner]
+steps = {steps}
+batch = 32
+slip_scale_mm = {slip_scale_mm}
+[inner.optics]
+rate = {rate}
+start = 0.12
+end = 0.8
+[optics]
+sample_um = {pitch_um}
+window_samples = {window}
+depth_count = 16
+focus_mm = {focus_mm}
+polynomials = {polynomials}
+"""
+BUDGET = 20.0  # MMACs that the one network stays below
+EDGE_UM = 1152.0  # of the image
+WINDOW_UM = 300.0  # of the PSFs
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What the studies vary.
+
+    focus_mm: of the hyperbolic lens that training starts from. moves: whether training moves the lens as well.
+    pitch_um: of pixels and samples. width: of the network. slip_mm, gaze_deg: reach of slippage and gaze.
+    """
+
+    focus_mm: float
+    moves: bool = False
+    pitch_um: float = 18.0
+    width: float = 0.35
+    steps: int = 2000
+    pool: int = 4096
+    slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
+    gaze_deg: tuple[float, float] = (18.0, 13.0)
+
+    @property
+    def toml(self) -> str:
+        """RUN.toml."""
+        pixels = round(EDGE_UM / self.pitch_um)
+        return TEXT.format(
+            pixels=pixels, margin=pixels // 8, pool=self.pool, slip_mm=list(self.slip_mm), gaze_deg=list(self.gaze_deg),
+            width=self.width, pitch_um=self.pitch_um, budget=BUDGET, steps=self.steps,
+            slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=0.02 if self.moves else 0.0,
+            window=2 * int(WINDOW_UM / self.pitch_um / 2) + 1, focus_mm=self.focus_mm,
+            polynomials=35 if self.moves else 0,
+        )  # fmt: skip
+
+
+def finished(folder: Path, recipe: Recipe) -> None:
+    """A run folder of these settings, trained with its largest architecture alone; goes on where it stopped."""
+    folder.mkdir(parents=True, exist_ok=True)
+    store.write_text(folder / "run.toml", recipe.toml)
+    settings = runs.load(folder / "run.toml")
+    path = folder / "checkpoint.safetensors"
+    going = runs.resume(path, settings) if path.exists() else runs.start(settings)
+    chosen = largest(settings.space)
+    going.trainer.architecture = chosen
+    for record in runs.train(going, path):
+        if record.step % 100 == 0:
+            print(record.step, f"{record.task:.3f}", flush=True)
+    going.searches = [Search((Candidate(chosen, 0.0, going.macs(chosen)),), {})]
+    runs.save(path, going)
+    row = {"budget_mmacs": BUDGET, "mmacs": going.macs(chosen) / 1e6}
+    row["architecture"] = json.loads(evolution.dumps(going.searches[0]))["history"][0]
+    if not (folder / "lens.h5").exists():
+        _design(folder / "lens.h5", settings, runs.coefficients(going).numpy())
+    store.write_text(folder / "result.json", json.dumps({"rows": [row]}))
+
+
+def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> None:
+    made = library.sweep(library.DEFAULT_CELL, wavelengths_um=(0.85,))
+    phase = trained.phase_of(settings.optics, coefficients)
+    aperture = settings.optics.aperture_mm * 1e3
+    shape = settings.optics.focus
+    lens.save(path, design.make(phase, shape, aperture_um=aperture, cell=made.cell, proxy=library.proxy_of(made))[0])
