@@ -122,8 +122,11 @@ def ome_positions(xml: str) -> Array:
 
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        return list(csv.DictReader(file, skipinitialspace=True))
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            return list(csv.DictReader(file, skipinitialspace=True))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not a table in UTF-8 text: {error}") from None
 
 
 def _read_json(path: Path) -> list[dict[str, Any]]:

@@ -98,7 +98,7 @@ def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
     try:
         with open(path, encoding="utf-8", newline="") as file:
             rows = [(n, row) for n, row in enumerate(csv.reader(file), 1) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ProcessError(f"{path}: cannot be read as a table ({error})") from None
     for number, row in rows:
         try:
