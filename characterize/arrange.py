@@ -12,6 +12,7 @@ from characterize.parameters import PLACE, vector
 from metalens.store import Array
 
 TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
+_ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
 MIRRORED = tuple("mirrored, then " + words for words in TURNS)
 
 
@@ -58,10 +59,10 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
     nearest = float(model.setting.depth_um.min())
     zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, 17) if scan_um > 0 else np.zeros(1)
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
-    scores = []
+    scores, rough = [], model.rough(_ROUGH)
     for zero in zeros:
         start[PLACE["stage_zero_um"]] = zero
-        scores.append(np.mean([score for score, _ in _compare(light, _expected(model, start, clipped), noise)]))
+        scores.append(np.mean([score for score, _ in _compare(light, _expected(rough, start, clipped), noise)]))
     best = int(np.argmax(scores))
     start[PLACE["stage_zero_um"]] = zeros[best]
     expected = _expected(model, start, clipped)

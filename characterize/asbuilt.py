@@ -17,6 +17,7 @@ For those who build on it (retraining, mask correction)::
 PSFs hold all that belongs to the lens (pillars, process, aberrations, distance, wavelength), nothing of the bench.
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -192,6 +193,8 @@ def save(path: str | Path, result: AsBuilt) -> None:
         "reason": result.reason,
         "response_center_um": result.response.center_um,
         "response_error": result.response.error,
+        "response_low_um": result.response.low_um,
+        "response_high_um": result.response.high_um,
     }
     store.save(path, "asbuilt", arrays, attributes=about, provenance=result.provenance)
 
@@ -209,7 +212,7 @@ def load(path: str | Path) -> AsBuilt:
     fields |= {name: tuple(w for w in _text(a[name]) if w) for name in _WORDS}
     return AsBuilt(
         design=design,
-        response=Sensitivity(a["response/coefficients"], about["response_center_um"], about["response_error"]),
+        response=_response(a, about),
         psf=_psf(a),
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],
@@ -219,6 +222,11 @@ def load(path: str | Path) -> AsBuilt:
         provenance=stored.provenance,
         **fields,
     )
+
+
+def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
+    ends = about.get("response_low_um", -math.inf), about.get("response_high_um", math.inf)
+    return Sensitivity(arrays["response/coefficients"], about["response_center_um"], about["response_error"], *ends)
 
 
 def _psf(arrays: dict[str, Array]) -> PsfStack | None:

@@ -147,8 +147,19 @@ def _frame(
     light = stack.intensity[0] * stack.energy_um2[0]
     step = camera.pixel_um / FINE
     light = _blur(light, x[PLACE["pinhole_um"]] * distance / z / step, x[PLACE["crosstalk_px"]] * FINE)
-    pixels = light.reshape(side, FINE, side, FINE).sum((1, 3))
+    pixels = _cell_means(light).reshape(side, FINE, side, FINE).sum((1, 3))
     return np.asarray(pixels[margin:-margin, margin:-margin])
+
+
+def _cell_means(light: Array) -> Array:
+    """Means over fine cells from samples at their middles, f + h² f'' / 24 along each axis; the rest is of order h⁴.
+
+    Sums of the samples themselves would make light of f cycles/um too strong by (pi f h)² / 6 in a pixel: 0.3 % of the
+    peak for a lens of NA 0.24 on 3 um pixels.
+    """
+    for axis in (-2, -1):
+        light = ndimage.convolve1d(light, np.array([1, 22, 1]) / 24, axis=axis, mode="nearest")
+    return light
 
 
 def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:

@@ -30,7 +30,7 @@ GEOMETRY = (
     "stage_scale",
 )
 PROCESS = ("height_nm", "index", "sidewall_deg")
-_SLOPE_TOLERANCE = 3e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
+_SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _STEP: dict[str, Callable[[Bench], float]] = {
     "distance_um": lambda bench: bench.distance_um,
     "wavelength_nm": lambda bench: bench.wavelength_um * 1e3,
@@ -87,7 +87,7 @@ class ForwardModel:
         sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
         over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
-        self.response, self._span = response, span
+        self.response, self._span, self._cut = response, span, 0.0
         self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
         self.stage_centre_um = float(setting.depth_um.mean())
@@ -119,6 +119,12 @@ class ForwardModel:
         places = [np.flatnonzero(np.isin(frames, group.index)) for group in self.groups]
         pairs = [(group, place) for group, place in zip(self.groups, places, strict=True) if len(place)]
         part.groups = [dataclasses.replace(group, index=place) for group, place in pairs]
+        return part
+
+    def rough(self, tolerance: float) -> "ForwardModel":
+        """The same model with fields to a relative ``tolerance``: quick enough to scan with."""
+        part = copy.copy(self)
+        part._cut = tolerance
         return part
 
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
@@ -182,9 +188,9 @@ class ForwardModel:
         phasor = np.exp(1j * self._phase(x, group))
         pupil, by_bias, by_process = self._pupil(x, group, bool(names))
         operators = self._operators(x, group)
-        field = operators.field(pupil * phasor)
+        field = operators.field(pupil * phasor, tolerance=self._cut)
         intensity = field.real**2 + field.imag**2
-        transfer, blurs = self._transfer(x, group)
+        transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
         out: dict[str, Array] = {}
         growth = self._growth(x, group)
@@ -230,7 +236,7 @@ class ForwardModel:
 
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, and by height, index, sidewall units."""
-        bias, _ = bias_um(x, group.reduced.u, group.reduced.v)
+        bias = np.tensordot([x[PLACE[name]] for name in BIAS], group.bias, 1)
         reach = group.pillars.span.bias_um
         weight, rate = group.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
         change = process(x)
@@ -295,14 +301,16 @@ class ForwardModel:
             "stage_scale": -from_centre / depth,
         }
 
-    def _transfer(self, x: Array, group: _Group) -> tuple[Array, dict[str, Array]]:
-        """(frames, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
+    def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[Array, dict[str, Array]]:
+        """(frames or 1, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
         fy, fx = self.grid.frequencies()
         pixel = self.setting.pixel_um
         blur, by_blur = detector.gauss(fy, fx, x[PLACE["crosstalk_px"]] * pixel)
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
         square = detector.pixel(fy, fx, pixel)
+        if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
+            return (square * blur)[None], {"crosstalk_px": (square * by_blur * pixel)[None]}
         discs = [detector.disc(fy, fx, x[PLACE["pinhole_um"]] * m) for m in shrink]
         disc = np.stack([value for value, _ in discs])
         by_disc = np.stack([slope * m for (_, slope), m in zip(discs, shrink, strict=True)])

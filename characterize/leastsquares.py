@@ -66,13 +66,15 @@ class Settings:
 
     secant: between exact Jacobians the last one is brought up to date by the images that each step gave (Broyden 1965);
         steps that look final, and those that fail, are checked with an exact one.
-    finish: the Jacobian at the end is exact.
+    near: sigma that an exact Jacobian still holds for.
+    finish: the Jacobian at the end is exact, or was so within ``near``.
     """
 
     iterations: int = 40
     step_tolerance: float = 0.02
     huber: float = 6.0
     secant: bool = False
+    near: float = 0.3
     finish: bool = True
 
 
@@ -122,31 +124,32 @@ def fit(
         step, image, damping, accepted = _step(model, data, state, prior, settings, damping)
         moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
         done = not accepted or moved < settings.step_tolerance * (1 + damping)
-        if done and not state.exact:
+        fresh = state.travel <= settings.near
+        if not fresh and (done or moved < settings.near):
             x = state.x + step if accepted else state.x
             state, damping = _linearise(model, data, x, prior, settings), 1e-3
             continue
         if accepted and settings.secant:
-            state = _secant(data, state, step, image, prior, settings)
+            state = _secant(data, state, step, image, prior, settings, moved=moved)
         elif accepted:
             state = _linearise(model, data, state.x + step, prior, settings)
         if done:
             converged = moved < 10 * settings.step_tolerance
             reason = f"last step moved {moved:.2g} sigma" if converged else "no step lowers the misfit"
             break
-    if settings.finish and not state.exact:
+    if settings.finish and state.travel > settings.near:
         state = _linearise(model, data, state.x, prior, settings)
     return _solution(data, state, prior, converged, reason, iteration)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _State:
-    """The problem about a point; exact: the Jacobian was computed here, not brought up to date from elsewhere."""
+    """The problem about a point; travel: sigma from where the Jacobian was computed, not only brought up to date."""
 
     x: Array
     image: Array
     jacobian: Array
-    exact: bool
+    travel: float
     residual: Array
     weight: Array
     gradient: Array
@@ -159,10 +162,12 @@ def _linearise(model: Model, data: Data, x: Array, prior: Prior, settings: Setti
     image, jacobian = model(x, True)
     if jacobian is None or not np.isfinite(image).all():
         raise FitError("the model is not finite at these parameters; bound them or correct the start")
-    return _state(data, (x, image, jacobian), prior, settings, exact=True)
+    return _state(data, (x, image, jacobian), prior, settings)
 
 
-def _secant(data: Data, state: _State, step: Array, image: Array, prior: Prior, settings: Settings) -> _State:
+def _secant(
+    data: Data, state: _State, step: Array, image: Array, prior: Prior, settings: Settings, *, moved: float
+) -> _State:
     """The problem after a step, with the least change of the Jacobian that explains how the images changed.
 
     J + (dI - J s) sᵀC / (sᵀC s), where C, the curvature, is the natural measure of a step.
@@ -170,10 +175,12 @@ def _secant(data: Data, state: _State, step: Array, image: Array, prior: Prior, 
     measure = state.curvature @ step
     missed = (image - state.image) - np.tensordot(step, state.jacobian, 1)
     jacobian = state.jacobian + np.multiply.outer(measure / max(float(step @ measure), 1e-300), missed)
-    return _state(data, (state.x + step, image, jacobian), prior, settings, exact=False)
+    return _state(data, (state.x + step, image, jacobian), prior, settings, travel=state.travel + moved)
 
 
-def _state(data: Data, at: tuple[Array, Array, Array], prior: Prior, settings: Settings, *, exact: bool) -> _State:
+def _state(
+    data: Data, at: tuple[Array, Array, Array], prior: Prior, settings: Settings, *, travel: float = 0.0
+) -> _State:
     x, image, jacobian = at
     noise = np.sqrt(data.variance(image))
     residual = _residual(data, image, noise)
@@ -185,7 +192,7 @@ def _state(data: Data, at: tuple[Array, Array, Array], prior: Prior, settings: S
     pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma**2, 0.0)
     gradient = -scaled @ (np.sqrt(weight) * residual).ravel()[keep] + pull
     curvature = information + np.diag(prior.sigma**-2.0)
-    return _State(x, image, jacobian, exact, residual, weight, gradient, curvature, information, noise)
+    return _State(x, image, jacobian, travel, residual, weight, gradient, curvature, information, noise)
 
 
 def _step(
@@ -198,7 +205,7 @@ def _step(
     blocked = ((state.x <= prior.low) & (state.gradient > 0)) | ((state.x >= prior.high) & (state.gradient < 0))
     free = np.flatnonzero(~blocked)
     step, image = np.zeros_like(state.x), state.image
-    for _ in range(10 if state.exact else 2):
+    for _ in range(10 if state.travel == 0 else 2):
         matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
         step = np.zeros_like(state.x)
         step[free] = -np.linalg.lstsq(matrix, state.gradient[free] / size[free], rcond=1e-14)[0] / size[free]

@@ -10,6 +10,8 @@ from characterize.pillars import Sensitivity, incidence_rad, process, transmissi
 from metalens.lens import DiameterMap, Lens
 from metalens.store import Array
 
+_TABLE = 1 << 16
+
 if TYPE_CHECKING:
     from metalens.psf_lens import View
     from metalens.psf_record import PsfStack
@@ -23,14 +25,24 @@ def pillars(
     Args:
         x: all parameters, in the order of ``parameters.NAMES``.
         noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence, where the proxy knows angles.
+
+    Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
     """
     d = lens.diameters
     u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
     bias, _ = bias_um(x, u, v)
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
-    t = transmission(lens.proxy, response, d.diameter_um + bias + noise_um, wave, process(x), angle_rad=angle_rad)
+    grown = np.where(d.diameter_um > 0, d.diameter_um + bias + noise_um, np.nan)
+    low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
+    place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
+    diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
+    t = transmission(lens.proxy, response, diameter, wave, process(x), angle_rad=angle_rad)
+    below = place.astype(np.int32)
+    t = t[below] + (place - below) * np.diff(t)[below]
     strength = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
-    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.tensordot(strength, aberrations(u, v), 1)), 0))
+    if any(strength):
+        t *= np.exp(1j * np.tensordot(strength, aberrations(u, v), 1))
+    return np.asarray(np.where(d.diameter_um > 0, t, 0))
 
 
 def built_lens(design: Lens, x: Array) -> Lens:

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from characterize.parameters import PLACE
 from metalens.cell import Index
@@ -28,16 +29,24 @@ class Sensitivity:
     coefficients: (3, degree + 1) complex power series in (D - center_um) of d ln t / d(height_um, index of the
         pillar, sidewall_rad); a row of zeros switches a parameter off.
     error: of the slopes, relative to their change across the lens; nan where not known.
+    low_um, high_um: diameters that the polynomials were made for; beyond them they go on along their tangents.
     """
 
     coefficients: Array
     center_um: float
     error: float = math.nan
+    low_um: float = -math.inf
+    high_um: float = math.inf
 
     def at(self, diameter_um: Array) -> Array:
         """(3, *shape) derivatives of ln t."""
-        offset = np.asarray(diameter_um) - self.center_um
-        return np.stack([np.polynomial.polynomial.polyval(offset, row) for row in self.coefficients])
+        inside = np.clip(diameter_um, self.low_um, self.high_um)
+        offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
+        values = [polynomial.polyval(offset, row) for row in self.coefficients]
+        if beyond.any():
+            slopes = [polynomial.polyval(offset, polynomial.polyder(row)) for row in self.coefficients]
+            values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
+        return np.stack(values)
 
 
 def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
@@ -72,8 +81,8 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     slope = 2 * n_eff * fit.deriv()(diameter - center) / (inside - around)
     by_index = (b * index + index * diameter * slope / 2) / n_eff
     by_wall = fit.deriv(2)(diameter - center) * cell.sidewall_rad * h**3 / 3
-    rows = [np.polynomial.polynomial.polyfit(diameter - center, v, degree) for v in (n_eff, by_index * h, by_wall)]
-    return Sensitivity(1j * k * np.array(rows), center, 0.5)
+    rows = [polynomial.polyfit(diameter - center, v, degree) for v in (n_eff, by_index * h, by_wall)]
+    return Sensitivity(1j * k * np.array(rows), center, 0.5, float(diameter[0]), float(diameter[-1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +128,9 @@ class Pillars:
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
         b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
         self.nodes_um = np.cos(np.pi * (np.arange(b) + 0.5) / b) * span.bias_um
-        columns = np.concatenate([self.exact(self.nodes_um[:, None], p) for p in self._training()])
+        self._slopes = response.at(self.diameter_um + self.nodes_um[:, None])
+        self._designed: dict[float, Array] = {}
+        columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
         self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
@@ -133,12 +144,22 @@ class Pillars:
 
     def coefficients(self, change: Process) -> Array:
         """(b, r) coefficients of t in the basis at the bias nodes."""
-        return np.asarray(self.exact(self.nodes_um[:, None], change) @ self.basis.T)
+        return np.asarray(self._at_nodes(change) @ self.basis.T)
 
     def slopes(self, change: Process) -> Array:
         """(3, b, r) derivatives of :meth:`coefficients` by height, index and sidewall."""
-        bias = self.nodes_um[:, None]
-        return np.asarray((self.response.at(self.diameter_um + bias) * self.exact(bias, change)) @ self.basis.T)
+        return np.asarray((self._slopes * self._at_nodes(change)) @ self.basis.T)
+
+    def _at_nodes(self, change: Process) -> Array:
+        """:meth:`exact` at the bias nodes; what the last few wavelengths made of the design is kept."""
+        wave = self.lens.wavelength_um + change.wavelength_um
+        if wave not in self._designed:
+            bias = self.nodes_um[:, None]
+            if len(self._designed) >= 8:
+                self._designed.pop(next(iter(self._designed)))
+            self._designed[wave] = self.exact(bias, Process(wavelength_um=change.wavelength_um))
+        amounts = [getattr(change, name) for name in CHANGES]
+        return np.asarray(self._designed[wave] * np.exp(np.tensordot(amounts, self._slopes, 1)))
 
     def table(self) -> Array:
         """(r, entries) complex64: the conjugate basis on a fine grid of diameters; the last entry is no pillar."""

@@ -78,6 +78,7 @@ class Reduced:
         self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
+        self._operators: dict[tuple[float, float, tuple[int, int]], Operators] = {}
         self._directions(depths_um)
         self.gathered = self._gather(lens, pillars)
         self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
@@ -152,7 +153,18 @@ class Reduced:
         )
 
     def operators(self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
-        """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples."""
+        """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples.
+
+        The last few are kept: most steps of a search move neither.
+        """
+        key = wavelength_um, distance_um, (len(axes_um[0]), len(axes_um[1]))
+        if key not in self._operators:
+            if len(self._operators) >= 6:
+                self._operators.pop(next(iter(self._operators)))
+            self._operators[key] = self._operators_of(wavelength_um, distance_um, axes_um)
+        return self._operators[key]
+
+    def _operators_of(self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
         k, scale = 2 * math.pi / wavelength_um, self.bench.distance_um / distance_um
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())

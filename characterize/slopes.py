@@ -42,7 +42,7 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, sidewall: bool = False) -> Se
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
-    return Sensitivity(np.array(padded) * scale, (low + high) / 2, error)
+    return Sensitivity(np.array(padded) * scale, (low + high) / 2, error, low, high)
 
 
 def _exact(cell: Cell, diameter_um: float, wavelength_um: float, sidewall: bool) -> tuple[complex, complex, complex]:
