@@ -24,7 +24,8 @@ scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
 
 - `hyperF`: hyperbolic, focused at F mm (20 is mid-range). `helixN`: double helix of N zones, focused at 20 mm.
 - `jointF`, `swiftF`: trained with the network from `hyperF`, at two learning rates of the phase.
-- `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18dim`: 100. `p18small`: half the width.
+- `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18long`: three times the frames. `p18dim`:
+  100 electrons. `p18small`: half the width.
 
 Ratios with 95 % intervals of a paired bootstrap over pairs of frames and over runs; with one seed, over frames alone.
 The best focus is the fixed hyperbolic lens of least error on natural frames. Made by

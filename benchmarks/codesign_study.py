@@ -56,6 +56,7 @@ class Case:
 CASES = {
     "p9": Case(9.0),
     "p18": Case(18.0),
+    "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
     "p18small": Case(18.0, width=0.25),
 }
@@ -199,7 +200,9 @@ def main() -> None:
 
 SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
 LENSES = ("hyper33", "joint33", "swift20", "hyper20", "helix2", "swift33")
-PLAN = [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+LONG = ("hyper33", "swift33", "joint33", "hyper20")
+PLAN = [f"p18long/{lens}/{seed}" for seed in range(5) for lens in LONG]
+PLAN += [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p18dim", "p18small") for seed in range(5) for lens in LENSES[:2]]
