@@ -70,7 +70,7 @@ def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float)
             case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
             made = evaluate(case, mesh.plan, weak=rung.weak)
             shared = max(rung.choice(case.rho).thin, mesh.thin) + mesh.wide * case.rho**4
-            error = rung.safety * made.spread + shared * made.drift + 1e-12
+            error = rung.bound(shared, made.spread, made.drift, case.rho)
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
             return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
 

@@ -1,5 +1,6 @@
 """The public solve: one pillar cell, one wavelength, one angle, with an error estimate."""
 
+import cmath
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,7 +22,7 @@ from metalens.modal.spaces import space
 from metalens.response import Response
 
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
-QUICK = 1e-10  # accuracies above it allow the quick way to the homogeneous modes
+QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
@@ -86,15 +87,21 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     The arithmetic mean, from which it differs in second order, where ``first`` is nearly singular (a black layer)
     or the ratio has no principal root.
     """
-    if abs(np.linalg.det(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
+    if abs(determinant(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
         ratio = np.linalg.solve(first, second)
-        root = np.sqrt(np.linalg.det(ratio) + 0j)
-        trace = np.sqrt(np.trace(ratio) + 2 * root)
+        root = cmath.sqrt(determinant(ratio))
+        trace = cmath.sqrt(ratio[0, 0] + ratio[1, 1] + 2 * root)
         if abs(trace) > 0.1:
-            mean: np.ndarray = first @ ((ratio + root * np.eye(2)) / trace)
+            mean: np.ndarray = (second + root * first) / trace
             return mean
     arithmetic: np.ndarray = (first + second) / 2
     return arithmetic
+
+
+def determinant(matrix: np.ndarray) -> complex:
+    """Of a 2 x 2 matrix."""
+    (a, b), (c, d) = matrix.tolist()
+    return complex(a * d - b * c)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -136,7 +143,7 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
     below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
     q, match, dual = layer_between(b, case, (below, above), magnetic=magnetic, weak=weak)
     foot = zero_order(b, below, case.bloch, te=te)
-    pair = (foot, len(below.ports) + zero_order(b, above, case.bloch, te=te))
+    pair = [foot, len(below.ports) + zero_order(b, above, case.bloch, te=te)]
     travelling = np.flatnonzero(np.abs(match.travel) > SEEN)
     travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
@@ -144,11 +151,11 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
     moved = moved[:0] if magnetic else moved
     sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic and not dual else np.ones((2, 2))
     return Form(
-        matrix=match.matrix[np.ix_(pair, pair)] * sign,
+        matrix=match.matrix[pair][:, pair] * sign,
         energy=float((np.abs(match.matrix[:, foot]) ** 2).sum()),
         unknowns=b.size,
         q=q[travelling],
-        by_q=np.array([match.rate(row)[np.ix_(pair, pair)] * sign for row in moved]).reshape(-1, 2, 2),
+        by_q=match.rate(moved)[:, pair][:, :, pair] * sign,
     )
 
 

@@ -121,31 +121,35 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
     """X with X² = square and eigenvalues in the right half plane, near the root of its diagonal; None if it is not.
 
     signs: of growth, with respect to which the square is symmetric. least: levels of the diagonal below it are
-    lifted to it. The rows of the lowest levels converge last: after the first steps they go on alone.
+    lifted to it. The rows of the lowest levels converge last: they are watched, and after the first steps go on alone.
     """
-    n = len(square)
+    n, slow = len(square), max(1, len(square) // SLOW)
     diagonal = np.sqrt(np.maximum(np.diag(square), least))
+    order = np.argsort(diagonal)
+    diagonal, ordered = diagonal[order], signs[order]
     weight = 1 / (diagonal[:, None] + diagonal)
-    rest = square * weight
+    rest = square[order[:, None], order] * weight
     rest.ravel()[:: n + 1] -= diagonal / 2
-    slow = np.argsort(diagonal)[: n // SLOW]
-    slow_rest, slow_weight, mirror = rest[slow], weight[slow], signs[slow] * signs[:, None]
-    aim = max(accuracy * diagonal.min(), ROUNDING * diagonal.max())
+    mirror = ordered[:slow] * ordered[:, None]
+    aim = max(accuracy * diagonal[0], ROUNDING * diagonal[-1])
     e, change, first, whole = rest, np.inf, np.inf, np.inf
     for step in range(STEPS):
         if step < WHOLE or change < max(aim, SETTLED * whole):
             after = e @ e
             after *= weight
             np.subtract(rest, after, out=after)
-            whole = change = np.abs(after - e).max()
+            whole = change = np.abs(after[:slow] - e[:slow]).max()
             e = after
             if change < aim:
                 e.ravel()[:: n + 1] += diagonal
-                return e
+                back = np.argsort(order)
+                return np.asarray(e[back[:, None], back])
         else:
-            rows = slow_rest - slow_weight * (e[slow] @ e)
-            change = np.abs(rows - e[slow]).max()
-            e[slow], e[:, slow] = rows, mirror * rows.T
+            rows = e[:slow] @ e
+            rows *= weight[:slow]
+            np.subtract(rest[:slow], rows, out=rows)
+            change = np.abs(rows - e[:slow]).max()
+            e[:slow], e[:, :slow] = rows, mirror * rows.T
         first = change if step == 0 else first
         if not change <= 2 * first:
             return None

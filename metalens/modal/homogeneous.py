@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
-import scipy.sparse
 
+from metalens.modal.dense import eigen_pairs
 from metalens.modal.spaces import Space
 
 
@@ -101,19 +101,17 @@ def quick_modes(space: Space) -> Basis:
     less its projection on the gradients: curl_cc x = te (mass_cc - mass_cG K⁻¹ mass_Gc) x. Half the time; the
     difference loses digits (1e-8 of t at worst).
     """
-    c, g = space.cotree, scipy.sparse.csc_array(space.gradient)
+    c, down_to = space.cotree, space.transposed
     corner = c[:, None], c
-    mass = (g.T @ space.cell.mass).T
-    tm, scalar = sl.eigh(g.T @ mass, space.cell.scalar, driver="gvd", check_finite=False)
+    mass = (down_to @ space.cell.mass).T
+    tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
     unit = scalar / np.sqrt(tm)
     inner = mass[c] @ unit
-    te, x = sl.eigh(
-        space.cell.curl[corner], space.cell.mass[corner] - inner @ inner.T, driver="gvd", check_finite=False
-    )
+    te, x = eigen_pairs(space.cell.curl[corner], space.cell.mass[corner] - inner @ inner.T)
     down = inner.T @ x
-    disc = (g.T @ space.disc.mass).T
+    disc = (down_to @ space.disc.mass).T
     across = x.T @ (disc[c] @ unit)
-    low = unit.T @ (g.T @ disc) @ unit
+    low = unit.T @ (down_to @ disc) @ unit
     mixed = across @ down
     high = x.T @ space.disc.mass[corner] @ x - mixed - mixed.T + down.T @ (low @ down)
     across -= down.T @ low
@@ -122,7 +120,7 @@ def quick_modes(space: Space) -> Basis:
     disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = high, across, across.T, low
 
     def vector() -> np.ndarray:
-        gradients = g @ unit
+        gradients = space.gradient @ unit
         rest = -gradients @ down
         rest[c] += x
         return np.concatenate([rest, gradients], 1)

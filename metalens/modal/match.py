@@ -158,14 +158,14 @@ class Match:
     amplitude: np.ndarray
 
     def rate(self, moved: np.ndarray) -> np.ndarray:
-        """Derivative of the scattering matrix, given those of the factors exp(i q h) of the carrying modes."""
-        c = len(self.carry)
-        push = swap(self.foot.reflect, self.top.reflect, moved) @ self.amplitude
+        """Derivatives (..., ports, ports) of the scattering matrix, given those (..., carry) of the factors exp(i q h)
+        of the carrying modes."""
+        c, x = len(self.carry), self.travel[:, None]
+        down, up = moved[..., None] * self.amplitude[c:], moved[..., None] * self.amplitude[:c]
+        push = np.concatenate([self.foot.reflect @ down, self.top.reflect @ up], -2)
         echo = np.linalg.solve(self.round_trip, push)
-        x = self.travel
-        out: np.ndarray = swap(self.foot.leave, self.top.leave, moved) @ self.amplitude
-        out[: len(self.foot.leave)] += (self.foot.leave * x) @ echo[c:]
-        out[len(self.foot.leave) :] += (self.top.leave * x) @ echo[:c]
+        down, up = down + x * echo[..., c:, :], up + x * echo[..., :c, :]
+        out: np.ndarray = np.concatenate([self.foot.leave @ down, self.top.leave @ up], -2)
         return out
 
 

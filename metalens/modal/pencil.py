@@ -14,8 +14,8 @@ reflection changes its sign. It needs no inverse of an indefinite matrix.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
+from metalens.modal.dense import below, definite_inverse
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium
 
@@ -51,10 +51,9 @@ def added(matrix: np.ndarray, diagonal: np.ndarray | float) -> np.ndarray:
 
 def whitened(definite: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Levels of lowerᵀ inner lower with lower lowerᵀ = definite, and lower⁻ᵀ vectors sqrt(|level|)."""
-    lower = sl.cholesky(definite, lower=True, check_finite=False)
-    level, vectors = sl.eigh(lower.T @ inner @ lower, driver="evd", check_finite=False, overwrite_a=True)
-    turn = sl.solve_triangular(lower, vectors, trans="T", lower=True, check_finite=False)
-    return level, turn * np.sqrt(np.abs(level))
+    lower = np.linalg.cholesky(definite)
+    level, vectors = np.linalg.eigh(lower.T @ inner @ lower)
+    return level, below(lower, vectors, transposed=True) * np.sqrt(np.abs(level))
 
 
 def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
@@ -62,10 +61,10 @@ def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
     around = float(medium.around.real)
     a, k2, step = len(basis.te), medium.k0**2, float((medium.disc - medium.around).real)
     first = added(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
-    te, te_turn = sl.eigh(first, driver="evd", check_finite=False, overwrite_a=True)
+    te, te_turn = np.linalg.eigh(first)
     second = added(k2 * step * basis.disc_mass[a:, a:], k2 * around)
-    scalar = sl.cholesky(added(step * basis.disc_scalar, around), lower=True, check_finite=False)
-    rise = sl.solve_triangular(scalar, np.diag(np.sqrt(basis.tm / k2)), lower=True, check_finite=False)
+    scalar = np.linalg.cholesky(added(step * basis.disc_scalar, around))
+    rise = below(scalar, np.diag(np.sqrt(basis.tm / k2)))
     tm, tm_turn = whitened(second, added(rise.T @ rise, -1.0))
     coupling = te_turn.T @ (-k2 * step * basis.disc_mass[:a, a:]) @ tm_turn
     return Pencil(te, tm, np.ones(a), -np.sign(tm), coupling, te_turn, tm_turn, dual=False)
@@ -75,12 +74,11 @@ def magnetic_pencil(basis: Basis, medium: Medium) -> Pencil:
     """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ - diag(0, tm / k0²)."""
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
     a, k2 = len(basis.te), medium.k0**2
-    weighted = np.linalg.inv(added((disc - around) * basis.disc_mass, around))
-    weighted = (weighted + weighted.T) / 2
+    weighted = definite_inverse(added((disc - around) * basis.disc_mass, around))
     curl = added((disc - around) * basis.disc_curl, around * basis.te - k2)
     te, te_turn = whitened(weighted[:a, :a], curl)
     second = added(-k2 * weighted[a:, a:], basis.tm)
-    tm, tm_turn = sl.eigh(second, driver="evd", check_finite=False, overwrite_a=True)
-    tm_turn *= medium.k0
+    tm, tm_turn = np.linalg.eigh(second)
+    tm_turn = tm_turn * medium.k0
     coupling = te_turn.T @ weighted[:a, a:] @ tm_turn
     return Pencil(te, tm, np.sign(te), -np.ones(len(tm)), coupling, te_turn, tm_turn, dual=True)

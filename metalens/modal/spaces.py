@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.linalg as sl
+import scipy.sparse
 
 from metalens.modal.assembly import Geometry, Part, assemble, gradient, integrate
 from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build
@@ -90,6 +91,7 @@ class Space:
     """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch.
 
     cotree: unknowns that with all gradients make a well-conditioned basis (those of the edges off a spanning tree).
+    transposed: of the gradient, sparse.
     """
 
     cell: Part
@@ -98,25 +100,43 @@ class Space:
     electric: bool
     half_phase_rad: float | None
     cotree: np.ndarray
+    transposed: scipy.sparse.csr_array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Topology:
+    """What a symmetry class has for all diameters: its unknowns, and the gradient, dense and transposed sparse."""
+
+    vectors: Selection
+    scalars: Selection
+    gradient: np.ndarray
+    transposed: scipy.sparse.csr_array
+
+
+@lru_cache(maxsize=32)
+def topology(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> Topology:
+    """See ``Topology``; cached, as it does not depend on the diameter."""
+    mesh = build(plan)
+    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
+    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
+    dense = restrict(gradient(plan), vectors, scalars)
+    return Topology(vectors, scalars, dense, scipy.sparse.csr_array(dense.T))
 
 
 @lru_cache(maxsize=32)
 def cotree(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> np.ndarray:
     """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a phase."""
-    mesh = build(plan)
-    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
-    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
-    size = np.sqrt(np.diag(restrict(assemble(TYPICAL, plan).cell.mass, vectors, vectors)))
-    matrix = size[:, None] * restrict(gradient(plan), vectors, scalars)
-    pivots = sl.qr(matrix.T, mode="r", pivoting=True)[1]
-    return np.sort(pivots[scalars.size :])
+    known = topology(plan, electric, half_phase_rad)
+    size = np.sqrt(np.diag(restrict(assemble(TYPICAL, plan).cell.mass, known.vectors, known.vectors)))
+    pivots = sl.qr((size[:, None] * known.gradient).T, mode="r", pivoting=True)[1]
+    return np.sort(pivots[known.scalars.size :])
 
 
 def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> Space:
     """The symmetry class with electric or natural y walls, and the given Bloch phase over half a pitch."""
-    mesh = geometry.mesh
-    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
-    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
+    plan = geometry.mesh.plan
+    known = topology(plan, electric, half_phase_rad)
+    vectors, scalars = known.vectors, known.scalars
 
     def part(p: Part) -> Part:
         return Part(
@@ -127,18 +147,18 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
     return Space(
         part(geometry.cell),
         part(geometry.disc),
-        restrict(geometry.gradient, vectors, scalars),
+        known.gradient,
         electric,
         half_phase_rad,
-        cotree(mesh.plan, electric, step),
+        cotree(plan, electric, step),
+        known.transposed,
     )
 
 
 def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> tuple[Space, Space]:
     """Derivatives of ``space`` in the radius rho and in the half phase (zero without one)."""
-    mesh = geometry.mesh
-    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
-    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
+    known = topology(geometry.mesh.plan, electric, half_phase_rad)
+    vectors, scalars = known.vectors, known.scalars
 
     def by_radius(p: Part) -> Part:
         return Part(
@@ -152,11 +172,11 @@ def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | N
             restrict(p.scalar, scalars, scalars, rate=True),
         )
 
-    cell, disc = integrate(mesh, geometry.rho, rate=True)
+    cell, disc = integrate(geometry.mesh, geometry.rho, rate=True)
     still = np.zeros((vectors.size, scalars.size))
     turned = restrict(geometry.gradient, vectors, scalars, rate=True)
-    none = np.zeros(0, int)
+    none, flat = np.zeros(0, int), known.transposed
     return (
-        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, none),
-        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, none),
+        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, none, flat),
+        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, none, flat),
     )

@@ -93,7 +93,7 @@ def test_quick_homogeneous_modes_are_the_homogeneous_modes(half_phase, rho):
         symmetry_class = space(assemble(rho, COARSE), electric=electric, half_phase_rad=half_phase)
         slow, quick = modes(symmetry_class, careful=True), modes(symmetry_class, quick=True)
         assert np.abs(slow.tm / quick.tm - 1).max() < 1e-6
-        assert np.abs(slow.te - quick.te).max() < 1e-8 * slow.te.max()
+        assert np.abs(slow.te - quick.te).max() < 3e-8 * slow.te.max()
         gram = quick.vector.T @ symmetry_class.cell.mass @ quick.vector
         assert np.abs(gram - np.eye(quick.size)).max() < 1e-6
         direct = quick.vector.T @ symmetry_class.disc.mass @ quick.vector
