@@ -1,5 +1,6 @@
 """A plain through-focus stack of a round pupil, Zernike phase only: our maximum likelihood beside solvephase's."""
 
+import dataclasses
 import math
 import time
 from typing import Any
@@ -11,7 +12,7 @@ from characterize import leastsquares, zernike
 from characterize.leastsquares import Data, Prior, Settings
 from characterize.pupil import PupilModel, PupilSpec
 
-WAVE_UM, NA, SAMPLING, SIDE, ORDER, PHOTONS, SEEDS = 0.85, 0.02, 2.0, 48, 7, 2e5, 5
+WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = 0.85, 0.02, 2.0, 48, 24, 7, 2e5, 5
 DEFOCUS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0)  # rms of the defocus term
 
 
@@ -26,7 +27,7 @@ def peer_rows() -> list[Row]:
     found: dict[str, list[tuple[float, float]]] = {"Levenberg-Marquardt, up to three starts": [_ours(c) for c in cases]}
     for label, method in peers.items():
         found[label] = [_theirs(solvephase, case, method) for case in cases]
-    about = f"rad rms from the true phase, mean of {SEEDS} stacks"
+    about = f"rad rms from the true phase, mean of {SEEDS} stacks; CPU time, least of them"
     goal = "no worse than L-BFGS in half its time, multi-start in a tenth"
     return [
         Row("5 images, 33 modes, 2e5 photons", label, min(t for t, _ in runs), _mean(runs), about, goal=goal)
@@ -51,8 +52,9 @@ def positions_um() -> np.ndarray:
     return np.array(DEFOCUS_RAD) * 4 * math.sqrt(3) * WAVE_UM / (2 * math.pi * NA**2)
 
 
-def _model() -> PupilModel:
-    return PupilModel(spec(), positions_um(), phase_order=ORDER, amplitude_order=0)
+def _model(side: int = SIDE) -> PupilModel:
+    of = dataclasses.replace(spec(), window=side)
+    return PupilModel(of, positions_um(), phase_order=ORDER, amplitude_order=0)
 
 
 def _stack(seed: int) -> dict[str, Any]:
@@ -77,40 +79,45 @@ def _vector(model: PupilModel, phase: np.ndarray, light: float, level: float) ->
 
 
 def _ours(case: dict[str, Any]) -> tuple[float, float]:
+    """The middle quarter of the images from each start, then all pixels: two steps are left to them."""
+    start = time.process_time()
     images = case["images"]
-    start = time.perf_counter()
-    model = _model()
-    layout = model.layout()
-    everywhere = np.ones(images.shape, bool)
-    data = Data(images, everywhere, ~everywhere, np.full(images.shape, 1.0), np.ones(images.shape))
+    middle = (slice(None), *(slice((SIDE - MIDDLE) // 2, (SIDE + MIDDLE) // 2),) * 2)
+    small, large = _model(MIDDLE), _model()
     level = float(np.median(images[:, 0]))
-    light = float((images - level).sum((1, 2)).mean())
-    prior = Prior.none(_vector(model, np.zeros(layout.phase), light, level))
-    blur = layout.size - 2 * layout.frames - 1
-    prior.low[blur] = prior.high[blur] = prior.mean[blur]
+    begin = _vector(small, np.zeros(small.layout().phase), float((images - level).sum((1, 2)).mean()), level)
+    settings = Settings(iterations=15, step_tolerance=1.0, near=3.0, finish=False)
     best = None
     for astigmatism in (0.0, 0.7, -0.7):  # further starts only where the first leaves something unexplained
-        phase = np.zeros(layout.phase)
-        phase[model.phase_indices.index((2, 2))] = astigmatism
-        begin = _vector(model, phase, light, level)
-        found = leastsquares.fit(model.images, data, begin, prior=prior, settings=Settings(secant=True))
+        begin[small.phase_indices.index((2, 2))] = astigmatism
+        rough = _fit(small, images[middle], begin, settings)
+        found = _fit(large, images, rough.value, Settings(near=1.0, step_tolerance=0.1))
         best = found if best is None or found.merit < best.merit else best
         if best.chi2_per_dof < 1.1:
             break
     found = best or found
-    seconds = time.perf_counter() - start
-    return seconds, float(np.linalg.norm(found.value[: layout.phase] - case["phase"]))
+    seconds = time.process_time() - start
+    return seconds, float(np.linalg.norm(found.value[: large.layout().phase] - case["phase"]))
+
+
+def _fit(model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: Settings) -> leastsquares.Solution:
+    everywhere = np.ones(images.shape, bool)
+    data = Data(images, everywhere, ~everywhere, np.full(images.shape, 1.0), np.ones(images.shape))
+    prior = Prior.none(begin)
+    blur = len(begin) - 2 * len(images) - 1
+    prior.low[blur] = prior.high[blur] = begin[blur]
+    return leastsquares.fit(model.images, data, begin, prior=prior, settings=settings)
 
 
 def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, float]:
     pupil = solvephase.Pupil.circular(64, 1.0)
     length = 2 * math.pi / WAVE_UM * 1e6  # rad for a metre of path
     amounts = [-a / length for a in DEFOCUS_RAD]
-    start = time.perf_counter()
+    start = time.process_time()
     found = solvephase.retrieve(
         case["images"], pupil, WAVE_UM * 1e-6, sampling=SAMPLING, diversity=amounts, basis=35, method=method
     )
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     inside = np.asarray(pupil.mask)
     n = inside.shape[0]
     v, u = (g / (n / 2) for g in np.mgrid[:n, :n] - (n - 1) / 2)

@@ -44,22 +44,21 @@ class Grid:
 
     def sample(self, intensity: Array, transfer: Array) -> Array:
         """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
-        blurred = fft.irfft2(fft.rfft2(intensity) * (transfer * self._half_step()), s=intensity.shape[-2:])
+        shifted = transfer if self.oversample % 2 else transfer * self._half_step()
+        blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
         return np.asarray(blurred[..., y, x])
 
-    def _half_step(self) -> Array | float:
+    def _half_step(self) -> Array:
         """Transfer that moves the light by half a fine sample, where no fine sample sits at a pixel's centre."""
-        if self.oversample % 2:
-            return 1.0
         fy, fx = self.frequencies()
         return np.asarray(np.exp(-1j * np.pi * (fy + fx) * self.fine_um))
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:
-    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled above twice that."""
-    return max(1, math.ceil(2 * highest * pixel_um * (1 + 1e-9)))
+    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled at twice that or above."""
+    return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
 
 def pixel(fy: Array, fx: Array, pixel_um: float) -> Array:

@@ -66,7 +66,7 @@ class Settings:
 
     secant: between exact Jacobians the last one is brought up to date by the images that each step gave (Broyden 1965);
         steps that look final, and those that fail, are checked with an exact one.
-    near: sigma that an exact Jacobian still holds for.
+    near: sigma that an exact Jacobian still holds for: shorter steps go on with it.
     finish: the Jacobian at the end is exact, or was so within ``near``.
     """
 
@@ -131,6 +131,8 @@ def fit(
             continue
         if accepted and settings.secant:
             state = _secant(data, state, step, image, prior, settings, moved=moved)
+        elif accepted and state.travel + moved <= settings.near:
+            state = _state(data, (state.x + step, image, state.jacobian), prior, settings, travel=state.travel + moved)
         elif accepted:
             state = _linearise(model, data, state.x + step, prior, settings)
         if done:
@@ -185,12 +187,11 @@ def _state(
     noise = np.sqrt(data.variance(image))
     residual = _residual(data, image, noise)
     weight = _robust(residual, settings.huber) * data.usable * ~(data.saturated & (residual == 0))
-    columns = jacobian.reshape(len(x), -1)
-    keep = np.flatnonzero(weight.ravel() > 0)
-    scaled = columns[:, keep] * (np.sqrt(weight) / noise).ravel()[keep]
+    root = np.sqrt(weight)
+    scaled = jacobian.reshape(len(x), -1) * (root / noise).ravel()
     information = scaled @ scaled.T
     pull = np.where(np.isfinite(prior.sigma), (x - prior.mean) / prior.sigma**2, 0.0)
-    gradient = -scaled @ (np.sqrt(weight) * residual).ravel()[keep] + pull
+    gradient = -scaled @ (root * residual).ravel() + pull
     curvature = information + np.diag(prior.sigma**-2.0)
     return _State(x, image, jacobian, travel, residual, weight, gradient, curvature, information, noise)
 

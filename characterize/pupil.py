@@ -14,7 +14,8 @@ from characterize import detector, zernike
 from metalens.errors import CaptureError, FitError
 from metalens.store import Array
 
-_COMPLEX = np.complex128
+_BLOCK = 1 << 22  # samples of the fields that are formed at once
+_SHARP = 0.01  # pixels of blur that are none: 5e-4 of the finest detail
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +109,7 @@ class PupilModel:
         fy, fx = self.grid.frequencies()
         fixed = detector.pixel(fy, fx, spec.pixel_um) if over > 1 else np.ones_like(fy * fx)
         self._fixed, self._f = fixed * detector.ball(fy, fx, spec.bead_um), (fy, fx)
+        self._sharp = over == 1 and not spec.bead_um
 
     def _sample_pupil(self, phase_order: int, amplitude_order: int) -> None:
         spec, k = self.spec, 2 * math.pi * self.spec.index / self.spec.wavelength_um
@@ -127,6 +129,8 @@ class PupilModel:
         u, v = self.sx * squeeze / sine, self.sy * squeeze / sine
         self.phase_basis = zernike.basis(self.phase_indices, u, v)
         self.amplitude_basis = zernike.basis(self.amplitude_indices, u, v)
+        turns = np.concatenate([1j * self.phase_basis, self.amplitude_basis, -1j * k * np.stack([self.sx, self.sy])])
+        self._columns = self._square(turns.astype(np.complex64))
         self.components = weight[self.inside] * _components(self.sx * squeeze, self.sy * squeeze, spec.vectorial)
         y, x = self.grid.axes_um()
         self._ey, self._ex = np.exp(1j * k * y[:, None] * q), np.exp(1j * k * q[:, None] * x)
@@ -157,32 +161,44 @@ class PupilModel:
         envelope = self.components * np.exp(amplitude @ self.amplitude_basis)
         total = (envelope**2).sum()
         scale = (np.exp(gain) * self._norm / total)[:, None, None]
-        pupil = self._pupils(phase, dx, dy)[:, None] * envelope
-        field = self._transform(pupil)
+        pupil = self._square(self._pupils(phase, dx, dy)[:, None] * envelope)
+        sharp = self._sharp and blur <= _SHARP * self.spec.pixel_um
+        field = self._transform(pupil, sharp)
         intensity = (field.real**2 + field.imag**2).sum(1)
-        blurring, slope = detector.gauss(*self._f, blur)
-        light = self.grid.sample(intensity, self._fixed * blurring) * scale
+        transfer = None if sharp else self._fixed * detector.gauss(*self._f, blur)[0]
+        light = self._seen(intensity, transfer) * scale
         image = light + background[:, None, None]
         if not jacobian:
             return image, None
         out = np.zeros((layout.size, *image.shape))
-        tilts = self._legendre()[:, :, None] * (-1j * self.k)
-        columns = [
-            *(1j * z for z in self.phase_basis),
-            *(z.astype(_COMPLEX) for z in self.amplitude_basis),
-            *(t * self.sx for t in tilts),
-            *(t * self.sy for t in tilts),
-        ]
-        short, conjugate = pupil.astype(np.complex64), field.conj()
-        transfer = self._fixed * blurring
-        for j, factor in enumerate(columns):
-            turned = short * np.atleast_2d(factor)[:, None].astype(np.complex64)
-            change = 2 * (conjugate * self._transform(turned)).real.sum(1)
-            out[j] = self.grid.sample(change, transfer) * scale
+        self._pupil_columns(out, layout, (pupil.astype(np.complex64), field.astype(np.complex64)), transfer)
+        out[: layout.size - 2 * layout.frames - 1] *= scale
         for j, z in enumerate(self.amplitude_basis, layout.phase):
             out[j] -= light * (2 * (envelope**2 * z).sum() / total)
-        self._linear_columns(out, layout, light, self.grid.sample(intensity, self._fixed * slope) * scale)
+        by_blur = None if sharp else self._fixed * detector.gauss(*self._f, blur)[1]
+        self._linear_columns(out, layout, light, 0 * light if sharp else self._seen(intensity, by_blur) * scale)
         return image, out
+
+    def _seen(self, intensity: Array, transfer: Array | None) -> Array:
+        """Intensity (..., y, x) through bead, blur and pixels; as it is, one sample a pixel, without a transfer."""
+        return intensity if transfer is None else self.grid.sample(intensity, transfer)
+
+    def _pupil_columns(self, out: Array, layout: Layout, at: tuple[Array, Array], transfer: Array | None) -> None:
+        """Derivatives by phase, log-amplitude and drift, before the scale: 2 Re E* dE, many at a time."""
+        pupil, field = at
+        first, drift = layout.phase + layout.amplitude, self._legendre()
+        block = max(1, _BLOCK // field.size)
+        for start in range(0, first + 2, block):
+            some = slice(start, min(start + block, first + 2))
+            change = self._transform(pupil * self._columns[some, None, None], transfer is None)
+            both = field.view(np.float32) * change.view(np.float32)
+            slope = 2 * (both[..., ::2] + both[..., 1::2]).sum(2)
+            for j, seen in zip(range(some.start, some.stop), self._seen(slope, transfer), strict=True):
+                if j < first:
+                    out[j] = seen
+                else:  # tilt along x or y, times each polynomial along the stack
+                    place = first + (j - first) * layout.drift
+                    out[place : place + layout.drift] = drift[:, :, None, None] * seen
 
     def _linear_columns(self, out: Array, layout: Layout, light: Array, blur_slope: Array) -> None:
         first = layout.size - 2 * layout.frames
@@ -202,15 +218,25 @@ class PupilModel:
         """(drift order + 1, n) Legendre polynomials along the stack."""
         return np.asarray(np.polynomial.legendre.legvander(self.position_um / self.span_um, self.spec.drift_order).T)
 
-    def _transform(self, pupil: Array) -> Array:
-        """(n, components, inside) -> (n, components, y, x) field on the fine grid."""
-        square = np.zeros((*pupil.shape[:2], self.nodes, self.nodes), pupil.dtype)
-        square[:, :, self.inside] = pupil
-        return np.asarray(self._ey.astype(pupil.dtype) @ square @ self._ex.astype(pupil.dtype))
+    def _transform(self, pupil: Array, sharp: bool) -> Array:
+        """(..., nodes, nodes) -> (..., y, x) field on the fine grid; without its margin where nothing blurs."""
+        inner = slice(self.grid.margin, -self.grid.margin) if sharp else slice(None)
+        ey, ex = (way.astype(pupil.dtype) for way in (self._ey[inner], self._ex[:, inner]))
+        rows = pupil.reshape(-1, self.nodes) @ ex
+        return np.asarray(ey @ rows.reshape(*pupil.shape[:-1], -1))
+
+    def _square(self, values: Array) -> Array:
+        """(..., inside) -> (..., nodes, nodes), 0 outside the aperture."""
+        square = np.zeros((*values.shape[:-1], self.nodes, self.nodes), values.dtype)
+        square[..., self.inside] = values
+        return square
 
 
 def _components(sx: Array, sy: Array, vectorial: bool) -> Array:
-    """(6 or 1, inside) amplitudes in the image of dipoles along x, y and z, with the aplanatic 1/sqrt(cos)."""
+    """(5 or 1, inside) amplitudes in the image of dipoles along x, y and z, with the aplanatic 1/sqrt(cos).
+
+    Two of the six are equal, and are one of sqrt(2) times the size.
+    """
     sine2 = sx**2 + sy**2
     cosine = np.sqrt(1 - sine2)
     if not vectorial:
@@ -219,9 +245,8 @@ def _components(sx: Array, sy: Array, vectorial: bool) -> Array:
     c, s, lower = np.cos(angle), np.sin(angle), cosine - 1
     rows = [
         1 + lower * c * c,
-        lower * s * c,
+        math.sqrt(2) * lower * s * c,
         -np.sqrt(sine2) * c,
-        lower * s * c,
         1 + lower * s * s,
         -np.sqrt(sine2) * s,
     ]

@@ -72,8 +72,8 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True)
     if len(position) < 3:
         raise FitError(f"{len(position)} planes: a pupil needs three or more through focus")
     data, background, notes = _crop(frames, spec)
-    held_out = _judge(spec, position, data, background) if judge and len(position) >= 5 else None
-    model, solution = _fit(spec, position, data)
+    held_out, start = _judge(spec, position, data, background) if judge and len(position) >= 5 else (None, None)
+    model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
     return PupilFit(
         spec=spec,
@@ -201,8 +201,11 @@ def _find(frames: Frames, background: float) -> tuple[int, int]:
     return row, column
 
 
-def _judge(spec: PupilSpec, position: Array, data: Data, background: float) -> Agreement:
-    """Even planes fitted, odd ones predicted: gains and backgrounds between neighbours, drift from its polynomial."""
+def _judge(spec: PupilSpec, position: Array, data: Data, background: float) -> tuple[Agreement, Array]:
+    """Even planes fitted, odd ones predicted: gains and backgrounds between neighbours, drift from its polynomial.
+
+    Also the parameters of all planes so found, where a fit of all of them starts.
+    """
     even, odd = np.arange(0, len(position), 2), np.arange(1, len(position), 2)
     fitted, solution = _fit(spec, position[even], data.planes(even))
     model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
@@ -213,21 +216,26 @@ def _judge(spec: PupilSpec, position: Array, data: Data, background: float) -> A
         np.interp(position, position[even][order], solution.value[shared + k * len(even) :][: len(even)][order])
         for k in (0, 1)
     )
-    predicted, _ = model.images(np.concatenate([solution.value[:shared], gain, level]), False)
-    return agree(predicted[odd], data.planes(odd), background)
+    x = np.concatenate([solution.value[:shared], gain, level])
+    predicted, _ = model.images(x, False)
+    return agree(predicted[odd], data.planes(odd), background), x
 
 
-def _fit(spec: PupilSpec, position: Array, data: Data) -> tuple[PupilModel, Solution]:
-    """Low orders from several starts, the best one on to all orders."""
+def _fit(spec: PupilSpec, position: Array, data: Data, start: Array | None = None) -> tuple[PupilModel, Solution]:
+    """Low orders from several starts, the best one on to all orders; all orders at once from a known ``start``."""
+    model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+    if start is None:
+        start = _coarse(spec, position, data, model)
+    settings = Settings(iterations=30, step_tolerance=0.3, near=1.0, secant=True)
+    return model, leastsquares.fit(model.images, data, start, prior=_prior(model, start), settings=settings)
+
+
+def _coarse(spec: PupilSpec, position: Array, data: Data, model: PupilModel) -> Array:
     coarse = PupilModel(spec, position, phase_order=4, amplitude_order=0)
     starts = [_start(coarse, data, spherical) for spherical in (0.0, 0.8, -0.8)]
-    settings = Settings(iterations=12, step_tolerance=1.0)
+    settings = Settings(iterations=12, step_tolerance=1.0, near=1.0, secant=True, finish=False)
     tries = [leastsquares.fit(coarse.images, data, s, prior=_prior(coarse, s), settings=settings) for s in starts]
-    best = min(tries, key=lambda t: t.merit)
-    model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
-    start = _grow(best.value, coarse, model)
-    settings = Settings(iterations=30, step_tolerance=0.3)
-    return model, leastsquares.fit(model.images, data, start, prior=_prior(model, start), settings=settings)
+    return _grow(min(tries, key=lambda t: t.merit).value, coarse, model)
 
 
 def _start(model: PupilModel, data: Data, spherical: float) -> Array:
