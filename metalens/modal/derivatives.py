@@ -11,22 +11,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.materials import index
+from metalens.materials import index, slope
 from metalens.modal.engine import Case, basis, case_of, check_tolerance, climb, geometric_mean, geometry
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import half_space, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.spaces import Space, space, space_rates
-from metalens.modal.variation import Change, electric_rates, half_space_rate, magnetic_rates, matrix_rate, waves
+from metalens.modal.variation import (
+    Change,
+    HalfRate,
+    electric_rates,
+    half_space_by_permittivity,
+    half_space_rate,
+    magnetic_rates,
+    matrix_rate,
+    waves,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Gradient:
     """t and its derivatives (each complex, per unit of the name).
 
-    n, k: of the pillar's index, at fixed wavelength. wavelength_um: at fixed indices and angle; for a dispersive
-    pillar add n times dn/dwavelength.
+    n, k: of the pillar's index, at fixed wavelength. wavelength_um: at fixed angle, with the dispersion of all
+    materials.
     """
 
     t: complex
@@ -38,16 +47,15 @@ class Gradient:
     angle_rad: complex
 
 
-PARAMETERS = ("k0", "disc", "rho", "bloch")
-
-
 def changes(case: Case, plan: MeshPlan, b: Basis, electric: bool) -> dict[str, Change]:
     """Rates of all matrices in each parameter, in the coordinates of the homogeneous modes."""
     n, m = b.size, len(b.tm)
     zero, small, mixed = np.zeros((n, n)), np.zeros((m, m)), np.zeros((n, m))
+    still = zero, zero, small, zero, zero, small, mixed
     out = {
-        "k0": Change(1.0, 0.0, 0.0, zero, zero, small, zero, zero, small, mixed),
-        "disc": Change(0.0, 1.0, 0.0, zero, zero, small, zero, zero, small, mixed),
+        "k0": Change(1.0, 0.0, 0.0, 0.0, *still),
+        "disc": Change(0.0, 1.0, 0.0, 0.0, *still),
+        "around": Change(0.0, 0.0, 1.0, 0.0, *still),
     }
     shape = geometry(case.rho, plan)
     phase = case.bloch or None
@@ -58,6 +66,7 @@ def changes(case: Case, plan: MeshPlan, b: Basis, electric: bool) -> dict[str, C
 
     def change(s: Space, bloch: float) -> Change:
         return Change(
+            0.0,
             0.0,
             0.0,
             bloch,
@@ -77,7 +86,7 @@ def changes(case: Case, plan: MeshPlan, b: Basis, electric: bool) -> dict[str, C
 
 
 def form_rates(case: Case, plan: MeshPlan, *, magnetic: bool) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Zero-order matrix of one form and its derivatives in height and in the ``PARAMETERS``."""
+    """Zero-order matrix of one form and its derivatives in height, both half-spaces, and the names of ``changes``."""
     electric_walls = case.p == magnetic if case.bloch else False
     te = case.p == magnetic if case.bloch else True
     b = basis(case.rho, plan, electric_walls, case.bloch)
@@ -99,6 +108,14 @@ def form_rates(case: Case, plan: MeshPlan, *, magnetic: bool) -> tuple[np.ndarra
         )
         inside = (magnetic_rates if magnetic else electric_rates)(b, case.k0, disc, around, change)
         rates[name] = matrix_rate(layer, w, case.height, inside, halves) * sign
+    none = HalfRate(np.zeros((b.size, b.size)), np.zeros(b.size))
+    nothing = np.zeros((b.size, b.size)), np.zeros((b.size, b.size))
+    ends = {
+        name: half_space_by_permittivity(b, half, zero, case.k0, e, magnetic=magnetic)
+        for name, half, e in (("below", below, case.below), ("above", above, case.above))
+    }
+    for name, pair in (("below", (ends["below"], none)), ("above", (none, ends["above"]))):
+        rates[name] = matrix_rate(layer, w, case.height, nothing, pair) * sign
     return match.matrix[pick] * sign, rates
 
 
@@ -142,6 +159,10 @@ def gradient(
     t = complex(geometric_mean(first, second)[1, 0])
     half = cell.pitch_um / 2
     refraction = index(cell.pillar, wavelength_um)
+    parts = {"disc": cell.pillar, "around": cell.between, "below": cell.substrate, "above": cell.cover}
+    dispersion = sum(
+        2 * index(part, wavelength_um) * slope(part, wavelength_um) * by[name] for name, part in parts.items()
+    )
     by_bloch = by.get("bloch", 0.0)
     sign = math.copysign(1.0, angle_rad)
     return Gradient(
@@ -150,6 +171,6 @@ def gradient(
         height_um=complex(by["height"] / half),
         n=complex(2 * refraction * by["disc"]),
         k=complex(2j * refraction * by["disc"]),
-        wavelength_um=complex(-(case.k0 * by["k0"] + case.bloch * by_bloch) / wavelength_um),
+        wavelength_um=complex(dispersion - (case.k0 * by["k0"] + case.bloch * by_bloch) / wavelength_um),
         angle_rad=complex(by_bloch * case.k0 * math.cos(angle_rad) * sign),
     )

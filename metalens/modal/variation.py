@@ -23,12 +23,13 @@ from metalens.modal.match import HalfSpace, Match
 class Change:
     """Rates of everything in one parameter.
 
-    k0, disc: of the wavenumber and the permittivity of the disc. bloch: of kx. mass, curl (n, n) and scalar (b, b):
-    of the cell; disc_mass, disc_curl, disc_scalar: of the disc; gradient: (n, b).
+    k0, disc, around: of the wavenumber and the permittivities of the layer. bloch: of kx. mass, curl (n, n) and scalar
+    (b, b): of the cell; disc_mass, disc_curl, disc_scalar: of the disc; gradient: (n, b).
     """
 
     k0: float
     disc: float
+    around: float
     bloch: float
     mass: np.ndarray
     curl: np.ndarray
@@ -53,10 +54,12 @@ def electric_rates(
     n, b = basis.size, len(basis.tm)
     step = disc - around
     mass = step * basis.disc_mass + around * np.eye(n)
-    d_mass = step * change.disc_mass + around * change.mass + change.disc * basis.disc_mass
+    d_step = change.disc - change.around
+    d_mass = step * change.disc_mass + around * change.mass + d_step * basis.disc_mass + change.around * np.eye(n)
     stiffness = change.curl - k0**2 * d_mass - 2 * k0 * change.k0 * mass
     scalar = step * basis.disc_scalar + around * np.eye(b)
-    d_scalar = step * change.disc_scalar + around * change.scalar + change.disc * basis.disc_scalar
+    d_scalar = step * change.disc_scalar + around * change.scalar + d_step * basis.disc_scalar
+    d_scalar = d_scalar + change.around * np.eye(b)
     raised = raise_gradient(basis)
     lower = np.linalg.solve(k0**2 * scalar, raised.T)
     turn = change.gradient @ lower
@@ -69,12 +72,14 @@ def magnetic_rates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rates of stiffness and 1 / growth of the magnetic form."""
     n, b = basis.size, len(basis.tm)
-    outer, step, d_step = 1 / around, 1 / disc - 1 / around, -change.disc / disc**2
+    outer, step = 1 / around, 1 / disc - 1 / around
+    d_outer = -change.around / around**2
+    d_step = -change.disc / disc**2 - d_outer
     stiffness = step * change.disc_curl + outer * change.curl - k0**2 * change.mass - 2 * k0 * change.k0 * np.eye(n)
     a = len(basis.te)
-    stiffness[:a, :a] = stiffness[:a, :a] + d_step * basis.disc_curl
+    stiffness[:a, :a] = stiffness[:a, :a] + d_step * basis.disc_curl + d_outer * np.diag(basis.te)
     weighted = np.linalg.inv(step * basis.disc_mass + outer * np.eye(n))
-    d_weighted = step * change.disc_mass + outer * change.mass + d_step * basis.disc_mass
+    d_weighted = step * change.disc_mass + outer * change.mass + d_step * basis.disc_mass + d_outer * np.eye(n)
     raised = raise_gradient(basis)
     lower = raised.T / k0**2
     turn = change.gradient @ lower
@@ -94,7 +99,7 @@ def half_space_rate(
     basis: Basis, half: HalfSpace, zero: int, k0: float, permittivity: float, change: Change, *, magnetic: bool
 ) -> HalfRate:
     """A half-space is a layer of infinite height with the homogeneous modes; its zero order has its own wavenumber."""
-    a, change = len(basis.te), replace(change, disc=0.0)
+    a, change = len(basis.te), replace(change, disc=0.0, around=0.0)
     discrete = axial(k0**2 * permittivity - np.concatenate([basis.te, basis.tm]))
     factor = np.ones(basis.size, complex)
     factor[a:] = k0**2 * permittivity / discrete[a:] ** 2
@@ -121,6 +126,21 @@ def half_space_rate(
     source = np.sqrt(y_exact) * dual
     source[zero] += d_exact / (2 * np.sqrt(y_exact))
     return HalfRate(operator, source)
+
+
+def half_space_by_permittivity(
+    basis: Basis, half: HalfSpace, zero: int, k0: float, permittivity: float, *, magnetic: bool
+) -> HalfRate:
+    """Derivative of ``match.half_space`` in its permittivity, at fixed kx: closed forms, mode by mode."""
+    a, e = len(basis.te), permittivity
+    kz = axial(k0**2 * e - np.concatenate([basis.te_exact, basis.tm_exact]))
+    by_kz = k0**2 / (2 * kz)
+    te = by_kz[:a] / e - kz[:a] / e**2 if magnetic else by_kz[:a]
+    tm = -by_kz[a:] / kz[a:] ** 2 if magnetic else 1 / kz[a:] - e * by_kz[a:] / kz[a:] ** 2
+    rate = 1j * np.concatenate([te, k0**2 * tm])
+    source = np.zeros(basis.size, complex)
+    source[zero] = rate[zero] / (2 * np.sqrt(half.admittance[zero]))
+    return HalfRate(np.diag(rate), source)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -71,6 +71,16 @@ def test_angle_derivative(polarization, angle):
     assert abs(got.angle_rad - want) < 1e-7
 
 
+@pytest.mark.parametrize("more", [{}, OBLIQUE, OBLIQUE | {"polarization": "p"}])
+def test_wavelength_derivative_holds_the_dispersion_of_all_materials(more):
+    """The Sellmeier formula of silica, smooth everywhere: in pillar and substrate, and in all but the pillar."""
+    glass = Cell(0.4, 0.7, "SiO2", "SiO2", "SiO2", "SiO2")
+    for cell in (replace(CELL, pillar="SiO2", substrate="SiO2"), replace(glass, pillar=Index(3.6))):
+        got = modal.gradient(cell, 0.15, 0.85, tolerance=ANY, **more).wavelength_um
+        want = slope(lambda s, c=cell: value(c, wavelength=0.85 + s, **more), 0.008)
+        assert abs(got - want) < 1e-8 * max(abs(want), 10.0)
+
+
 def test_angle_derivative_vanishes_at_normal_incidence():
     assert modal.gradient(CELL, 0.15, 0.85, tolerance=ANY).angle_rad == 0
 
