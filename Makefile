@@ -5,7 +5,7 @@ BIN     = $(VENV)/bin
 READY   = $(VENV)/.ready
 OUT    ?= demo
 
-.PHONY: setup demo test test-slow check bench bench-peers notebooks clean
+.PHONY: setup demo test test-slow check bench peers bench-peers test-peers notebooks clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -33,12 +33,17 @@ bench: setup
 	$(BIN)/python -m benchmarks
 
 # The projects that the benchmarks compare with live in an environment of their own: never a dependency.
-bench-peers: setup
+peers: setup
 	test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet -c constraints.txt torch numpy
 	.venv-peers/bin/python -m pip install --quiet -r benchmarks/peers.txt
 	.venv-peers/bin/python -m pip install --quiet -c constraints.txt -e .
+
+bench-peers: peers
 	.venv-peers/bin/python -m benchmarks --peers
+
+test-peers: peers
+	.venv-peers/bin/python -m pytest -m peers tests
 
 notebooks: setup
 	$(BIN)/python -m examples.run
