@@ -23,6 +23,7 @@ from metalens.store import Array
 
 Tensor = torch.Tensor
 RATE = 0.15  # first step of Adam, rad
+NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
 CHECKS = 20  # iterations between two honest looks
 __all__ = ["Fisher", "FisherPhase", "Score", "fisher_profile", "optimise", "phase_on", "score", "spline", "vortices"]
@@ -183,10 +184,11 @@ def _climb(
         elif len(controls) != grid:
             controls = _refined(controls, grid)
         controls = controls.detach().requires_grad_(True)
-        build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=RATE, betas=(0.9, 0.99))
+        rate = RATE if grid else NODE_RATE
+        build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
         for _ in range(count):
             for group in step.param_groups:
-                group["lr"] = RATE * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
+                group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
             loss, energy = objective.loss(build(controls), focus_um, generator)
             missing = torch.relu(settings.encircled + margin - energy)
             loss = loss + 10 * (1 + 4 * done / total) * (missing.mean() + 8 * (missing**2).mean())

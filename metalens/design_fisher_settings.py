@@ -31,8 +31,9 @@ class Fisher:
     """What a Fisher-designed lens is asked for.
 
     objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets of eyes).
-    depths_mm: range of the source. pixel_um: pixels that the information is read with; give 2 or 3 times the sensor's
-        pitch for 2 x 2 or 3 x 3 binning.
+    depths_mm: range of the source. angles_deg: field angles that the lens is made for, each in every direction; the
+        energy is held at all of them, and the information of each counts alike.
+    pixel_um: pixels that the information is read with; give 2 or 3 times the sensor's pitch for 2 x 2 or 3 x 3 binning.
     encircled: least share of the light inside ``radius_um`` of the axis, at every depth; 0 leaves it free.
     focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread between them.
     grids: control points across the aperture, stage by stage; 0 as the last for one free value a node of the pupil
@@ -50,14 +51,15 @@ class Fisher:
 
     objective: Literal["axial", "scenes"] = "axial"
     depths_mm: tuple[float, float] = (16.0, 26.0)
+    angles_deg: tuple[float, ...] = (0.0,)
     pixel_um: float = 3.0
     encircled: float = 0.5
     radius_um: float = 18.0
     focus_mm: tuple[float, float] = (18.0, 22.0)
-    grids: tuple[int, ...] = (10, 0)
-    iterations: int = 400
-    starts: int = 2
-    zones: tuple[int, ...] = (0, 2)
+    grids: tuple[int, ...] = (16, 0)
+    iterations: int = 800
+    starts: int = 3
+    zones: tuple[int, ...] = (0,)
     spread_rad: float = 3.0
     even: float = 0.1
     normalisation: Literal["sum", "l2"] = "l2"
@@ -70,6 +72,8 @@ class Fisher:
     def __post_init__(self) -> None:
         if not 0 < self.depths_mm[0] < self.depths_mm[1]:
             raise ConfigError(f"depths_mm = {self.depths_mm}: need 0 < least < largest")
+        if not self.angles_deg or not all(0 <= a <= 40 for a in self.angles_deg):
+            raise ConfigError(f"angles_deg = {self.angles_deg}: need at least one field angle of 0 to 40 degrees")
         if not 0 <= self.encircled < 1 or not self.radius_um > 0 or not self.pixel_um >= 3 * SAMPLE_UM:
             raise ConfigError(
                 f"encircled = {self.encircled}, radius_um = {self.radius_um}, pixel_um = {self.pixel_um}: need a share "

@@ -90,7 +90,7 @@ def run(options: Options) -> int:
     if wanted.profile == "map" and own is not None and own.file.is_file():
         inputs[own.file.name] = store.sha256(own.file)
     radius_um = wanted.aperture_mm * 500
-    phase, focus = _phase(wanted, options, radius_um)
+    phase, focus, judged = _phase(wanted, options, radius_um)
     made, quality = design.make(
         phase,
         focus,
@@ -104,7 +104,11 @@ def run(options: Options) -> int:
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(target, made)
     write_bytes(target.with_suffix(".png"), lens_plot.picture(made))
-    options.console.result(_values(quality, check), _text(target, wanted, quality, check))
+    values, text = _values(quality, check), _text(target, wanted, quality, check)
+    if judged is not None:
+        values["fisher"], text = judged.values, f"{text}\n\n{judged.text}"
+        write_bytes(target.with_name(f"{target.stem}_fisher.png"), judged.picture)
+    options.console.result(values, text)
     return 0 if check is None or check.passed else 1
 
 
@@ -117,23 +121,47 @@ def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
     return quality.pillars <= MOST_SUMMED
 
 
-def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf, Focus]:
-    """The phase of the profile, and what it images onto what."""
-    if wanted.profile == "fisher":
-        from metalens.design_fisher import fisher_profile
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """What a free-form design is worth: numbers, text, PNG."""
 
-        objective = _scene_objective(wanted, radius_um) if wanted.fisher.objective == "scenes" else None
-        phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=wanted.fisher, objective=objective)
-        least, mean = float(found.score.encircled.min()), float(found.score.information.mean())
-        figure = f"I(z) {mean:.3f} /mm²" if objective is None else f"Eq. 6 {-mean:.3f} (0 without blur)"
-        options.console.say(f"free form: {figure}, encircled energy {least:.2f} or more; {found.reason}")
-        return phase, replace(wanted.focus, source_distance_um=found.focus_um)
+    values: dict[str, Any]
+    text: str
+    picture: bytes
+
+
+def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf, Focus, _Judged | None]:
+    """The phase of the profile, what it images onto what, and for a free form how it compares."""
+    if wanted.profile == "fisher":
+        return _free_form(wanted, options, radius_um)
     shape: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
         "double-helix": wanted.double_helix,
         "cubic": wanted.cubic,
         "map": _located(wanted, options.config),
     }
-    return design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um), wanted.focus
+    return design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um), wanted.focus, None
+
+
+def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf, Focus, _Judged | None]:
+    """A designed phase; where it was made for axial information, beside simple lenses tuned as hard."""
+    from metalens import design_fisher_report as reports
+    from metalens.design_fisher import design_pupil, fisher_profile
+
+    console, settings = options.console, wanted.fisher
+    objective = _scene_objective(wanted, radius_um) if settings.objective == "scenes" else None
+    console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
+    phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=settings, objective=objective)
+    least, mean = float(found.score.encircled.min()), float(found.score.information.mean())
+    figure = f"I(z) {mean:.3f} /mm²" if objective is None else f"Eq. 6 {-mean:.3f} (0 without blur)"
+    console.say(f"free form: {figure}, encircled energy {least:.2f} or more; {found.reason}")
+    focus = replace(wanted.focus, source_distance_um=found.focus_um)
+    if objective is not None:
+        return phase, focus, None
+    console.say("tuning a hyperbolic lens and a double helix for the same pixels, depths and angles")
+    pupil = design_pupil(wanted.focus, radius_um)
+    lenses = reports.judged(found, pupil, settings)
+    picture = reports.picture(lenses, pupil, settings)
+    return phase, focus, _Judged(reports.values(lenses, settings), reports.text(lenses, settings), picture)
 
 
 def _scene_objective(wanted: Design, radius_um: float) -> Any:
@@ -173,7 +201,8 @@ def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
         "max_phase_error_rad": quality.max_phase_error_rad,
     }
     if check is not None:
-        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": check.z_um}
+        along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
+        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": along}
         values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
     return values
 
