@@ -1,8 +1,10 @@
 """The direction of imports, lazy start-up, and what the repository may hold."""
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,35 @@ def test_no_module_takes_the_name_of_a_standard_one():
     names = {path.stem for package in PACKAGES for path in (ROOT / package).rglob("*.py")} - {"__init__"}
     # `profiles`-like near misses are fine; an equal name would shadow the library when run as a script
     assert not names & (sys.stdlib_module_names - {"test"}) - {"bench"}
+
+
+IMPORTED_AS = {  # the last three come with the package that they are named after here
+    "cv2": "opencv-contrib-python-headless",
+    "colour": "colour-science",
+    "OCP": "build123d",
+    "cycler": "matplotlib",
+    "mpl_toolkits": "matplotlib",
+}
+
+
+def _declared(table):
+    return {re.split(r"[<>=\[; ]", entry)[0].lower() for entry in table}
+
+
+def test_every_dependency_is_declared_and_every_declared_one_is_used():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = _declared(project["dependencies"])
+    extras = _declared(entry for table in project["optional-dependencies"].values() for entry in table)
+    outside = {
+        name.split(".")[0]
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+        for name in _imports(path)
+        if name and name.split(".")[0] not in {*sys.stdlib_module_names, *PACKAGES}
+    }
+    used = {IMPORTED_AS.get(name, name).lower().replace("_", "-") for name in outside}
+    assert used <= needed | extras
+    assert needed <= used
 
 
 def _loaded(code):

@@ -1,15 +1,19 @@
-"""What a file is: kind, version, provenance, its arrays, and a small picture of the largest."""
+"""What a file is: kind, version, provenance, its arrays, and a small picture of the largest; networks as well."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 
 from metalens import store
 from metalens.commands import Common
+from metalens.errors import StoreError
 
 _SHADES = " .:-=+*#%@"
+NETWORK = ".safetensors"
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class Options(Common):
     """Options of ``metalens info``.
 
     Attributes:
-        file: an artefact of this toolchain.
+        file: an artefact of this toolchain: HDF5, or a network or checkpoint (safetensors).
     """
 
     file: tyro.conf.Positional[Path]
@@ -25,6 +29,10 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Print what the file holds; exit 0."""
+    if options.file.suffix == NETWORK:
+        told = network(options.file)
+        options.console.result(told, _network_text(told))
+        return 0
     stored = store.load(options.file)
     arrays = {name: f"{a.dtype} {tuple(a.shape)}" for name, a in stored.arrays.items()}
     about = {
@@ -42,6 +50,45 @@ def run(options: Options) -> int:
     }
     options.console.result(about, _text(stored, arrays))
     return 0
+
+
+def network(path: Path) -> dict[str, Any]:
+    """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of its length, then JSON).
+
+    Raises:
+        StoreError: missing, cut short, or no such file.
+    """
+    try:
+        with open(path, "rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            size = path.stat().st_size
+            head = json.loads(file.read(length) if length <= size else b"")
+        tensors = {name: entry for name, entry in head.items() if name != "__metadata__"}
+        about = dict(head.get("__metadata__", {}))
+        if "about" in about:
+            about = {k: v for k, v in json.loads(about["about"]).items() if k != "state"}
+        ends = [int(entry["data_offsets"][1]) for entry in tensors.values()]
+        arrays = {name: f"{entry['dtype']} {tuple(entry['shape'])}" for name, entry in sorted(tensors.items())}
+    except FileNotFoundError:
+        raise StoreError(f"{path}: no such file") from None
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise StoreError(f"{path}: cut short or no safetensors file ({error}); make it again") from None
+    if 8 + length + max(ends, default=0) != size:
+        raise StoreError(f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again")
+    kind, version = str(about.get("kind", "network")), str(about.get("version", "1"))
+    return {
+        "file": path.name,
+        "kind": kind,
+        "version": version,
+        "settings": about.get("settings", ""),
+        "arrays": arrays,
+    }
+
+
+def _network_text(told: dict[str, Any]) -> str:
+    lines = [f"{told['kind']} version {told['version']}"]
+    lines += [f"  {name}: {shape}" for name, shape in told["arrays"].items()]
+    return "\n".join([*lines, *("  config: " + line for line in told["settings"].splitlines() if line)])
 
 
 def _text(stored: store.Stored, arrays: dict[str, str]) -> str:

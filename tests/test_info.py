@@ -1,0 +1,72 @@
+"""``metalens info`` on every kind of artefact that the toolchain writes, whole and cut short."""
+
+import ast
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
+import test_file_fuzz as artefacts
+
+from codesign import checkpoint
+from codesign.inner import InnerConfig
+from metalens import store
+from metalens.cli import BAD_INPUT, SUCCESS, main
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("metalens", "layout", "characterize", "codesign")
+
+
+def _kinds():
+    """Second argument of every ``store.save`` in the packages."""
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                named = isinstance(node, ast.Call) and ast.unparse(node.func) == "store.save"
+                if named and isinstance(node.args[1], ast.Constant):
+                    yield node.args[1].value
+
+
+def _write(kind, path):
+    if kind in artefacts.KINDS:
+        artefacts.KINDS[kind][0](path)
+    else:  # info asks no more of a kind than that it was written by the store
+        store.save(path, kind, {"image": np.eye(12)}, provenance=store.Provenance(config="x = 1\n", seed=3))
+
+
+@pytest.mark.parametrize("kind", sorted(set(_kinds())))
+def test_every_kind_of_file_says_what_it_is_and_what_made_it(kind, tmp_path, capsys):
+    path = tmp_path / "f.h5"
+    _write(kind, path)
+    assert main(["info", str(path), "--json"]) == SUCCESS
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kind"], told["version"]) == (kind, 1)
+    assert told["arrays"]
+    assert "metalens-toolchain" in told["provenance"]["versions"]
+    path.write_bytes(path.read_bytes()[:-9])
+    assert main(["info", str(path)]) == BAD_INPUT
+    assert str(path) in capsys.readouterr().err
+
+
+def test_the_kinds_are_those_of_the_toolchain():
+    assert set(_kinds()) >= {"library", "lens", "psf", "asbuilt", "pupil", "scene", "pool", "layers", "budget"}
+
+
+def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
+    path = tmp_path / "checkpoint.safetensors"
+    checkpoint.save(path, {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0]}, settings=InnerConfig(steps=7))
+    assert main(["info", str(path)]) == SUCCESS
+    text = capsys.readouterr().out
+    assert text.startswith(f"checkpoint version {checkpoint.VERSION}")
+    assert "F32 (3, 2)" in text
+    assert "config: steps = 7" in text
+    whole = path.read_bytes()
+    for damaged in (whole[:5], whole[:40], whole[:-1], b"", b"\xff" * 30, (2).to_bytes(8, "little") + b"[]"):
+        path.write_bytes(damaged)
+        assert main(["info", str(path)]) == BAD_INPUT
+        assert "make it again" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "absent.safetensors")]) == BAD_INPUT
