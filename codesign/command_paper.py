@@ -1,19 +1,20 @@
 """RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import tyro
 
-from codesign import command_evaluate_optics, command_experiment, paper, retraining
+from codesign import command_evaluate_optics, command_experiment, paper, paper_runs, retraining
 from codesign.experiment import ExperimentConfig
 from codesign.paper import ROLES, Line, Measured
 from metalens import report, store
 from metalens.commands import Common, Output
 from metalens.errors import ConfigError
 
-JSON, PAGE = "paper.json", "report.html"
+JSON, PAGE, GAZE = "paper.json", "report.html", "gaze.json"
 DIM_DB = 15.0
 
 
@@ -24,6 +25,8 @@ class Options(Common):
     Attributes:
         runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
             far as there are; without any, the claims are listed with the commands that measure them.
+        others: further finished runs: other networks (Table 2), runs with one part frozen (Fig. 8b); each run's
+            result.json tells which it is.
         output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
         subjects: of the experiment.
         scenes: of Table 1.
@@ -31,6 +34,7 @@ class Options(Common):
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    others: tuple[Path, ...] = ()
     output: Output = Path("paper")
     subjects: int = 20
     scenes: int = 24
@@ -47,7 +51,7 @@ def run(options: Options) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     if options.runs and options.measure:
         _measure(options, folder)
-    found = collect(folder, dict(zip(ROLES, options.runs, strict=False)))
+    found = collect(folder, dict(zip(ROLES, options.runs, strict=False)), options.others)
     told = paper.lines(found, folder)
     _write(folder, told)
     values = [{**asdict(t.claim), "ours": asdict(t.ours) if t.ours else None, "picture": t.picture} for t in told]
@@ -56,8 +60,8 @@ def run(options: Options) -> int:
     return 0
 
 
-def collect(folder: Path, runs: dict[str, Path]) -> dict[str, Measured]:
-    """Everything that was measured into ``folder``, and the rows of the runs.
+def collect(folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()) -> dict[str, Measured]:
+    """Everything that was measured into ``folder``, and the rows of the runs and of those with a part frozen.
 
     Raises:
         StoreError, TrainingError: a measurement or a run is damaged or of another version.
@@ -73,7 +77,11 @@ def collect(folder: Path, runs: dict[str, Path]) -> dict[str, Measured]:
         found |= paper.of_dim(experiment, dim)
     if optics.is_file():
         found |= paper.of_optics(optics)
-    return found | paper.of_runs({role: retraining.rows_of(path) for role, path in runs.items()})
+    if (folder / GAZE).is_file():
+        found |= paper_runs.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
+    rows = {role: retraining.rows_of(path) for role, path in runs.items()}
+    found |= paper.of_runs(rows)
+    return found | paper_runs.of_ablations(rows.get("proposed", []), dict(paper_runs.frozen_rows(others)))
 
 
 def _measure(options: Options, folder: Path) -> None:
@@ -84,6 +92,7 @@ def _measure(options: Options, folder: Path) -> None:
             options.console.say(f"measuring: {name}")
             asked = command_experiment.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
             command_experiment.run(asked)
+    _measure_gaze(options, folder / GAZE)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
         order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
@@ -92,6 +101,18 @@ def _measure(options: Options, folder: Path) -> None:
             lenses=lenses, output=folder / "optics", scenes=options.scenes, quiet=True, force=True
         )
         command_evaluate_optics.run(optics)
+
+
+def _measure_gaze(options: Options, path: Path) -> None:
+    """Gaze of the proposed run and of the other networks; runs that are in the file are not measured again."""
+    told = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+    for folder in (options.runs[0], *options.others):
+        kind = paper_runs.kind_of(folder)
+        if str(folder) in told or (folder != options.runs[0] and kind.network == "supernet"):
+            continue
+        options.console.say(f"measuring: gaze of {folder}")
+        told[str(folder)] = {"network": kind.network, "rows": paper_runs.gaze(folder)}
+        store.write_text(path, json.dumps(told, indent=1) + "\n")
 
 
 def _named(folder: Path, name: str, run_dir: Path) -> Path:

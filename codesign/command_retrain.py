@@ -82,9 +82,9 @@ def run(options: Options) -> int:
     true = (
         truth.vector() if truth else list(posterior(result, options.settings.draws + 1, seed=options.settings.seed))[-1]
     )
-    proposals = []
+    proposals, frames = [], retraining.held(source, options.settings)
     for state in correction.next_lenses(made, plan, result.parameters(), true):
-        error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,))
+        error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,), frames=frames)
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
     apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
     story = retrain_report.Story(

@@ -22,7 +22,7 @@ from codesign import run as runs
 from codesign.architecture import Architecture, check
 from codesign.built import MadeLens
 from codesign.eye_scenes import TEST
-from codesign.inner import Batch, InnerConfig, Record, Scenes, Schedule, Trainer
+from codesign.inner import Batch, InnerConfig, Record, Scenes, Schedule, Trainer, model
 from codesign.optics import Stack
 from codesign.reading import Accuracy
 from codesign.run import Run, RunConfig
@@ -145,7 +145,7 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     if not found:
         have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
         raise TrainingError(f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}")
-    return Source(made, _architecture(found[0]["architecture"], made, folder), found[0])
+    return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:
@@ -168,7 +168,12 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _architecture(entry: dict[str, Any], run: Run, folder: Path) -> Architecture:
+def architecture_of(entry: dict[str, Any], run: Run, folder: Path) -> Architecture:
+    """The architecture in a row of result.json.
+
+    Raises:
+        TrainingError: of another version, or outside the run's space.
+    """
     values: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k not in ("error", "macs")
     }
@@ -214,13 +219,17 @@ def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth 
 
 def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:
     """The inner loop of the run, from its trained weights, on given PSFs; only the weights move."""
-    fresh = runs.start(source.settings).trainer
-    fresh.model.net.load_state_dict(source.run.trainer.model.net.state_dict())
+    settings, origin = source.settings, source.run.trainer
+    fresh = model(
+        settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
+        network=settings.network,
+    )  # fmt: skip
+    fresh.net.load_state_dict(origin.model.net.state_dict())
     with torch.no_grad():
-        fresh.model.log_pitch.copy_(source.run.trainer.model.log_pitch)
-    inner = fine_tuning(source.settings.inner, config)
+        fresh.coefficients_rad.copy_(origin.model.coefficients_rad)
+        fresh.log_pitch.copy_(origin.model.log_pitch)
     return Trainer(
-        inner, source.settings.optics, fresh.sensor, fresh.scenes, fresh.model,
+        fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, fresh,
         architecture=source.architecture, stacks=stacks,
     )  # fmt: skip
 
@@ -294,12 +303,38 @@ class _Step:
         return self.scenes.batch(self.number, size)
 
 
-def judge(going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Accuracy:
-    """Errors on test frames through these lenses, all of them together."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Held:
+    """Frames that judge, rendered once for every case."""
+
+    batches: tuple[Batch, ...]
+    margin: int
+    stream: int
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Batch number ``step``, of the size that it was rendered in."""
+        return self.batches[step]
+
+
+def held(source: Source, config: RetrainConfig) -> Held:
+    """The test frames of a run, that no training sees."""
+    scenes = source.run.scenes(TEST)
+    size = source.settings.inner.batch
+    return Held(tuple(scenes.batch(n, size) for n in range(config.test_batches)), scenes.margin, scenes.stream)
+
+
+def judge(
+    going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack], *, frames: Held | None = None
+) -> Accuracy:
+    """Errors on test frames through these lenses, all of them together.
+
+    frames: of :func:`held`, where several cases are judged.
+    """
     settle(going, source)
+    frames = frames or held(source, config)
     parts = []
     for made in stacks[: config.judge]:
-        seen = assess.frames(going, source.run.scenes(TEST), config.test_batches, stack=made)
+        seen = assess.frames(going, frames, config.test_batches, stack=made)
         answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
         parts.append(reading.accuracy(answers, seen))
     return Accuracy(torch.cat([p.error_mm for p in parts]), torch.cat([p.iou for p in parts]))
@@ -307,14 +342,18 @@ def judge(going: Trainer, source: Source, config: RetrainConfig, stacks: Sequenc
 
 def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]) -> Outcome:
     """Accuracy of all cases, on the same test frames."""
-    nominal = (found.nominal,)
+    nominal, frames = (found.nominal,), held(source, config)
     untouched = trainer(source, config, nominal)
+
+    def of(going: Trainer, stacks: Sequence[Stack]) -> Accuracy:
+        return judge(going, source, config, stacks, frames=frames)
+
     return Outcome(
-        designed=judge(untouched, source, config, nominal),
-        nominal=judge(trained["nominal"], source, config, nominal),
-        before=judge(trained["nominal"], source, config, found.judges),
-        after=judge(trained["retrained"], source, config, found.judges),
-        known=judge(trained["known"], source, config, found.judges) if found.known else None,
+        designed=of(untouched, nominal),
+        nominal=of(trained["nominal"], nominal),
+        before=of(trained["nominal"], found.judges),
+        after=of(trained["retrained"], found.judges),
+        known=of(trained["known"], found.judges) if found.known else None,
     )
 
 
