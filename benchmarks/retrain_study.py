@@ -102,9 +102,11 @@ def expected(design_lens: lens.Lens) -> AsBuilt:
     slopes["background_e"] = np.ones_like(light) / scale
     names = tuple(slopes)
     table = np.stack([slopes[n].ravel() * scale for n in names])
-    information = (table / (light.ravel() * scale + 10.0 + 4.0)) @ table.T
     prior = np.array([next(p.sigma for p in PARAMETERS if p.name == n) for n in names])
-    covariance = np.linalg.inv(information + np.diag(1 / prior**2))
+    table *= prior[:, None]  # in units of the priors, so that the inverse keeps its digits
+    information = (table / (light.ravel() * scale + 10.0 + 4.0)) @ table.T
+    covariance = np.linalg.inv(information + np.eye(len(names))) * np.outer(prior, prior)
+    covariance = (covariance + covariance.T) / 2
     keep = [i for i, n in enumerate(names) if n in OF_LENS]
     part, blank = covariance[np.ix_(keep, keep)], np.zeros((1, 2, 2))
     return AsBuilt(
@@ -116,8 +118,10 @@ def expected(design_lens: lens.Lens) -> AsBuilt:
 
 def template(work: Path, design_lens: lens.Lens) -> AsBuilt:
     """The fit whose covariance quick cases draw from: that of complete case 1000 where it is there, else the bound."""
-    path = work / "asbuilt_1000.h5"
-    return asbuilt.load(path) if path.exists() else expected(design_lens)
+    path, bound = work / "asbuilt_1000.h5", work / "bound.h5"
+    if not path.exists() and not bound.exists():
+        asbuilt.save(bound, expected(design_lens))
+    return asbuilt.load(path if path.exists() else bound)
 
 
 def quick(template: AsBuilt, case: int) -> AsBuilt:
