@@ -130,6 +130,7 @@ def bad_pixels(capture: Capture) -> Array:
 
     From dark (8 robust sigma above the rest) and flat (outside 0.3 to 3 of the median) where there are any; always
     from the frames: the same single pixel far above its eight neighbours, or constant, in every one of >= 3 frames.
+    Constant pixels count where they differ from those around them: a dark background of few bits is constant too.
     """
     frames = np.asarray(capture.frames, float)
     bad = _lonely(frames)
@@ -139,10 +140,12 @@ def bad_pixels(capture: Capture) -> Array:
     if capture.flat is not None:
         level = np.asarray(capture.flat, float).mean(0)
         bad |= ~((level > 0.3 * np.median(level)) & (level < 3 * np.median(level)))
+    level = frames.mean(0)
+    apart = np.abs(level - ndimage.median_filter(level, 5, mode="nearest")) > 1
     if len(frames) >= 3:
-        bad |= np.ptp(frames, axis=0) == 0
+        bad |= (np.ptp(frames, axis=0) == 0) & apart
     for axis in (0, 1):
-        dead = np.all(bad | (frames.max(0) == 0), axis=1 - axis)
+        dead = np.all(bad | ((frames.max(0) == 0) & apart), axis=1 - axis)
         bad |= dead[:, None] if axis == 0 else dead[None, :]
     return np.asarray(bad)
 

@@ -76,11 +76,11 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
     spec = config.load(pupil, PupilSpec)
-    found = fit_pupil(captures.load(options.capture), spec)
+    found = fit_pupil(captures.load(options.capture), spec, insist=options.insist)
     save(target, found, _provenance(options, pupil))
     report.pupil_report(target.with_suffix(".html"), found)
     options.console.result(_values(found), _text(found, target))
-    return 0 if found.converged else 1
+    return 1 if found.problems else 0
 
 
 def _provenance(options: Options, source: Path) -> store.Provenance:
@@ -123,6 +123,7 @@ def _values(found: PupilFit) -> dict[str, object]:
         "reason": found.reason,
         "parameters": {n: [float(v), float(s)] for n, v, s in zip(found.names, found.value, found.sigma, strict=True)},
         "cautions": list(found.cautions),
+        "problems": list(found.problems),
     }
 
 
@@ -135,4 +136,5 @@ def _text(found: PupilFit, target: Path) -> str:
     lines += [
         f"  {n} = {v:.4g} +- {s:.2g}" for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
     ]
-    return "\n".join(lines + ["  note: " + words for words in found.cautions])
+    lines += ["  note: " + words for words in found.cautions]
+    return "\n".join(lines + ["  PROBLEM: " + words for words in found.problems])

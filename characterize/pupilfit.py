@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from characterize import capture as captures
-from characterize import leastsquares
+from characterize import leastsquares, pupilcheck
 from characterize.clean import Frames, clean
 from characterize.leastsquares import Data, Prior, Settings, Solution
 from characterize.pupil import PupilModel, PupilSpec
@@ -39,7 +39,7 @@ class PupilFit:
     measured, predicted: (n, y, x) windows in electrons; every plane of ``predicted`` by the fit of all planes.
     phase_rad, amplitude: (nodes, nodes) pupil maps, nan and 0 outside the aperture.
     held_out: agreement on odd planes predicted from a fit of the even ones, or None where not judged.
-    cautions: degeneracies and corrections in words.
+    cautions: degeneracies and corrections in words. problems: checks that failed, with their cause.
     """
 
     spec: PupilSpec
@@ -58,13 +58,18 @@ class PupilFit:
     converged: bool
     reason: str
     cautions: tuple[str, ...]
+    problems: tuple[str, ...] = ()
 
 
-def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True) -> PupilFit:
+def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True, insist: bool = False) -> PupilFit:
     """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also even planes alone, tested on odd.
 
+    Args:
+        insist: return a pupil that fails its checks (problems filled) instead of refusing it.
+
     Raises:
-        CaptureError: wavelength, pixel or stage positions unknown. FitError: too few planes, no bead, no convergence.
+        CaptureError: wavelength, pixel or stage positions unknown.
+        FitError: too few planes, no bead, or refused: no convergence, planes out of order, predictions too poor.
     """
     spec = _complete(spec, capture)
     frames = clean(capture)
@@ -75,6 +80,12 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True)
     held_out, start = _judge(spec, position, data, background) if judge and len(position) >= 5 else (None, None)
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
+    agreement = agree(solution.image, data, background)
+    stopped = "" if solution.converged else solution.reason
+    score = held_out or agreement
+    problems = pupilcheck.problems(data, background, (score.ncc, score.nrmse), stopped)
+    if problems and not insist:
+        raise FitError("fit refused: " + "; ".join(problems))
     return PupilFit(
         spec=spec,
         names=tuple(model.names()),
@@ -86,12 +97,13 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True)
         residual_sigma=solution.residual_sigma,
         phase_rad=phase,
         amplitude=amplitude,
-        agreement=agree(solution.image, data, background),
+        agreement=agreement,
         held_out=held_out,
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
         cautions=(*frames.corrections, *notes, *_cautions(spec, solution)),
+        problems=tuple(problems),
     )
 
 
@@ -119,7 +131,11 @@ def save(path: str | Path, fit: PupilFit, provenance: store.Provenance | None = 
             "amplitude",
         )
     }
-    arrays |= {"names": np.array(fit.names), "cautions": np.array(fit.cautions)}
+    arrays |= {
+        "names": np.array(fit.names),
+        "cautions": np.array(fit.cautions),
+        "problems": np.array(fit.problems or ("",)),
+    }
     about: dict[str, store.Attribute] = {
         "spec": _spec_text(fit.spec),
         "chi2_per_dof": fit.chi2_per_dof,
@@ -158,7 +174,7 @@ def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
     """The window about the bead, moved inwards where it would reach over the edge; the background level; notes."""
     total = np.where(frames.usable, frames.electrons, np.nan)
     background = float(np.nanmedian(total))
-    row, column = spec.center or _find(frames, background)
+    row, column = spec.center or _find(total - _plane(total) - background)
     sides = zip((row, column), total.shape[1:], strict=True)
     first = [int(np.clip(place - spec.window // 2, 0, side - spec.window)) for place, side in sides]
     notes = []
@@ -169,6 +185,7 @@ def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
     plane = _plane(total[cut])
     seen = total[cut] - background
     if np.ptp(plane) > 0.02 * np.nanmax(seen):
+        background = float(np.nanpercentile(total[cut] - plane, 20))
         notes.append(f"a background plane of {np.ptp(plane):.3g} e across the window was taken off")
     else:
         plane = np.zeros_like(plane)
@@ -179,7 +196,8 @@ def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
 
 def _plane(frames: Array) -> Array:
     """(y, x) tilt of the background, of mean 0: least squares on the rim of the median plane, without its outliers."""
-    level = np.nanmedian(frames, axis=0)
+    bad = np.isnan(frames).all(0)
+    level = np.where(bad, np.nan, np.nanmedian(np.where(bad, 0, frames), axis=0))
     ny, nx = level.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     rim = np.isfinite(level) & ((np.abs(x) > 0.8) | (np.abs(y) > 0.8))
@@ -193,9 +211,9 @@ def _plane(frames: Array) -> Array:
     return np.asarray(found[1] * x + found[2] * y)
 
 
-def _find(frames: Frames, background: float) -> tuple[int, int]:
-    """Row and column of the light's centre in the brightest planes, well inside the frame."""
-    light = np.where(frames.usable, frames.electrons - background, 0)
+def _find(light: Array) -> tuple[int, int]:
+    """Row and column of the light's centre in the brightest planes; ``light`` (n, y, x) is nan where masked."""
+    light = np.nan_to_num(light)
     peak = np.sort(ndimage.gaussian_filter(light, (0, 1, 1)), axis=0)[-3:].mean(0)
     row, column = (int(i) for i in np.unravel_index(int(peak.argmax()), peak.shape))
     return row, column
@@ -226,7 +244,7 @@ def _fit(spec: PupilSpec, position: Array, data: Data, start: Array | None = Non
     model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
     if start is None:
         start = _coarse(spec, position, data, model)
-    settings = Settings(iterations=30, step_tolerance=0.3, near=1.0, secant=True)
+    settings = Settings(iterations=60, step_tolerance=1.0, near=2.0, secant=True)
     return model, leastsquares.fit(model.images, data, start, prior=_prior(model, start), settings=settings)
 
 

@@ -33,6 +33,8 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
         report.Section("Pupil", "", [maps, report.Table(("parameter", "value", "1 sigma"), rows)]),
         report.Section("Read with care", "\n\n".join(fit.cautions)),
     ]
+    if fit.problems:
+        sections.insert(0, report.Section("Problems", "\n\n".join(fit.problems)))
     report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
 
 

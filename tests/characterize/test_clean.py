@@ -96,3 +96,13 @@ def test_brackets_merge_to_the_true_rate_with_the_stated_variance():
     z = np.array(z)
     assert abs(z.mean()) < 0.03  # 1 / sqrt(50000) is 0.005, weights are estimated
     assert 0.9 < z.std() < 1.05  # the dark of one frame counts as noisy here, though it is exact
+
+
+def test_a_dark_background_of_few_bits_is_not_taken_for_dead_pixels():
+    y, x = np.mgrid[:40, :40] - 20
+    spot = 200 * np.exp(-(x**2 + y**2) / (2 * 2.0**2))
+    frames = np.stack([np.round(spot * share) for share in (0.5, 1.0, 0.7)]).astype(np.uint8)
+    assert (np.ptp(frames, axis=0) == 0).mean() > 0.5
+    assert not clean.bad_pixels(capture(frames)).any()
+    frames[:, 22] = 0  # a dead row through the light
+    assert clean.bad_pixels(capture(frames))[22, 16:25].all()

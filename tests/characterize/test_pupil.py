@@ -92,6 +92,50 @@ def test_a_known_pupil_is_found_within_its_interval():
     assert np.linalg.norm(fit.predicted - bright) < 0.02 * np.linalg.norm(bright - 20)
 
 
+def wide(side=64, place=(40, 20)):
+    """The stack of a known pupil inside a larger frame, as a microscope gives it, in electrons."""
+    model = make()
+    small = 2 * (model.images(truth(model), False)[0] - 20)
+    frames = np.full((len(Z), side, side), 300.0)
+    first = [p - SPEC.window // 2 for p in place]
+    frames[:, first[0] : first[0] + SPEC.window, first[1] : first[1] + SPEC.window] += small
+    return frames
+
+
+def shots_of(frames, gain_e=20.0):
+    n = len(frames)
+    counts = np.round(np.random.default_rng(5).poisson(frames * gain_e) / gain_e)
+    about = {"gain_e": gain_e, "read_noise_e": 0.1}
+    return capture.Capture(counts, np.arange(n) * 4.0, np.zeros((n, 2)), np.full(n, np.nan), ("",) * n, 16, about=about)
+
+
+@pytest.mark.parametrize("slope", [0.3, -0.5])
+def test_a_bead_on_a_steep_background_is_found_and_fitted(slope):
+    """Across the window the background changes by a share of the peak; across the frame by more than the peak."""
+    frames = wide()
+    light = frames.max() - 300
+    ramp = slope * light * (np.arange(64) - 31.5) / SPEC.window
+    found = pupilfit.fit_pupil(shots_of(frames + 3 * light + ramp[:, None]), SPEC)
+    assert any("background plane" in words for words in found.cautions)
+    assert found.held_out.ncc > 0.97
+    bright = found.measured - np.median(found.measured)
+    assert np.linalg.norm(found.predicted - found.measured) < 0.2 * np.linalg.norm(bright)
+
+
+def test_shuffled_planes_are_refused():
+    model = PupilModel(SPEC, np.linspace(-8, 8, 9), phase_order=4, amplitude_order=1)
+    x = np.concatenate([truth(make())[:-10], np.full(9, math.log(3e4)), np.full(9, 20.0)])
+    frames = model.images(x, False)[0]
+    assert pupilfit.fit_pupil(shots_of(frames), dataclasses.replace(SPEC, step_um=2.0)).held_out.ncc > 0.97
+    with pytest.raises(FitError, match="the stack is shuffled"):
+        pupilfit.fit_pupil(shots_of(frames[[4, 0, 7, 2, 8, 5, 1, 6, 3]]), dataclasses.replace(SPEC, step_um=2.0))
+
+
+def test_a_wrong_aperture_is_refused_with_the_share_of_light_missed():
+    with pytest.raises(FitError, match="of the light beyond noise"):
+        pupilfit.fit_pupil(shots_of(wide()), dataclasses.replace(SPEC, numerical_aperture=0.12))
+
+
 def test_missing_wavelength_pixel_or_positions_are_refused():
     model = make()
     shots = noisy(model, truth(model))
