@@ -75,7 +75,7 @@ RUNGS = (
             Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 0.0, 3e-5),
         ),
         1.2,
-        1e-3,
+        2e-3,
     ),
     Rung(
         "fair",
