@@ -13,7 +13,7 @@ from characterize.asbuilt import AsBuilt
 from characterize.capture import Capture
 from characterize.clean import Gain, clean
 from characterize.forward import ForwardModel, Setting, true_depth
-from characterize.leastsquares import Data, Prior, Settings, Solution
+from characterize.leastsquares import Ball, Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Sensitivity
 from characterize.prepare import data_of, merged, setting_of, stated
@@ -24,7 +24,7 @@ from metalens.psf_lens import View
 from metalens.psf_record import PsfStack
 from metalens.store import Array
 
-MISFIT, LIKENESS, LEAST_PEAK_E = 1.15, 0.45, 100.0
+MISFIT, LIKENESS, LEAST_PEAK_E, WAVES_RAD = 1.15, 0.45, 100.0, 0.9
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
 
 
@@ -167,7 +167,8 @@ def _search(
     if "bandwidth_nm" in names and base[PLACE["bandwidth_nm"]] == 0:
         begins = [_with(x, {"bandwidth_nm": 0.5}) for x in begins]
     few = _few(model.setting)
-    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False)
+    waves = Ball(np.array([i for i, name in enumerate(names) if name.endswith("_rad")]), WAVES_RAD)
+    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
     part, seen = problem(model.only(few)), data.planes(few)
     tries = [leastsquares.fit(part, seen, x[place], prior=prior, settings=short) for x in begins]
     best = min(tries, key=lambda t: t.merit)
@@ -315,7 +316,7 @@ def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain_kno
             f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
         )
     wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
-    if wave > 0.9:
+    if wave > WAVES_RAD:
         words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
     for name, value, low, high in zip(names, solution.value, prior.low, prior.high, strict=True):
         at_zero = name in ("pinhole_um", "bandwidth_nm", "crosstalk_px") and value <= low

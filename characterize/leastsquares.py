@@ -60,6 +60,18 @@ class Prior:
         return cls(np.array(start, float), wide, -wide, wide)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Ball:
+    """Limit of the root sum of squares of some parameters: ``index`` of them, ``radius`` in their unit."""
+
+    index: Array
+    radius: float
+
+    def inside(self, x: Array) -> bool:
+        """Whether the limit holds."""
+        return float(np.linalg.norm(x[self.index])) <= self.radius * (1 + 1e-9)
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """When to stop, and how far an outlier is (sigma).
@@ -68,6 +80,7 @@ class Settings:
         steps that look final, and those that fail, are checked with an exact one.
     near: sigma that an exact Jacobian still holds for: shorter steps go on with it.
     finish: the Jacobian at the end is exact, or was so within ``near``.
+    bounded: steps that a bound or ``ball`` stops are the best ones inside (NLopt), not clipped.
     """
 
     iterations: int = 40
@@ -76,6 +89,8 @@ class Settings:
     secant: bool = False
     near: float = 0.3
     finish: bool = True
+    bounded: bool = False
+    ball: Ball | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,7 +225,7 @@ def _step(
         matrix = scaled[np.ix_(free, free)] + damping * np.eye(len(free))
         step = np.zeros_like(state.x)
         step[free] = -np.linalg.lstsq(matrix, state.gradient[free] / size[free], rcond=1e-14)[0] / size[free]
-        step = np.clip(state.x + step, prior.low, prior.high) - state.x
+        step = _inside(state, step, matrix if len(free) == len(step) else None, prior, settings)
         image, _ = model(state.x + step, False)
         if np.isfinite(image).all():
             after = _merit(data, image, state.x + step, state.noise, prior, settings)
@@ -218,6 +233,19 @@ def _step(
                 return step, image, max(damping / 5, 1e-10), True
         damping *= 6
     return step, image, damping, False
+
+
+def _inside(state: _State, step: Array, damped: Array | None, prior: Prior, settings: Settings) -> Array:
+    """The step kept inside bounds and ball: clipped, or the best one there."""
+    clipped = np.asarray(np.clip(state.x + step, prior.low, prior.high) - state.x)
+    held = settings.ball is None or settings.ball.inside(state.x + clipped)
+    if not settings.bounded or (held and np.array_equal(clipped, step)):
+        return clipped
+    from characterize import constrained
+
+    size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
+    matrix = state.curvature if damped is None else damped * np.outer(size, size)
+    return constrained.step(matrix, state.gradient, state.x, low=prior.low, high=prior.high, ball=settings.ball)
 
 
 def _merit(data: Data, image: Array, x: Array, noise: Array, prior: Prior, settings: Settings) -> float:
