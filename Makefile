@@ -48,5 +48,14 @@ test-peers: peers
 notebooks: setup
 	$(BIN)/python -m examples.run
 
+# The wheel, installed where nothing of this folder can be seen, runs the demo.
+wheel-check: setup
+	rm -rf build/wheel && mkdir -p build/wheel
+	$(BIN)/python -m pip wheel --quiet --no-deps -w build/wheel .
+	$(PYTHON) -m venv build/wheel/venv
+	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt torch numpy
+	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt build/wheel/*.whl
+	cd build/wheel && venv/bin/metalens demo demo
+
 clean:
 	rm -rf $(VENV) .venv-peers build *.egg-info $(OUT)
