@@ -51,6 +51,7 @@ class AsBuilt:
     identifiable: combinations of parameters that the frames alone fix, with their 1 sigma, best first, in words.
     degeneracies: what cannot be told apart, in words. cautions: everything that was put right or assumed.
     trusted: every check passed; problems: those that did not.
+    residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty where none was kept.
     psf: of the lens as built at the true depths of the captures, (angle, depth, y, x); None before it is computed.
     """
 
@@ -75,6 +76,7 @@ class AsBuilt:
     degeneracies: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
+    residual_modes: Array = field(default_factory=lambda: np.empty(0))
     psf: PsfStack | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -123,7 +125,7 @@ class AsBuilt:
 
     def pillars(self, value: Array | None = None) -> Array:
         """(y, x) complex transmission of every as-built pillar at normal incidence, wave-front errors included."""
-        return made.pillars(self.design, self.response, self.parameters(value))
+        return made.pillars(self.design, self.response, self.parameters(value), modes=self.residual_modes)
 
     def psf_stack(self, view: "View", value: Array | None = None, *, tolerance: float = 1e-4) -> PsfStack:
         """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of :meth:`samples`.
@@ -137,7 +139,8 @@ class AsBuilt:
         """
         x, best = self.parameters(value), self.parameters()
         dx, dy = (float(x[PLACE[name]] - best[PLACE[name]]) for name in ("decentre_x_um", "decentre_y_um"))
-        return made.psf_stack(self.design, self.response, x, view, offset_um=(dx, dy), tolerance=tolerance)
+        more: dict[str, Any] = {"modes": self.residual_modes, "offset_um": (dx, dy), "tolerance": tolerance}
+        return made.psf_stack(self.design, self.response, x, view, **more)
 
     def save(self, path: str | Path) -> None:
         """Write the file; see :func:`save`."""
@@ -180,6 +183,8 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
+    if len(result.residual_modes):
+        arrays["residual_modes"] = result.residual_modes
     arrays |= {"response/coefficients": result.response.coefficients}
     if result.psf is not None:
         arrays |= {f"psf/{name}": np.asarray(getattr(result.psf, name)) for name in _PSF}
@@ -214,6 +219,7 @@ def load(path: str | Path) -> AsBuilt:
         design=design,
         response=_response(a, about),
         psf=_psf(a),
+        residual_modes=a.get("residual_modes", np.empty(0)),
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],
         chi2_per_dof=about["chi2_per_dof"],

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize import knowable, leastsquares, made
+from characterize import knowable, leastsquares, made, thinplate
 from characterize.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
 from characterize.asbuilt import AsBuilt
 from characterize.capture import Capture
@@ -17,6 +17,7 @@ from characterize.leastsquares import Ball, Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Sensitivity
 from characterize.prepare import data_of, merged, setting_of, stated
+from characterize.residual import MOST_RAD, Attempt, attempt
 from characterize.slopes import slopes
 from metalens.errors import FitError
 from metalens.lens import Lens
@@ -78,6 +79,14 @@ def fit(
         if wider[1].chi2_per_dof < 0.97 * solution.chi2_per_dof:
             names, solution = wider
             cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
+    if frames.gain.known and _left_over(solution):
+        rest = _with_residual(model, data, names, solution, start, known)
+        if rest is not None:
+            model, solution = model.with_residual(rest.modes, thinplate.basis), rest.solution
+            cautions.append(
+                f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
+                f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
+            )
     result = _result(capture, lens, model, data, names, solution, start, known, cautions, frames.gain)
     if result.problems and not options.insist:
         raise FitError("fit refused: " + "; ".join(result.problems))
@@ -220,6 +229,24 @@ def _explained(solution: Solution) -> bool:
     return solution.chi2_per_dof <= MISFIT
 
 
+def _left_over(solution: Solution) -> bool:
+    """Whether the frames hold more than noise, but not so much that they are of something else."""
+    counted = float((solution.residual_sigma != 0).sum())
+    return 3 * math.sqrt(2 / max(counted, 1.0)) < solution.chi2_per_dof - 1 < 30
+
+
+def _with_residual(
+    model: ForwardModel,
+    data: Data,
+    names: tuple[str, ...],
+    solution: Solution,
+    start: Array,
+    known: dict[str, Known],
+) -> Attempt | None:
+    place = [PLACE[name] for name in names]
+    return attempt(model, data, names, solution.value, base=start.copy(), place=place, prior=prior_of(names, known))
+
+
 def _full(names: tuple[str, ...], solution: Solution, start: Array) -> Array:
     return _with(start, dict(zip(names, solution.value.tolist(), strict=True)))
 
@@ -243,6 +270,9 @@ def _result(
     clipped = float(data.saturated.mean())
     if problems and clipped > 0.1:
         problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
+    left = float(np.linalg.norm(model.modes))
+    if left > MOST_RAD:
+        problems.append(f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens")
     held = {name: float(start[PLACE[name]]) for name in NAMES if name not in fitted}
     return AsBuilt(
         design=lens,
@@ -258,7 +288,8 @@ def _result(
         pixel_um=capture.pixel_um,
         measured=data.electrons,
         predicted=solution.image,
-        nominal=model.images(_with(start, bench))[0],
+        residual_modes=model.modes,
+        nominal=model.with_residual(np.empty(0), thinplate.basis).images(_with(start, bench))[0],
         residual_sigma=solution.residual_sigma,
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
@@ -278,7 +309,7 @@ def _psf(lens: Lens, model: ForwardModel, x: Array) -> PsfStack:
     samples = side * model.grid.oversample
     angles = tuple((float(a[0]), float(a[1])) for a in np.unique(s.angle_rad, axis=0))
     view = View(tuple(depths.tolist()), angles, side * s.pixel_um, samples)
-    return made.psf_stack(lens, model.response, x, view, tolerance=1e-3)
+    return made.psf_stack(lens, model.response, x, view, modes=model.modes, tolerance=1e-3)
 
 
 def _with_gain(names: tuple[str, ...], solution: Solution, gain: Gain) -> Array:

@@ -72,6 +72,7 @@ class _Group:
     reduced: Reduced
     zernike: Array
     bias: Array
+    residual: Array
 
 
 class ForwardModel:
@@ -88,6 +89,7 @@ class ForwardModel:
         over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
         self.response, self._span, self._cut = response, span, 0.0
+        self.modes = np.empty(0)
         self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
         self.stage_centre_um = float(setting.depth_um.mean())
@@ -108,7 +110,7 @@ class ForwardModel:
         pillars = self._pillars[incidence]
         reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
         _, maps = bias_um(np.zeros(len(NAMES)), reduced.u, reduced.v)
-        return _Group(index, pillars, reduced, aberrations(reduced.u, reduced.v), maps)
+        return _Group(index, pillars, reduced, aberrations(reduced.u, reduced.v), maps, np.empty((0, *reduced.u.shape)))
 
     def only(self, frames: Array) -> "ForwardModel":
         """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
@@ -125,6 +127,19 @@ class ForwardModel:
         """The same model with fields to a relative ``tolerance``: quick enough to scan with."""
         part = copy.copy(self)
         part._cut = tolerance
+        return part
+
+    def with_residual(self, modes: Array, basis: Callable[[Array, Array, int], Array]) -> "ForwardModel":
+        """The same lens with a phase of ``modes`` (m,) times ``basis`` (u, v, m) -> (m, *shape); see :mod:`thinplate`.
+
+        Their derivatives are wanted as ``residual_0`` and so on.
+        """
+        part = copy.copy(self)
+        part.modes = np.asarray(modes)
+        if len(modes) and any(len(group.residual) != len(modes) for group in self.groups):
+            shapes = [basis(group.reduced.u, group.reduced.v, len(modes)) for group in self.groups]
+            kept = [dataclasses.replace(g, residual=s) for g, s in zip(self.groups, shapes, strict=True)]
+            part.groups = self.groups = kept
         return part
 
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
@@ -214,6 +229,9 @@ class ForwardModel:
             elif name.removesuffix("_rad") in ABERRATIONS:
                 z = group.zernike[ABERRATIONS.index(name.removesuffix("_rad"))]
                 out[name] = sampled((1j * z).astype(np.complex64) * lit)
+            elif name.startswith("residual_"):
+                shape = group.residual[int(name.removeprefix("residual_"))]
+                out[name] = sampled((1j * shape).astype(np.complex64) * lit)
             elif name in GEOMETRY:
                 turned = 1j * self._phase_slope(x, group, name)
                 more = self._by_operators(x, group, name, lit, field) if name in _STEP else 0.0
@@ -272,7 +290,8 @@ class ForwardModel:
             tangents = tx - lateral[0] / z, ty - lateral[1] / z
             out[i] = k * (source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path) - known
         strengths = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
-        return out + np.tensordot(strengths, group.zernike, 1)
+        out += np.tensordot(strengths, group.zernike, 1)
+        return out + np.tensordot(self.modes, group.residual, 1) if len(self.modes) else out
 
     def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
         """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from characterize import thinplate
 from characterize.parameters import ABERRATIONS, PLACE, aberrations, bias_um
 from characterize.pillars import Sensitivity, incidence_rad, process, transmission
 from metalens.lens import DiameterMap, Lens
@@ -18,13 +19,20 @@ if TYPE_CHECKING:
 
 
 def pillars(
-    lens: Lens, response: Sensitivity, x: Array, *, noise_um: Array | float = 0.0, angle_rad: float = 0.0
+    lens: Lens,
+    response: Sensitivity,
+    x: Array,
+    *,
+    noise_um: Array | float = 0.0,
+    angle_rad: float = 0.0,
+    modes: Array | None = None,
 ) -> Array:
     """(y, x) complex transmission of every as-built pillar: diameter, process and wave-front aberrations.
 
     Args:
         x: all parameters, in the order of ``parameters.NAMES``.
         noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence, where the proxy knows angles.
+        modes: of a residual phase (:mod:`thinplate`).
 
     Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
     """
@@ -42,6 +50,8 @@ def pillars(
     strength = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
     if any(strength):
         t *= np.exp(1j * np.tensordot(strength, aberrations(u, v), 1))
+    if modes is not None and len(modes):
+        t *= np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
     return np.asarray(np.where(d.diameter_um > 0, t, 0))
 
 
@@ -74,6 +84,7 @@ def psf_stack(
     x: Array,
     view: "View",
     *,
+    modes: Array | None = None,
     offset_um: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-4,
 ) -> "PsfStack":
@@ -87,7 +98,7 @@ def psf_stack(
 
     parts = []
     for angle in view.angles_rad:
-        t = pillars(lens, response, x, angle_rad=incidence_rad(lens.proxy, angle))
+        t = pillars(lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes)
         parts.append(
             psf.psf_stack(
                 np.angle(t).astype(np.float32),
