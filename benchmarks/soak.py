@@ -70,15 +70,17 @@ def files(work: Path, seed: int, number: int) -> dict[str, str]:
         "samples": int(rng.integers(8, 65)),
         "tolerance": float(10 ** rng.uniform(-4, -1.5)),
     }
-    limits = f"[limits]\nmin_diameter_nm = {rng.integers(50, 80)}\nmin_gap_nm = {rng.integers(30, 70)}\n"
-    return {"design.toml": _text(design) + limits, "psf.toml": _text(psf), **_bench(rng, source)}
+    least, gap = int(rng.integers(50, 76)), int(rng.integers(30, 70))
+    limits = f"[limits]\nmin_diameter_nm = {least}\nmin_gap_nm = {gap}\n"
+    return {"design.toml": _text(design) + limits, "psf.toml": _text(psf), **_bench(rng, source, least, gap)}
 
 
-def _bench(rng: np.random.Generator, source: float) -> dict[str, str]:
-    """Process and hidden errors."""
+def _bench(rng: np.random.Generator, source: float, least: int, gap: int) -> dict[str, str]:
+    """Process and hidden errors; most processes print what the design asks for."""
     grid = rng.choice([1, 2, 5])
     process = (
-        f'name = "x"\n[rules]\nminimum_feature_nm = {rng.integers(40, 120)}\nminimum_gap_nm = {rng.integers(30, 90)}\n'
+        f'name = "x"\n[rules]\nminimum_feature_nm = {int(least * rng.uniform(0.5, 1.02))}\n'
+        f"minimum_gap_nm = {int(gap * rng.uniform(0.5, 1.02))}\n"
         f"grid_nm = {grid}\ndiameter_step_nm = {grid * rng.integers(1, 5)}\n"
         f"[bias]\ntable_nm = [[80, {rng.uniform(-8, 3):.2f}], [200, {rng.uniform(-3, 3):.2f}]]\n"
     )
