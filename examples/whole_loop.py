@@ -13,6 +13,7 @@
 # %%
 import tempfile
 import tomllib
+from importlib import resources
 from pathlib import Path
 
 from IPython.display import Image, display
@@ -32,40 +33,15 @@ work = Path(tempfile.mkdtemp())
 
 # %% [markdown]
 # ## 1. Co-design
-# A run file over the preset `smoke`: one small network before a hyperbolic lens. (A minute of training reads the pupil and the sideways slip; the distance takes some twenty
-# minutes: see the preset `laptop`.)
+# The run file of `metalens demo`, with fewer steps: one small network before a hyperbolic lens, over the preset `smoke`.
+# (A minute of training reads the pupil and the sideways slip; the distance takes some twenty minutes: see the preset
+# `laptop`.)
 
 # %%
-(work / "run.toml").write_text("""
-preset = "smoke"
-checkpoint_every = 100
-test_batches = 4
-[scenes]
-pixels = 48
-margin = 4
-pool = 256
-[optics]
-aperture_mm = 0.2
-sensor_distance_mm = 1.0
-sample_um = 12.0
-polynomials = 0
-depth_count = 6
-window_samples = 9
-[space]
-widths = [0.25]
-expansions = [3]
-kernels = [3]
-resolution = [1.0, 1.0]
-[inner]
-steps = 60
-[search]
-population = 2
-tournament = 1
-rounds = 2
-[run]
-pitch_um = 12.0
-budgets_mmacs = [4.0]
-""")
+settings = resources.files("metalens").joinpath("data", "demo", "run.toml").read_text(encoding="utf-8")
+settings = settings.replace("steps = 400", "steps = 60").replace("pool = 512", "pool = 256")
+print(settings)
+(work / "run.toml").write_text(settings)
 main(["codesign", str(work / "run.toml"), "-o", str(work / "run"), "--quiet"])
 design = lenses.load(work / "run" / "lens.h5")
 print(f"{(design.diameters.diameter_um > 0).sum():,} pillars")
@@ -123,8 +99,8 @@ display(Image(retrain_report.bars(told)))
 # A new bias table and a corrected map, and what they would gain on the true lens.
 
 # %%
-settings = retraining.load(work / "run").settings
-engine = built.MadeLens(design, settings.optics)
+optics = retraining.load(work / "run").settings.optics
+engine = built.MadeLens(design, optics)
 plan = correction.propose(design, made.parameters(), response=engine.response, old=correction.present_bias(process))
 correction.write(work, plan)
 print(tomllib.loads((work / "bias.toml").read_text())["bias"]["table_nm"][::4])
