@@ -23,8 +23,9 @@ from metalens import store
 
 RESULT = Path(__file__).parent / "results" / "experiment_study.json"
 WIDE = {
-    "pitch_um": 12.0,
-    "steps": 1200,
+    "pitch_um": 18.0,
+    "edge_um": 1872.0,  # 20 mm at the eye: the pupil stays in the image at every stimulus and slippage
+    "steps": 2000,
     "slip_mm": (5.0, 1.0, 5.5),
     "gaze_deg": (24.0, 16.0),
 }  # the reach of the experiment itself
@@ -48,7 +49,12 @@ def rows() -> list[Row]:
     case = f"{config.frames} frames: render, image, read, calibrate"
     out = [
         Row(
-            case, f"{source.row['mmacs']:.1f} MMACs, 96 x 96 pixels", seconds, float("nan"), "untrained", goal="1-2 min"
+            case,
+            f"{source.row['mmacs']:.1f} MMACs, 104 x 104 pixels",
+            seconds,
+            float("nan"),
+            "untrained",
+            goal="1-2 min",
         )
     ]
     if RESULT.is_file():
@@ -66,7 +72,7 @@ def main() -> None:
     parser.add_argument("what", choices=("train", "run"))
     parser.add_argument("name", nargs="?", choices=tuple(LENSES))
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--steps", type=int, default=2000)
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.what == "train":

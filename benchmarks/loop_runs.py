@@ -50,7 +50,6 @@ focus_mm = {focus_mm}
 polynomials = {polynomials}
 """
 BUDGET = 20.0  # MMACs that the one network stays below
-EDGE_UM = 1152.0  # of the image
 WINDOW_UM = 300.0  # of the PSFs
 
 
@@ -59,12 +58,14 @@ class Recipe:
     """What the studies vary.
 
     focus_mm: of the hyperbolic lens that training starts from. moves: whether training moves the lens as well.
-    pitch_um: of pixels and samples. width: of the network. slip_mm, gaze_deg: reach of slippage and gaze.
+    pitch_um: of pixels and samples. edge_um: of the image. width: of the network. slip_mm, gaze_deg: reach of slippage
+    and gaze.
     """
 
     focus_mm: float
     moves: bool = False
     pitch_um: float = 18.0
+    edge_um: float = 1152.0
     width: float = 0.35
     steps: int = 2000
     pool: int = 4096
@@ -74,7 +75,7 @@ class Recipe:
     @property
     def toml(self) -> str:
         """RUN.toml."""
-        pixels = round(EDGE_UM / self.pitch_um)
+        pixels = round(self.edge_um / self.pitch_um)
         return TEXT.format(
             pixels=pixels, margin=pixels // 8, pool=self.pool, slip_mm=list(self.slip_mm), gaze_deg=list(self.gaze_deg),
             width=self.width, pitch_um=self.pitch_um, budget=BUDGET, steps=self.steps,

@@ -105,7 +105,8 @@ class Result:
     """One run in the experiment.
 
     slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
-    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2).
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where the
+    regressor is told the true slippage: what the reading of the pupil alone leaves.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Result:
     iou: Array
     gaze_deg: Array
     predicted_deg: Array
+    told_deg: Array
 
     def gaze(self, kind: str) -> float:
         """Mean gaze error over the judged frames of a group, deg."""
@@ -237,8 +239,9 @@ def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config
         torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("slip_mm", "centre", "iou")
     )
     predicted, judged = calibrated(centre, slip, trial, config)
-    error = np.where(judged, angle_deg(predicted, trial.stimulus_deg), math.nan)
-    return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted)
+    told, _ = calibrated(centre, trial.slip_mm, trial, config)
+    error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
+    return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted, told_error)
 
 
 def calibrated(centre: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig) -> tuple[Array, Array]:
