@@ -103,9 +103,11 @@ def expected(design_lens: lens.Lens) -> AsBuilt:
     names = tuple(slopes)
     table = np.stack([slopes[n].ravel() * scale for n in names])
     prior = np.array([next(p.sigma for p in PARAMETERS if p.name == n) for n in names])
-    table *= prior[:, None]  # in units of the priors, so that the inverse keeps its digits
+    known = np.isfinite(prior)
+    unit = np.where(known, prior, 1 / np.linalg.norm(table, axis=1))  # so that the inverse keeps its digits
+    table *= unit[:, None]
     information = (table / (light.ravel() * scale + 10.0 + 4.0)) @ table.T
-    covariance = np.linalg.inv(information + np.eye(len(names))) * np.outer(prior, prior)
+    covariance = np.linalg.inv(information + np.diag(known.astype(float))) * np.outer(unit, unit)
     covariance = (covariance + covariance.T) / 2
     keep = [i for i, n in enumerate(names) if n in OF_LENS]
     part, blank = covariance[np.ix_(keep, keep)], np.zeros((1, 2, 2))
