@@ -13,7 +13,7 @@ from codesign.eye import Rig, States
 from codesign.renderer import Camera, Rendered
 from metalens import scene
 from metalens.errors import ConfigError, SceneError
-from metalens.fisher import Normalisation, axial_information, encircled_energy
+from metalens.fisher import Normalisation, axial_information
 from metalens.lens import Lens
 from metalens.psf import View, from_lens
 from metalens.sensor import integrate
@@ -91,7 +91,7 @@ class Axial:
     """Honest axial information of one lens.
 
     information: (angles, binnings, depths) per mm², over sub-pixel positions. encircled: (angles, depths) share of the
-    light through the lens that falls within the radius of the PSF's centroid. psf_error: estimate of the engine.
+    light through the lens that a circle of the radius holds, placed where it holds most. psf_error: of the engine.
     slices: (depths, x) the light on axis summed over y, on samples: what a line across the PSF's image shows.
     """
 
@@ -125,20 +125,22 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
         )
     light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(len(angles), s.count)
     share = light / passed_um2(lens) / torch.cos(torch.tensor([a for a, _ in angles]))[:, None]
-    inside = encircled_energy(_centred(intensity[:, 0]), s.sample_um, radius_um=s.radius_um)
+    inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
     slices = intensity[0, 0].sum(1)
     return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error), slices)
 
 
-def _centred(intensity: Tensor) -> Tensor:
-    """PSFs moved by whole samples so that their centroid is in the middle of the window."""
+def most_encircled(intensity: Tensor, sample_um: float, *, radius_um: float) -> Tensor:
+    """Largest share of the light (..., y, x) that a circle of this radius holds, wherever in the window it lies.
+
+    Off axis the core of a PSF is neither at the chief ray nor at the centroid, which haze pulls away.
+    """
     n = intensity.shape[-1]
-    grid = torch.arange(n, dtype=intensity.dtype) - (n - 1) / 2
-    y = (intensity.sum(-1) * grid).sum(-1).round().long()
-    x = (intensity.sum(-2) * grid).sum(-1).round().long()
-    flat = intensity.reshape(-1, n, n)
-    moved = [torch.roll(p, (-int(a), -int(b)), (0, 1)) for p, a, b in zip(flat, y.flatten(), x.flatten(), strict=True)]
-    return torch.stack(moved).reshape(intensity.shape)
+    grid = (torch.arange(n, dtype=torch.float64) + n // 2) % n - n // 2  # 0 first, as the transform counts
+    inside = (radius_um / sample_um + 0.5 - torch.hypot(grid[:, None], grid)).clamp(0, 1).to(intensity)
+    summed: Tensor = torch.fft.irfft2(torch.fft.rfft2(intensity) * torch.fft.rfft2(inside), s=(n, n))
+    most: Tensor = summed.amax((-2, -1))
+    return most
 
 
 @dataclass(frozen=True, eq=False, slots=True)

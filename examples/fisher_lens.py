@@ -25,14 +25,13 @@ helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
 
 # %% [markdown]
 # ## A short design
-# One start on a double helix, 50 steps a stage; `metalens design` with `profile = "fisher"` does more.
+# One start, 150 steps, a few seconds. `metalens design` with `profile = "fisher"` takes three starts of 800 steps, which
+# gives 1.44, 1.84 and 2.11 times the better tuned simple lens at 1 x 1, 2 x 2 and 3 x 3 pixels (docs/fisher).
 
 # %%
-settings = Fisher(iterations=50, starts=1, zones=(2,), focus_mm=(20.0, 20.0), grids=(8, 16, 32))
-made = design_fisher.optimise(optics, settings)
-weights_x, weights_y = (design_fisher.spline(a.ravel() / 500.0, len(made.controls)) for a in (x, y))
-free = torch.from_numpy((weights_y @ made.controls.numpy() * weights_x).sum(1).reshape(x.shape)) + helix
-print(made.reason, "; information and least energy of the starts:", made.starts)
+made = design_fisher.optimise(optics, Fisher(iterations=150, starts=1))
+free = design_fisher.phase_on(optics, made)
+print(made.reason, "; information and least energy:", made.starts)
 
 # %% [markdown]
 # ## Three lenses, three pixel sizes
@@ -43,7 +42,8 @@ figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), sharey=True)
 depths = torch.linspace(16, 26, 11)
 for binning, ax in zip((1, 2, 3), axes, strict=True):
     for name, phase in lenses.items():
-        score = design_fisher.score(phase, optics, focus_um=20e3, settings=Fisher(pixel_um=3.0 * binning))
+        focus = made.focus_um if name == "free form" else 20e3
+        score = design_fisher.score(phase, optics, focus_um=focus, settings=Fisher(pixel_um=3.0 * binning))
         ax.semilogy(depths, score.information, label=f"{name}: {float(score.information.mean()):.3f}")
     ax.set(title=f"{binning} x {binning} pixels of 3 um", xlabel="depth, mm")
     ax.legend(fontsize=7)

@@ -50,6 +50,18 @@ def test_full_lens_agrees_with_the_pupil_model():
     assert float(got.encircled.max()) <= 1.0
 
 
+@pytest.mark.parametrize("size", [64, 65])
+def test_encircled_energy_is_that_of_the_best_circle(size):
+    """Half the light in a disc of 5 um anywhere, half as haze over the whole window: a circle of 6 um holds both."""
+    grid = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * 0.75
+    for x, y in ((0.0, 0.0), (9.0, -12.0)):
+        disc = (torch.hypot(grid - x, grid[:, None] - y) <= 5.0).double()
+        light = 0.5 * disc / disc.sum() + 0.5 / size**2
+        want = 0.5 + 0.5 * math.pi * 6.0**2 / (0.75 * size) ** 2
+        got = evaluate.most_encircled(light[None], 0.75, radius_um=6.0)
+        assert float(got) == pytest.approx(want, abs=2e-3)  # staircase of the circle on samples of 0.75 um
+
+
 def test_scene_energies_tell_lenses_apart():
     states = dataset.states_at(torch.arange(2), 2)
     lenses = [_lens(20e3), _lens(20e3, zones=3)]
