@@ -59,16 +59,21 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
     nearest = float(model.setting.depth_um.min())
     zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, 17) if scan_um > 0 else np.zeros(1)
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
-    scores, rough = [], model.rough(_ROUGH)
+    scores, rough, back = [], model.rough(_ROUGH), _reversed(model)
     for zero in zeros:
         start[PLACE["stage_zero_um"]] = zero
-        scores.append(np.mean([score for score, _ in _compare(light, _expected(rough, start, clipped), noise)]))
+        expected = _expected(rough, start, clipped)
+        ways = (light, expected, noise), (light[back], expected, noise[back])
+        scores.append(max(float(np.mean([score for score, _ in _compare(*way)])) for way in ways))
     best = int(np.argmax(scores))
     start[PLACE["stage_zero_um"]] = zeros[best]
     expected = _expected(model, start, clipped)
-    found = _compare(light, expected, noise)
     order, reordered, seen = _order(light, expected, noise, model)
     orientation, clearly = _orientation(light, expected, noise)
+    if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
+        reordered, clearly = _plainest(light, expected, noise, order, orientation)
+    laid = turn(light, orientation) if clearly else light
+    found = _compare(laid[order] if reordered else laid, expected, noise)
     possible = [k for k in range(1, 8) if k % 2 == 0 or expected.shape[1] == expected.shape[2]]
     turned = {k: np.mean([s for s, _ in _compare(turn(expected, k), expected, 0 * noise)]) for k in possible}
     shift = np.median([s for _, s in found], axis=0)
@@ -83,6 +88,15 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
         clearly=clearly,
         alike=tuple(k for k, likeness in turned.items() if likeness >= 0.997),
     )
+
+
+def _reversed(model: ForwardModel) -> Array:
+    """(n,) frames from the other end of the stage, at each field angle."""
+    back = np.arange(len(model.setting.depth_um))
+    for group in model.groups:
+        by_depth = group.index[np.argsort(model.setting.depth_um[group.index], kind="stable")]
+        back[by_depth] = by_depth[::-1]
+    return back
 
 
 def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
@@ -119,6 +133,17 @@ def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift that makes them most alike."""
     _, (dy, dx) = _likeness(a, b, 0.0)
     return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
+
+
+def _plainest(light: Array, expected: Array, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
+    """(reordered, turned): the least that explains the frames, of reordering, turning and both."""
+
+    def mean(frames: Array) -> float:
+        return float(np.mean([score for score, _ in _compare(frames, expected, noise)]))
+
+    turned = turn(light, orientation)
+    scores = {(True, False): mean(light[order]), (False, True): mean(turned), (True, True): mean(turned[order])}
+    return next(way for way, score in scores.items() if score > max(scores.values()) - 5e-3)
 
 
 def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool]:

@@ -75,7 +75,7 @@ def fit(
     names, solution = _search(model, data, start, known, found, options)
     if not _explained(solution) and not set(MORE) <= set(names):
         more = dataclasses.replace(options, free=(*options.free, *MORE))
-        wider = _search(model, data, _full(names, solution, start), known, found, more, brief=True)
+        wider = _wider(model, data, _full(names, solution, start), known, found, more) or (names, solution)
         if wider[1].chi2_per_dof < 0.97 * solution.chi2_per_dof:
             names, solution = wider
             cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
@@ -183,6 +183,16 @@ def _search(
     best = min(tries, key=lambda t: t.merit)
     settings = Settings(iterations=40, secant=True)
     return names, leastsquares.fit(problem(model), data, best.value, prior=prior, settings=settings)
+
+
+def _wider(
+    model: ForwardModel, data: Data, start: Array, known: dict[str, Known], found: Arrangement, options: Options
+) -> tuple[tuple[str, ...], Solution] | None:
+    """A search with more parameters from where the usual ones led; None where they lead out of the model's range."""
+    try:
+        return _search(model, data, start, known, found, options, brief=True)
+    except FitError:
+        return None
 
 
 def _few(setting: Setting) -> Array:
