@@ -5,6 +5,7 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.modal.assembly import assemble
+from metalens.modal.dense import below, definite_inverse, eigen_pairs
 from metalens.modal.engine import case_of, evaluate
 from metalens.modal.few_modes import few_modes, root
 from metalens.modal.homogeneous import modes
@@ -66,6 +67,23 @@ def test_absorbing_and_metallic_layers_take_all_modes():
     assert not lossless(Medium(1.0, 3.6**2 + 0.1j, 1.0))
     assert not lossless(Medium(1.0, -4.0, 1.0))
     assert lossless(Medium(1.0, 3.6**2, 1.0))
+
+
+def test_dense_algebra_does_what_it_says():
+    random = np.random.default_rng(1)
+    left, right = random.normal(size=(2, 20, 20))
+    definite, symmetric = left @ left.T + np.eye(20), right + right.T
+    lower = np.linalg.cholesky(definite)
+    assert np.abs(lower @ below(lower, right) - right).max() < 1e-12
+    assert np.abs(lower.T @ below(lower, right, transposed=True) - right).max() < 1e-12
+    inverse = definite_inverse(definite)
+    assert np.abs(inverse @ definite - np.eye(20)).max() < 1e-11
+    assert (inverse == inverse.T).all()
+    value, vectors = eigen_pairs(symmetric, definite)
+    assert np.abs(symmetric @ vectors - definite @ vectors * value).max() < 1e-11
+    assert np.abs(vectors.T @ definite @ vectors - np.eye(20)).max() < 1e-11
+    with pytest.raises(np.linalg.LinAlgError):
+        eigen_pairs(definite, symmetric)
 
 
 def test_root_of_a_matrix_near_a_diagonal():
