@@ -150,7 +150,7 @@ def collect(folder: Path) -> None:
         "baselines": simple,
         "two_point_fringe": {str(b): fringe(b) for b in (1, 2, 3)},
         "pillars_what": "mean over 6 depths (16, 18 ... 26 mm), per field angle (rows) and binning (columns); the "
-        "least energy of each angle; proxy at normal incidence",
+        "least energy of each angle, in the circle of 18 um that holds most; proxy at normal incidence",
         "paper": {"proposed at 5 degrees": PAPER},
         "pillars": held.get("pillars", {}) | on_pillars,
     }

@@ -83,13 +83,24 @@ def blind(phase: Tensor, focus_um: float) -> dict[str, float]:
 
 
 def scene_information(lens: str, frames: Frames) -> dict[str, float]:
-    """Noise-weighted information on depth of whole frames, with and without nuisances, mean over the frames.
+    """Noise-weighted information on depth of whole frames, with and without nuisances, mean over the frames."""
+    plain, known = frame_information(lens, frames)
+    return {
+        "scene Fisher information of depth alone": float(np.mean(plain)),
+        "scene Fisher information, brightness, size, place, texture unknown": float(np.mean(known)),
+    }
+
+
+def frame_information(
+    lens: str, frames: Frames, *, made: optics.Stack | None = None
+) -> tuple[list[float], list[float]]:
+    """Information on depth of every frame, alone and with the nuisances unknown, per mm²; ``made``: other PSFs.
 
     Depth moves the blur alone (the scale ambiguity: the pinhole image stays). Nuisances: brightness, size, two
     shifts, and the texture: the radiance times every wave of up to ``READS`` periods across the frame.
     """
     settings = replace(optics_of(lens)[0], depth_count=48)
-    made = optics.stack(settings, torch.zeros(0))
+    made = optics.stack(settings, torch.zeros(0)) if made is None else made
     size = frames.radiance.shape[-1]
     ready = optics.prepared(settings, made, size, margin=SCENES.margin)
 
@@ -112,10 +123,7 @@ def scene_information(lens: str, frames: Frames) -> dict[str, float]:
         matrix = fisher.information(jacobians, variance(here[0], sensor=SENSOR))
         plain.append(float(matrix[0, 0]))
         known.append(float(fisher.without_nuisance(matrix, 1)))
-    return {
-        "scene Fisher information of depth alone": float(np.mean(plain)),
-        "scene Fisher information, brightness, size, place, texture unknown": float(np.mean(known)),
-    }
+    return plain, known
 
 
 def _waves(size: int) -> Tensor:
