@@ -103,11 +103,10 @@ def expected(design_lens: lens.Lens) -> AsBuilt:
     names = tuple(slopes)
     table = np.stack([slopes[n].ravel() * scale for n in names])
     prior = np.array([next(p.sigma for p in PARAMETERS if p.name == n) for n in names])
-    known = np.isfinite(prior)
-    unit = np.where(known, prior, 1 / np.linalg.norm(table, axis=1))  # so that the inverse keeps its digits
-    table *= unit[:, None]
-    information = (table / (light.ravel() * scale + 10.0 + 4.0)) @ table.T
-    covariance = np.linalg.inv(information + np.diag(known.astype(float))) * np.outer(unit, unit)
+    variance = np.maximum(light.ravel(), 0) * scale + 10.0 + 4.0  # low-passed PSFs dip below 0
+    precision = (table / variance) @ table.T + np.diag(1 / prior**2)
+    unit = 1 / np.sqrt(np.diag(precision))  # so that the inverse keeps its digits
+    covariance = np.linalg.inv(precision * np.outer(unit, unit)) * np.outer(unit, unit)
     covariance = (covariance + covariance.T) / 2
     keep = [i for i, n in enumerate(names) if n in OF_LENS]
     part, blank = covariance[np.ix_(keep, keep)], np.zeros((1, 2, 2))
