@@ -129,7 +129,7 @@ def weight_maps(psf: PsfBasis, depth_um: Tensor) -> Tensor:
     code = _codes(psf.depths_um, depth_um)
     table = _table(psf)
     if table.shape[:2] == (1, 1):
-        return torch.stack([row[code] for row in table[0, 0]])
+        return table[0, 0].index_select(1, code.flatten()).reshape(-1, *code.shape)
     (rows, y), (columns, x) = (_span(n, f) for n, f in zip(depth_um.shape[-2:], table.shape[:2], strict=True))
     total = table.new_zeros(())
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -193,11 +193,8 @@ def image(frames: Frames, optics: Imager, *, margin: int = 0, chunk: int = 2) ->
     out = []
     for start in range(0, len(frames.radiance), chunk):
         part = slice(start, start + chunk)
-        weights = weight_maps(optics.psf, frames.depth_um[part])
-        pair = torch.stack([frames.radiance[part], frames.coverage[part]], 1)  # (b, 2 kinds, 2 sheets, y, x)
-        source = _padded(weights[:, :, None] * pair, optics.shape)  # (rank, b, 2 kinds, 2 sheets, y, x)
-        spectrum = torch.fft.rfft2(source) * optics.transfer[:, None, None, None]
-        blurred = torch.fft.irfft2(spectrum.sum(0), s=optics.shape)
+        source = _sources(Frames(*(getattr(frames, name)[part] for name in Frames.__slots__)), optics)
+        blurred = torch.fft.irfft2(_mixed(torch.fft.rfft2(source), optics), s=optics.shape)
         size = frames.radiance.shape[-2:]
         blurred = blurred[..., margin : size[0] - margin, margin : size[1] - margin]
         out.append(_over(blurred[:, 0], blurred[:, 1]))
@@ -209,10 +206,24 @@ def spectra(frames: Frames, optics: Imager) -> Tensor:
 
     They do not change with the kernels: for many images of the same frames, as in a design, see :func:`with_kernels`.
     """
-    weights = weight_maps(optics.psf, frames.depth_um)
-    pair = torch.stack([frames.radiance, frames.coverage], 1)
-    spectrum: Tensor = torch.fft.rfft2(_padded(weights[:, :, None] * pair, optics.shape))
+    spectrum: Tensor = torch.fft.rfft2(_sources(frames, optics))
     return spectrum
+
+
+def _mixed(spectrum: Tensor, optics: Imager) -> Tensor:
+    """Sum over the kernels of spectrum times transfer, without the products in memory."""
+    total = spectrum[0] * optics.transfer[0]
+    for part, transfer in zip(spectrum[1:], optics.transfer[1:], strict=True):
+        total = torch.addcmul(total, part, transfer)
+    return total
+
+
+def _sources(frames: Frames, optics: Imager) -> Tensor:
+    """(rank, frames, 2 kinds, 2 sheets, y, x) light and coverage weighted for every kernel, ready to transform."""
+    pair = torch.stack([frames.radiance, frames.coverage], 1)
+    if optics.psf.weights.shape[:2] == (1, 1):  # weights of the depth alone: pad once, not once a kernel
+        return weight_maps(optics.psf, _padded(frames.depth_um, optics.shape))[:, :, None] * _padded(pair, optics.shape)
+    return _padded(weight_maps(optics.psf, frames.depth_um)[:, :, None] * pair, optics.shape)
 
 
 def with_kernels(optics: Imager, kernels: Tensor) -> Imager:
@@ -222,8 +233,7 @@ def with_kernels(optics: Imager, kernels: Tensor) -> Imager:
 
 def image_spectra(source: Tensor, optics: Imager, size: tuple[int, int]) -> Tensor:
     """(frames, y, x) the image that :func:`image` gives, from :func:`spectra` of frames of ``size`` = (y, x) pixels."""
-    mixed = (source * optics.transfer[:, None, None, None]).sum(0)
-    blurred = torch.fft.irfft2(mixed, s=optics.shape)[..., : size[0], : size[1]]
+    blurred = torch.fft.irfft2(_mixed(source, optics), s=optics.shape)[..., : size[0], : size[1]]
     return _over(blurred[:, 0], blurred[:, 1])
 
 
