@@ -61,9 +61,10 @@ def _millimetre() -> list[Row]:
     found = model.images(x)[0]
     found *= (found * light).sum() / (found**2).sum()
     quick = fastest(lambda: model.images(x))
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), time.process_time()
     fitted = fit(shots.capture, design, Options(), response=millimetre.RESPONSE)
-    seconds = time.perf_counter() - start
+    seconds, busy = time.perf_counter() - start, time.process_time() - busy
+    goal = f"<= 10 s; {busy:.1f} s of processor time"
     z = millimetre.normalised(fitted)
     peak = float(np.abs(found - light).max() / light.max())
     worst = max(np.abs(f - w).max() / w.max() for f, w in zip(found, light, strict=True))
@@ -75,7 +76,7 @@ def _millimetre() -> list[Row]:
         Row(case, "every pillar", shots.seconds, float("nan"), "is the reference", threads),
         Row(case, "reduced model", quick, peak, about, threads, goal=times),
         Row(case, "reduced model", quick, float(worst), "the same, of each frame's own peak", threads, goal="<= 1e-3"),
-        Row(fit_case, "fit", seconds, float(np.sqrt((z**2).mean())), "truth, sigma, rms", threads, goal="<= 10 s"),
+        Row(fit_case, "fit", seconds, float(np.sqrt((z**2).mean())), "truth, sigma, rms", threads, goal=goal),
         Row(fit_case, "fit", seconds, float(np.abs(z).max()), "truth, sigma, worst", threads),
         Row(fit_case, "fit", seconds, fitted.chi2_per_dof, "chi-square per degree", threads, goal="0.95 to 1.05"),
     ]

@@ -1,4 +1,4 @@
-"""One step of a fit inside its limits: the least of a quadratic between bounds and inside a ball, by NLopt's SLSQP."""
+"""One step of a fit inside its limits: the least of a quadratic between bounds and inside a ball, by SLSQP (NLopt)."""
 
 import contextlib
 from collections.abc import Callable
@@ -10,19 +10,28 @@ from characterize.leastsquares import Ball
 from metalens.store import Array
 
 
-def step(curvature: Array, gradient: Array, x: Array, *, low: Array, high: Array, ball: Ball | None = None) -> Array:
+def step(
+    curvature: Array,
+    gradient: Array,
+    x: Array,
+    *,
+    low: Array,
+    high: Array,
+    ball: Ball | None = None,
+    tolerance: float = 1e-3,
+) -> Array:
     """The s with least sᵀCs / 2 + gᵀs for which x + s lies between ``low`` and ``high`` and inside the ball.
 
     Clipping the free minimum to the bounds is not it where parameters go together: what one may not do, others do.
 
     Args:
         curvature: (p, p) positive definite. gradient, x, low, high: (p,); x inside all limits, bounds may be infinite.
-
-    Accuracy:
-        1e-8 of a parameter's own sigma (Kraft 1988, as NLopt has it).
+        tolerance: of the step, in each parameter's own sigma.
     """
-    size = np.sqrt(np.diag(curvature))
-    matrix, slope = curvature / np.outer(size, size), gradient / size
+    own = np.sqrt(np.diag(curvature))
+    matrix, slope = curvature / np.outer(own, own), gradient / own
+    length = max(float(np.linalg.norm(slope)), 1e-12)  # of the step along the gradient, in sigma: makes it of order 1
+    size, slope = own / length, slope / length
 
     def value(s: Array, out: Array) -> float:
         bent = matrix @ s
@@ -36,10 +45,10 @@ def step(curvature: Array, gradient: Array, x: Array, *, low: Array, high: Array
     solver.set_upper_bounds((high - x) * size)
     if ball is not None:
         solver.add_inequality_constraint(_limit(ball, x, size), 1e-10)
-    solver.set_xtol_abs(1e-8)
-    solver.set_maxeval(400)
+    solver.set_xtol_abs(tolerance / length)
+    solver.set_maxeval(100)
     best = np.zeros(len(x))
-    with contextlib.suppress(nlopt.RoundoffLimited, RuntimeError):  # a step of zero is refused by the caller
+    with contextlib.suppress(nlopt.RoundoffLimited, RuntimeError):
         best = np.asarray(solver.optimize(best))
     return np.asarray(np.clip(x + best / size, low, high) - x)
 

@@ -19,7 +19,7 @@ from characterize.pillars import Sensitivity
 from characterize.prepare import data_of, merged, setting_of, stated
 from characterize.residual import MOST_RAD, Attempt, attempt
 from characterize.slopes import slopes
-from metalens.errors import FitError
+from metalens.errors import FitError, FitRefused
 from metalens.lens import Lens
 from metalens.psf_lens import View
 from metalens.psf_record import PsfStack
@@ -73,7 +73,7 @@ def fit(
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     data = _rearranged(data, found)
     names, solution = _search(model, data, start, known, found, options)
-    if not _explained(solution) and not set(MORE) <= set(names):
+    if not _explained(solution, frames.gain) and not set(MORE) <= set(names):
         more = dataclasses.replace(options, free=(*options.free, *MORE))
         wider = _wider(model, data, _full(names, solution, start), known, found, more) or (names, solution)
         if wider[1].chi2_per_dof < 0.97 * solution.chi2_per_dof:
@@ -89,7 +89,7 @@ def fit(
             )
     result = _result(capture, lens, model, data, names, solution, start, known, cautions, frames.gain)
     if result.problems and not options.insist:
-        raise FitError("fit refused: " + "; ".join(result.problems))
+        raise FitRefused("fit refused: " + "; ".join(result.problems))
     return result
 
 
@@ -99,7 +99,7 @@ def _fits(options: Options, name: str) -> bool:
 
 def _check_likeness(found: Arrangement, lens: Lens) -> None:
     if found.likeness < LIKENESS:
-        raise FitError(
+        raise FitRefused(
             f"fit refused: the frames look like no image of this lens (best correlation {found.likeness:.2f}); "
             f"they are of another lens than this {lens.profile} one, far from the stated depths, or dark"
         )
@@ -235,8 +235,11 @@ def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -
     return starts
 
 
-def _explained(solution: Solution) -> bool:
-    return solution.chi2_per_dof <= MISFIT
+def _explained(solution: Solution, gain: Gain) -> bool:
+    """Whether chi-square is that of noise: within 15 %, or four of its own sigma where pixels or flats are few."""
+    counted = float((solution.residual_sigma != 0).sum())
+    chance = 4 * math.hypot(math.sqrt(2 / max(counted, 1.0)), gain.gain_sigma_e / gain.gain_e)
+    return solution.chi2_per_dof <= 1 + max(MISFIT - 1, min(chance, 0.5))
 
 
 def _left_over(solution: Solution) -> bool:
@@ -276,7 +279,7 @@ def _result(
     prior = prior_of(names, known)
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
     bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
-    problems = _problems(names, solution, prior, gain.known)
+    problems = _problems(names, solution, prior, gain)
     clipped = float(data.saturated.mean())
     if problems and clipped > 0.1:
         problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
@@ -334,25 +337,25 @@ def _with_gain(names: tuple[str, ...], solution: Solution, gain: Gain) -> Array:
     return np.asarray(solution.covariance + np.outer(by_gain, by_gain))
 
 
-def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain_known: bool) -> list[str]:
+def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Gain) -> list[str]:
     """Checks of a finished fit, each with the cause it points to."""
     words = []
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
     peak = float((solution.image - np.median(solution.image)).max())
-    if gain_known and peak < LEAST_PEAK_E:
+    if gain.known and peak < LEAST_PEAK_E:
         words.append(
             f"too little light: brightest pixel {peak:.0f} electrons above background, need {LEAST_PEAK_E:.0f} or more "
             "for intervals that hold; expose longer, or average frames"
         )
     outliers = float((np.abs(solution.residual_sigma) > 6).mean())
-    if gain_known and not _explained(solution):
+    if gain.known and not _explained(solution, gain):
         frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))
         words.append(
             f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, not 1: the model does not explain "
             f"the frames (worst: frame {frame}); another lens, a shifted or repeated frame, a ghost, a wrong gain"
         )
-    if gain_known and outliers > 0.02:
+    if gain.known and outliers > 0.02:
         words.append(
             f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
         )

@@ -14,7 +14,7 @@ from characterize.clean import Frames, clean
 from characterize.leastsquares import Data, Prior, Settings, Solution
 from characterize.pupil import PupilModel, PupilSpec
 from metalens import config, store
-from metalens.errors import FitError
+from metalens.errors import FitError, FitRefused
 from metalens.store import Array
 
 
@@ -85,7 +85,7 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True,
     score = held_out or agreement
     problems = pupilcheck.problems(data, background, (score.ncc, score.nrmse), stopped)
     if problems and not insist:
-        raise FitError("fit refused: " + "; ".join(problems))
+        raise FitRefused("fit refused: " + "; ".join(problems))
     return PupilFit(
         spec=spec,
         names=tuple(model.names()),

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.errors import MetalensError, nearest
+from metalens.errors import FitRefused, MetalensError, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT = 0, 1, 2
 
@@ -63,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _stop)
     try:
         return _dispatch(words[0], words[1:])
+    except FitRefused as error:
+        return _refuse(str(error), FAILED_CHECK)
     except (MetalensError, OSError) as error:
         return _refuse(str(error))
     except KeyboardInterrupt:

@@ -55,6 +55,10 @@ class FitError(MetalensError):
     """A fit cannot be done or is refused; the message names the cause."""
 
 
+class FitRefused(FitError):
+    """A fit was done and fails its own checks; commands turn it into exit code 1."""
+
+
 class SceneError(MetalensError):
     """An eye, scene or sensor state cannot be rendered."""
 

@@ -20,7 +20,9 @@ def test_bounded_step_is_that_of_an_independent_solver():
     low, high = np.full(4, -0.4), np.array([0.3, 0.2, 0.5, 0.1])
     want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-12).x
     free = np.linalg.lstsq(jacobian, target, rcond=None)[0]
-    found = constrained.step(jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high)
+    found = constrained.step(
+        jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high, tolerance=1e-8
+    )
     assert np.abs(found - want).max() < 1e-6
     assert np.abs(np.clip(free, low, high) - want).max() > 0.05  # clipping the free minimum is something else
 
@@ -28,7 +30,7 @@ def test_bounded_step_is_that_of_an_independent_solver():
 def test_step_into_a_ball_of_equal_curvature_is_the_projection():
     goal = np.array([3.0, 4.0, 0.5, 0.0])
     ball = Ball(np.array([0, 1]), 1.0)
-    found = constrained.step(np.eye(4), -goal, np.zeros(4), low=-FREE, high=FREE, ball=ball)
+    found = constrained.step(np.eye(4), -goal, np.zeros(4), low=-FREE, high=FREE, ball=ball, tolerance=1e-8)
     assert np.abs(found - [0.6, 0.8, 0.5, 0.0]).max() < 1e-6
     assert ball.inside(found)
 
