@@ -43,6 +43,7 @@ def references(angle_deg: float) -> dict[tuple[float, str], complex]:
         if e["angle_deg"] == angle_deg
         and e["wavelength_um"] == WAVELENGTH_UM
         and e["cell"]["pillar"] == [3.6, 0.0]
+        and e["cell"]["height_um"] == CELL.height_um
         and 0.08 <= e["diameter_um"] <= 0.32
     }
 
