@@ -36,7 +36,7 @@ class Baseline:
     @property
     def name(self) -> str:
         """Kind and focus, for tables."""
-        kind = f"helix of {self.zones} zones" if self.zones else "hyperbolic"
+        kind = f"helix of {self.zones} zone{'s' * (self.zones > 1)}" if self.zones else "hyperbolic"
         return f"{kind}, {self.focus_um / 1e3:.1f} mm"
 
     def phase(self, focus: Focus, *, radius_um: float) -> tuple[PhaseOf, Focus]:

@@ -75,11 +75,11 @@ def text(lenses: tuple[Judged, ...], settings: Fisher) -> str:
     lines = [
         f"I(z) per mm², mean over {low:g}-{high:g} mm (least energy in {settings.radius_um:g} um); pixels of "
         f"{settings.pixel_um:g} um, {settings.normalisation} normalisation, smooth phases",
-        f"  {'lens':<32}" + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
+        f"  {'lens':<36}" + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
     ]
     for lens in lenses:
         pairs = zip(lens.score.information.mean(1), lens.score.encircled.amin(1), strict=True)
-        lines.append(f"  {lens.name:<32}" + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs))
+        lines.append(f"  {lens.name:<36}" + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs))
     energy = ", ".join(
         f"{depth:g} mm {share:.2f}"
         for depth, share in zip(_depths(lenses, settings)[::2], lenses[0].score.encircled.amin(0)[::2], strict=True)
@@ -89,10 +89,10 @@ def text(lenses: tuple[Judged, ...], settings: Fisher) -> str:
 
 def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes:
     """Information and energy over depth at the first angle, and PSFs of the lenses through the range."""
-    figure, _ = canvas(1, 1, size=(10, 7.2))
+    figure, _ = canvas(1, 1, size=(10, 7.6))
     figure.clear()
-    grid = figure.add_gridspec(5, STRIP, height_ratios=(3, 0.45, 1.2, 1.2, 1.2))
-    left, right = figure.add_subplot(grid[0, : STRIP // 2]), figure.add_subplot(grid[0, STRIP // 2 :])
+    top, bottom = figure.subfigures(2, 1, height_ratios=(3, 0.4 + 1.3 * len(lenses)))
+    left, right = top.subplots(1, 2)
     depths, angle = _depths(lenses, settings), settings.angles_deg[0]
     for lens in lenses:
         left.plot(depths, lens.score.information[0].numpy(), ".-", label=lens.name)
@@ -104,19 +104,20 @@ def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes
     left.legend(fontsize=7)
     planes = torch.linspace(1e3 * settings.depths_mm[0], 1e3 * settings.depths_mm[1], STRIP, dtype=torch.float64)
     fields = [Field(float(np.radians(angle)))] * STRIP
+    panels = bottom.subplots(len(lenses), STRIP, squeeze=False)
     for row, lens in enumerate(lenses):
         samples = int(SHOWN_UM / SAMPLE_UM)
         stack = pupil_oblique.psf(lens.phase_rad, pupil, depths_um=planes, fields=fields, focus_um=lens.focus_um,
                                   sample_um=SAMPLE_UM, samples=samples)  # fmt: skip
         for column, image in enumerate(stack):
-            panel = figure.add_subplot(grid[2 + row, column])
+            panel = panels[row, column]
             panel.imshow(torch.sqrt(image).numpy(), cmap="inferno")
             panel.set(xticks=[], yticks=[])
             if row == 0:
                 panel.set_title(f"{planes[column] / 1e3:g} mm", fontsize=8)
             if column == 0:
                 panel.set_ylabel(lens.name.replace(", ", "\n"), fontsize=7)
-    figure.text(0.5, 0.005, f"PSFs, {SHOWN_UM:g} µm wide, square root of the intensity", ha="center", fontsize=8)
+    bottom.supxlabel(f"PSFs, {SHOWN_UM:g} µm wide, square root of the intensity, each at its own scale", fontsize=8)
     return png(figure)
 
 
