@@ -13,6 +13,7 @@ from metalens.store import Array
 
 TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
 _ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
+_TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
 MIRRORED = tuple("mirrored, then " + words for words in TURNS)
 
 
@@ -64,7 +65,8 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
         start[PLACE["stage_zero_um"]] = zero
         expected = _expected(rough, start, clipped)
         ways = (light, expected, noise), (light[back], expected, noise[back])
-        scores.append(max(float(np.mean([score for score, _ in _compare(*way)])) for way in ways))
+        stated, turned_round = (float(np.mean([score for score, _ in _compare(*way)])) for way in ways)
+        scores.append(max(stated, turned_round - _TWIN))
     best = int(np.argmax(scores))
     start[PLACE["stage_zero_um"]] = zeros[best]
     expected = _expected(model, start, clipped)
