@@ -182,3 +182,20 @@ def test_command_writes_a_pupil_file_and_a_page(tmp_path):
     assert store.load(tmp_path / "p.h5", "pupil").attributes["agreement_ncc"] > 0.99
     assert (tmp_path / "p.html").stat().st_size > 10000
     assert main(words) == 2  # exists, no --force
+
+
+def test_command_ends_with_1_where_a_fit_is_refused(tmp_path):
+    from metalens.cli import main
+
+    random = np.random.default_rng(0)
+    frames = random.poisson(200, (9, 32, 32)).astype(np.uint16)  # no bead anywhere
+    tifffile.imwrite(tmp_path / "stack.tif", frames, photometric="minisblack")
+    (tmp_path / "pupil.toml").write_text(
+        "numerical_aperture = 0.3\nwavelength_um = 0.5\npixel_um = 0.4\nstep_um = 4.0\nwindow = 16\nphase_order = 4\n"
+        "amplitude_order = 1\ndrift_order = 1\n"
+    )
+    words = ["fit", str(tmp_path / "stack.tif"), "--pupil", str(tmp_path / "pupil.toml"), "-o", str(tmp_path / "p.h5")]
+    assert main([*words, "--quiet"]) == 1
+    assert not (tmp_path / "p.h5").exists()
+    assert main([*words, "--quiet", "--insist"]) == 1
+    assert (tmp_path / "p.h5").exists()
