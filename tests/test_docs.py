@@ -25,6 +25,7 @@ def _blocks(path, language):
 
 def _records():
     from characterize.bench import Truth
+    from characterize.pupil import PupilSpec
     from codesign.plan import PlanConfig
     from layout.process import Process
 
@@ -34,6 +35,7 @@ def _records():
         "PSF.toml": Settings,
         "PROCESS.toml": Process,
         "TRUTH.toml": Truth,
+        "PUPIL.toml": PupilSpec,
         "PLAN.toml": PlanConfig,
         "CHAIN.toml": ChainFiles,
     }
