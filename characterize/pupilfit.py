@@ -84,6 +84,7 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True,
     stopped = "" if solution.converged else solution.reason
     score = held_out or agreement
     problems = pupilcheck.problems(data, background, (score.ncc, score.nrmse), stopped)
+    notes += pupilcheck.doubts(data, background, score.nrmse, stopped)
     if problems and not insist:
         raise FitRefused("fit refused: " + "; ".join(problems))
     return PupilFit(
