@@ -1,4 +1,7 @@
-"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables and keep them in benchmarks/results."""
+"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables and keep them in benchmarks/results.
+
+Without a topic all are run but those that take a quarter of an hour (``LONG``).
+"""
 
 import importlib
 import json
@@ -11,6 +14,7 @@ from pathlib import Path
 import benchmarks
 from benchmarks import Row
 
+LONG = ("limits", "plan")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 
@@ -18,7 +22,7 @@ def main(words: list[str]) -> None:
     peers = "--peers" in words
     folder = Path(__file__).parent
     known = sorted(m.name for m in pkgutil.iter_modules([str(folder)]) if not m.name.startswith("_"))
-    for topic in [w for w in words if not w.startswith("-")] or known:
+    for topic in [w for w in words if not w.startswith("-")] or [k for k in known if k not in LONG]:
         module = importlib.import_module(f"benchmarks.{topic}")
         make = getattr(module, "peer_rows" if peers else "rows", None)
         if make is None:

@@ -23,7 +23,8 @@ each frame is scaled to one that has nothing to do with its picture (by a factor
 scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
 
 - `hyperF`: hyperbolic, focused at F mm (20 is mid-range). `helixN`: double helix of N zones, focused at 20 mm.
-- `jointF`, `swiftF`: trained with the network from `hyperF`, at two learning rates of the phase.
+- `jointF`, `swiftF`, `rushF`: trained with the network from `hyperF`, at three learning rates of the phase (0.02, 0.05
+  and 0.15 rad).
 - `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18long`: three times the frames. `p18dim`:
   100 electrons. `p18small`: half the width.
 
@@ -96,7 +97,7 @@ def best_focus(runs: dict[str, Runs]) -> str:
     return min(fixed, key=lambda name: float(runs[name].axial("natural").mean()))
 
 
-def rows(runs: dict[str, Runs]) -> list[dict[str, Any]]:
+def summaries(runs: dict[str, Runs]) -> list[dict[str, Any]]:
     """One row a lens, least axial error first."""
     best, out = best_focus(runs), []
     for lens, mine in runs.items():
@@ -160,7 +161,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     options = parser.parse_args()
     runs = load(options.work)
-    found = {case: rows(mine) for case, mine in runs.items()}
+    found = {case: summaries(mine) for case, mine in runs.items()}
     folder = ROOT / "docs" / "codesign"
     folder.mkdir(parents=True, exist_ok=True)
     content = table(found, runs)

@@ -36,6 +36,7 @@ LINES = "runs.jsonl"
 SCENES = SceneConfig(pixels=128, margin=16, pool=4096)
 FREE = Schedule(0.02, 0.12, 0.8, clip=1.0)
 SWIFT = Schedule(0.05, 0.12, 0.8, clip=1.0)  # from focus 20 to 33 mm is 5 rad: all that 540 steps of FREE can go
+RUSH = Schedule(0.15, 0.06, 0.85, clip=1.0)
 SPACE = Space(widths=(0.25, 0.5), depths=(2, 3), expansions=(3, 4), kernels=(3, 5), resolution=(0.5, 1.0))
 
 
@@ -65,8 +66,8 @@ CASES = {
 def optics_of(lens: str) -> tuple[OpticsConfig, Schedule]:
     """Optics and their schedule.
 
-    hyperF: fixed, focused at F mm. helixN: fixed double helix of N zones. jointF, swiftF: trained from hyperF, at two
-    learning rates of the phase. jointhelixN: trained from helixN.
+    hyperF: fixed, focused at F mm. helixN: fixed double helix of N zones. jointF, swiftF, rushF: trained from hyperF,
+    at three learning rates of the phase. jointhelixN: trained from helixN.
     """
     kind, number = lens.rstrip("0123456789"), float(lens.lstrip("abcdefghijklmnopqrstuvwxyz"))
     fixed = OpticsConfig(polynomials=0, depth_count=20)
@@ -78,9 +79,11 @@ def optics_of(lens: str) -> tuple[OpticsConfig, Schedule]:
         return replace(fixed, polynomials=35, focus_mm=number), FREE
     if kind == "swift":
         return replace(fixed, polynomials=35, focus_mm=number), SWIFT
+    if kind == "rush":
+        return replace(fixed, polynomials=35, focus_mm=number), RUSH
     if kind == "jointhelix":
         return replace(fixed, polynomials=35, zones=int(number)), FREE
-    raise SystemExit(f"no lens {lens!r}: need hyperF, helixN, jointF, swiftF or jointhelixN")
+    raise SystemExit(f"no lens {lens!r}: need hyperF, helixN, jointF, swiftF, rushF or jointhelixN")
 
 
 def architecture_of(width: float) -> Architecture:
@@ -200,8 +203,9 @@ def main() -> None:
 
 SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
 LENSES = ("hyper33", "joint33", "swift20", "hyper20", "helix2", "swift33")
-LONG = ("hyper33", "swift33", "joint33", "hyper20")
+LONG = ("hyper33", "swift33", "hyper20")
 PLAN = [f"p18long/{lens}/{seed}" for seed in range(5) for lens in LONG]
+PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28", "hyper40")]
 PLAN += [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
