@@ -139,7 +139,7 @@ def fit(
         step, image, damping, accepted = _step(model, data, state, prior, settings, damping)
         moved = math.sqrt(max(float(step @ state.curvature @ step), 0.0))
         done = not accepted or moved < settings.step_tolerance * (1 + damping)
-        fresh = state.travel <= settings.near
+        fresh = state.travel <= settings.near if accepted else state.travel == 0
         if not fresh and (done or moved < settings.near):
             x = state.x + step if accepted else state.x
             state, damping = _linearise(model, data, x, prior, settings), 1e-3

@@ -1,6 +1,7 @@
 """Every pillar of an as-built lens: its transmission, the lens it makes, and the PSFs of that lens."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from characterize import thinplate
 from characterize.parameters import ABERRATIONS, PLACE, aberrations, bias_um
 from characterize.pillars import Sensitivity, incidence_rad, process, transmission
+from metalens import legendre
 from metalens.lens import DiameterMap, Lens
 from metalens.store import Array
 
@@ -37,8 +39,7 @@ def pillars(
     Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
     """
     d = lens.diameters
-    u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
-    bias, _ = bias_um(x, u, v)
+    bias = _on_pillars(d, lambda u, v: bias_um(x, u, v)[0])
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias + noise_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
@@ -49,10 +50,18 @@ def pillars(
     t = t[below] + (place - below) * np.diff(t)[below]
     strength = [x[PLACE[name + "_rad"]] for name in ABERRATIONS]
     if any(strength):
-        t *= np.exp(1j * np.tensordot(strength, aberrations(u, v), 1))
+        t *= np.exp(1j * _on_pillars(d, lambda u, v: np.tensordot(strength, aberrations(u, v), 1)))
     if modes is not None and len(modes):
         t *= np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
     return np.asarray(np.where(d.diameter_um > 0, t, 0))
+
+
+def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Array]) -> Array:
+    """(y, x) values at every pillar of a polynomial in (u, v) of degree 4 or less in each: exact from 5 x 5 nodes."""
+    node = legendre.nodes(5)[0]
+    axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
+    along_x, along_y = (legendre.interpolation(len(node), axis) for axis in axes)
+    return np.asarray(along_y @ low_order(*np.meshgrid(node, node)) @ along_x.T)
 
 
 def built_lens(design: Lens, x: Array) -> Lens:
@@ -61,9 +70,7 @@ def built_lens(design: Lens, x: Array) -> Lens:
     Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and :func:`psf_stack` hold them.
     """
     d = design.diameters
-    radius = d.radius_um
-    u, v = np.meshgrid(d.x_um / radius, d.y_um / radius)
-    bias, _ = bias_um(x, u, v)
+    bias = _on_pillars(d, lambda u, v: bias_um(x, u, v)[0])
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
     return Lens(
