@@ -41,8 +41,8 @@ def step(
 
     solver = nlopt.opt(nlopt.LD_SLSQP, len(x))
     solver.set_min_objective(value)
-    solver.set_lower_bounds((low - x) * size)
-    solver.set_upper_bounds((high - x) * size)
+    solver.set_lower_bounds(np.minimum((low - x) * size, 0))  # x may sit on a limit to within rounding
+    solver.set_upper_bounds(np.maximum((high - x) * size, 0))
     if ball is not None:
         solver.add_inequality_constraint(_limit(ball, x, size), 1e-10)
     solver.set_xtol_abs(tolerance / length)
