@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import keep_line, kept_lines
 from benchmarks.codesign_report import ROOT, ratio
 from codesign import ambiguity, assess, evolution, finish, run
 from codesign.eye_scenes import TEST
@@ -41,8 +42,8 @@ TABLE: dict[str, Any] = {
 }
 HEAD = """# Ablations
 
-Whole co-design runs under one budget of 4 MMACs, from a hyperbolic lens in focus at 33 mm (the best fixed focus) and
-pixels of 14 um: 1200 joint steps of 32 frames, search over 24 architectures, 300 steps of fine-tuning. Errors on the
+Whole co-design runs under one budget of 4 MMACs, from a hyperbolic lens in focus at 33 mm and pixels of 14 um: 1200
+joint steps of 32 frames, search over 24 architectures, 300 steps of fine-tuning. Errors on the
 frames of [the study](results.md), where blur alone tells depth. Ratios with 95 % intervals of a paired bootstrap over
 pairs of frames and over runs. Made by `python -m benchmarks.codesign_ablation run --work DIR` and `report --work DIR`.
 
@@ -81,7 +82,7 @@ def run_one(work: Path, variant: str, seed: int) -> dict[str, Any]:
 def report(work: Path) -> None:
     """JSON and table of the runs there are."""
     lines: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for line in _lines(work):
+    for line in kept_lines(work / LINES):
         lines[line["variant"]].append(line)
     errors = {
         v: np.stack([np.load(work / f"{v.replace(' ', '-')}-{line['seed']}.npz")["ambiguous"] for line in mine])
@@ -105,11 +106,6 @@ def report(work: Path) -> None:
     print(text)
 
 
-def _lines(work: Path) -> list[dict[str, Any]]:
-    path = work / LINES
-    return [json.loads(text) for text in path.read_text("utf-8").splitlines()] if path.exists() else []
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -122,12 +118,11 @@ def main() -> None:
         return
     torch.set_num_threads(1)
     options.work.mkdir(parents=True, exist_ok=True)
-    there = {(line["variant"], line["seed"]) for line in _lines(options.work)}
+    there = {(line["variant"], line["seed"]) for line in kept_lines(options.work / LINES)}
     for seed in range(options.seeds):
         for variant in (v for v in VARIANTS if (v, seed) not in there):
             line = run_one(options.work, variant, seed)
-            with open(options.work / LINES, "a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
+            keep_line(options.work / LINES, line)
             print(json.dumps(line), flush=True)
 
 

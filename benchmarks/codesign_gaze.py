@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file
 
+from benchmarks import kept_lines
 from benchmarks.codesign_study import CASES, SCENES, SPACE, architecture_of, optics_of, scenes_of
 from codesign import assess, gaze_test, inner
 from codesign.eye_scenes import TEST
@@ -73,8 +74,7 @@ def main() -> None:
     test = gaze_test.people(scenes_of(TEST), PEOPLE, EACH, seed=5)
     frames = rendered(test)
     rows = []
-    for text in (options.work / "runs.jsonl").read_text(encoding="utf-8").splitlines():
-        line = json.loads(text)
+    for line in kept_lines(options.work / "runs.jsonl"):
         if line["run"].startswith(options.case + "/") and not line.get("skipped"):
             rows.append(gaze_of(options.work, line["run"], line["coefficients_rad"], test, frames))
             print(json.dumps(rows[-1]), flush=True)

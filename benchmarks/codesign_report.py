@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import kept_lines
 from metalens import report, store
 
 ROOT = Path(__file__).parents[1]
@@ -56,8 +57,7 @@ class Runs:
 def load(work: Path) -> dict[str, dict[str, Runs]]:
     """{case: {lens: runs}} of the lines there are."""
     lines: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
-    for text in (work / "runs.jsonl").read_text(encoding="utf-8").splitlines():
-        line = json.loads(text)
+    for line in kept_lines(work / "runs.jsonl"):
         if not line.get("skipped"):
             case, lens, _ = line["run"].split("/")
             lines[case, lens].append(line)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
+from benchmarks import keep_line, kept_lines
 from codesign import ambiguity, assess, cost, dataset, inner, pool
 from codesign.architecture import Architecture, Space
 from codesign.depth_test import depth_response
@@ -196,8 +197,7 @@ def main() -> None:
     for name in options.only or PLAN:
         if name not in done(options.work):
             line = run_one(options.work, name)
-            with open(options.work / LINES, "a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
+            keep_line(options.work / LINES, line)
             print(json.dumps({k: v for k, v in line.items() if k != "coefficients_rad"}), flush=True)
 
 
@@ -214,8 +214,7 @@ PLAN += [f"{case}/{lens}/{seed}" for case in ("p18dim", "p18small") for seed in 
 
 def done(work: Path) -> set[str]:
     """Runs that have a line."""
-    path = work / LINES
-    return {json.loads(text)["run"] for text in path.read_text().splitlines()} if path.exists() else set()
+    return {line["run"] for line in kept_lines(work / LINES)}
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import keep_line, kept_lines
 from benchmarks.loop_runs import Recipe, finished
 from characterize import asbuilt, bench, capture, command_capture
 from characterize.asbuilt import AsBuilt
@@ -177,12 +178,11 @@ def one(on: Ground, case: int, *, model: AsBuilt | None) -> dict[str, Any]:
         for _ in going.run():
             pass
         numbers[name] = retraining.judge(going, on.source, config, found.judges, frames=on.frames)
-    gap = (numbers["before"].error_mm - numbers["nominal"].error_mm).mean(1)
     return {
         "case": case,
         "complete": complete,
         "psf_error": {"fitted": psf_error(found.best, true), "nominal": psf_error(on.nominal, true)},
-        "gap_sigma_mm": float(gap.std()) / math.sqrt(len(gap)),
+        "gap_sigma_mm": retraining.gap_sigma_mm(numbers["before"], numbers["nominal"]),
         "z": z_scores(result, case),
         "cpu_s": time.process_time() - start,
         "trusted": result.trusted,
@@ -203,22 +203,16 @@ def z_scores(result: AsBuilt, case: int) -> dict[str, float]:
 def run(work: Path, cases: int, complete: int, minutes: float) -> None:
     """Cases without a line, until the time is up; quick ones from 0, complete ones from 1000."""
     on = ground(work)
-    done = {entry["case"] for entry in _lines(work)}
+    done = {entry["case"] for entry in kept_lines(work / LINES)}
     end, model = time.monotonic() + minutes * 60, None
     for case in [c for c in (*range(1000, 1000 + complete), *range(cases)) if c not in done]:
         if case < 1000 and model is None:
             model = template(work, on.made.design)
         entry = one(on, case, model=None if case >= 1000 else model)
-        with open(work / LINES, "a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+        keep_line(work / LINES, entry)
         print(case, f"{recovered(entry):.2f}", f"{entry['cpu_s']:.0f} s", flush=True)
         if time.monotonic() > end:
             break
-
-
-def _lines(work: Path) -> list[dict[str, Any]]:
-    path = work / LINES
-    return [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
 
 
 def _slip(entries: Sequence[dict[str, Any]], name: str) -> np.ndarray:
@@ -281,7 +275,7 @@ def _middle(values: np.ndarray) -> float | None:
 
 def report(work: Path) -> None:
     """Print and keep the summary."""
-    found = summary(_lines(work))
+    found = summary(kept_lines(work / LINES))
     print(json.dumps(found, indent=1))
     store.write_text(RESULT, json.dumps({"spread": SPREAD, "settings": str(CONFIG), **found}, indent=1) + "\n")
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import Row
+from benchmarks import Row, keep_line, kept_lines
 from characterize import asbuilt, bench, capture, command_capture
 from characterize.bench import Truth
 from characterize.estimate import Options, fit
@@ -202,22 +202,20 @@ def _odd_arrays(path: Path) -> Iterator[str]:
 
 def soak(work: Path, designs: int, seed: int) -> None:
     """Every design without a line yet; one JSON line each."""
-    done = {entry["number"] for entry in _lines(work, seed)}
+    done = {entry["number"] for entry in kept_lines(_lines(work, seed))}
     for number in [n for n in range(designs) if n not in done]:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             for file, text in files(work, seed, number).items():
                 store.write_text(folder / file, text)
             entry: dict[str, Any] = {"number": number, "ends": list(one(folder))}
-        with open(work / f"soak_{seed}.jsonl", "a", encoding="utf-8") as kept:
-            kept.write(json.dumps(entry) + "\n")
+        keep_line(_lines(work, seed), entry)
         ends = " ".join(f"{e['verb']}:{e['status']}" for e in entry["ends"])
         print(number, ends, *(f for e in entry["ends"] for f in e["faults"]), flush=True)
 
 
-def _lines(work: Path, seed: int) -> list[dict[str, Any]]:
-    path = work / f"soak_{seed}.jsonl"
-    return [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+def _lines(work: Path, seed: int) -> Path:
+    return work / f"soak_{seed}.jsonl"
 
 
 def summary(lines: list[dict[str, Any]], seed: int) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
         start[PLACE["stage_zero_um"]] = zero
         expected = _expected(rough, start, clipped)
         ways = (light, expected, noise), (light[back], expected, noise[back])
-        stated, turned_round = (float(np.mean([score for score, _ in _compare(*way)])) for way in ways)
+        stated, turned_round = (_mean_likeness(*way) for way in ways)
         scores.append(max(stated, turned_round - _TWIN))
     best = int(np.argmax(scores))
     start[PLACE["stage_zero_um"]] = zeros[best]
@@ -77,7 +77,7 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
     laid = turn(light, orientation) if clearly else light
     found = _compare(laid[order] if reordered else laid, expected, noise)
     possible = [k for k in range(1, 8) if k % 2 == 0 or expected.shape[1] == expected.shape[2]]
-    turned = {k: np.mean([s for s, _ in _compare(turn(expected, k), expected, 0 * noise)]) for k in possible}
+    turned = {k: _mean_likeness(turn(expected, k), expected, 0 * noise) for k in possible}
     shift = np.median([s for _, s in found], axis=0)
     return Arrangement(
         stage_zero_um=float(zeros[best]),
@@ -112,6 +112,10 @@ def _compare(light: Array, expected: Array, noise: Array) -> list[tuple[float, t
     return [_likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
 
 
+def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
+    return float(np.mean([score for score, _ in _compare(light, expected, noise)]))
+
+
 def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
     """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
     n = len(light)
@@ -139,12 +143,9 @@ def _distance(a: Array, b: Array) -> float:
 
 def _plainest(light: Array, expected: Array, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
     """(reordered, turned): the least that explains the frames, of reordering, turning and both."""
-
-    def mean(frames: Array) -> float:
-        return float(np.mean([score for score, _ in _compare(frames, expected, noise)]))
-
     turned = turn(light, orientation)
-    scores = {(True, False): mean(light[order]), (False, True): mean(turned), (True, True): mean(turned[order])}
+    ways = {(True, False): light[order], (False, True): turned, (True, True): turned[order]}
+    scores = {way: _mean_likeness(frames, expected, noise) for way, frames in ways.items()}
     return next(way for way, score in scores.items() if score > max(scores.values()) - 5e-3)
 
 
@@ -155,8 +156,7 @@ def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool
         if orientation % 2 and not square:
             scores.append(-1.0)
             continue
-        turned = turn(light, orientation)
-        scores.append(float(np.mean([score for score, _ in _compare(turned, expected, noise)])))
+        scores.append(_mean_likeness(turn(light, orientation), expected, noise))
     best = int(np.flatnonzero(np.array(scores) > max(scores) - 2e-3)[0])  # of equals the plainest turn
     return best, best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02
 

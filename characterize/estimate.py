@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize import knowable, leastsquares, made, thinplate
+from characterize import knowable, leastsquares, made, residual, thinplate
 from characterize.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
 from characterize.asbuilt import AsBuilt
 from characterize.capture import Capture
@@ -17,7 +17,6 @@ from characterize.leastsquares import Ball, Data, Prior, Settings, Solution
 from characterize.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.pillars import Sensitivity
 from characterize.prepare import data_of, merged, setting_of, stated
-from characterize.residual import MOST_RAD, Attempt, attempt
 from characterize.slopes import slopes
 from metalens.errors import FitError, FitRefused
 from metalens.lens import Lens
@@ -80,7 +79,7 @@ def fit(
             names, solution = wider
             cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
     if frames.gain.known and _left_over(solution):
-        rest = _with_residual(model, data, names, solution, start, known)
+        rest = residual.attempt(model, data, names, solution.value, base=start, prior=prior_of(names, known))
         if rest is not None:
             model, solution = model.with_residual(rest.modes, thinplate.basis), rest.solution
             cautions.append(
@@ -161,15 +160,6 @@ def _search(
     names = _names(known, options.free)
     prior, base = prior_of(names, known), start.copy()
     place = [PLACE[name] for name in names]
-
-    def problem(of: ForwardModel) -> leastsquares.Model:
-        def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
-            x = base.copy()
-            x[place] = values
-            return of.images(x, names if jacobian else None)
-
-        return images
-
     begins = [start] if brief else _starts(model, data, start, found)
     if "pinhole_um" in names and base[PLACE["pinhole_um"]] == 0:
         begins = [_with(x, {"pinhole_um": 5.0}) for x in begins]
@@ -178,11 +168,13 @@ def _search(
     few = _few(model.setting)
     waves = Ball(np.array([i for i, name in enumerate(names) if name.endswith("_rad")]), WAVES_RAD)
     short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
-    part, seen = problem(model.only(few)), data.planes(few)
+    part, seen = residual.problem(model.only(few), names, base), data.planes(few)
     tries = [leastsquares.fit(part, seen, x[place], prior=prior, settings=short) for x in begins]
     best = min(tries, key=lambda t: t.merit)
     settings = Settings(iterations=40, secant=True)
-    return names, leastsquares.fit(problem(model), data, best.value, prior=prior, settings=settings)
+    return names, leastsquares.fit(
+        residual.problem(model, names, base), data, best.value, prior=prior, settings=settings
+    )
 
 
 def _wider(
@@ -237,27 +229,18 @@ def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -
 
 def _explained(solution: Solution, gain: Gain) -> bool:
     """Whether chi-square is that of noise: within 15 %, or four of its own sigma where pixels or flats are few."""
-    counted = float((solution.residual_sigma != 0).sum())
-    chance = 4 * math.hypot(math.sqrt(2 / max(counted, 1.0)), gain.gain_sigma_e / gain.gain_e)
+    chance = 4 * math.hypot(_chance(solution), gain.gain_sigma_e / gain.gain_e)
     return solution.chi2_per_dof <= 1 + max(MISFIT - 1, min(chance, 0.5))
 
 
 def _left_over(solution: Solution) -> bool:
     """Whether the frames hold more than noise, but not so much that they are of something else."""
-    counted = float((solution.residual_sigma != 0).sum())
-    return 3 * math.sqrt(2 / max(counted, 1.0)) < solution.chi2_per_dof - 1 < 30
+    return 3 * _chance(solution) < solution.chi2_per_dof - 1 < 30
 
 
-def _with_residual(
-    model: ForwardModel,
-    data: Data,
-    names: tuple[str, ...],
-    solution: Solution,
-    start: Array,
-    known: dict[str, Known],
-) -> Attempt | None:
-    place = [PLACE[name] for name in names]
-    return attempt(model, data, names, solution.value, base=start.copy(), place=place, prior=prior_of(names, known))
+def _chance(solution: Solution) -> float:
+    """Standard deviation of chi-square per degree of freedom over the pixels that count."""
+    return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
 
 
 def _full(names: tuple[str, ...], solution: Solution, start: Array) -> Array:
@@ -284,7 +267,7 @@ def _result(
     if problems and clipped > 0.1:
         problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
     left = float(np.linalg.norm(model.modes))
-    if left > MOST_RAD:
+    if left > residual.MOST_RAD:
         problems.append(f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens")
     held = {name: float(start[PLACE[name]]) for name in NAMES if name not in fitted}
     return AsBuilt(

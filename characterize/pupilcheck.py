@@ -43,11 +43,11 @@ def missed(nrmse: float, data: Data, background: float) -> float:
     return math.sqrt(max(nrmse**2 - by_noise**2, 0.0))
 
 
-def problems(data: Data, background: float, score: tuple[float, float], stopped: str) -> list[str]:
+def problems(data: Data, ncc: float, share: float, stopped: str) -> list[str]:
     """What makes a pupil no result, in words.
 
     Args:
-        score: correlation (NCC) and NRMSE of the planes left out, else of all.
+        ncc: correlation with the planes left out, else with all. share: of the light that is :func:`missed` there.
         stopped: why the fit stopped before it converged; empty where it did.
     """
     if order_score(data) < 0.4:
@@ -56,12 +56,11 @@ def problems(data: Data, background: float, score: tuple[float, float], stopped:
             "listed in the wrong order"
         ]
     words = []
-    share = missed(score[1], data, background)
     if stopped and share > DOUBTFUL:
         words.append(f"not converged ({stopped})")
-    if score[0] < LEAST_NCC:
+    if ncc < LEAST_NCC:
         words.append(
-            f"images and model correlate by {score[0]:.2f} only (need {LEAST_NCC}): too little light, or no bead at "
+            f"images and model correlate by {ncc:.2f} only (need {LEAST_NCC}): too little light, or no bead at "
             "the centre of the window; give center = [row, column]"
         )
     if share > MISSED:
@@ -71,9 +70,8 @@ def problems(data: Data, background: float, score: tuple[float, float], stopped:
     return words
 
 
-def doubts(data: Data, background: float, nrmse: float, stopped: str) -> list[str]:
-    """What a pupil that is not refused still leaves to explain, in words."""
-    share = missed(nrmse, data, background)
+def doubts(share: float, stopped: str) -> list[str]:
+    """What a pupil that is not refused still leaves to explain, in words; ``share`` of the light is missed."""
     words = [f"not converged ({stopped}), though it predicts the images well"] if stopped and share <= DOUBTFUL else []
     if DOUBTFUL < share <= MISSED:
         words.append(

@@ -83,8 +83,9 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True,
     agreement = agree(solution.image, data, background)
     stopped = "" if solution.converged else solution.reason
     score = held_out or agreement
-    problems = pupilcheck.problems(data, background, (score.ncc, score.nrmse), stopped)
-    notes += pupilcheck.doubts(data, background, score.nrmse, stopped)
+    share = pupilcheck.missed(score.nrmse, data, background)
+    problems = pupilcheck.problems(data, score.ncc, share, stopped)
+    notes += pupilcheck.doubts(share, stopped)
     if problems and not insist:
         raise FitRefused("fit refused: " + "; ".join(problems))
     return PupilFit(

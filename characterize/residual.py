@@ -13,6 +13,7 @@ import numpy as np
 from characterize import leastsquares
 from characterize.forward import ForwardModel
 from characterize.leastsquares import Data, Prior, Settings, Solution
+from characterize.parameters import PLACE
 from characterize.thinplate import MODES, basis, prior_rad
 from metalens.store import Array
 
@@ -39,12 +40,12 @@ class Attempt:
 
 
 def attempt(
-    model: ForwardModel, data: Data, names: Sequence[str], start: Array, *, base: Array, place: list[int], prior: Prior
+    model: ForwardModel, data: Data, names: Sequence[str], start: Array, *, base: Array, prior: Prior
 ) -> Attempt | None:
     """The fit with a residual phase; None unless frames left out improve by more than chance allows.
 
     Every second depth is left out, then the others: fitted without and with the phase from ``start`` (p,), the
-    physical parameters alone. ``base``: all parameters; ``place``: of the fitted ones in it.
+    physical parameters alone. ``base``: all parameters.
     """
     n = len(data.electrons)
     if n < 4:
@@ -58,13 +59,13 @@ def attempt(
         part, rest = data.planes(np.sort(seen)), data.planes(np.sort(hidden))
         here, there = model.only(np.sort(seen)), model.only(np.sort(hidden))
         for i, (begin, known) in enumerate(((start, prior), (wide, joint))):
-            found = leastsquares.fit(_problem(here, names, base, place), part, begin, prior=known, settings=settings)
-            scores[i] += _misfit(_problem(there, names, base, place), rest, found.value)
+            found = leastsquares.fit(problem(here, names, base), part, begin, prior=known, settings=settings)
+            scores[i] += _misfit(problem(there, names, base), rest, found.value)
     count = float((data.usable & ~data.saturated).sum())
     if scores[1] > scores[0] - max(4 * math.sqrt(2 * count), 0.02 * scores[0]):
         return None
     settings = dataclasses.replace(settings, iterations=40, step_tolerance=0.02, near=0.3, finish=True)
-    found = leastsquares.fit(_problem(model, names, base, place), data, wide, prior=joint, settings=settings)
+    found = leastsquares.fit(problem(model, names, base), data, wide, prior=joint, settings=settings)
     p = len(names)
     physical = dataclasses.replace(
         found,
@@ -75,9 +76,9 @@ def attempt(
     return Attempt(physical, found.value[p:], scores[0] / count, scores[1] / count)
 
 
-def _problem(model: ForwardModel, names: Sequence[str], base: Array, place: list[int]) -> leastsquares.Model:
-    """Images by the physical parameters, and by the modes where there are any behind them."""
-    p = len(place)
+def problem(model: ForwardModel, names: Sequence[str], base: Array) -> leastsquares.Model:
+    """Images by the named parameters, and by the modes where values are left behind them; the others as in ``base``."""
+    place, p = [PLACE[name] for name in names], len(names)
 
     def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
         x = base.copy()

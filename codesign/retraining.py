@@ -85,6 +85,12 @@ class Lenses:
     known: bool
 
 
+def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
+    """Standard error of the difference of two mean slippage errors over the frames, which both cases share."""
+    apart = (worse.error_mm - better.error_mm).mean(1)
+    return float(apart.std()) / math.sqrt(len(apart))
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Outcome:
     """Accuracy in the order of the story.
@@ -107,9 +113,8 @@ class Outcome:
 
     @property
     def gap_sigma_mm(self) -> float:
-        """Standard error of the gap over the frames, which both cases share."""
-        apart = (self.before.error_mm - self.nominal.error_mm).mean(1)
-        return float(apart.std()) / math.sqrt(len(apart))
+        """Standard error of the gap."""
+        return gap_sigma_mm(self.before, self.nominal)
 
     @property
     def recovered(self) -> float | None:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 
@@ -58,15 +58,8 @@ class AxialObjective:
         near, far = _stacks(phase_rad, self.pupil, focus_um, depths, CLIMB_WINDOW_UM, fields)
         total = phase_rad.new_zeros(())
         for y, x in (positions * settings.pixel_um).tolist():
-            value = pixel_information(
-                near,
-                far,
-                step_um=STEP_UM,
-                sample_um=SAMPLE_UM,
-                pixel_um=settings.pixel_um,
-                normalisation=settings.normalisation,
-                shift_um=(y, x),
-            ).reshape(-1, len(settings.angles_deg))
+            value = pixel_information(near, far, shift_um=(y, x), **_counted(settings))
+            value = value.reshape(-1, len(settings.angles_deg))
             spread, mean = torch.log(value + 1e-4).mean(), torch.log(value.mean(0) + 1e-4).mean()
             total = total - (settings.even * spread + (1 - settings.even) * mean) / len(positions)
         return total, encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)
@@ -132,20 +125,19 @@ def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Fisher,
         seen = []
         for turn in (0.0, 0.25) if angle > 0 else (0.0,):
             near, far = _stacks(phase_rad.detach(), pupil, focus_um, where, WINDOW_UM, [_field(angle, turn)] * depths)
-            value = axial_information(
-                near,
-                far,
-                step_um=STEP_UM,
-                sample_um=SAMPLE_UM,
-                pixel_um=settings.pixel_um,
-                normalisation=settings.normalisation,
-            )
+            value = axial_information(near, far, **_counted(settings))
             seen.append((value, encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)))
         values.append(torch.stack([value for value, _ in seen]).mean(0))
         energies.append(torch.stack([energy for _, energy in seen]).amin(0))
     if len(values) == 1:
         return Score(values[0], energies[0])
     return Score(torch.stack(values), torch.stack(energies))
+
+
+def _counted(settings: Fisher) -> dict[str, Any]:
+    """How Eq. 11 counts, as arguments."""
+    return {"step_um": STEP_UM, "sample_um": SAMPLE_UM, "pixel_um": settings.pixel_um,
+            "normalisation": settings.normalisation}  # fmt: skip
 
 
 def _field(angle_deg: float, turn: float) -> Field:

@@ -44,9 +44,22 @@ class Pupil:
         return self.wavelength_um / (2 * self.edge)
 
 
+def axis(pupil: Pupil) -> Tensor:
+    """(nodes,) direction cosines of the nodes from their middle."""
+    return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (2 * pupil.edge / pupil.nodes)
+
+
+@functools.lru_cache(maxsize=16)
+def kernel(pupil: Pupil, sample_um: float, samples: int) -> Tensor:
+    """(samples, nodes) Fourier transform from direction cosines to the samples of a window."""
+    position = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * sample_um
+    k = 2 * math.pi / pupil.wavelength_um
+    return torch.exp(-1j * k * position[:, None] * axis(pupil)).to(torch.complex64)
+
+
 def coordinates(pupil: Pupil) -> tuple[Tensor, Tensor]:
     """(x, y) on the lens, um, of the pupil's nodes: two (nodes, nodes) arrays."""
-    q = _axis(pupil)
+    q = axis(pupil)
     qy, qx = torch.meshgrid(q, q, indexing="ij")
     stretch = pupil.sensor_distance_um / torch.sqrt((1 - qx**2 - qy**2).clamp_min(1e-3))
     return qx * stretch, qy * stretch
@@ -60,7 +73,7 @@ def radius(pupil: Pupil) -> Tensor:
 
 def amplitude(pupil: Pupil) -> Tensor:
     """(nodes, nodes) weight of the nodes: the share of the rim cells inside the aperture, and the solid angle."""
-    q = _axis(pupil)
+    q = axis(pupil)
     q2 = q[:, None] ** 2 + q**2
     step = 2 * pupil.edge / pupil.nodes
     inside = ((pupil.edge - torch.sqrt(q2)) / step + 0.5).clamp(0, 1)
@@ -101,12 +114,13 @@ def psf(
             f"window of {samples * sample_um:.0f} um is wider than the period {pupil.period_um:.0f} um; "
             "raise Pupil.nodes or take a smaller window"
         )
-    kernel, defocus, weight = _tables(pupil, float(focus_um), sample_um, samples)
+    to_window = kernel(pupil, sample_um, samples)
+    defocus, weight = _tables(pupil, float(focus_um))
     k = 2 * math.pi / pupil.wavelength_um
     path = torch.stack([spherical_path(radius(pupil), depth) - defocus for depth in depths_um.tolist()])
     angle = wrapped(k * path).float() + wrapped(phase_rad).float()
     field = torch.polar(weight.expand_as(angle), angle)
-    image = kernel @ (field @ kernel.mT)
+    image = to_window @ (field @ to_window.mT)
     return (image.real**2 + image.imag**2) * _share(pupil, sample_um)
 
 
@@ -116,17 +130,10 @@ def wrapped(phase_rad: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=16)
-def _tables(pupil: Pupil, focus_um: float, sample_um: float, samples: int) -> tuple[Tensor, Tensor, Tensor]:
-    position = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * sample_um
-    k = 2 * math.pi / pupil.wavelength_um
-    kernel = torch.exp(-1j * k * position[:, None] * _axis(pupil)).to(torch.complex64)
-    return kernel, spherical_path(radius(pupil), focus_um), amplitude(pupil).float()
+def _tables(pupil: Pupil, focus_um: float) -> tuple[Tensor, Tensor]:
+    return spherical_path(radius(pupil), focus_um), amplitude(pupil).float()
 
 
 def _share(pupil: Pupil, sample_um: float) -> float:
     """Scale from |field|² to the share of the light: Parseval over one period of the nodes."""
     return float((sample_um / pupil.period_um) ** 2 / (amplitude(pupil) ** 2).sum())
-
-
-def _axis(pupil: Pupil) -> Tensor:
-    return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (2 * pupil.edge / pupil.nodes)

@@ -60,7 +60,7 @@ def psf(
     Returns:
         (images, samples, samples): share of the light through the aperture on each sample; float32.
     """
-    kernel = _kernel(pupil, sample_um, samples)
+    kernel = pupils.kernel(pupil, sample_um, samples)
     k = 2 * math.pi / pupil.wavelength_um
     angles, weights = [], []
     flat = phase_rad.reshape(-1)
@@ -89,7 +89,7 @@ def view(pupil: Pupil, field: Field, focus_um: float) -> Seen:
     out = d * math.tan(field.angle_rad)
     cx, cy = out * math.cos(field.azimuth_rad), out * math.sin(field.azimuth_rad)
     mx, my = _middle(pupil.radius_um, cx, cy, d)
-    axis = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * (2 * edge / n)
+    axis = pupils.axis(pupil)
     qy, qx = torch.meshgrid(axis + my, axis + mx, indexing="ij")
     rest = (1 - qx**2 - qy**2).clamp_min(1e-3)
     x, y = cx + qx * d / torch.sqrt(rest), cy + qy * d / torch.sqrt(rest)
@@ -111,14 +111,6 @@ def _middle(radius_um: float, cx: float, cy: float, d: float) -> tuple[float, fl
     path = torch.sqrt(x**2 + y**2 + d**2)
     qx, qy = x / path, y / path
     return float(qx.min() + qx.max()) / 2, float(qy.min() + qy.max()) / 2
-
-
-@functools.lru_cache(maxsize=16)
-def _kernel(pupil: Pupil, sample_um: float, samples: int) -> Tensor:
-    position = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * sample_um
-    n = pupil.nodes
-    axis = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * (2 * pupil.edge / n)
-    return torch.exp(-2j * math.pi / pupil.wavelength_um * position[:, None] * axis).to(torch.complex64)
 
 
 def _light(weights: list[Tensor]) -> Tensor:

@@ -1,5 +1,6 @@
 """A small lens with a hand-made proxy, and captures of it on the virtual bench; shared by the tests beside it."""
 
+import dataclasses
 import functools
 import math
 
@@ -94,3 +95,10 @@ def electrons(peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float) 
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
     return bright * (peak_e / bright.max()) + bench.background(truth(**more))
+
+
+def with_a_moved_frame(shots: Capture) -> Capture:
+    """The capture with one frame a pixel off."""
+    frames = shots.frames.copy()
+    frames[2] = np.roll(frames[2], 1, 1)
+    return dataclasses.replace(shots, frames=frames)

@@ -167,11 +167,8 @@ def test_a_repeated_frame_is_refused():
 
 @pytest.mark.slow
 def test_a_frame_shifted_by_a_pixel_is_refused():
-    shots = b.capture(b.electrons())
-    moved = shots.frames.copy()
-    moved[2] = np.roll(moved[2], 1, 1)
     with pytest.raises(FitError, match="shifted or repeated frame"):
-        fit(frames_of(shots, moved))
+        fit(b.with_a_moved_frame(b.capture(b.electrons())))
 
 
 @pytest.mark.slow

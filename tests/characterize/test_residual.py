@@ -103,8 +103,5 @@ def test_without_such_a_phase_none_is_kept():
 @pytest.mark.slow
 def test_a_moved_frame_is_not_explained_by_a_phase():
     """Frames left out do not improve: the fit is refused as without the phase."""
-    shots = b.capture(b.electrons())
-    moved = shots.frames.copy()
-    moved[2] = np.roll(moved[2], 1, 1)
     with pytest.raises(FitError, match="shifted or repeated frame"):
-        characterize.fit(dataclasses.replace(shots, frames=moved), b.lens(), USUAL, response=b.RESPONSE)
+        characterize.fit(b.with_a_moved_frame(b.capture(b.electrons())), b.lens(), USUAL, response=b.RESPONSE)
