@@ -73,12 +73,13 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         return torch.stack([x, y], -1)
 
     t, h = straight, 1e-6
+    around = h * torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=t.dtype)
     for _ in range(steps):
-        miss = land(t) - iris_um
+        here, right, left, down, up = land(t + around[:, None, None])
+        miss = here - iris_um
         if not t.requires_grad and float(miss.abs().max()) < SETTLED_UM:
             break
-        along_x = (land(t + torch.tensor([h, 0.0])) - land(t - torch.tensor([h, 0.0]))) / (2 * h)
-        along_y = (land(t + torch.tensor([0.0, h])) - land(t - torch.tensor([0.0, h]))) / (2 * h)
+        along_x, along_y = (right - left) / (2 * h), (down - up) / (2 * h)
         det = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
         det = torch.where(det.abs() < 1e3, 1e3, det)
         dx = (along_y[..., 1] * miss[..., 0] - along_y[..., 0] * miss[..., 1]) / det

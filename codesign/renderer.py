@@ -96,22 +96,20 @@ def render(
     """
     rig, camera = rig or Rig(), camera or Camera()
     p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed)
-    light, cover, depth, pupil = _compiled(p, rig, camera, texture_seed)
-    scale = states.scale.to(torch.float32)[:, None, None, None]
-    frames = Frames(torch.from_numpy(light), torch.from_numpy(cover), torch.from_numpy(depth) * scale)
-    mask = torch.from_numpy(pupil)
+    frames, mask = _compiled(p, states.scale, rig, camera, texture_seed)
     return Rendered(frames, mask, _labels(states, p, mask, rig=rig, camera=camera))
 
 
-def _compiled(p: Tensor, rig: Rig, camera: Camera, seed: int) -> tuple[Array, Array, Array, Array]:
+def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int) -> tuple[Frames, Tensor]:
     from codesign import render_kernel
 
     n, size = len(p), camera.pixels
     t = camera.tangents(rig).astype(np.float32)
-    light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
-    pupil = np.empty((n, size, size), np.float32)
-    render_kernel.frames(p.detach().numpy().astype(np.float32), textures.bank(seed), t, t, light, cover, depth, pupil)
-    return light, cover, depth, pupil
+    sheets = [np.empty((n, 2, size, size), np.float32) for _ in range(3)]
+    pupil = np.empty((n, 1, size, size), np.float32)
+    values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
+    render_kernel.frames(values, factor, textures.pairs(seed), t, t, *sheets, pupil)
+    return Frames(*map(torch.from_numpy, sheets)), torch.from_numpy(pupil[:, 0])
 
 
 def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera) -> Labels:
@@ -183,7 +181,9 @@ def sensitivities(
     n, size = len(states), camera.pixels
     t = camera.tangents(rig).astype(np.float32)
     out = np.empty((n, 3, 5, size, size), np.float32)
-    render_kernel.tangents(packed.numpy().astype(np.float32), textures.bank(texture_seed), t, t, out)
+    render_kernel.tangents(
+        packed.numpy().astype(np.float32), textures.pairs(texture_seed), t, t, out.reshape(n, 15, size, size)
+    )
     scale = states.scale.to(torch.float32)[:, None, None, None]
     value, first, second = (torch.from_numpy(out[:, k]) for k in range(3))
     hidden = torch.stack([1 - value[:, 2], value[:, 2]], 1)

@@ -10,19 +10,29 @@ from scipy import ndimage
 Array = np.ndarray[Any, np.dtype[Any]]
 SIZE = 256  # of every picture, a power of two; periodic
 VARIANTS = 16  # of each kind
+STEPS = 32767  # of 1 in the values, which lie in [-1, 1]
 KINDS = ("iris", "vein", "skin", "fine", "lash")
 
 
 @functools.lru_cache(maxsize=2)
 def bank(seed: int = 0) -> Array:
-    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32, the variants of a kind together; about 1 s."""
+    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants of a kind together; about 1 s."""
     makers = (_iris, _veins, _skin, _fine, _lashes)
     pictures = [
         maker(np.random.default_rng((seed, kind, variant)))
         for kind, maker in enumerate(makers)
         for variant in range(VARIANTS)
     ]
-    out = np.stack(pictures).astype(np.float32)
+    out = (np.round(np.stack(pictures).clip(-1, 1) * STEPS) / STEPS).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@functools.lru_cache(maxsize=2)
+def pairs(seed: int = 0) -> Array:
+    """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its right neighbour, flat."""
+    steps = np.round(bank(seed) * STEPS).astype(np.int32)
+    out = ((steps & 0xFFFF) | (np.roll(steps, -1, axis=2) << 16)).ravel()
     out.flags.writeable = False
     return out
 

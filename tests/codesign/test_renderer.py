@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,27 @@ def test_compiled_frames_agree_with_the_twin():
     assert float((cover - out.frames.coverage).abs().max()) < 1e-3
     assert float(((depth - out.frames.depth_um) * (cover > 0)).abs().max()) < 0.5  # um
     assert float((pupil - out.pupil).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("pixels", [1, 13, 37])
+def test_frames_that_do_not_fill_the_tiles_agree_with_the_twin(pixels):
+    camera = Camera(pixels=pixels, pitch_um=1440 / pixels)
+    out = renderer.render(STATES, camera=camera)
+    light, cover, _, pupil = renderer.twin(_p(STATES, camera), Rig(), camera)
+    assert float((light - out.frames.radiance).abs().max()) < 1e-3
+    assert float((cover - out.frames.coverage).abs().max()) < 1e-3
+    assert float((pupil - out.pupil).abs().max()) < 1e-3
+    slopes = renderer.sensitivities(STATES, camera=camera).frames
+    assert float((slopes.radiance - out.frames.radiance).abs().max()) < 1e-3
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+def test_frames_do_not_depend_on_the_threads():
+    many = renderer.render(STATES, camera=SMALL).pinhole()
+    numba.set_num_threads(1)
+    one = renderer.render(STATES, camera=SMALL).pinhole()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert torch.equal(many, one)
 
 
 def test_compiled_derivatives_agree_with_exact_ones():
