@@ -43,11 +43,24 @@ def test_constant_radiance_stays_constant_at_every_edge():
     assert (slow - 0.37).abs().max() < 1e-12
 
 
+def _single(frames):
+    return Frames(frames.radiance.float(), frames.coverage.float(), frames.depth_um.float())
+
+
 def test_constant_radiance_stays_constant_in_single_precision():
-    flat = _eye(radiance=0.37)
-    single = Frames(flat.radiance.float(), flat.coverage.float(), flat.depth_um.float())
+    """The mean is not transformed: nothing is left to round but the mean itself."""
     psf = scene.basis(STACK.float(), DEPTHS)
-    assert float((scene.image(single, scene.imager(psf, (N, N))) / 0.37 - 1).abs().max()) < 1e-5
+    assert float((scene.image(_single(_eye(radiance=0.37)), scene.imager(psf, (N, N))) / 0.37 - 1).abs().max()) < 1e-6
+
+
+def test_compiled_weights_give_the_image_of_the_differentiable_path():
+    """In single precision without gradients the weights are compiled; in double precision they are torch's."""
+    frames, psf = _eye(), scene.basis(STACK, DEPTHS)
+    imager = scene.imager(psf, (N, N))  # rows and columns to spare on all sides
+    assert imager.shape[0] > N
+    exact = scene.image(frames, imager)
+    quick = scene.image(_single(frames), scene.imager(scene.basis(STACK.float(), DEPTHS), (N, N)))
+    assert float((quick - exact).norm() / exact.norm()) < 2e-5  # depths that round to the next of 4096 codes
 
 
 def test_the_published_formula_loses_light_at_edges():
@@ -124,6 +137,19 @@ def test_fewer_depths_need_fewer_kernels():
     assert part.kernels.shape[0] < whole.kernels.shape[0]
     assert part.depths_um[0] <= 18e3
     assert part.depths_um[-1] >= 20e3
+
+
+def test_trimmed_bases_keep_their_word_on_frames_they_have_not_seen():
+    whole = scene.basis(STACK, DEPTHS, tolerance=1e-4)
+    few = scene.trimmed(whole, _eye(), tolerance=1e-2)
+    assert len(few.kernels) < len(whole.kernels)
+    assert few.error <= 1e-2
+    frames = _eye()
+    other = Frames(frames.radiance.flip(3), frames.coverage.flip(3), frames.depth_um.flip(3) * 0.95)
+    exact, quick = (scene.image(other, scene.imager(psf, (N, N))) for psf in (whole, few))
+    assert float((quick - exact).norm() / exact.norm()) < 2 * few.error  # other depths of the same population
+    assert few.bound > whole.bound
+    assert scene.trimmed(whole, frames, tolerance=0.0) is whole
 
 
 def test_field_dependent_psfs_change_across_the_image():
