@@ -1,8 +1,6 @@
 """The planner against what its plans achieve: twenty random goals, and what the planned runs cost beside the finest."""
 
 import math
-import time
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -57,16 +55,7 @@ def _seconds(chain: Chain, choice: Choice) -> float:
     """Time of the run with these settings: library, stacks, images, each measured."""
     table = chain.table(choice.library_tolerance)
     library = chain.library(choice.library_tolerance)[1]
-    stack = _least(lambda: chain.optics(table, choice.numerics))
-    optics = chain.optics(table, choice.numerics)
-    image = _least(lambda: chain.electrons(optics)) / CONFIG.task.scenes
+    optics = chain.optics(table, choice.numerics)  # plans the propagation, which a run does once
+    stack = plan.fastest(lambda: chain.optics(table, choice.numerics))
+    image = plan.fastest(lambda: chain.electrons(optics)) / CONFIG.task.scenes
     return library + CONFIG.stacks * stack + CONFIG.frames * image
-
-
-def _least(work: Callable[[], object]) -> float:
-    best = math.inf
-    for _ in range(2):
-        start = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - start)
-    return best

@@ -1,13 +1,16 @@
 """The planner: the tolerances, depths and wavelengths that keep the numerical gaze error of a run below a goal.
 
-A pilot measures, for every setting of every knob alone, the gaze error it makes for each eye and the time it takes.
-Errors of several knobs add as vectors (to first order), times by the structure of the run; all combinations are then
-compared, and the cheapest that meets the goal is taken. Everything is judged against the finest setting of every knob.
+A pilot measures, for every setting of every knob alone, the gaze error it makes for each eye and the time it takes: an
+estimator that believes in these optics reads images through those of the knob's finest setting. Errors of several knobs
+add as vectors to first order; where they happen to cancel, that is not relied on. Times add by the structure of the
+run. All combinations are compared, and the cheapest that meets the goal is taken. Everything is judged against the
+finest setting of every knob.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,7 @@ import torch
 
 from codesign import task
 from codesign.chain_optics import Aperture, Numerics, Window, kernels
-from codesign.task import Linear, TaskSetting, Views
+from codesign.task import TaskSetting, Views
 from metalens import design, engines, library
 from metalens.cell import Cell
 from metalens.engines import Light
@@ -36,6 +39,7 @@ LEVELS: dict[str, tuple[float, ...]] = {  # coarsest first; the last of each is 
 }
 PILOT = Numerics(12, 1, 1e-4, 1e-4)  # of the other knobs while one is looked at
 REFERENCE_DIAMETERS = 12
+SETTLE_STEPS = 2  # of the estimator, which starts at the true state
 CLASS_SECONDS = 0.003  # a class of pillars on a mask: polygons, exposure at its edges, one cell
 
 
@@ -151,6 +155,10 @@ class Chain:
         """Images of the eyes."""
         return task.electrons(self.eyes.anchor, optics, self.config.task)
 
+    def read(self, images: torch.Tensor, believed: PsfBasis) -> torch.Tensor:
+        """(scenes, unknowns) where the estimate of the eyes' states comes to rest, less the true ones."""
+        return task.settle(images, believed, self.states, self.config.task, steps=SETTLE_STEPS)
+
     def _design(self) -> Lens:
         made, _ = self.library(self.levels["library_tolerance"][0])
         focus, aperture_um = self.config.focus, self.config.aperture_mm * 1e3
@@ -165,17 +173,17 @@ def pilot(chain: Chain) -> Pilot:
     start = time.perf_counter()
     exact, solving = _exact(chain)
     base = chain.optics(exact, PILOT)
-    reader = task.linear(chain.eyes, base, chain.config.task)
     errors, seconds = {}, {}
     for knob, levels in chain.levels.items():
         if knob == "library_tolerance":
-            errors[knob], seconds[knob] = _library_knob(chain, reader, exact, solving)
+            errors[knob], seconds[knob] = _library_knob(chain, base, solving)
         elif knob == "diameter_step_nm":
-            errors[knob], seconds[knob] = _mask_knob(chain, reader, exact)
+            errors[knob], seconds[knob] = _mask_knob(chain, base, exact)
         else:
-            errors[knob], seconds[knob] = _optics_knob(chain, reader, exact, knob)
+            errors[knob], seconds[knob] = _optics_knob(chain, exact, knob)
         chain.say(f"{knob}: {', '.join(f'{v:g}' for v in levels)}")
-    return Pilot(chain.levels, errors, seconds, reader.noise_rad, time.perf_counter() - start)
+    noise = task.linear(chain.eyes, base, chain.config.task).noise_rad
+    return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start)
 
 
 def _exact(chain: Chain) -> tuple[Array, float]:
@@ -198,49 +206,58 @@ def _exact(chain: Chain) -> tuple[Array, float]:
     return coarse * np.exp(change[0] + 1j * change[1]), each * 1.5 * made.solves
 
 
-def _library_knob(chain: Chain, reader: Linear, exact: Array, finest_seconds: float) -> tuple[Array, Array]:
+def _library_knob(chain: Chain, truth: PsfBasis, finest_seconds: float) -> tuple[Array, Array]:
     """Whole sweeps at all but the finest tolerance."""
-    errors, seconds = [], []
-    for tolerance in chain.levels["library_tolerance"][:-1]:
-        errors.append(_shift(chain, reader, chain.optics(chain.table(tolerance), PILOT)))
-        seconds.append(chain.library(tolerance)[1])
-    return -np.stack([*errors, np.zeros_like(errors[0])]), np.array([*seconds, finest_seconds])
+    coarse = chain.levels["library_tolerance"][:-1]
+    errors = [_misread(chain, truth, chain.optics(chain.table(tolerance), PILOT)) for tolerance in coarse]
+    seconds = [*(chain.library(tolerance)[1] for tolerance in coarse), finest_seconds]
+    return np.stack([*errors, np.zeros_like(errors[0])]), np.maximum.accumulate(np.array(seconds))
 
 
-def _mask_knob(chain: Chain, reader: Linear, exact: Array) -> tuple[Array, Array]:
+def _mask_knob(chain: Chain, believed: PsfBasis, exact: Array) -> tuple[Array, Array]:
     """Rounding of the diameters; the cost is that of the classes on the mask."""
     errors, seconds = [], []
     span = float(np.ptp(chain.aperture.diameter_um[np.flatnonzero(chain.aperture.share)]))
     for step in chain.levels["diameter_step_nm"]:
-        table = chain.aperture.rounded(exact, step * 1e-3)
-        errors.append(_shift(chain, reader, chain.optics(table, PILOT)))
+        truth = chain.optics(chain.aperture.rounded(exact, step * 1e-3), PILOT)
+        errors.append(_misread(chain, truth, believed))
         seconds.append(CLASS_SECONDS * (span * 1e3 / step + 1))
-    return np.stack(errors) - errors[-1], np.array(seconds)
+    return np.stack(errors), np.array(seconds)
 
 
 FIELD = {"depth_count": "depth_count", "wavelength_count": "wavelength_count", "psf_tolerance": "psf_tolerance",
          "kernel_tolerance": "basis_tolerance"}  # fmt: skip
 
 
-def _optics_knob(chain: Chain, reader: Linear, table: Array, knob: str) -> tuple[Array, Array]:
+def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
     """Settings of the optics, against the finest of this knob; seconds of a stack, or of an image for the kernels."""
-    errors, seconds = [], []
+    made, seconds = [], []
     around = replace(PILOT, depth_count=48) if knob == "kernel_tolerance" else PILOT
     for level in chain.levels[knob]:
         value: Any = int(level) if knob.endswith("count") else level
         numerics = replace(around, **{FIELD[knob]: value})
+        made.append(chain.optics(table, numerics))  # plans the propagation, which a run does once
+        if knob == "kernel_tolerance":
+            seconds.append(fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes)
+        else:
+            seconds.append(fastest(partial(chain.optics, table, numerics)))
+    errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
+    return np.stack([*errors, np.zeros_like(errors[0])]), np.maximum.accumulate(np.array(seconds))
+
+
+def fastest(work: Callable[[], object]) -> float:
+    """Seconds of the faster of two calls."""
+    spent = []
+    for _ in range(2):
         start = time.perf_counter()
-        optics = chain.optics(table, numerics)
-        middle = time.perf_counter()
-        errors.append(_shift(chain, reader, optics))
-        each = (time.perf_counter() - middle) / chain.config.task.scenes
-        seconds.append(each if knob == "kernel_tolerance" else middle - start)
-    return errors[-1] - np.stack(errors), np.maximum.accumulate(np.array(seconds))
+        work()
+        spent.append(time.perf_counter() - start)
+    return min(spent)
 
 
-def _shift(chain: Chain, reader: Linear, optics: PsfBasis) -> Array:
-    """(scenes, 2) error of the gaze that images through these optics are read as."""
-    return np.asarray(reader.shift(chain.electrons(optics))[:, :2].numpy())
+def _misread(chain: Chain, truth: PsfBasis, believed: PsfBasis) -> Array:
+    """(scenes, 2) error of the gaze that an estimator reads from images through optics other than it believes in."""
+    return np.asarray(chain.read(chain.electrons(truth), believed)[:, :2].numpy())
 
 
 def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
@@ -249,7 +266,9 @@ def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
     grids = np.meshgrid(*(np.arange(len(measured.levels[n])) for n in names), indexing="ij")
     places = np.stack([g.ravel() for g in grids], 1)
     total = np.sum([measured.errors[n][places[:, i]] for i, n in enumerate(names)], axis=0)
-    error = np.sqrt((total**2).sum(-1).mean(-1))
+    vector = (total**2).sum(-1).mean(-1)
+    apart = np.sum([(measured.errors[n] ** 2).sum(-1).mean(-1)[places[:, i]] for i, n in enumerate(names)], axis=0)
+    error = np.sqrt(np.maximum(vector, apart))
     cost = _cost(measured, places, names, config)
     good = np.flatnonzero(error <= goal_rad)
     best = int(good[cost[good].argmin()]) if len(good) else len(places) - 1
@@ -279,18 +298,15 @@ def _place(measured: Pilot, knob: str) -> int:
     return measured.levels[knob].index(getattr(PILOT, knob))
 
 
-def achieved(chain: Chain, choice: Choice, truth: torch.Tensor, *, steps: int = 4) -> float:
-    """Gaze error, rad, of the nonlinear estimate that believes in the optics of ``choice``.
+def achieved(chain: Chain, choice: Choice, truth: torch.Tensor) -> float:
+    """Gaze error, rad, of the estimator that believes in the optics of ``choice``.
 
     Args:
         truth: images (scenes, pixels) of the eyes through the finest optics with the mask of ``choice``; see
             :func:`reality`.
-        steps: of the iteration; every step renders the eyes anew.
     """
     optics = chain.optics(chain.table(choice.library_tolerance), choice.numerics)
-    reader = task.linear(chain.eyes, optics, chain.config.task)
-    found = task.settle(reader, truth, optics, chain.states, chain.config.task, steps=steps)
-    return task.gaze_rms(found)
+    return task.gaze_rms(chain.read(truth, optics))
 
 
 def reality(chain: Chain, diameter_step_nm: float) -> torch.Tensor:

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
+from torch.nn.functional import avg_pool2d
 
 from codesign import eye
 from codesign.eye import POPULATION, Motion, Rig, States
@@ -21,10 +22,11 @@ from metalens.sensor import Sensor
 
 Tensor = torch.Tensor
 MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z", "scale")
-STEPS = (math.radians(0.25), math.radians(0.25), 100.0, 100.0, 100.0, 0.01)  # rad, um, 1: half the central difference
+STEPS = (math.radians(0.02), math.radians(0.02), 5.0, 5.0, 5.0, 1e-3)  # rad, um, 1: half the central difference
 PRIOR = (0.18, 0.13, 1200.0, 900.0, 2000.0, 0.12)  # standard deviations before the image is seen
 TRAITS = tuple(n for n, trait in POPULATION.items() if trait.sd > 0 and n != "depth_um")  # a depth is a slip along z
-TRAIT_STEP = 0.1  # of a trait's standard deviation
+TRAIT_STEP = 0.005  # of a trait's standard deviation
+FINE = 3  # rays along a side of a pixel: edges of the eye move smoothly, as they do on a sensor
 NAMES = (*MOTIONS, *TRAITS, "brightness")
 BRIGHTNESS = 0.3  # standard deviation before the image is seen
 
@@ -54,9 +56,9 @@ class TaskSetting:
         return Rig(sensor_distance_um=self.sensor_distance_um)
 
     @property
-    def camera(self) -> Camera:
-        """Grid of the renderings."""
-        return Camera(self.pixels + 2 * self.margin, self.pitch_um)
+    def size(self) -> int:
+        """Pixels along a side with the margin."""
+        return self.pixels + 2 * self.margin
 
     @property
     def states(self) -> States:
@@ -78,20 +80,30 @@ class Views:
         return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
-def views(setting: TaskSetting, states: States | None = None) -> Views:
+def views(setting: TaskSetting, states: States | None = None, *, exposed: States | None = None) -> Views:
     """Render everything that the linear estimator needs; two frames an unknown and eye.
 
     Args:
-        states: instead of those of the setting.
+        states: instead of those of the setting. exposed: that the exposure was set at, by default these.
     """
     still = setting.states if states is None else states
-    rig, camera = setting.rig, setting.camera
+    lit = still if exposed is None else exposed
 
-    def frames(moved: States) -> Frames:
-        return render(moved, rig=rig, camera=camera, exposed=still).frames
+    def frames(unknown: int, step: float) -> Frames:
+        return _frames(shifted(still, unknown, step), lit, setting)
 
-    pairs = [(frames(shifted(still, k, step)), frames(shifted(still, k, -step))) for k, step in enumerate(_steps())]
-    return Views(frames(still), tuple(pairs))
+    pairs = [(frames(k, step), frames(k, -step)) for k, step in enumerate(_steps())]
+    return Views(_frames(still, lit, setting), tuple(pairs))
+
+
+def _frames(states: States, exposed: States, setting: TaskSetting) -> Frames:
+    """Renderings averaged over each pixel."""
+    camera = Camera(FINE * setting.size, setting.pitch_um / FINE)
+    fine = render(states, rig=setting.rig, camera=camera, exposed=exposed).frames
+    radiance, coverage, deep, plain = (
+        avg_pool2d(v, FINE) for v in (fine.radiance, fine.coverage, fine.coverage * fine.depth_um, fine.depth_um)
+    )
+    return Frames(radiance, coverage, torch.where(coverage > 0, deep / coverage.clamp_min(1e-9), plain))
 
 
 def _steps() -> tuple[float, ...]:
@@ -121,8 +133,7 @@ def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
 
 def electrons(frames: Frames, optics: PsfBasis, setting: TaskSetting) -> Tensor:
     """(scenes, pixels) expected electrons through these optics, float64."""
-    size = setting.camera.pixels
-    prepared = scene.imager(optics, (size, size), margin=setting.margin)
+    prepared = scene.imager(optics, (setting.size, setting.size), margin=setting.margin)
     light = scene.image(frames, prepared, margin=setting.margin)
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     return sensor.mean_electrons(light, setting.pitch_um, sensor=chip).flatten(1).double()
@@ -174,22 +185,18 @@ def gaze_rms(shift: Tensor) -> float:
     return float(shift[..., :2].pow(2).sum(-1).mean().sqrt())
 
 
-def settle(
-    reader: Linear, image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, steps: int
-) -> Tensor:
+def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, steps: int) -> Tensor:
     """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels), starting from the true states.
 
-    Gauss-Newton with the slopes of the start; every step renders the eyes at the estimate.
+    Gauss-Newton: every step renders the eyes and their slopes at the estimate.
     """
-    found = torch.zeros(reader.pull.shape[:2], dtype=torch.float64)
     prior = torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
-    expected = reader.image
+    found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
     for _ in range(steps):
-        linearised = reader.shift(image - expected + reader.image)
-        found = found + linearised - (reader.covariance @ (found @ prior)[..., None])[..., 0]
         moved = states
         for k in range(len(NAMES) - 1):
             moved = shifted(moved, k, found[:, k])
-        seen = render(moved, rig=setting.rig, camera=setting.camera, exposed=states).frames
-        expected = electrons(seen, optics, setting) * (1 + found[:, -1:])
+        reader = linear(views(setting, moved, exposed=states), optics, setting)
+        pulled = reader.shift(image / (1 + found[:, -1:])) - (reader.covariance @ (found @ prior)[..., None])[..., 0]
+        found = found + pulled
     return found

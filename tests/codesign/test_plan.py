@@ -59,12 +59,14 @@ def test_the_cheapest_combination_of_all_is_found():
         assert best.seconds == pytest.approx(min(costs))
 
 
-def test_errors_that_cancel_are_used():
+def test_errors_that_happen_to_cancel_are_not_relied_on():
     measured = _pilot()
     measured.errors["depth_count"][0] = -measured.errors["library_tolerance"][0]
-    both = plan.choose(measured, 1e-9, CONFIG)
-    assert both.choice.depth_count == 4
-    assert both.predicted_rad == pytest.approx(0, abs=1e-12)
+    tight = plan.choose(measured, 1e-9, CONFIG)
+    assert tight.choice.depth_count == 12
+    loose = plan.choose(measured, 1.5e-4, CONFIG)  # one of the two alone, or both: sqrt(2) of 1e-4 together
+    assert (loose.choice.depth_count, loose.choice.library_tolerance) == (4, plan.LEVELS["library_tolerance"][0])
+    assert loose.predicted_rad == pytest.approx(math.sqrt(2) * 1e-4)
 
 
 @pytest.mark.parametrize(

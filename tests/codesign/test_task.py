@@ -40,13 +40,11 @@ def test_the_same_image_is_no_error(eyes, reader):
 def test_a_moved_eye_is_read_as_moved(reader, unknown, amount):
     """The answer to an image of the moved eye is the move, less what the prior and the other unknowns hold back."""
     states = SETTING.states
-    from codesign.renderer import render
-
-    moved = render(task.shifted(states, unknown, amount), rig=SETTING.rig, camera=SETTING.camera, exposed=states)
-    image = task.electrons(moved.frames, _optics(0.8), SETTING)
+    moved = task.views(SETTING, task.shifted(states, unknown, amount), exposed=states).anchor
+    image = task.electrons(moved, _optics(0.8), SETTING)
     if unknown < 2:  # slip along the axis is confounded with size and anatomy, the gaze is not
         assert reader.shift(image)[:, unknown].tolist() == pytest.approx([amount] * 2, rel=0.35)
-    settled = task.settle(reader, image, _optics(0.8), states, SETTING, steps=3)
+    settled = task.settle(image, _optics(0.8), states, SETTING, steps=3)
     assert (settled[:, unknown] * amount > 0).all()
 
 
