@@ -150,7 +150,8 @@ def figure(found: dict[str, list[dict[str, Any]]]) -> bytes:
             axes.plot(values, [i] * len(values), "o", alpha=0.5, color="C0")
             axes.plot([row["axial_mm"]], [i], "|", markersize=18, color="k")
         axes.set_yticks(range(len(mine)), [row["lens"] for row in mine])
-        axes.set(xlabel="axial slippage error / mm (ambiguity set)", title=case, xlim=(0, None))
+        axes.set(xlabel="axial slippage error / mm (ambiguity set)", title=case)
+        axes.set_xlim(0, 1.05 * max(row["axial_mm"] for row in mine) + 0.05)
         axes.invert_yaxis()
     return report.png(canvas)
 

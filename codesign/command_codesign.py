@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 from safetensors.torch import save_file
 
@@ -18,6 +19,7 @@ from codesign.evolution import best, pareto
 from codesign.finish import finished
 from codesign.inner import Model, Record
 from codesign.journal import Journal
+from codesign.placement import Place, device_of, place
 from codesign.run import Run, RunConfig
 from codesign.subnet import Subnet
 from metalens import config, design, lens, library, report, store
@@ -37,6 +39,7 @@ class Options(Common):
         output: folder of the run.
         resume: go on from the folder's checkpoint, bit for bit.
         freeze: parts that stay as they start, beside those of the config: the ablations.
+        device: of the network; auto takes a GPU where there is one. Scenes and optics stay on the processor.
         events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
     """
 
@@ -44,6 +47,7 @@ class Options(Common):
     output: Output = Path("run")
     resume: bool = False
     freeze: tuple[runs.Part, ...] = ()
+    device: Place = "auto"
     events: bool = False
 
 
@@ -51,10 +55,12 @@ def run(options: Options) -> int:
     """Train, search, finish; exit 0."""
     settings = _frozen(runs.load(options.config), options.freeze)
     folder, console = options.output, options.console
+    device = device_of(options.device)
     parallel.join()
     if parallel.rank():
-        return _assist(folder, settings)
+        return _assist(folder, settings, device)
     going = _resume(folder, settings) if options.resume else _start(folder, settings, force=options.force)
+    place(going.trainer, device)
     parallel.wait()
     journal = Journal(folder) if options.events else None
     for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
@@ -77,10 +83,11 @@ def run(options: Options) -> int:
     return 0
 
 
-def _assist(folder: Path, settings: RunConfig) -> int:
+def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     """Another process of ``torchrun``: trains along from the same checkpoint, writes nothing."""
     parallel.wait()
     going = runs.resume(folder / CHECKPOINT, settings)
+    place(going.trainer, device)
     for _ in runs.train(going, folder / CHECKPOINT):
         pass
     parallel.leave()

@@ -70,8 +70,8 @@ def average(parameters: Iterable[nn.Parameter]) -> None:
     if ranks() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
-    for kind in sorted({g.dtype for g in grads}, key=str):  # in the same order everywhere
-        mine = [g for g in grads if g.dtype == kind]
+    for kind in sorted({(g.dtype, g.device) for g in grads}, key=str):  # in the same order everywhere
+        mine = [g for g in grads if (g.dtype, g.device) == kind]
         joined = _reduced(torch.cat([g.flatten() for g in mine])) / ranks()
         start = 0
         for grad in mine:
