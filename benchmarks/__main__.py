@@ -1,6 +1,6 @@
 """``python -m benchmarks [TOPIC ...] [--peers]``: print the tables and keep them in benchmarks/results.
 
-Without a topic all are run but those that take a quarter of an hour (``LONG``).
+Without a topic all are run but those that take a quarter of an hour or need an extra package (``LONG``).
 """
 
 import importlib
@@ -14,7 +14,7 @@ from pathlib import Path
 import benchmarks
 from benchmarks import Row
 
-LONG = ("limits", "plan")
+LONG = ("limits", "plan", "scene_referee")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import tyro
 
-from codesign import dataset, landmarks
+from codesign import dataset, landmarks, pathtraced
 from codesign.eye import Motion, Rig
 from codesign.renderer import Camera, Rendered, render
 from metalens import config, scene, store
@@ -70,16 +70,21 @@ class Options(Common):
     Attributes:
         config: SCENE.toml; without it the defaults.
         output: folder for scene.h5, layers.h5, sheet.png and labels.csv.
+        referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
+            referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
     """
 
     config: tyro.conf.Positional[Path | None] = None
     output: Output = Path("scene")
+    referee: bool = False
     settings: tyro.conf.Suppress[Scene] = field(default_factory=Scene)
 
 
 def run(options: Options) -> int:
     """Render, write and show."""
     settings = options.settings if options.config is None else config.load(options.config, Scene)
+    if options.referee:
+        pathtraced.start()
     folder = options.claim(options.output)
     folder.mkdir(exist_ok=True)
     camera = Camera(settings.pixels, settings.pitch_um)
@@ -90,6 +95,11 @@ def run(options: Options) -> int:
     count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)
     store.write_text(folder / "labels.csv", _table(made))
     contact_sheet(made, folder / "sheet.png")
+    if options.referee:
+        view = Camera(96, settings.pixels * settings.pitch_um / 96)
+        judged = pathtraced.compare(states, rig=settings.rig, camera=view)
+        pathtraced.picture(judged, folder / "referee.png")
+        store.write_text(folder / "referee.txt", "\n".join(judged.lines()) + "\n")
     values = {"frames": settings.frames, "layers": count, "folder": str(folder)}
     options.console.result(values, f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png")
     return 0

@@ -113,15 +113,20 @@ def iris(
     r = sqrt(x * x + y * y + 1.0)
     disc = inside * step((p[LIMBUS_R] - r) / (3.0 * p[EDGE] + 120.0))
     pupil = disc * step((p[PUPIL_R] - r) / p[EDGE])
+    brown = pigment(p, t, x, y, r)
+    virtual = path / (p[INDEX] - (p[INDEX] - 1.0) * path / p[CORNEA_R])
+    return disc, pupil, r, brown, virtual
+
+
+def pigment(p: Real, t: Real, x: Real, y: Real, r: Real) -> Real:
+    """Albedo of the iris at (x, y) in its plane, ``r`` from the axis; the picture stretches with the pupil."""
     span = unit((r - p[PUPIL_R]) / above(p[LIMBUS_R] - p[PUPIL_R], 300.0))
     place = (40.0 + 84.0 * span) / r
     tu = x * place
     tv = y * place
     figure = tex(t, p[T_IRIS], 128.0 + p[TURN_X] * tu - p[TURN_Y] * tv, 128.0 + p[TURN_Y] * tu + p[TURN_X] * tv)
     brown = p[IRIS] * (1.0 + p[IRIS_CONTRAST] * figure)
-    brown = brown * (1.0 - 0.45 * step((span - 0.94) * 9.0)) * (1.0 - 0.35 * step((0.03 - span) * 25.0))
-    virtual = path / (p[INDEX] - (p[INDEX] - 1.0) * path / p[CORNEA_R])
-    return disc, pupil, r, brown, virtual
+    return brown * (1.0 - 0.45 * step((span - 0.94) * 9.0)) * (1.0 - 0.35 * step((0.03 - span) * 25.0))
 
 
 def sclera(
