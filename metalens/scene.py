@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import scipy.fft
 import torch
+from torch.autograd import forward_ad
 
 from metalens.errors import SceneError
 
@@ -253,7 +254,7 @@ def _sources(frames: Frames, optics: Imager) -> Tensor:
     """(rank, frames, 2 kinds, 2 sheets, y, x) light and coverage weighted for every kernel, ready to transform."""
     psf, given = optics.psf, (frames.radiance, frames.coverage, frames.depth_um)
     single = psf.weights.shape[:2] == (1, 1)
-    if single and not any(a.requires_grad or a.dtype != torch.float32 for a in (*given, psf.weights)):
+    if single and all(_plain(a) for a in (*given, psf.weights)):
         from metalens.scene_sources import weighted
 
         ends = float(psf.depths_um[0]), float(psf.depths_um[-1])
@@ -263,6 +264,14 @@ def _sources(frames: Frames, optics: Imager) -> Tensor:
     if single:  # weights of the depth alone: pad once, not once a kernel
         return weight_maps(psf, _padded(frames.depth_um, optics.shape))[:, :, None] * _padded(pair, optics.shape)
     return _padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
+
+
+def _plain(a: Tensor) -> bool:
+    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
+    if a.dtype != torch.float32 or a.device.type != "cpu" or a.requires_grad:
+        return False
+    tangent = forward_ad.unpack_dual(a).tangent  # type: ignore[no-untyped-call]
+    return tangent is None
 
 
 def with_kernels(optics: Imager, kernels: Tensor) -> Imager:

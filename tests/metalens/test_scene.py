@@ -139,6 +139,19 @@ def test_fewer_depths_need_fewer_kernels():
     assert part.depths_um[-1] >= 20e3
 
 
+def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
+    """The image is linear in the radiance: its derivative along a change is the image of the change."""
+    frames = _single(_eye())
+    imager = scene.imager(scene.basis(STACK.float(), DEPTHS), (N, N))
+    change = torch.rand(frames.radiance.shape, generator=torch.Generator().manual_seed(0)) * frames.coverage
+
+    def seen(light):
+        return scene.image(Frames(light, frames.coverage, frames.depth_um), imager)
+
+    slope = torch.func.jvp(seen, (frames.radiance,), (change,))[1]
+    assert float((slope - seen(change)).abs().max()) < 2e-5  # the two paths' depth codes
+
+
 def test_trimmed_bases_keep_their_word_on_frames_they_have_not_seen():
     whole = scene.basis(STACK, DEPTHS, tolerance=1e-4)
     few = scene.trimmed(whole, _eye(), tolerance=1e-2)
