@@ -119,7 +119,10 @@ def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
 def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
     """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
     n = len(light)
-    bright = expected * (light.sum() / max(expected.sum(), 1e-300))
+    power = float((light**2).sum())
+    seen = max(power - float((noise**2).sum()), 0.1 * power)
+    # by their power: the sum of frames less a plane may be 0, or below
+    bright = expected * math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
     apart = np.full((n, n), np.inf)
     unlike = np.full((n, n), np.inf)
     for group in model.groups:
