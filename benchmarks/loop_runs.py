@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign import evolution
 from codesign import optics as trained
 from codesign import run as runs
 from codesign.architecture import largest
 from codesign.evolution import Candidate, Search
+from codesign.finish import finish
 from metalens import design, lens, library, store
 
 TEXT = """
@@ -99,11 +99,9 @@ def finished(folder: Path, recipe: Recipe) -> None:
             print(record.step, f"{record.task:.3f}", flush=True)
     going.searches = [Search((Candidate(chosen, 0.0, going.macs(chosen)),), {})]
     runs.save(path, going)
-    row = {"budget_mmacs": BUDGET, "mmacs": going.macs(chosen) / 1e6}
-    row["architecture"] = json.loads(evolution.dumps(going.searches[0]))["history"][0]
     if not (folder / "lens.h5").exists():
         _design(folder / "lens.h5", settings, runs.coefficients(going).numpy())
-    store.write_text(folder / "result.json", json.dumps({"rows": [row]}))
+    store.write_text(folder / "result.json", json.dumps({"rows": finish(going)}))
 
 
 def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> None:
