@@ -259,7 +259,7 @@ def main() -> None:
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
     soak(given.work, given.designs, given.seed)
-    found = summary(_lines(given.work, given.seed), given.seed)
+    found = summary(kept_lines(_lines(given.work, given.seed)), given.seed)
     store.write_text(RESULT, json.dumps(found, indent=1) + "\n")
     print(json.dumps(found, indent=1))
 
