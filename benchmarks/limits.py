@@ -69,8 +69,10 @@ def _run(folder: Path, words: list[str]) -> tuple[dict[str, object], float, floa
     shown = process.stdout.read() if process.stdout else b""
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):
-        raise RuntimeError(f"metalens {' '.join(words)} ended with {process.returncode}")
+    if process.returncode not in (0, 1) or not shown:
+        verb = " ".join(words)
+        raise RuntimeError(f"metalens {verb} ended with {process.returncode}, {len(shown)} bytes of result")
+    print(f"{time.perf_counter() - start:8.1f} s  metalens {' '.join(words)}", file=sys.stderr, flush=True)
     return json.loads(shown), time.perf_counter() - start, usage.ru_maxrss / 1024
 
 

@@ -242,7 +242,7 @@ def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
         else:
             seconds.append(fastest(partial(chain.optics, table, numerics)))
     errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
-    return np.stack([*errors, np.zeros_like(errors[0])]), np.maximum.accumulate(np.array(seconds))
+    return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
 def fastest(work: Callable[[], object]) -> float:

@@ -7,6 +7,7 @@ import pytest
 
 from codesign import command_plan, plan
 from codesign.plan import Pilot, PlanConfig
+from codesign.task import TaskSetting
 from metalens.errors import ConfigError
 
 CONFIG = PlanConfig(stacks=10, frames=100)
@@ -95,3 +96,16 @@ def test_the_words_say_what_was_chosen(tmp_path):
     assert "library tolerance" in text
     assert "NOT MET" not in text
     assert command_plan.values(best, measured)["met"] is True
+
+
+def test_a_run_at_one_wavelength_is_planned():
+    """The pilot of a lens of 0.1 mm with few settings; one knob has a single one."""
+    config = PlanConfig(aperture_mm=0.1, stacks=2, frames=10, task=TaskSetting(scenes=1, pixels=32, margin=4))
+    chain = plan.Chain(config)
+    chain.levels |= {"library_tolerance": (3e-2, 1e-2), "depth_count": (4, 12), "psf_tolerance": (1e-2, 1e-4)}
+    chain.levels |= {"kernel_tolerance": (1e-1, 1e-4), "diameter_step_nm": (20, 1)}
+    measured = plan.pilot(chain)
+    best = plan.choose(measured, math.radians(0.1), config)
+    assert best.met
+    assert best.choice.wavelength_count == 1
+    assert 0 < best.predicted_rad < math.radians(0.1)
