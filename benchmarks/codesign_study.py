@@ -203,9 +203,9 @@ def main() -> None:
 
 SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
 LENSES = ("hyper33", "joint33", "swift20", "hyper20", "helix2", "swift33")
-LONG = ("hyper33", "swift33", "hyper20")
+LONG = ("hyper33", "swift33", "hyper40", "swift40", "hyper20")
 PLAN = [f"p18long/{lens}/{seed}" for seed in range(5) for lens in LONG]
-PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28", "hyper40")]
+PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28")]
 PLAN += [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]

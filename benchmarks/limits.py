@@ -62,7 +62,7 @@ def _row(folder: Path, stage: Stage) -> Row:
 
 def _run(folder: Path, words: list[str]) -> tuple[dict[str, object], float, float]:
     """(--json result, wall seconds, largest resident memory in MB) of one command, by itself."""
-    start = time.perf_counter()
+    start, verb = time.perf_counter(), " ".join(words)
     process = subprocess.Popen(
         [sys.executable, "-m", "metalens", *words], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )
@@ -70,9 +70,8 @@ def _run(folder: Path, words: list[str]) -> tuple[dict[str, object], float, floa
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 1) or not shown:
-        verb = " ".join(words)
         raise RuntimeError(f"metalens {verb} ended with {process.returncode}, {len(shown)} bytes of result")
-    print(f"{time.perf_counter() - start:8.1f} s  metalens {' '.join(words)}", file=sys.stderr, flush=True)
+    print(f"{time.perf_counter() - start:8.1f} s  metalens {verb}", file=sys.stderr, flush=True)
     return json.loads(shown), time.perf_counter() - start, usage.ru_maxrss / 1024
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from benchmarks import Row
+from benchmarks import Row, fastest
 from codesign import plan
 from codesign.plan import Chain, Choice, PlanConfig
 from codesign.task import TaskSetting
@@ -55,7 +55,7 @@ def _seconds(chain: Chain, choice: Choice) -> float:
     """Time of the run with these settings: library, stacks, images, each measured."""
     table = chain.table(choice.library_tolerance)
     library = chain.library(choice.library_tolerance)[1]
-    optics = chain.optics(table, choice.numerics)  # plans the propagation, which a run does once
-    stack = plan.fastest(lambda: chain.optics(table, choice.numerics))
-    image = plan.fastest(lambda: chain.electrons(optics)) / CONFIG.task.scenes
+    optics = chain.optics(table, choice.numerics)
+    stack = fastest(lambda: chain.optics(table, choice.numerics))
+    image = fastest(lambda: chain.electrons(optics)) / CONFIG.task.scenes
     return library + CONFIG.stacks * stack + CONFIG.frames * image

@@ -157,7 +157,7 @@ class Chain:
 
     def read(self, images: torch.Tensor, believed: PsfBasis) -> torch.Tensor:
         """(scenes, unknowns) where the estimate of the eyes' states comes to rest, less the true ones."""
-        return task.settle(images, believed, self.states, self.config.task, steps=SETTLE_STEPS)
+        return task.settle(images, believed, self.states, self.config.task, seen=self.eyes, steps=SETTLE_STEPS)
 
     def _design(self) -> Lens:
         made, _ = self.library(self.levels["library_tolerance"][0])
@@ -238,14 +238,14 @@ def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
         numerics = replace(around, **{FIELD[knob]: value})
         made.append(chain.optics(table, numerics))  # plans the propagation, which a run does once
         if knob == "kernel_tolerance":
-            seconds.append(fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes)
+            seconds.append(_fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes)
         else:
-            seconds.append(fastest(partial(chain.optics, table, numerics)))
+            seconds.append(_fastest(partial(chain.optics, table, numerics)))
     errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
     return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
-def fastest(work: Callable[[], object]) -> float:
+def _fastest(work: Callable[[], object]) -> float:
     """Seconds of the faster of two calls."""
     spent = []
     for _ in range(2):

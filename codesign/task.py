@@ -114,6 +114,11 @@ def _priors() -> tuple[float, ...]:
     return (*PRIOR, *(POPULATION[name].sd for name in TRAITS), BRIGHTNESS)
 
 
+def _precision() -> Tensor:
+    """(unknowns, unknowns) information before the image is seen."""
+    return torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
+
+
 def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
     """States moved along one of :data:`NAMES` but the last."""
     if unknown < 2:
@@ -173,7 +178,7 @@ def linear(seen: Views, optics: PsfBasis, setting: TaskSetting) -> Linear:
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     noise = sensor.variance(image, sensor=chip) + (setting.mismatch * image) ** 2
     weighted = derivative / noise[:, None]
-    prior = torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
+    prior = _precision()
     normal = weighted @ derivative.mT + prior
     unit = normal.diagonal(dim1=1, dim2=2).rsqrt()  # the unknowns differ by powers of ten in size
     inverse = torch.linalg.inv(normal * unit[:, :, None] * unit[:, None, :]) * unit[:, :, None] * unit[:, None, :]
@@ -185,18 +190,20 @@ def gaze_rms(shift: Tensor) -> float:
     return float(shift[..., :2].pow(2).sum(-1).mean().sqrt())
 
 
-def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, steps: int) -> Tensor:
+def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, seen: Views, steps: int) -> Tensor:
     """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels), starting from the true states.
 
-    Gauss-Newton: every step renders the eyes and their slopes at the estimate.
+    Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen`` are those of the true states.
     """
-    prior = torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
+    prior = _precision()
     found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
-    for _ in range(steps):
-        moved = states
-        for k in range(len(NAMES) - 1):
-            moved = shifted(moved, k, found[:, k])
-        reader = linear(views(setting, moved, exposed=states), optics, setting)
+    for step in range(steps):
+        if step:
+            moved = states
+            for k in range(len(NAMES) - 1):
+                moved = shifted(moved, k, found[:, k])
+            seen = views(setting, moved, exposed=states)
+        reader = linear(seen, optics, setting)
         pulled = reader.shift(image / (1 + found[:, -1:])) - (reader.covariance @ (found @ prior)[..., None])[..., 0]
         found = found + pulled
     return found

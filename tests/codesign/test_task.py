@@ -37,14 +37,14 @@ def test_the_same_image_is_no_error(eyes, reader):
 
 
 @pytest.mark.parametrize(("unknown", "amount"), [(0, math.radians(0.1)), (1, math.radians(-0.1)), (4, 80.0)])
-def test_a_moved_eye_is_read_as_moved(reader, unknown, amount):
+def test_a_moved_eye_is_read_as_moved(eyes, reader, unknown, amount):
     """The answer to an image of the moved eye is the move, less what the prior and the other unknowns hold back."""
     states = SETTING.states
     moved = task.views(SETTING, task.shifted(states, unknown, amount), exposed=states).anchor
     image = task.electrons(moved, _optics(0.8), SETTING)
     if unknown < 2:  # slip along the axis is confounded with size and anatomy, the gaze is not
         assert reader.shift(image)[:, unknown].tolist() == pytest.approx([amount] * 2, rel=0.35)
-    settled = task.settle(image, _optics(0.8), states, SETTING, steps=3)
+    settled = task.settle(image, _optics(0.8), states, SETTING, seen=eyes, steps=3)
     assert (settled[:, unknown] * amount > 0).all()
 
 
