@@ -23,9 +23,12 @@ from metalens import store
 
 RESULT = Path(__file__).parent / "results" / "experiment_study.json"
 WIDE = {
-    "pitch_um": 18.0,
+    "pitch_um": 12.0,
     "edge_um": 1872.0,  # 20 mm at the eye: the pupil stays in the image at every stimulus and slippage
-    "steps": 2000,
+    "steps": 5000,
+    "pool": 12288,
+    "rate": 0.05,
+    "optics_weight": 0.0,
     "slip_mm": (5.0, 1.0, 5.5),
     "gaze_deg": (24.0, 16.0),
 }  # the reach of the experiment itself
@@ -50,7 +53,7 @@ def rows() -> list[Row]:
     out = [
         Row(
             case,
-            f"{source.row['mmacs']:.1f} MMACs, 104 x 104 pixels",
+            f"{source.row['mmacs']:.1f} MMACs, 156 x 156 pixels",
             seconds,
             float("nan"),
             "untrained",
@@ -72,7 +75,7 @@ def main() -> None:
     parser.add_argument("what", choices=("train", "run"))
     parser.add_argument("name", nargs="?", choices=tuple(LENSES))
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=WIDE["steps"])
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.what == "train":

@@ -38,6 +38,7 @@ budgets_mmacs = [{budget}]
 steps = {steps}
 batch = 32
 slip_scale_mm = {slip_scale_mm}
+optics_weight = {optics_weight}
 [inner.optics]
 rate = {rate}
 start = 0.12
@@ -59,7 +60,7 @@ class Recipe:
 
     focus_mm: of the hyperbolic lens that training starts from. moves: whether training moves the lens as well.
     pitch_um: of pixels and samples. edge_um: of the image. width: of the network. slip_mm, gaze_deg: reach of slippage
-    and gaze.
+    and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss.
     """
 
     focus_mm: float
@@ -71,6 +72,8 @@ class Recipe:
     pool: int = 4096
     slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
     gaze_deg: tuple[float, float] = (18.0, 13.0)
+    rate: float = 0.02
+    optics_weight: float = 0.05
 
     @property
     def toml(self) -> str:
@@ -79,7 +82,8 @@ class Recipe:
         return TEXT.format(
             pixels=pixels, margin=pixels // 8, pool=self.pool, slip_mm=list(self.slip_mm), gaze_deg=list(self.gaze_deg),
             width=self.width, pitch_um=self.pitch_um, budget=BUDGET, steps=self.steps,
-            slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=0.02 if self.moves else 0.0,
+            slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=self.rate if self.moves else 0.0,
+            optics_weight=self.optics_weight,
             window=2 * int(WINDOW_UM / self.pitch_um / 2) + 1, focus_mm=self.focus_mm,
             polynomials=35 if self.moves else 0,
         )  # fmt: skip

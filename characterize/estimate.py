@@ -79,7 +79,8 @@ def fit(
             names, solution = wider
             cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
     if frames.gain.known and _left_over(solution):
-        rest = residual.attempt(model, data, names, solution.value, base=start, prior=prior_of(names, known))
+        prior = prior_of(names, known, lens.sensor_distance_um)
+        rest = residual.attempt(model, data, names, solution.value, base=start, prior=prior)
         if rest is not None:
             model, solution = model.with_residual(rest.modes, thinplate.basis), rest.solution
             cautions.append(
@@ -137,13 +138,19 @@ def _names(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in wanted)
 
 
-def prior_of(names: Sequence[str], known: dict[str, Known]) -> Prior:
-    """Priors of the fitted parameters: metrology where there is, else what is usual."""
+def prior_of(names: Sequence[str], known: dict[str, Known], distance_um: float) -> Prior:
+    """Priors of the fitted parameters: metrology where there is, else what is usual.
+
+    distance_um: lens to sensor by design; it may be wrong by a quarter, so that no search runs into the lens.
+    """
     table = [PARAMETERS[PLACE[name]] for name in names]
     entries = [known.get(name) for name in names]
     mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
     sigma = [k.sigma if k and k.sigma > 0 else p.sigma for k, p in zip(entries, table, strict=True)]
-    return Prior(np.array(mean), np.array(sigma), np.array([p.low for p in table]), np.array([p.high for p in table]))
+    reach = [distance_um / 4 if p.name == "distance_um" else math.inf for p in table]
+    low = [max(p.low, -r) for p, r in zip(table, reach, strict=True)]
+    high = [min(p.high, r) for p, r in zip(table, reach, strict=True)]
+    return Prior(np.array(mean), np.array(sigma), np.array(low), np.array(high))
 
 
 def _search(
@@ -158,7 +165,7 @@ def _search(
 ) -> tuple[tuple[str, ...], Solution]:
     """Short fits from each start, the best one to the end."""
     names = _names(known, options.free)
-    prior, base = prior_of(names, known), start.copy()
+    prior, base = prior_of(names, known, model.lens.sensor_distance_um), start.copy()
     place = [PLACE[name] for name in names]
     begins = [start] if brief else _starts(model, data, start, found)
     if "pinhole_um" in names and base[PLACE["pinhole_um"]] == 0:
@@ -259,7 +266,7 @@ def _result(
     cautions: list[str],
     gain: Gain,
 ) -> AsBuilt:
-    prior = prior_of(names, known)
+    prior = prior_of(names, known, lens.sensor_distance_um)
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
     bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
     problems = _problems(names, solution, prior, gain)

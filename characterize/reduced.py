@@ -2,8 +2,9 @@
 
 E(X, Y) = sum over nodes of G_pq f_pq K, where the nodes are direction cosines (p, q) seen from the window's centre,
 G is the lens without its known focusing phase, f is whatever acts smoothly over the aperture, and
-K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) = exp(-ik s(pX + qY)) times a smooth rest of low rank. The adjoint of
-Legendre interpolation gathers the pillars, so the result is that of the full sum for every smooth f.
+K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) is a factor of (p, X), one of (q, Y), one of (X, Y) and a smooth rest of
+low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pillars, so the result is that of the full
+sum for every smooth f.
 """
 
 import math
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.kernel import Kernel, factors
 from characterize.pillars import Pillars
 from metalens import legendre, threads
 from metalens.errors import FitError
@@ -165,32 +167,25 @@ class Reduced:
         return self._operators[key]
 
     def _operators_of(self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
-        k, scale = 2 * math.pi / wavelength_um, self.bench.distance_um / distance_um
+        kernel = Kernel(
+            2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
+        )
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
-        w = 12 + int(k * max(wy, wx) ** 2 / self.bench.distance_um)
-        m = 10 + int(16 * max(np.abs(self._p).max(), np.abs(self._q).max()))
+        w, m = kernel.counts(wy, wx)
         Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
         P, Q = np.meshgrid(legendre.mapped(m, *self._p), legendre.mapped(m, *self._q))
-        table = self._rest(P.ravel(), Q.ravel(), X[None, :, None], Y[:, None, None], (k, distance_um, scale))
-        table = table.reshape(w * w, m * m)
         weight = np.where(np.hypot(*self._on_lens(P, Q)).ravel() < 1.03 * self.radius_um, 1.0, _BESIDE)
-        table = table * weight
-        power, v = np.linalg.eigh(table.conj().T @ table)  # cheaper than an SVD, and 1e-8 is small enough
-        power, v = np.maximum(power[::-1], 0), v[:, ::-1].conj().T
-        remainder = np.sqrt(np.cumsum(power[::-1])[::-1] / power.sum())
-        rank = max(1, int((remainder > self.tolerance).sum()))
-        lens_side = v[:rank].conj().T
+        table = np.concatenate([weight * kernel.rest(P.ravel(), Q.ravel(), X[:, None], height) for height in Y])
+        columns, rows, remainder = factors(table, self.tolerance)
         iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
-        window = np.einsum("Yj,jir,Xi->rYX", iy, (table @ lens_side).reshape(w, w, rank), ix, optimize=True)
-        v = v[:rank] / weight
+        window = np.einsum("Yj,jir,Xi->rYX", iy, columns.reshape(w, w, -1), ix, optimize=True)
         to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
-        lens = np.einsum("bq,rqp,ap->rba", to_p, v.reshape(rank, m, m), to_p, optimize=True)
-        p, q = self.p[0], self.q[:, 0]
-        along_y, along_x = np.exp(-1j * k * scale * y[:, None] * q), np.exp(-1j * k * scale * p[:, None] * x)
-        ways, terms = (along_y, along_x), (lens * self.pitch_um**2, window)
+        lens = np.einsum("bq,rqp,ap->rba", to_p, (rows / weight).reshape(-1, m, m), to_p, optimize=True)
+        ways = kernel.along_y(self.q[:, 0], y[:, None]), kernel.along_x(self.p[0][:, None], x)
+        terms = lens * self.pitch_um**2, window * kernel.window(x, y[:, None])
         a, b, c, d = (part.astype(np.complex64) for part in (*ways, *terms))
-        return Operators(a, b, c, d, remainder[:rank])
+        return Operators(a, b, c, d, remainder)
 
     def small_change(self, axes_um: tuple[Array, Array]) -> float:
         """Relative change of wavelength or distance that turns no path inside the window by more than 4 mrad."""
@@ -201,18 +196,6 @@ class Reduced:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
-
-    def _rest(self, p: Array, q: Array, X: Array, Y: Array, at: tuple[float, float, float]) -> Array:
-        """Kernel without exp(-ik s(pX + qY)) and without the path to the window's centre."""
-        k, d, scale = at
-        r_0 = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
-        (cx, cy), (tx, ty) = self.center_um, self.bench.tangents
-        dx, dy = d * tx - cx - r_0 * p, d * ty - cy - r_0 * q
-        r_w = np.sqrt(dx**2 + dy**2 + d**2)
-        more = X**2 + Y**2 + 2 * (X * dx + Y * dy)
-        r = np.sqrt(r_w**2 + more)
-        path = more / (r + r_w) + scale * (p * X + q * Y)
-        return np.asarray(d / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * path))
 
 
 def source_path(x: Array, y: Array, tangents: tuple[float, float], inverse_depth: Array | float) -> Array:
