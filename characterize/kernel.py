@@ -14,6 +14,7 @@ import numpy as np
 from metalens.store import Array
 
 _COARSE = 9  # places a coordinate at which the rest's slopes are sampled
+_BLOCK = 24  # columns by which a range grows
 Span = tuple[float, float]
 
 
@@ -55,9 +56,11 @@ class Kernel:
         return np.asarray(np.exp(1j * self.k * self._by_window(X, Y)))
 
     def rest(self, p: Array, q: Array, X: Array, Y: Array) -> Array:
-        """What the three factors leave, with the amplitude; arguments broadcast."""
+        """What the three factors leave, with the amplitude, in single precision; arguments broadcast."""
         path, r = self._left(p, q, X, Y)
-        return np.asarray(self.distance_um / (2 * np.pi * r**2) * (1 / r - 1j * self.k) * np.exp(1j * self.k * path))
+        size = (self.distance_um / (2 * np.pi * r**2)).astype(np.float32)
+        fade = (1 / r).astype(np.float32) - np.complex64(1j * self.k)
+        return np.asarray(size * fade * turns(self.k * path))
 
     def counts(self, wy: float, wx: float) -> tuple[int, int]:
         """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx): of the window, of the directions.
@@ -89,25 +92,36 @@ class Kernel:
         return np.asarray(self.path(a, b, X, Y)[0] - self._by_x(a, X) - self._by_y(b, Y))
 
 
+def turns(phase: Array) -> Array:
+    """exp(i phase) in single precision, the phase wrapped in double."""
+    whole = phase * (1 / (2 * np.pi))
+    small = (whole - np.rint(whole)).astype(np.float32) * np.float32(2 * np.pi)
+    out = np.empty(small.shape, np.complex64)
+    out.real, out.imag = np.cos(small), np.sin(small)
+    return out
+
+
 def factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
     """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but for ``tolerance`` of its norm.
 
     Their number need not be known: the range is found by random blocks (Halko, Martinsson and Tropp 2011) until what
     is left is a fifth of the tolerance. Third: (r,) share of the norm that is left out before each term.
     """
-    total = float(np.linalg.norm(table)) ** 2
-    rng, found = np.random.default_rng(0), np.empty((len(table), 0), complex)
-    rows = np.empty((0, table.shape[1]), complex)
-    missing = total
-    while missing > (0.2 * tolerance) ** 2 * total and found.shape[1] < min(table.shape):
-        block = table @ rng.standard_normal((table.shape[1], min(32, min(table.shape) - found.shape[1])))
-        for _ in range(2):  # twice is enough to be orthogonal to what is there
-            block = np.linalg.qr(block - found @ (found.conj().T @ block))[0]
-        found = np.concatenate([found, block], 1)
-        rows = np.concatenate([rows, block.conj().T @ table])
-        missing = max(total - float(np.linalg.norm(rows)) ** 2, 0.0)
-    power, turn = np.linalg.eigh(rows @ rows.conj().T)
-    power, turn = np.maximum(power[::-1], 0), turn[:, ::-1]
+    rng, total = np.random.default_rng(0), float(np.linalg.norm(table)) ** 2
+    found, most, missing = np.empty((len(table), 0), table.dtype), min(table.shape), total
+    while found.shape[1] < most:
+        count = min(_BLOCK, most - found.shape[1])
+        block = table @ rng.standard_normal((table.shape[1], count)).astype(table.real.dtype)
+        block -= found @ (found.conj().T @ block)
+        missing = float(np.linalg.norm(block)) ** 2 / count  # its expectation is the power that is left
+        if missing < (0.2 * tolerance) ** 2 * total:
+            break
+        block = np.linalg.qr(block)[0]  # twice is enough to be orthogonal to what is there
+        found = np.concatenate([found, np.linalg.qr(block - found @ (found.conj().T @ block))[0]], 1)
+        missing = 0.0
+    rows = found.conj().T @ table
+    power, turn = np.linalg.eigh((rows @ rows.conj().T).astype(complex))
+    power, turn = np.maximum(power[::-1], 0), turn[:, ::-1].astype(table.dtype)
     remainder = np.sqrt((np.cumsum(power[::-1])[::-1] + missing) / total)
     rank = max(1, int((remainder > tolerance).sum()))
     return found @ turn[:, :rank], turn[:, :rank].conj().T @ rows, remainder[:rank]

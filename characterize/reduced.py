@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.kernel import Kernel, factors
+from characterize.kernel import Kernel, factors, turns
 from characterize.pillars import Pillars
 from metalens import legendre, threads
 from metalens.errors import FitError
@@ -127,7 +127,7 @@ class Reduced:
             for i in range(first, last):
                 rows = parts[i]
                 path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
-                light = table[:, pillars.place(d.diameter_um[rows])] * _turns(self.k * path)
+                light = table[:, pillars.place(d.diameter_um[rows])] * turns(self.k * path)
                 halves = np.concatenate([light.real, light.imag]).reshape(-1, len(x)) @ across
                 real, imaginary = along[rows].T @ halves.reshape(2, r, -1, n)
                 sums[i] = real + 1j * imaginary
@@ -174,14 +174,14 @@ class Reduced:
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
         w, m = kernel.counts(wy, wx)
         Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
-        P, Q = np.meshgrid(legendre.mapped(m, *self._p), legendre.mapped(m, *self._q))
-        weight = np.where(np.hypot(*self._on_lens(P, Q)).ravel() < 1.03 * self.radius_um, 1.0, _BESIDE)
-        table = np.concatenate([weight * kernel.rest(P.ravel(), Q.ravel(), X[:, None], height) for height in Y])
+        P, Q = legendre.mapped(m, *self._p), legendre.mapped(m, *self._q)[:, None]
+        weight = np.where(np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE).astype(np.float32)
+        table = np.stack([weight * kernel.rest(P, Q, X[:, None, None], height) for height in Y]).reshape(w * w, m * m)
         columns, rows, remainder = factors(table, self.tolerance)
         iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
         window = np.einsum("Yj,jir,Xi->rYX", iy, columns.reshape(w, w, -1), ix, optimize=True)
         to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
-        lens = np.einsum("bq,rqp,ap->rba", to_p, (rows / weight).reshape(-1, m, m), to_p, optimize=True)
+        lens = np.einsum("bq,rqp,ap->rba", to_p, rows.reshape(-1, m, m) / weight, to_p, optimize=True)
         ways = kernel.along_y(self.q[:, 0], y[:, None]), kernel.along_x(self.p[0][:, None], x)
         terms = lens * self.pitch_um**2, window * kernel.window(x, y[:, None])
         a, b, c, d = (part.astype(np.complex64) for part in (*ways, *terms))
@@ -212,12 +212,6 @@ def sensor_path(x: Array, y: Array, center_um: tuple[float, float], distance_um:
     r_0 = math.sqrt(cx * cx + cy * cy + distance_um**2)
     more = x * x + y * y - 2 * (x * cx + y * cy)
     return np.asarray(more / (np.sqrt(more + r_0**2) + r_0))
-
-
-def _turns(phase: Array) -> Array:
-    """exp(i phase) in single precision, the phase wrapped in double."""
-    small = np.remainder(phase, 2 * np.pi).astype(np.float32)
-    return np.asarray(np.cos(small) + 1j * np.sin(small))
 
 
 def _at(count: int, span: tuple[float, float], values: Array) -> Array:
