@@ -178,7 +178,7 @@ def _search(
     part, seen = residual.problem(model.only(few), names, base), data.planes(few)
     tries = [leastsquares.fit(part, seen, x[place], prior=prior, settings=short) for x in begins]
     best = min(tries, key=lambda t: t.merit)
-    settings = Settings(iterations=40, secant=True)
+    settings = Settings(iterations=80, secant=True)
     return names, leastsquares.fit(
         residual.problem(model, names, base), data, best.value, prior=prior, settings=settings
     )

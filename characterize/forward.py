@@ -31,6 +31,7 @@ GEOMETRY = (
 )
 PROCESS = ("height_nm", "index", "sidewall_deg")
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
+_LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 _STEP: dict[str, Callable[[Bench], float]] = {
     "distance_um": lambda bench: bench.distance_um,
     "wavelength_nm": lambda bench: bench.wavelength_um * 1e3,
@@ -237,7 +238,7 @@ class ForwardModel:
                 more = self._by_operators(x, group, name, lit, field) if name in _STEP else 0.0
                 out[name] = sampled(turned.astype(np.complex64) * lit, more)
                 if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
-                    disc = blurs["pinhole_um"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+                    disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
                     out[name] = out[name] + self.grid.sample(intensity, disc)
             elif name in blurs:
                 out[name] = self.grid.sample(intensity, blurs[name])
@@ -330,11 +331,18 @@ class ForwardModel:
         square = detector.pixel(fy, fx, pixel)
         if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
             return (square * blur)[None], {"crosstalk_px": (square * by_blur * pixel)[None]}
-        discs = [detector.disc(fy, fx, x[PLACE["pinhole_um"]] * m) for m in shrink]
+        sizes, shared = x[PLACE["pinhole_um"]] * shrink, square * blur
+        discs = [detector.disc(fy, fx, size) for size in sizes]
         disc = np.stack([value for value, _ in discs])
-        by_disc = np.stack([slope * m for (_, slope), m in zip(discs, shrink, strict=True)])
-        shared = square * blur
-        return shared * disc, {"crosstalk_px": square * by_blur * pixel * disc, "pinhole_um": shared * by_disc}
+        by_size = np.stack([slope for _, slope in discs]) * shrink[:, None, None]
+        some = np.maximum(sizes, _LEAST_DISC * pixel)
+        seen = np.stack([detector.disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
+        slopes = {
+            "crosstalk_px": square * by_blur * pixel * disc,
+            "pinhole_um": shared * seen,
+            "growth": shared * by_size,
+        }
+        return shared * disc, slopes
 
 
 def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:

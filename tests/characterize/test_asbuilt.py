@@ -68,6 +68,27 @@ def test_derivatives_match_finite_differences(model, name):
     assert np.abs(slope - want).max() < 2e-2 * np.abs(want).max()  # operators of derivatives are cut at 3e-3 of all
 
 
+def test_a_point_source_has_a_slope_by_its_size(model):
+    """Light changes as the square of the size: no slope at 0. That of 0.3 pixels is taken, twice the chord to there."""
+    x = vector(b.VALUES)
+    slope = model.images(x, ["pinhole_um"])[1][0]
+    for i, depth in enumerate(b.DEPTHS):
+        size = 0.3 * 1.5 * depth * 1.004 / 112.0
+        chord = (model.images(vector(b.VALUES | {"pinhole_um": size}))[0] - model.images(x)[0])[i] / size
+        assert np.abs(slope[i] - 2 * chord).max() < 0.1 * np.abs(2 * chord).max()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_point_source_is_not_thrown_to_the_bound_of_its_size(seed):
+    """Without a slope at 0 a search jumps to 2 mm, and the size comes back with a sigma of 1e36."""
+    free = dataclasses.replace(USUAL, free=("pinhole_um",))
+    found = characterize.fit(b.capture(b.electrons(), seed=seed), b.lens(), free, response=b.RESPONSE)
+    i = found.names.index("pinhole_um")
+    assert found.trusted
+    assert found.value[i] < 4
+    assert 0.3 < found.sigma[i] < 10  # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
+
+
 def test_hidden_lens_is_found_within_its_intervals(fitted):
     assert fitted.trusted
     assert fitted.converged
