@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign import assess, eye, regressor
+from codesign import assess, eye, personal
 from codesign import optics as lens
 from codesign.assess import Answers, Seen
-from codesign.eye import POPULATION, States
+from codesign.eye import POPULATION, Rig, States
 from codesign.eye_scenes import EyeScenes, as_batch
 from codesign.formation import read_out
+from codesign.personal import angle_deg
 from codesign.renderer import Rendered, render
 from codesign.retraining import Source, network
 from codesign.supernet import recalibrate
@@ -238,36 +239,29 @@ def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config
     slip, centre, iou = (
         torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("slip_mm", "centre", "iou")
     )
-    predicted, judged = calibrated(centre, slip, trial, config)
-    told, _ = calibrated(centre, trial.slip_mm, trial, config)
+    scenes = source.run.scenes(9)
+    pupil_mm = centre * scenes.settings.pixels * scenes.sample_um * 1e-3
+    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=scenes.rig)
+    told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=scenes.rig)
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
     return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted, told_error)
 
 
-def calibrated(centre: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig) -> tuple[Array, Array]:
-    """(n, 2) gaze of every frame by its subject's own regressor, and (n,) frames that it never saw."""
-    predicted, judged = np.empty((len(centre), 2)), np.ones(len(centre), bool)
-    features = np.concatenate([centre, slip_mm], 1)
+def calibrated(
+    pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
+) -> tuple[Array, Array]:
+    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
+    predicted, judged = np.empty((len(pupil_mm), 2)), np.ones(len(pupil_mm), bool)
     for subject in np.unique(trial.subject):
         rows = np.flatnonzero(trial.subject == subject)
         points = np.unique(trial.stimulus[rows])
         rng = np.random.default_rng([config.seed, int(subject), 21])
         chosen = rng.choice(points, round(config.share * len(points)), replace=False)
         seen = np.isin(trial.stimulus[rows], chosen)
-        made = regressor.fit(
-            features[rows[seen]], trial.stimulus_deg[rows[seen]], hidden=config.hidden, seed=config.seed
+        known = rows[seen]
+        person = personal.fit(
+            pupil_mm[known], slip_mm[known], trial.stimulus_deg[known], rig=rig, hidden=config.hidden, seed=config.seed
         )
-        predicted[rows] = made(features[rows])
-        judged[rows[seen]] = False
+        predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
+        judged[known] = False
     return predicted, judged
-
-
-def angle_deg(one: Array, other: Array) -> Array:
-    """(n,) angle between directions given by their angles across and down, deg."""
-    a, b = (_direction(np.radians(v)) for v in (one, other))
-    return np.asarray(np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=1) / 2, 0, 1))))
-
-
-def _direction(angles_rad: Array) -> Array:
-    x, y = angles_rad.T
-    return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], 1)

@@ -201,8 +201,7 @@ def parameters(states: States, rig: Rig, *, pixel_rad: float, exposed: States | 
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
     cornea, limbus, sclera = (t[k] * size for k in ("cornea_radius_um", "limbus_radius_um", "sclera_radius_um"))
-    ring = torch.sqrt((sclera**2 - limbus**2).clamp_min(1e6))  # the limbus lies on both spheres
-    offset = ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
+    ring, offset = _spheres(sclera, cornea, limbus)
     behind = offset + cornea - t["pupil_behind_um"] * size
     face = _face(rig, states)
     axis, across, down = _turned(face, states)
@@ -231,6 +230,21 @@ def parameters(states: States, rig: Rig, *, pixel_rad: float, exposed: States | 
         t["fissure_middle_um"] - 0.93 * half,
     ]
     return torch.cat([*columns, torch.stack(scalars, 1)], 1)
+
+
+def mean_eye_um(rig: Rig) -> tuple[tuple[float, float, float], float]:
+    """Rotation centre of the population's mean eye before this camera, and how far its pupil lies from that centre."""
+    mean = {name: torch.tensor([trait.mean], dtype=torch.float64) for name, trait in POPULATION.items()}
+    _, offset = _spheres(*(mean[f"{name}_radius_um"] for name in ("sclera", "cornea", "limbus")))
+    radius = offset + mean["cornea_radius_um"] - mean["pupil_behind_um"]
+    x, y, z = _nominal_centre(rig, mean["depth_um"], radius)[0].tolist()
+    return (x, y, z), float(radius)
+
+
+def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Tensor]:
+    """(n,) plane of the limbus, which lies on both spheres, and centre of the cornea, from the sclera's centre."""
+    ring = torch.sqrt((sclera**2 - limbus**2).clamp_min(1e6))
+    return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
 
 
 def directions(states: States, rig: Rig) -> tuple[Tensor, Tensor]:

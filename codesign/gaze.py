@@ -1,15 +1,14 @@
-"""From pupil centre and slippage to gaze: the spherical-eye solver, and what is left to learn for each person.
+"""From pupil centre and slippage to gaze: the spherical-eye solver, and a learned turn from optical to visual axis.
 
 Camera frame: origin at the lens, z towards the eye, x right and y down as on the (upright) sensor image.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from metalens.errors import SceneError, TrainingError
+from metalens.errors import SceneError
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,57 +112,3 @@ def turn(axis: Tensor, yaw_rad: Tensor, pitch_rad: Tensor) -> Tensor:
     x, z = c * x + s * z, c * z - s * x
     c, s = torch.cos(pitch_rad), torch.sin(pitch_rad)
     return torch.stack([x, c * y - s * z, c * z + s * y], -1)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PersonalCalibration:
-    """Ridge regression from features of one person's samples to the angles of gaze.
-
-    weights: (features, 2). scale: (5, 2) mean and spread of the raw features.
-    """
-
-    weights: Tensor
-    scale: Tensor
-
-    def __call__(self, axis: Tensor, slip_mm: Tensor) -> Tensor:
-        """(batch, 2) gaze yaw and pitch in rad."""
-        return _features(axis, slip_mm, self.scale) @ self.weights
-
-
-def calibrate(axis: Tensor, slip_mm: Tensor, gaze_rad: Tensor, *, ridge: float = 1e-3) -> PersonalCalibration:
-    """Personal calibration from a few points: quadratic in optical axis and slippage, with a ridge.
-
-    Args:
-        axis: (points, 3) optical axes; slip_mm: (points, 3); gaze_rad: (points, 2) true yaw and pitch.
-        ridge: penalty on the weights; the mean is free.
-
-    Raises:
-        TrainingError: fewer than 3 points.
-    """
-    if len(axis) < 3:
-        raise TrainingError(f"personal calibration from {len(axis)} points, need 3 or more")
-    raw = _raw(axis, slip_mm)
-    scale = torch.stack([raw.mean(0), raw.std(0).clamp_min(1e-6)], -1)
-    features = _features(axis, slip_mm, scale)
-    penalty = ridge * len(axis) * torch.eye(features.shape[1], dtype=features.dtype)
-    penalty[0, 0] = 1e-12
-    weights = torch.linalg.solve(features.T @ features + penalty, features.T @ gaze_rad.to(features.dtype))
-    return PersonalCalibration(weights, scale)
-
-
-def yaw_pitch(direction: Tensor) -> Tensor:
-    """(batch, 2) angles of directions that point back to the camera (-z): yaw to +x, pitch to +y."""
-    x, y, z = direction.unbind(-1)
-    return torch.stack([torch.atan2(x, -z), torch.asin(y.clamp(-1, 1))], -1)
-
-
-def _raw(axis: Tensor, slip_mm: Tensor) -> Tensor:
-    return torch.cat([yaw_pitch(axis), slip_mm], -1)
-
-
-def _features(axis: Tensor, slip_mm: Tensor, scale: Tensor) -> Tensor:
-    """1, the angles, the slips, and all products of two."""
-    unit = (_raw(axis, slip_mm) - scale[:, 0]) / scale[:, 1] / math.sqrt(2)
-    count = unit.shape[-1]
-    i, j = torch.triu_indices(count, count)
-    return torch.cat([torch.ones_like(unit[..., :1]), unit, unit[..., i] * unit[..., j]], -1)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign import eye
+from codesign import eye, personal
 from codesign.eye import States
 from codesign.eye_scenes import EyeScenes, as_batch
-from codesign.gaze import EyeGeometry, angle_rad, calibrate, optical_axis, yaw_pitch
+from codesign.gaze import EyeGeometry, angle_rad, optical_axis
 from codesign.inner import Batch
+from codesign.personal import angle_deg, face_angles
 from codesign.renderer import Labels, render
 from metalens.errors import TrainingError
 
@@ -66,8 +67,8 @@ def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
 class GazeErrors:
     """Mean angles in degrees between found and true gaze, over the frames that no calibration saw.
 
-    population: optical axis, mean eye. anatomy: optical axis, the person's own eye. personal: visual axis, the mean
-    eye's answer corrected by a quadratic regression on the person's calibration frames. The floors: the same with
+    population: optical axis, mean eye. anatomy: optical axis, the person's own eye. personal: visual axis after
+    :mod:`codesign.personal` on the person's calibration frames. The floors: the same with
     true slippage and pupil, what is left to the solver and not to the network.
     """
 
@@ -102,12 +103,13 @@ def gaze_errors(test: People, centre: Tensor, slip_mm: Tensor, *, share: float =
 
 
 def _angles(test: People, pupil_mm: Tensor, slip_mm: Tensor, known: int) -> tuple[float, float, float]:
-    labels = test.labels
+    labels, rig = test.labels, test.scenes.rig
     own = (labels.centre_um - labels.slip_um) * 1e-3
     radius = (labels.pupil_um - labels.centre_um).norm(dim=1).mean().item() * 1e-3
     early = (torch.arange(len(own)) % test.each) < known
     mean = _fitted(test, own.mean(0), radius, torch.nonzero(early)[:, 0], pupil_mm, slip_mm)
     crowd = optical_axis(pupil_mm, -slip_mm, mean).direction
+    looked = face_angles(labels.visual_axis.numpy(), rig.elevation_rad)
     errors: list[list[Tensor]] = [[], [], []]
     for person in range(test.people):
         rows = torch.arange(person * test.each, (person + 1) * test.each)
@@ -116,10 +118,9 @@ def _angles(test: People, pupil_mm: Tensor, slip_mm: Tensor, known: int) -> tupl
         geometry = _fitted(test, own[rows[0]], radius, first, pupil_mm, slip_mm)
         axis = optical_axis(pupil_mm[rest], -slip_mm[rest], geometry).direction
         errors[1].append(angle_rad(axis, labels.optic_axis[rest]))
-        missing = yaw_pitch(labels.visual_axis[first]) - yaw_pitch(crowd[first])
-        fit = calibrate(crowd[first], slip_mm[first], missing, ridge=_ridge(crowd[first], slip_mm[first], missing))
-        yaw, rise = (yaw_pitch(crowd[rest]) + fit(crowd[rest], slip_mm[rest])).unbind(-1)
-        errors[2].append(angle_rad(_towards(yaw, rise), labels.visual_axis[rest]))
+        taught = personal.fit(pupil_mm[first].numpy(), slip_mm[first].numpy(), looked[first], rig=rig)
+        found = taught(pupil_mm[rest].numpy(), slip_mm[rest].numpy())
+        errors[2].append(torch.from_numpy(np.radians(angle_deg(found, looked[rest]))))
     one, two, three = (float(torch.cat(e).mean()) for e in errors)
     return one, two, three
 
@@ -137,26 +138,6 @@ def _fitted(
     )
 
 
-def _ridge(axis: Tensor, slip_mm: Tensor, goal: Tensor) -> float:
-    """The penalty under which each calibration frame is best foretold by the others."""
-
-    def missed(ridge: float) -> float:
-        total = 0.0
-        for out in range(len(axis)):
-            kept = torch.arange(len(axis)) != out
-            fit = calibrate(axis[kept], slip_mm[kept], goal[kept], ridge=ridge)
-            total += float((fit(axis[[out]], slip_mm[[out]]) - goal[[out]]).square().sum())
-        return total
-
-    return min((0.03, 0.1, 0.3, 1.0, 3.0, 10.0), key=missed)
-
-
 def _place(centre: Tensor) -> tuple[float, float, float]:
     x, y, z = centre.tolist()
     return x, y, z
-
-
-def _towards(yaw: Tensor, rise: Tensor) -> Tensor:
-    """Directions of these angles of :func:`codesign.gaze.yaw_pitch`."""
-    level = torch.cos(rise)
-    return torch.stack([torch.sin(yaw) * level, torch.sin(rise), -torch.cos(yaw) * level], -1)

@@ -27,11 +27,14 @@ class Regressor:
         return np.asarray(_forward(self.inside, self.outside, unit) * self.targets[1] + self.targets[0])
 
 
-def fit(features: Array, targets: Array, *, hidden: int = 10, penalty: float = 3e-4, seed: int = 0) -> Regressor:
+def fit(
+    features: Array, targets: Array, *, hidden: int = 10, penalty: float = 3e-4, seed: int = 0, steps: int = 200
+) -> Regressor:
     """Least squares with a penalty on the weights, by Levenberg-Marquardt with exact derivatives.
 
     Args:
         features: (n, f). targets: (n, t). penalty: of the squared weights, relative to the squared error of a point.
+        steps: evaluations that the search may take.
 
     Raises:
         TrainingError: fewer than 3 points.
@@ -55,7 +58,7 @@ def fit(features: Array, targets: Array, *, hidden: int = 10, penalty: float = 3
         inside, outside = parts(v)
         return np.concatenate([_jacobian(inside, outside, x), np.diag(weight)])
 
-    found = least_squares(residual, start, slope, method="lm", max_nfev=200)
+    found = least_squares(residual, start, slope, method="lm", max_nfev=steps)
     return Regressor(*parts(found.x), *scales)
 
 

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import made_lens as m
 
-from codesign import experiment, eye, regressor, retraining
+from codesign import experiment, eye, personal, regressor, retraining
 from codesign.experiment import AXIAL, LATERAL, ExperimentConfig, Trial
+from codesign.eye import Rig
+from codesign.gaze import pupil_of
 from metalens.cli import main
 from metalens.errors import ConfigError, TrainingError
 
@@ -86,25 +89,20 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
 
 
 def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_much():
-    """A pinhole eye by hand: the pupil's image moves with gaze and slip; only a slip that is read tells them apart."""
-    config = ExperimentConfig(subjects=2)
+    """The mean eye, a sphere: the pupil's image moves with gaze and slip; only a slip that is read tells them apart."""
+    config, rig = ExperimentConfig(subjects=2), Rig()
     trial = _trial(config, 2)
-    turn = np.radians(trial.stimulus_deg)
-    point = np.stack([10 * np.sin(turn[:, 0]), 10 * np.sin(turn[:, 1])], 1) + trial.slip_mm[:, :2] + [2.0, 0.0]
-    centre = point / (21 + trial.slip_mm[:, 2:])
+    person = personal.fit(np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0)
+    s, c = np.sin(rig.elevation_rad), np.cos(rig.elevation_rad)
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
+    direction = torch.from_numpy(personal.direction(np.radians(trial.stimulus_deg)) @ axes)
+    pupil = pupil_of(direction, torch.from_numpy(-trial.slip_mm), person.mean).numpy()
     for slip, low, high in ((trial.slip_mm, 0.0, 0.5), (0 * trial.slip_mm, 1.5, 20.0)):
-        predicted, judged = experiment.calibrated(centre, slip, trial, config)
-        error = experiment.angle_deg(predicted, trial.stimulus_deg)[judged]
+        predicted, judged = experiment.calibrated(pupil, slip, trial, config, rig=rig)
+        error = personal.angle_deg(predicted, trial.stimulus_deg)[judged]
         assert low <= error.mean() < high
     assert judged.mean() == pytest.approx(39 / 49)
     assert all(len(np.unique(trial.stimulus[~judged & (trial.subject == s)])) == 10 for s in (0, 1))
-
-
-def test_angles_between_directions():
-    zero = np.zeros((3, 2))
-    assert np.allclose(experiment.angle_deg(zero, np.array([[3.0, 0.0], [0.0, -4.0], [0.0, 0.0]])), [3.0, 4.0, 0.0])
-    one, other = np.array([[10.0, 20.0]]), np.array([[12.0, 20.0]])
-    assert experiment.angle_deg(one, other)[0] == pytest.approx(2 * np.cos(np.radians(20.0)), rel=1e-3)
 
 
 @pytest.mark.parametrize("change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}])
