@@ -3,6 +3,8 @@
     python -m benchmarks.experiment train NAME --work DIR      # NAME: codesigned, midrange or bestfocus; resumes
     python -m benchmarks.experiment run --work DIR             # of the lenses there are, kept in benchmarks/results
 
+Gaze is calibrated twice: on stimuli drawn at random, and on as many spread over the field.
+
 ``python -m benchmarks experiment`` shows what was kept, and times the experiment itself on small untrained networks.
 """
 
@@ -12,13 +14,14 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import torch
 
 from benchmarks import Row
 from benchmarks.loop_runs import Recipe, finished
 from codesign import retraining
-from codesign.experiment import ExperimentConfig, experiment
+from codesign.experiment import ExperimentConfig, Points, experiment
 from metalens import store
 
 RESULT = Path(__file__).parent / "results" / "experiment_study.json"
@@ -62,11 +65,11 @@ def rows() -> list[Row]:
     ]
     if RESULT.is_file():
         kept = json.loads(RESULT.read_text("utf-8"))
-        for entry in kept["ratios"]:
-            case = f"{entry['quantity']}, {entry['against']}"
-            out.append(
-                Row(case, kept["first"], float("nan"), entry["ratio"], "ratio of the errors", goal=entry["goal"])
-            )
+        for points, found in kept.items():
+            for entry in found["ratios"]:
+                case = f"{entry['quantity']}, {entry['against']}, {points} points"
+                what = "ratio of the errors"
+                out.append(Row(case, found["first"], float("nan"), entry["ratio"], what, goal=entry["goal"]))
     return out
 
 
@@ -85,9 +88,12 @@ def main() -> None:
 
     names = tuple(name for name in LENSES if (given.work / name / "result.json").is_file())
     folders = tuple(given.work / name for name in names)
-    options = command_experiment.Options(folders, given.work / "experiment", names=names, force=True)
-    command_experiment.run(options)
-    store.write_text(RESULT, (given.work / "experiment" / "experiment.json").read_text("utf-8"))
+    kept = {}
+    for points in get_args(Points):
+        out, settings = given.work / f"experiment_{points}", ExperimentConfig(points=points)
+        command_experiment.run(command_experiment.Options(folders, out, names=names, settings=settings, force=True))
+        kept[points] = json.loads((out / command_experiment.JSON).read_text("utf-8"))
+    store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from metalens.commands import Common, Output
 from metalens.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
+PLACED = {"random": "drawn at random", "spread": "spread over the field"}
 GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-range"}
 
 
@@ -90,7 +91,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
                 "goal": GOALS.get(quantity, ""),
             })  # fmt: skip
     about = {"subjects": config.subjects, "frames": config.frames, "seed": config.seed, "share": config.share,
-             "fixation_deg": config.fixation_deg}  # fmt: skip
+             "points": config.points, "fixation_deg": config.fixation_deg}  # fmt: skip
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
 
 
@@ -172,8 +173,9 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
     ]
     about = values["settings"]
     text = (
-        f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each subject's regressor of "
-        f"gaze (one hidden layer) is fitted to {about['share']:.0%} of the stimuli and judged on the rest; subjects "
+        f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each subject's eye (sphere "
+        f"and regressor of one hidden layer) is fitted to {about['share']:.0%} of the stimuli, "
+        f"{PLACED[about['points']]}, and judged on the rest; subjects "
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
         "error under axial slip is that of the pupil alone. Intervals are over subjects."
     )

@@ -8,6 +8,7 @@ population of :mod:`codesign.eye`, none of whom training saw; every run sees the
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from metalens.store import Array
 
 Tensor = torch.Tensor
 AXIAL, LATERAL = "axial", "lateral"
+Points = Literal["random", "spread"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,8 @@ class ExperimentConfig:
 
     subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that they span.
     axial_mm, lateral_mm: slippage states beside the origin, along z and x.
-    share: of the stimuli that a subject is calibrated on; the rest is judged.
+    share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
+        at random or spread over the field, as a calibration screen would show them.
     hidden: neurons of the regressor. fixation_deg: standard deviation of where a subject really looks.
     pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
     snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
@@ -49,6 +52,7 @@ class ExperimentConfig:
     axial_mm: tuple[float, ...] = (-5.0, -2.5, 2.5, 5.0)
     lateral_mm: tuple[float, ...] = (-2.5, -5.0)
     share: float = 0.2
+    points: Points = "random"
     hidden: int = 10
     fixation_deg: float = 0.3
     pupil_sd: float = 0.05
@@ -256,8 +260,12 @@ def calibrated(
         rows = np.flatnonzero(trial.subject == subject)
         points = np.unique(trial.stimulus[rows])
         rng = np.random.default_rng([config.seed, int(subject), 21])
-        chosen = rng.choice(points, round(config.share * len(points)), replace=False)
-        seen = np.isin(trial.stimulus[rows], chosen)
+        count = round(config.share * len(points))
+        if config.points == "spread":
+            chosen = spread(config.stimuli_deg[points], count, first=int(rng.integers(len(points))))
+        else:
+            chosen = rng.choice(len(points), count, replace=False)
+        seen = np.isin(trial.stimulus[rows], points[chosen])
         known = rows[seen]
         person = personal.fit(
             pupil_mm[known], slip_mm[known], trial.stimulus_deg[known], rig=rig, hidden=config.hidden, seed=config.seed
@@ -265,3 +273,12 @@ def calibrated(
         predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
         judged[known] = False
     return predicted, judged
+
+
+def spread(places: Array, count: int, *, first: int) -> Array:
+    """(count,) numbers of places (n, 2) that cover them: each next one is the farthest from all before it."""
+    chosen = [first]
+    while len(chosen) < count:
+        gaps = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)
+        chosen.append(int(gaps.argmax()))
+    return np.array(chosen)

@@ -105,6 +105,15 @@ def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_muc
     assert all(len(np.unique(trial.stimulus[~judged & (trial.subject == s)])) == 10 for s in (0, 1))
 
 
+def test_spread_points_reach_the_corners():
+    grid = ExperimentConfig().stimuli_deg
+    chosen = experiment.spread(grid, 10, first=24)
+    assert len(set(chosen)) == 10
+    assert set(chosen[1:5]) == {0, 6, 42, 48}  # the middle first, then the corners
+    gaps = np.linalg.norm(grid[:, None] - grid[chosen], axis=2).min(1)
+    assert gaps.max() < 10.0  # of a field of 35 x 25 degrees
+
+
 @pytest.mark.parametrize("change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}])
 def test_impossible_experiments_are_refused(change):
     with pytest.raises(ConfigError, match="subject"):
