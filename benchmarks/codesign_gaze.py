@@ -10,17 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 
 from benchmarks import kept_lines
-from benchmarks.codesign_study import CASES, SCENES, SPACE, architecture_of, optics_of, scenes_of
-from codesign import assess, gaze_test, inner
+from benchmarks.codesign_study import CASES, SCENES, architecture_of, restored, scenes_of, stem
+from codesign import assess, gaze_test
 from codesign.eye_scenes import TEST
 from codesign.flat import flattened
 from codesign.gaze_test import People
-from codesign.inner import InnerConfig, Trainer
 from codesign.inner_batch import Batch
-from metalens.sensor import Sensor
 
 ROOT = Path(__file__).parents[1]
 PEOPLE, EACH, BATCH = 16, 40, 32
@@ -49,19 +46,13 @@ def rendered(test: People) -> Rendered:
     return Rendered(out)
 
 
-def gaze_of(work: Path, name: str, coefficients: list[float], test: People, frames: Rendered) -> dict[str, Any]:
+def gaze_of(work: Path, line: dict[str, Any], test: People, frames: Rendered) -> dict[str, Any]:
     """Gaze errors of one run of the study."""
-    case_name, lens, _ = name.split("/")
-    case, (optics, _) = CASES[case_name], optics_of(lens)
-    made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE)
-    made.net.load_state_dict(load_file(work / (name.replace("/", "-") + ".safetensors")))
-    with torch.no_grad():
-        made.coefficients_rad.copy_(torch.tensor(coefficients, dtype=torch.float64))
-    sensor = Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
-    trainer = Trainer(InnerConfig(batch=BATCH), optics, sensor, frames, made)
+    trainer = restored(work, line, frames)
     seen = assess.frames(trainer, frames, len(frames.batches))
-    answers = assess.predict(made.net, architecture_of(case.width), seen, trainer.inner)
-    return {"run": name, **asdict(gaze_test.gaze_errors(test, answers.centre, answers.slip_mm))}
+    architecture = architecture_of(CASES[line["run"].split("/")[0]].width)
+    answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
+    return {"run": line["run"], **asdict(gaze_test.gaze_errors(test, answers.centre, answers.slip_mm))}
 
 
 def main() -> None:
@@ -75,8 +66,9 @@ def main() -> None:
     frames = rendered(test)
     rows = []
     for line in kept_lines(options.work / "runs.jsonl"):
-        if line["run"].startswith(options.case + "/") and not line.get("skipped"):
-            rows.append(gaze_of(options.work, line["run"], line["coefficients_rad"], test, frames))
+        weights = stem(options.work, line["run"]).with_suffix(".safetensors")
+        if line["run"].startswith(options.case + "/") and weights.is_file():
+            rows.append(gaze_of(options.work, line, test, frames))
             print(json.dumps(rows[-1]), flush=True)
     target = ROOT / "benchmarks" / "results" / "codesign_gaze.json"
     target.write_text(

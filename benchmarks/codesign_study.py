@@ -2,6 +2,7 @@
 
     python -m benchmarks.codesign_study run --work DIR             # every run of the plan that has no line yet
     python -m benchmarks.codesign_study run --work DIR --only p18/hyper33/0
+    python -m benchmarks.codesign_study retest --work DIR --only p9/hyper33/0     # as p9wide: on four times the frames
     python -m benchmarks.codesign_report --work DIR                # JSON, table and figures from the lines there are
 
 Every run draws the same number of frames from one pool, with the same network, noise and schedule; the lens alone
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from benchmarks import keep_line, kept_lines
 from codesign import ambiguity, assess, cost, dataset, inner, pool
@@ -25,7 +26,7 @@ from codesign.architecture import Architecture, Space
 from codesign.depth_test import depth_response
 from codesign.eye import States
 from codesign.eye_scenes import TEST, TRAINING, EyeScenes, SceneConfig
-from codesign.inner import Batch, InnerConfig, Schedule, Trainer
+from codesign.inner import Batch, InnerConfig, Scenes, Schedule, Trainer
 from codesign.optics import OpticsConfig
 from codesign.pool import PoolScenes
 from codesign.renderer import render
@@ -34,6 +35,7 @@ from metalens.scene import Frames
 from metalens.sensor import Sensor
 
 LINES = "runs.jsonl"
+WIDE = 2048  # frames of a retest
 SCENES = SceneConfig(pixels=128, margin=16, pool=4096)
 FREE = Schedule(0.02, 0.12, 0.8, clip=1.0)
 SWIFT = Schedule(0.05, 0.12, 0.8, clip=1.0)  # from focus 20 to 33 mm is 5 rad: all that 540 steps of FREE can go
@@ -57,6 +59,7 @@ class Case:
 
 CASES = {
     "p9": Case(9.0),
+    "p9wide": Case(9.0),  # the networks of p9, tested on more frames
     "p18": Case(18.0),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
@@ -124,7 +127,7 @@ class Kept:
 
 def kept(work: Path, name: str, count: int) -> Kept:
     """``ambiguous`` or ``natural`` test frames."""
-    path = work / f"{name}.h5"
+    path = work / (f"{name}.h5" if count == 512 else f"{name}_{count}.h5")
     scenes = scenes_of(TEST)
     if not path.exists():
         states = ambiguity.ambiguous(scenes, count // 2, 17).states if name == "ambiguous" else _natural(scenes, count)
@@ -143,10 +146,9 @@ def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
     """The trainer at the end of its run, with the batch statistics of the final lens."""
     optics, moving = optics_of(lens)
     settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
-    sensor = Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
     scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
     made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE)
-    trainer = Trainer(settings, optics, sensor, scenes, made, architecture=architecture_of(case.width))
+    trainer = Trainer(settings, optics, sensor_of(case), scenes, made, architecture=architecture_of(case.width))
     for record in trainer.run():
         if record.step % 100 == 0:
             print(f"{lens}/{seed} step {record.step}: task {record.task:.3f}, {record.skipped} skipped", flush=True)
@@ -166,34 +168,75 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     frames = case.steps * trainer.inner.batch
     macs = float(cost.macs(architecture, case.pitch_um, window_um=SCENES.pixels * 9.0, space=SPACE))
     line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
-    errors = {}
-    for test in ("ambiguous", "natural"):
-        scenes = kept(work, test, 512)
-        seen = assess.frames(trainer, scenes, 16)
-        answers = assess.predict(net, architecture, seen, trainer.inner)
-        error = (answers.slip_mm - seen.slip_mm).abs()
-        errors[test] = error.numpy()
-        line[test] = {"axial_mm": float(error[:, 2].mean()), "lateral_mm": float(error[:, :2].mean()),
-                      "iou": float(answers.iou.mean())}  # fmt: skip
+    line |= tested(work, name, trainer, 512)
     response = depth_response(trainer, kept(work, "ambiguous", 512), net, architecture, batches=8)
     line["depth_response"] = {"mm_per_mm": response.mean, "standard_error": response.standard_error}
     line["skipped_steps"] = trainer.skipped
     line["coefficients_rad"] = [round(float(v), 4) for v in trainer.model.coefficients_rad.detach()]
-    stem = work / name.replace("/", "-")
-    np.savez_compressed(stem.with_suffix(".npz"), ambiguous=errors["ambiguous"], natural=errors["natural"])
-    save_file({k: v.contiguous() for k, v in net.state_dict().items()}, stem.with_suffix(".safetensors"))
+    save_file({k: v.contiguous() for k, v in net.state_dict().items()}, stem(work, name).with_suffix(".safetensors"))
     return line
+
+
+def tested(work: Path, name: str, trainer: Trainer, count: int) -> dict[str, Any]:
+    """Errors of a run on ``count`` frames of both tests; those of every frame go to a file of the run's name."""
+    architecture, errors, line = architecture_of(CASES[name.split("/")[0]].width), {}, {}
+    for test in ("ambiguous", "natural"):
+        seen = assess.frames(trainer, kept(work, test, count), count // trainer.inner.batch)
+        answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
+        error = (answers.slip_mm - seen.slip_mm).abs()
+        errors[test] = error.numpy()
+        line[test] = {"axial_mm": float(error[:, 2].mean()), "lateral_mm": float(error[:, :2].mean()),
+                      "iou": float(answers.iou.mean())}  # fmt: skip
+    path = stem(work, name).with_suffix(".npz")
+    np.savez_compressed(path, ambiguous=errors["ambiguous"], natural=errors["natural"])
+    return line
+
+
+def restored(work: Path, line: dict[str, Any], scenes: Scenes) -> Trainer:
+    """A run of the study as it ended, from its line and the weights beside it."""
+    case_name, lens, _ = line["run"].split("/")
+    case, (optics, _) = CASES[case_name], optics_of(lens)
+    made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE)
+    made.net.load_state_dict(load_file(stem(work, line["run"]).with_suffix(".safetensors")))
+    with torch.no_grad():
+        made.coefficients_rad.copy_(torch.tensor(line["coefficients_rad"], dtype=torch.float64))
+    return Trainer(InnerConfig(batch=32), optics, sensor_of(case), scenes, made)
+
+
+def sensor_of(case: Case) -> Sensor:
+    """Pixels of a case."""
+    return Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
+
+
+def retest(work: Path, line: dict[str, Any]) -> dict[str, Any]:
+    """The line of a run tested on four times the frames; its case is named after the other with ``wide``."""
+    case, lens, seed = line["run"].split("/")
+    name = f"{case}wide/{lens}/{seed}"
+    return line | {"run": name} | tested(work, name, restored(work, line, kept(work, "natural", WIDE)), WIDE)
+
+
+def stem(work: Path, name: str) -> Path:
+    """Path of what belongs to a run, without its ending."""
+    return work / name.replace("/", "-")
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("verb", choices=["run"])
+    parser.add_argument("verb", choices=["run", "retest"])
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.work.mkdir(parents=True, exist_ok=True)
+    if options.verb == "retest":
+        for line in kept_lines(options.work / LINES):
+            case, lens, seed = line["run"].split("/")
+            if line["run"] in (options.only or ()) and f"{case}wide/{lens}/{seed}" not in done(options.work):
+                again = retest(options.work, line)
+                keep_line(options.work / LINES, again)
+                print(json.dumps({k: again[k] for k in ("run", "ambiguous", "natural")}), flush=True)
+        return
     for name in options.only or PLAN:
         if name not in done(options.work):
             line = run_one(options.work, name)
