@@ -168,6 +168,39 @@ def pareto(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     return tuple(front)
 
 
+def sandwich(
+    space: Space, count: Count, budget: float, generator: np.random.Generator, *, subnets: int
+) -> list[Architecture]:
+    """Members of one training step: the largest, the smallest and ``subnets`` drawn ones.
+
+    With a budget above 0 each sees its input at the highest resolution that the budget allows, and the largest is the
+    largest uniform one: what is never chosen is not trained. Where nothing fits, the smallest at least resolution.
+    """
+    if not budget:
+        return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
+    least = fitted(space, smallest(space), count, budget)
+    top = fitted(space, largest(space), count, budget)
+    if count(top) > budget:
+        top = within(space, count, budget)
+    drawn = [
+        _within(lambda: fitted(space, sample(space, generator), count, budget), count, budget, tries=20)
+        for _ in range(subnets)
+    ]
+    return [top, least, *(one or least for one in drawn)]
+
+
+def fitted(space: Space, architecture: Architecture, count: Count, budget: float) -> Architecture:
+    """The architecture at the highest resolution that the budget allows, its own at most; at the least if none does."""
+    if count(architecture) <= budget:
+        return architecture
+    low, high = space.resolution[0], architecture.resolution
+    for _ in range(7):  # to a hundredth of the range
+        middle = (low + high) / 2
+        fits = count(dataclasses.replace(architecture, resolution=middle)) <= budget
+        low, high = (middle, high) if fits else (low, middle)
+    return dataclasses.replace(architecture, resolution=low)
+
+
 def within(space: Space, count: Count, budget: float) -> Architecture:
     """The largest uniform network inside the budget: width, then depth, then the rest is reduced."""
     top, bottom = largest(space), smallest(space)

@@ -16,8 +16,9 @@ from torch import Tensor, nn
 
 from codesign import losses, parallel
 from codesign import optics as lens
-from codesign.architecture import Architecture, Space, largest, sample, smallest
+from codesign.architecture import Architecture, Space, smallest
 from codesign.baselines import Baseline, Name, make
+from codesign.evolution import Count, sandwich
 from codesign.flat import Flat, irradiance, samples
 from codesign.formation import depth_loss, network_macs, read_out
 from codesign.inner_batch import Batch
@@ -73,7 +74,8 @@ class InnerConfig:
         ``architecture`` fixed, that one alone is trained.
     weights, optics, pitch: schedules of the three groups.
     slip_weight, optics_weight, budget_weight: of Eq. 10. energy: encircled share that the optics loss keeps.
-    budget_mmacs: C_budget; 0 for none.
+    budget_mmacs: C_budget; 0 for none. Members lower their resolution to keep it (:func:`sandwich`); the hinge acts on
+        those that cannot.
     slip_scale_mm: spread of the slippage, the unit of the network's answer.
     patience: steps without a finite gradient, one after the other, that end the run.
     """
@@ -212,12 +214,12 @@ class Trainer:
         rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        task, optics_loss, macs = self._losses(
+        task, optics_loss, each = self._losses(
             live=rates["optics"] > 0 and "optics" in self.optimisers, pitch_moves=rates["pitch"] > 0
         )
-        total = task + self.inner.optics_weight * optics_loss
+        total, macs = task + self.inner.optics_weight * optics_loss, each.mean()
         if self.inner.budget_mmacs:
-            total = total + self.inner.budget_weight * losses.over_budget(macs, self.inner.budget_mmacs * 1e6)
+            total = total + self.inner.budget_weight * losses.over_budget(each, self.inner.budget_mmacs * 1e6).mean()
         total.backward()  # type: ignore[no-untyped-call]
         parallel.average(p for _, ps in self.groups.values() for p in ps)
         self._apply(rates, finite=math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite())
@@ -235,13 +237,13 @@ class Trainer:
         noise = self._generator(1)
         frames = read_out(light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False)
         scale = torch.tensor(self.inner.slip_scale_mm)
-        members = self._members()
+        size = light.shape[-1] * self.optics.sample_um
+        members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
         parts = [
             losses.task(self.model.net(frames, a), batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight)
             for a in members
         ]
-        size = light.shape[-1] * self.optics.sample_um
-        macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members]).mean()
+        macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), optics_loss, macs
 
     def _light(self, frames: Frames | Flat, live: bool) -> tuple[Imager, Tensor]:
@@ -268,14 +270,15 @@ class Trainer:
     def _lens_error(self) -> Tensor | None:
         return self.optics.spread.draw(self._generator(2))
 
-    def _members(self) -> Sequence[Architecture]:
+    def _members(self, count: Count) -> Sequence[Architecture]:
         if self.architecture is not None:
             return [self.architecture]
         space = self.model.net.space
         if isinstance(self.model.net, Baseline):
             return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
-        return [largest(space), smallest(space), *(sample(space, generator) for _ in range(self.inner.subnets))]
+        budget = self.inner.budget_mmacs * 1e6
+        return sandwich(space, count, budget, generator, subnets=self.inner.subnets)
 
     def _generator(self, stream: int) -> torch.Generator:
         seed = int(np.random.SeedSequence([self.inner.seed, self.step, stream]).generate_state(1, np.uint64)[0])

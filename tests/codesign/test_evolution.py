@@ -123,3 +123,34 @@ def test_a_uniform_start_is_the_largest_uniform_network_within_the_budget():
     (only,) = states[-1].history
     assert only.architecture == evolution.within(SPACE, _count, budget)
     assert len(set(only.architecture.kernels)) == 1
+
+
+def _at_resolution(architecture):
+    return float(cost.macs_of_size(SPACE, architecture, 128 * architecture.resolution))
+
+
+def test_a_network_is_fitted_by_resolution_alone():
+    space, count, top = SPACE, _at_resolution, arch.largest(SPACE)
+    assert evolution.fitted(space, top, count, 2 * count(top)) == top
+    budget = 0.4 * count(top)
+    made = evolution.fitted(space, top, count, budget)
+    assert 0.95 * budget < count(made) <= budget  # steps of a hundredth of the range, and of whole pixels
+    assert dataclasses.replace(made, resolution=1.0) == top
+    least = evolution.fitted(space, top, count, 1.0)
+    assert least.resolution == pytest.approx(space.resolution[0])
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.03, 0.2, 0.6, 2.0])
+def test_members_of_a_step_keep_the_budget_where_anything_does(share):
+    space, count = SPACE, _at_resolution
+    budget = share * count(arch.largest(space))
+    members = evolution.sandwich(space, count, budget, np.random.default_rng(1), subnets=6)
+    assert len(members) == 8
+    if budget >= count(arch.smallest(space)):
+        assert all(count(a) <= budget for a in members)
+    else:
+        assert all(a == arch.smallest(space) for a in members)
+    if share == 2.0:
+        assert members[0] == arch.largest(space)
+    free = evolution.sandwich(space, count, 0.0, np.random.default_rng(1), subnets=6)
+    assert free[:2] == [arch.largest(space), arch.smallest(space)]
