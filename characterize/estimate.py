@@ -25,6 +25,7 @@ from metalens.psf_record import PsfStack
 from metalens.store import Array
 
 MISFIT, LIKENESS, LEAST_PEAK_E, WAVES_RAD = 1.15, 0.45, 100.0, 0.9
+_LEANING_RAD = 0.3  # of the starts that look for a twin
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
 
 
@@ -72,6 +73,12 @@ def fit(
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     data = _rearranged(data, found)
     names, solution = _search(model, data, start, known, found, options)
+    if not _explained(solution, frames.gain) or _at_bounds(
+        names, solution, prior_of(names, known, lens.sensor_distance_um)
+    ):
+        twins = _twins(_starts(model, data, start, found)[0], _full(names, solution, start))
+        again = _search(model, data, start, known, found, options, begins=twins)[1]
+        solution = min(solution, again, key=lambda s: s.merit)
     if not _explained(solution, frames.gain) and not set(MORE) <= set(names):
         more = dataclasses.replace(options, free=(*options.free, *MORE))
         wider = _wider(model, data, _full(names, solution, start), known, found, more) or (names, solution)
@@ -161,13 +168,13 @@ def _search(
     found: Arrangement,
     options: Options,
     *,
-    brief: bool = False,
+    begins: list[Array] | None = None,
 ) -> tuple[tuple[str, ...], Solution]:
-    """Short fits from each start, the best one to the end."""
+    """Short fits from each start, or from ``begins``, the best one to the end."""
     names = _names(known, options.free)
     prior, base = prior_of(names, known, model.lens.sensor_distance_um), start.copy()
     place = [PLACE[name] for name in names]
-    begins = [start] if brief else _starts(model, data, start, found)
+    begins = begins or _starts(model, data, start, found)
     if "pinhole_um" in names and base[PLACE["pinhole_um"]] == 0:
         begins = [_with(x, {"pinhole_um": 5.0}) for x in begins]
     if "bandwidth_nm" in names and base[PLACE["bandwidth_nm"]] == 0:
@@ -189,7 +196,7 @@ def _wider(
 ) -> tuple[tuple[str, ...], Solution] | None:
     """A search with more parameters from where the usual ones led; None where they lead out of the model's range."""
     try:
-        return _search(model, data, start, known, found, options, brief=True)
+        return _search(model, data, start, known, found, options, begins=[start])
     except FitError:
         return None
 
@@ -232,6 +239,17 @@ def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -
         gain = float((light * (data.electrons - level))[keep].sum() / (light[keep] ** 2).sum())
         starts.append(_with(x, {"log_gain": math.log(max(gain, 1e-12))}))
     return starts
+
+
+def _twins(plain: Array, found: Array) -> list[Array]:
+    """Starts for a search that ended in a wrong valley.
+
+    About its focus a lens with the opposite even aberrations gives nearly the same images, and the plain start lies
+    between the two: either sign of both astigmatisms, and what was found with its even aberrations reversed.
+    """
+    even = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
+    leaning = [_with(plain, {name: size}) for name in even[:2] for size in (_LEANING_RAD, -_LEANING_RAD)]
+    return [*leaning, _with(found, {name: -float(found[PLACE[name]]) for name in even})]
 
 
 def _explained(solution: Solution, gain: Gain) -> bool:
@@ -352,8 +370,13 @@ def _problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Ga
     wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
     if wave > WAVES_RAD:
         words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
-    for name, value, low, high in zip(names, solution.value, prior.low, prior.high, strict=True):
-        at_zero = name in ("pinhole_um", "bandwidth_nm", "crosstalk_px") and value <= low
-        if not at_zero and (value <= low or value >= high):
-            words.append(f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread")
+    for name, value in _at_bounds(names, solution, prior):
+        words.append(f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread")
     return words
+
+
+def _at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[tuple[str, float]]:
+    """Parameters that ended on a bound which is not the natural zero of a blur."""
+    ends = zip(names, solution.value.tolist(), prior.low, prior.high, strict=True)
+    blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px")
+    return [(n, v) for n, v, low, high in ends if v >= high or (v <= low and n not in blurs)]

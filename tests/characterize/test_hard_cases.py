@@ -59,6 +59,31 @@ def test_orientation_of_a_symmetric_design_is_declared_unobservable():
     assert any("orientation of the frames cannot be seen" in words for words in found.cautions)
 
 
+@pytest.mark.parametrize("wave", [(0.35, -0.37), pytest.param((0.32, 0.28), marks=pytest.mark.slow)])
+def test_opposite_astigmatism_is_not_mistaken_for_the_true_one(wave):
+    """Sources all near the focus: the lens with the opposite even aberrations gives nearly the same images."""
+    depths = 560.0, 590.0, 620.0, 650.0
+    values = dict(zip(("astigmatism_rad", "coma_x_rad"), wave, strict=True))
+    values |= {"bias_nm": -2.5, "bias_r_nm": -3.9, "height_nm": -2.5, "crosstalk_px": 0.2}
+    known = tuple(Known(name, value) for name, value in values.items())
+    truth = Truth(depths, parameter=known, camera=Camera(pixel_um=1.5, pixels=12))
+    light = bench.irradiance(b.lens(), truth, b.RESPONSE)
+    shots = b.capture(np.concatenate([light, light[:1]]) * (4000 / light.max()))
+    n = len(depths)
+    shots = dataclasses.replace(
+        shots,
+        frames=shots.frames[:n],
+        position_um=np.array(depths),
+        angle_rad=np.zeros((n, 2)),
+        exposure_s=np.full(n, np.nan),
+        names=shots.names[:n],
+    )
+    found = characterize.fit(shots, b.lens(), response=b.RESPONSE)
+    for name in ("astigmatism_rad", "coma_x_rad", "bias_nm", "height_nm"):
+        i = found.names.index(name)
+        assert abs(found.value[i] - values[name]) < 4 * found.sigma[i], name
+
+
 def test_too_little_light_is_refused():
     with pytest.raises(FitError, match="too little light"):
         fit(b.capture(b.electrons(50.0)))
