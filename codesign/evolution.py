@@ -80,7 +80,8 @@ def evolve(
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
         count: its multiply-accumulates; only candidates within ``budget`` are evaluated.
-        uniform: the first candidate is the largest uniform network within the budget (:func:`within`).
+        uniform: the first candidate is the largest uniform network within the budget (:func:`within`); otherwise the
+            one that :func:`sandwich` trains at every step (:func:`top`).
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -91,8 +92,10 @@ def evolve(
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
-        first = uniform and not state.history
-        chosen = within(space, count, budget) if first else _next(space, plan, state, count, budget, generator)
+        if state.history:
+            chosen = _next(space, plan, state, count, budget, generator)
+        else:
+            chosen = within(space, count, budget) if uniform else top(space, count, budget)
         key = active(space, chosen)
         if key not in known:
             known[key] = float(evaluate(chosen))
@@ -179,14 +182,17 @@ def sandwich(
     if not budget:
         return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
     least = fitted(space, smallest(space), count, budget)
-    top = fitted(space, largest(space), count, budget)
-    if count(top) > budget:
-        top = within(space, count, budget)
     drawn = [
         _within(lambda: fitted(space, sample(space, generator), count, budget), count, budget, tries=20)
         for _ in range(subnets)
     ]
-    return [top, least, *(one or least for one in drawn)]
+    return [top(space, count, budget), least, *(one or least for one in drawn)]
+
+
+def top(space: Space, count: Count, budget: float) -> Architecture:
+    """The largest network, at the highest resolution within the budget; the largest uniform one where none is."""
+    whole = fitted(space, largest(space), count, budget)
+    return whole if count(whole) <= budget else within(space, count, budget)
 
 
 def fitted(space: Space, architecture: Architecture, count: Count, budget: float) -> Architecture:
