@@ -126,7 +126,8 @@ def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs
             "PSF depth |\n|---|---|---|---|---|---|---|---|"
         )
         for row in mine:
-            ratios = [_interval(row.get(key)) for key in ("to_mid_range", "to_best_focus")]
+            references = {"to_mid_range": "hyper20", "to_best_focus": best_focus(runs[case])}
+            ratios = ["1" if row["lens"] == name else _interval(row.get(key)) for key, name in references.items()]
             parts.append(
                 f"| {row['lens']} | {row['seeds']} | {row['axial_mm']:.3f} | {ratios[0]} | {ratios[1]} | "
                 f"{row['lateral_mm']:.3f} | {row['iou']:.3f} | {row['response_mm_per_mm']:.2f} |"
@@ -136,7 +137,7 @@ def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs
 
 
 def _interval(value: tuple[float, float, float] | None) -> str:
-    return "1" if value is None else f"{value[0]:.3f} [{value[1]:.3f}, {value[2]:.3f}]"
+    return "-" if value is None else f"{value[0]:.3f} [{value[1]:.3f}, {value[2]:.3f}]"
 
 
 def matched(runs: dict[str, dict[str, Runs]], *, small: str = "p18", large: str = "p9") -> dict[str, Any]:
