@@ -21,8 +21,8 @@ from metalens.store import Array
 # What people differ by, standard deviations: centre of the eye 1 mm each way (mounting and head), its radius 0.6 mm
 # (size, and the cornea that magnifies), angles between sphere and gaze 5 degrees (kappa and mounting), roll 0.05 rad.
 SPREAD = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
-READING_DEG = 1.0  # what a frame is trusted to, against SPREAD
-PENALTIES = (0.01, 0.1, 1.0)  # of the regressor's weights: from ten clean points to eight noisy ones
+READING_DEG = 1.0  # what a frame is trusted to at first, against SPREAD; then what the first fit leaves, 0.3 at least
+PENALTIES = (0.01, 0.1, 1.0, 10.0)  # of the regressor's weights: from ten clean points to eight noisy ones
 FOLDS = 4  # that the penalty is chosen over
 TRIAL_STEPS = 40  # of a fit whose penalty is on trial
 
@@ -77,11 +77,14 @@ def fit(pupil_mm: Array, slip_mm: Array, gaze_deg: Array, *, rig: Rig, hidden: i
     def of(own: Array) -> PersonalGaze:
         return PersonalGaze(mean, rig.elevation_rad, own, None)
 
-    def residual(unit: Array) -> Array:
+    def residual(unit: Array, reading_deg: float) -> Array:
         miss = of(unit * SPREAD).sphere(pupil, slip) - gaze_deg
-        return np.concatenate([miss.ravel() / READING_DEG, unit])
+        return np.concatenate([miss.ravel() / reading_deg, unit])
 
-    person = of(least_squares(residual, np.zeros(len(SPREAD))).x * SPREAD)
+    own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
+    freedom = max(1, 2 * len(pupil) - len(own))
+    left = max(0.3, float(np.sqrt((residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum() / freedom)))
+    person = of(least_squares(residual, own, args=(left,)).x * SPREAD)
     if not hidden:
         return person
     first = person.sphere(pupil, slip)
