@@ -35,7 +35,7 @@ from metalens.scene import Frames
 from metalens.sensor import Sensor
 
 LINES = "runs.jsonl"
-WIDE = 2048  # frames of a retest
+TESTED, WIDE = 512, 2048  # frames of either test, and of a retest
 SCENES = SceneConfig(pixels=128, margin=16, pool=4096)
 FREE = Schedule(0.02, 0.12, 0.8, clip=1.0)
 SWIFT = Schedule(0.05, 0.12, 0.8, clip=1.0)  # from focus 20 to 33 mm is 5 rad: all that 540 steps of FREE can go
@@ -59,7 +59,6 @@ class Case:
 
 CASES = {
     "p9": Case(9.0),
-    "p9wide": Case(9.0),  # the networks of p9, tested on more frames
     "p18": Case(18.0),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
@@ -127,7 +126,7 @@ class Kept:
 
 def kept(work: Path, name: str, count: int) -> Kept:
     """``ambiguous`` or ``natural`` test frames."""
-    path = work / (f"{name}.h5" if count == 512 else f"{name}_{count}.h5")
+    path = work / (f"{name}.h5" if count == TESTED else f"{name}_{count}.h5")
     scenes = scenes_of(TEST)
     if not path.exists():
         states = ambiguity.ambiguous(scenes, count // 2, 17).states if name == "ambiguous" else _natural(scenes, count)
@@ -168,8 +167,8 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     frames = case.steps * trainer.inner.batch
     macs = float(cost.macs(architecture, case.pitch_um, window_um=SCENES.pixels * 9.0, space=SPACE))
     line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
-    line |= tested(work, name, trainer, 512)
-    response = depth_response(trainer, kept(work, "ambiguous", 512), net, architecture, batches=8)
+    line |= tested(work, name, trainer, architecture, count=TESTED)
+    response = depth_response(trainer, kept(work, "ambiguous", TESTED), net, architecture, batches=8)
     line["depth_response"] = {"mm_per_mm": response.mean, "standard_error": response.standard_error}
     line["skipped_steps"] = trainer.skipped
     line["coefficients_rad"] = [round(float(v), 4) for v in trainer.model.coefficients_rad.detach()]
@@ -177,9 +176,9 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     return line
 
 
-def tested(work: Path, name: str, trainer: Trainer, count: int) -> dict[str, Any]:
+def tested(work: Path, name: str, trainer: Trainer, architecture: Architecture, *, count: int) -> dict[str, Any]:
     """Errors of a run on ``count`` frames of both tests; those of every frame go to a file of the run's name."""
-    architecture, errors, line = architecture_of(CASES[name.split("/")[0]].width), {}, {}
+    errors, line = {}, {}
     for test in ("ambiguous", "natural"):
         seen = assess.frames(trainer, kept(work, test, count), count // trainer.inner.batch)
         answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
@@ -208,11 +207,17 @@ def sensor_of(case: Case) -> Sensor:
     return Sensor(case.pitch_um, 9.0, case.electrons, 0.0, 2 * case.electrons, 5.0, 10)
 
 
-def retest(work: Path, line: dict[str, Any]) -> dict[str, Any]:
-    """The line of a run tested on four times the frames; its case is named after the other with ``wide``."""
-    case, lens, seed = line["run"].split("/")
-    name = f"{case}wide/{lens}/{seed}"
-    return line | {"run": name} | tested(work, name, restored(work, line, kept(work, "natural", WIDE)), WIDE)
+def retest(work: Path, only: list[str] | None) -> None:
+    """Test runs whose weights are kept (of those, ``only``) on four times the frames: lines of the case ``...wide``."""
+    for line in kept_lines(work / LINES):
+        case, lens, seed = line["run"].split("/")
+        name = f"{case}wide/{lens}/{seed}"
+        wanted = line["run"] in only if only else stem(work, line["run"]).with_suffix(".safetensors").is_file()
+        if wanted and name not in done(work):
+            trainer = restored(work, line, kept(work, "natural", WIDE))
+            found = tested(work, name, trainer, architecture_of(CASES[case].width), count=WIDE)
+            keep_line(work / LINES, line | {"run": name} | found)
+            print(json.dumps({"run": name} | found), flush=True)
 
 
 def stem(work: Path, name: str) -> Path:
@@ -230,12 +235,7 @@ def main() -> None:
     torch.set_num_threads(1)
     options.work.mkdir(parents=True, exist_ok=True)
     if options.verb == "retest":
-        for line in kept_lines(options.work / LINES):
-            case, lens, seed = line["run"].split("/")
-            if line["run"] in (options.only or ()) and f"{case}wide/{lens}/{seed}" not in done(options.work):
-                again = retest(options.work, line)
-                keep_line(options.work / LINES, again)
-                print(json.dumps({k: again[k] for k in ("run", "ambiguous", "natural")}), flush=True)
+        retest(options.work, options.only)
         return
     for name in options.only or PLAN:
         if name not in done(options.work):

@@ -47,7 +47,7 @@ def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         finished(Path(folder) / "run", replace(LENSES["midrange"], steps=1, pool=64))
         source = retraining.load(Path(folder) / "run")
-        config = ExperimentConfig()
+        config, edge = ExperimentConfig(), source.settings.scenes.pixels
         start = time.perf_counter()
         for _ in experiment([source], config):
             pass
@@ -56,7 +56,7 @@ def rows() -> list[Row]:
     out = [
         Row(
             case,
-            f"{source.row['mmacs']:.1f} MMACs, 156 x 156 pixels",
+            f"{source.row['mmacs']:.1f} MMACs, {edge} x {edge} pixels",
             seconds,
             float("nan"),
             "untrained",

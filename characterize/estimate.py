@@ -73,10 +73,10 @@ def fit(
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     data = _rearranged(data, found)
     names, solution = _search(model, data, start, known, found, options)
-    if not _explained(solution, frames.gain) or _at_bounds(
-        names, solution, prior_of(names, known, lens.sensor_distance_um)
-    ):
-        twins = _twins(_starts(model, data, start, found)[0], _full(names, solution, start))
+    prior = prior_of(names, known, lens.sensor_distance_um)
+    if not _explained(solution, frames.gain) or _at_bounds(names, solution, prior):
+        (plain,) = _starts(model, data, start, found, biases_nm=(0.0,))
+        twins = _twins(plain, _full(names, solution, start))
         again = _search(model, data, start, known, found, options, begins=twins)[1]
         solution = min(solution, again, key=lambda s: s.merit)
     if not _explained(solution, frames.gain) and not set(MORE) <= set(names):
@@ -218,7 +218,9 @@ def _with(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -> list[Array]:
+def _starts(
+    model: ForwardModel, data: Data, start: Array, found: Arrangement, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)
+) -> list[Array]:
     """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
     pixel = model.setting.pixel_um
     level = float(np.median(data.electrons[data.usable]))
@@ -232,7 +234,7 @@ def _starts(model: ForwardModel, data: Data, start: Array, found: Arrangement) -
         },
     )
     starts = []
-    for bias in (0.0, 8.0, -8.0):
+    for bias in biases_nm:
         x = _with(base, {"bias_nm": base[PLACE["bias_nm"]] + bias})
         light = model.images(_with(x, {"background_e": 0.0}))[0]
         keep = data.usable & ~data.saturated

@@ -181,7 +181,7 @@ def sandwich(
     """
     if not budget:
         return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
-    least = fitted(space, smallest(space), count, budget)
+    least = smallest(space)
     drawn = [
         _within(lambda: fitted(space, sample(space, generator), count, budget), count, budget, tries=20)
         for _ in range(subnets)

@@ -243,10 +243,9 @@ def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config
     slip, centre, iou = (
         torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("slip_mm", "centre", "iou")
     )
-    scenes = source.run.scenes(9)
-    pupil_mm = centre * scenes.settings.pixels * scenes.sample_um * 1e-3
-    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=scenes.rig)
-    told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=scenes.rig)
+    pupil_mm, rig = centre * source.run.window_um * 1e-3, source.run.scenes(9).rig
+    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig)
+    told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=rig)
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
     return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted, told_error)
 

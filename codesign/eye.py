@@ -255,17 +255,21 @@ def directions(states: States, rig: Rig) -> tuple[Tensor, Tensor]:
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
+def face_axes(elevation_rad: float) -> Tensor:
+    """(3, 3) rows right, down and out of the face in the frame of a camera that sees it from this far below."""
+    s, c = math.sin(elevation_rad), math.cos(elevation_rad)
+    return torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64)
+
+
 def _face(rig: Rig, states: States) -> tuple[Tensor, Tensor, Tensor]:
     """Axes of the face in the camera's frame: right, down, and out towards the viewer."""
-    s, c = math.sin(rig.elevation_rad), math.cos(rig.elevation_rad)
-    axes = torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64)
+    axes = face_axes(rig.elevation_rad)
     right, down, out = (_turn(row.expand(len(states), 3), states.mount_rad) for row in axes)
     return right, down, out
 
 
 def _nominal_centre(rig: Rig, depth_um: Tensor, behind_um: Tensor) -> Tensor:
-    s, c = math.sin(rig.elevation_rad), math.cos(rig.elevation_rad)
-    out = torch.tensor([0.0, -s, -c], dtype=torch.float64)
+    out = face_axes(rig.elevation_rad)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out

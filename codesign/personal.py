@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from codesign import eye, regressor
 from codesign.eye import Rig
-from codesign.gaze import EyeGeometry, optical_axis
+from codesign.gaze import EyeGeometry, angle_rad, optical_axis
 from codesign.regressor import Regressor
 from metalens.errors import TrainingError
 from metalens.store import Array
@@ -114,16 +114,14 @@ def _penalty(features: Array, missed: Array, gaze_deg: Array, *, hidden: int, se
 
 def face_angles(direction: Array, elevation_rad: float) -> Array:
     """(n, 2) angles across and down, deg, in the frame of the face, of directions (n, 3) in the camera's."""
-    s, c = math.sin(elevation_rad), math.cos(elevation_rad)
-    x, y, z = np.asarray(direction).T
-    down, out = c * y - s * z, -s * y - c * z
-    return np.asarray(np.degrees(np.stack([np.arctan2(x, out), np.arcsin(np.clip(down, -1, 1))], 1)))
+    right, down, out = eye.face_axes(elevation_rad).numpy() @ np.asarray(direction).T
+    return np.asarray(np.degrees(np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)))
 
 
 def angle_deg(one: Array, other: Array) -> Array:
     """(n,) angle between directions given by their angles across and down, deg."""
-    a, b = (direction(np.radians(v)) for v in (one, other))
-    return np.asarray(np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=1) / 2, 0, 1))))
+    a, b = (torch.from_numpy(direction(np.radians(v))) for v in (one, other))
+    return np.asarray(np.degrees(angle_rad(a, b).numpy()))
 
 
 def direction(angles_rad: Array) -> Array:
