@@ -7,6 +7,7 @@ Each is what ``metalens codesign RUN.toml --freeze PART`` does: joint training, 
 """
 
 import argparse
+import copy
 import json
 import time
 from collections import defaultdict
@@ -31,13 +32,14 @@ VARIANTS: dict[str, tuple[Part, ...]] = {
     "pitch frozen": ("pitch",),
     "architecture frozen": ("architecture",),
 }
+ALIKE = (("nothing frozen", "architecture frozen"), ("optics frozen",), ("pitch frozen",))  # of one training each
 TABLE: dict[str, Any] = {
     "preset": "laptop",
     "ambiguity_pairs": 256,
     "scenes": {"pool": 4096},
     "optics": {"focus_mm": 33.0},
     "sensor": {"exposure_e": 2000.0, "full_well_e": 4000.0},
-    "inner": {"steps": 1200, "optics_weight": 0.0, "budget_mmacs": 4.0, "pitch": {"rate": 0.01}},
+    "inner": {"steps": 1200, "optics_weight": 0.0, "budget_mmacs": 4.0, "pitch": {"rate": 0.005}},
     "run": {"pitch_um": 14.0, "budgets_mmacs": [4.0], "finetune_steps": 300},
 }
 HEAD = """# Ablations
@@ -57,16 +59,22 @@ def settings_of(variant: str, seed: int) -> RunConfig:
     return replace(made, inner=replace(made.inner, seed=seed), run=replace(made.run, frozen=VARIANTS[variant]))
 
 
-def run_one(work: Path, variant: str, seed: int) -> dict[str, Any]:
-    """Train, search, fine-tune and test one run; its line, the error of every frame beside it."""
-    begun = time.perf_counter()
-    name = f"{variant.replace(' ', '-')}-{seed}"
-    settings = settings_of(variant, seed)
-    going, path = run.start(settings), work / f"{name}.safetensors"
-    for record in run.train(going, path):
+def trained(work: Path, variant: str, seed: int) -> run.Run:
+    """The joint training of one variant."""
+    going = run.start(settings_of(variant, seed))
+    for record in run.train(going, work / "going.safetensors"):
         if record.step % 100 == 0:
-            print(f"{name} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um", flush=True)
-    for _ in run.search(going, path):
+            print(f"{variant}-{seed} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um", flush=True)
+    return going
+
+
+def run_one(work: Path, variant: str, seed: int, state: dict[str, object]) -> dict[str, Any]:
+    """Search, fine-tune and test one variant from the end of its training; its line, every frame's error beside it."""
+    begun = time.perf_counter()
+    settings = settings_of(variant, seed)
+    going = run.start(settings)
+    going.trainer.restore(copy.deepcopy(state))
+    for _ in run.search(going, work / "going.safetensors"):
         pass
     ((row, model),) = finish.finished(going)
     best = evolution.best(going.searches[0].history)
@@ -74,9 +82,15 @@ def run_one(work: Path, variant: str, seed: int) -> dict[str, Any]:
     seen = assess.frames(going.trainer, pairs, max(1, len(pairs) // settings.inner.batch))
     answers = assess.predict(model.net, best.architecture, seen, settings.inner)
     error = (answers.slip_mm - seen.slip_mm).abs().numpy()
-    np.savez_compressed(work / f"{name}.npz", ambiguous=error)
+    np.savez_compressed(stem(work, variant, seed), ambiguous=error)
     pitch = float(going.trainer.model.pitch_um.detach())
-    return {"variant": variant, "seed": seed, "pitch_um": pitch, "seconds": time.perf_counter() - begun} | row
+    line = {"variant": variant, "seed": seed, "pitch_um": pitch, "resolution": best.architecture.resolution}
+    return line | {"seconds": time.perf_counter() - begun} | row
+
+
+def stem(work: Path, variant: str, seed: int) -> Path:
+    """Errors of every frame of a run."""
+    return work / f"{variant.replace(' ', '-')}-{seed}.npz"
 
 
 def report(work: Path) -> None:
@@ -85,14 +99,17 @@ def report(work: Path) -> None:
     for line in kept_lines(work / LINES):
         lines[line["variant"]].append(line)
     errors = {
-        v: np.stack([np.load(work / f"{v.replace(' ', '-')}-{line['seed']}.npz")["ambiguous"] for line in mine])
-        for v, mine in lines.items()
+        v: np.stack([np.load(stem(work, v, line["seed"]))["ambiguous"] for line in mine]) for v, mine in lines.items()
     }
-    text = HEAD + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um |\n"
-    text += "|---|---|---|---|---|---|---|---|\n"
+    text = (
+        HEAD
+        + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um | pixels of the network / um |\n"
+    )
+    text += "|---|---|---|---|---|---|---|---|---|\n"
     rows = []
     for variant, mine in lines.items():
         means = {k: float(np.mean([m[k] for m in mine])) for k in ("ambiguous_iou", "mmacs", "pitch_um")}
+        means["effective_pitch_um"] = float(np.mean([m["pitch_um"] / m["resolution"] for m in mine]))
         axial, lateral = errors[variant][..., 2], float(errors[variant][..., :2].mean())
         against = ratio(axial, errors["nothing frozen"][..., 2])
         by_seed = [round(float(e), 4) for e in axial.mean(1)]
@@ -100,7 +117,8 @@ def report(work: Path) -> None:
         text += (
             f"| {variant} | {len(mine)} | {axial.mean():.3f} | {against[0]:.2f} [{against[1]:.2f}, {against[2]:.2f}] "
         )
-        text += f"| {lateral:.3f} | {means['ambiguous_iou']:.3f} | {means['mmacs']:.2f} | {means['pitch_um']:.1f} |\n"
+        text += f"| {lateral:.3f} | {means['ambiguous_iou']:.3f} | {means['mmacs']:.2f} | {means['pitch_um']:.1f} "
+        text += f"| {means['effective_pitch_um']:.1f} |\n"
     store.write_text(ROOT / "benchmarks" / "results" / "codesign_ablation.json", json.dumps(rows, indent=1) + "\n")
     store.write_text(ROOT / "docs" / "codesign" / "ablations.md", text)
     print(text)
@@ -111,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("verb", choices=["run", "report"])
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     options = parser.parse_args()
     if options.verb == "report":
         report(options.work)
@@ -119,11 +137,14 @@ def main() -> None:
     torch.set_num_threads(1)
     options.work.mkdir(parents=True, exist_ok=True)
     there = {(line["variant"], line["seed"]) for line in kept_lines(options.work / LINES)}
-    for seed in range(options.seeds):
-        for variant in (v for v in VARIANTS if (v, seed) not in there):
-            line = run_one(options.work, variant, seed)
-            keep_line(options.work / LINES, line)
-            print(json.dumps(line), flush=True)
+    for seed in options.seeds:
+        for alike in ALIKE:
+            missing = [v for v in alike if (v, seed) not in there]
+            state = trained(options.work, alike[0], seed).trainer.state() if missing else {}
+            for variant in missing:
+                line = run_one(options.work, variant, seed, state)
+                keep_line(options.work / LINES, line)
+                print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

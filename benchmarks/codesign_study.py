@@ -21,11 +21,13 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from benchmarks import keep_line, kept_lines
-from codesign import ambiguity, assess, cost, dataset, inner, pool
+from codesign import ambiguity, assess, dataset, inner, pool
 from codesign.architecture import Architecture, Space
+from codesign.baselines import Name
 from codesign.depth_test import depth_response
 from codesign.eye import States
 from codesign.eye_scenes import TEST, TRAINING, EyeScenes, SceneConfig
+from codesign.formation import network_macs
 from codesign.inner import Batch, InnerConfig, Scenes, Schedule, Trainer
 from codesign.optics import OpticsConfig
 from codesign.pool import PoolScenes
@@ -48,13 +50,14 @@ class Case:
     """Conditions that all lenses of a comparison share.
 
     pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of 32 frames.
-    width: of the network.
+    width: of the elastic network. network: it, or a baseline in its place.
     """
 
     pitch_um: float
     electrons: float = 2000.0
     steps: int = 800
     width: float = 0.5
+    network: Name = "supernet"
 
 
 CASES = {
@@ -62,7 +65,11 @@ CASES = {
     "p18": Case(18.0),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
-    "p18small": Case(18.0, width=0.25),
+    "p9dim": Case(9.0, electrons=400.0),
+    "p18small": Case(18.0, steps=2400, width=0.25),
+    "p18nvgaze": Case(18.0, steps=2400, network="nvgaze"),
+    "p18popovic": Case(18.0, steps=2400, network="popovic"),
+    "p18de2gaze": Case(18.0, steps=2400, network="de2gaze"),
 }
 
 
@@ -146,7 +153,7 @@ def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
     optics, moving = optics_of(lens)
     settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
     scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
-    made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE)
+    made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE, network=case.network)
     trainer = Trainer(settings, optics, sensor_of(case), scenes, made, architecture=architecture_of(case.width))
     for record in trainer.run():
         if record.step % 100 == 0:
@@ -165,7 +172,9 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     seconds = time.perf_counter() - start
     net, architecture = trainer.model.net, architecture_of(case.width)
     frames = case.steps * trainer.inner.batch
-    macs = float(cost.macs(architecture, case.pitch_um, window_um=SCENES.pixels * 9.0, space=SPACE))
+    macs = float(
+        network_macs(net, architecture, SCENES.pixels * optics_of(lens)[0].sample_um, torch.tensor(case.pitch_um))
+    )
     line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
     line |= tested(work, name, trainer, architecture, count=TESTED)
     response = depth_response(trainer, kept(work, "ambiguous", TESTED), net, architecture, batches=8)
@@ -195,7 +204,7 @@ def restored(work: Path, line: dict[str, Any], scenes: Scenes) -> Trainer:
     """A run of the study as it ended, from its line and the weights beside it."""
     case_name, lens, _ = line["run"].split("/")
     case, (optics, _) = CASES[case_name], optics_of(lens)
-    made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE)
+    made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE, network=case.network)
     made.net.load_state_dict(load_file(stem(work, line["run"]).with_suffix(".safetensors")))
     with torch.no_grad():
         made.coefficients_rad.copy_(torch.tensor(line["coefficients_rad"], dtype=torch.float64))
@@ -246,13 +255,17 @@ def main() -> None:
 
 SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
 LENSES = ("hyper33", "joint33", "swift20", "hyper20", "helix2", "swift33")
+MAIN = ("hyper33", "swift33", "hyper20")
+BASELINES = ("nvgaze", "popovic", "de2gaze")
 LONG = ("hyper33", "swift33", "hyper40", "swift40", "hyper20")
 PLAN = [f"p18long/{lens}/{seed}" for seed in range(5) for lens in LONG]
 PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28")]
 PLAN += [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
-PLAN += [f"{case}/{lens}/{seed}" for case in ("p18dim", "p18small") for seed in range(5) for lens in LENSES[:2]]
+PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
+PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
+PLAN += [f"p18{network}/{lens}/{seed}" for network in BASELINES for seed in range(3) for lens in ("hyper33", "hyper20")]
 
 
 def done(work: Path) -> set[str]:

@@ -23,30 +23,43 @@ def read_out(
     *,
     generator: torch.Generator | None,
     exact: bool = True,
+    resized: bool = False,
 ) -> Tensor:
     """(batch, 1, rows, columns) standardised frames as the network sees them: pixels, noise, quantisation.
+
+    The gradient in the pitch is that of a network whose own grid stays on the scene, so of a fixed cost: the box of the
+    pixels widens, and an area of the sensor is read (pitch0 / pitch)^2 times; its light and photon noise stay. (The
+    frame as such zooms while its pixels grow, until one drops off at the rim: a slope that says nothing of the next
+    count of pixels.)
 
     Args:
         exact: Poisson counts; otherwise their normal approximation, four times faster (the skewness 1 / sqrt(mean)
             is lost), still Poisson where the mean is below 20 electrons.
+        resized: the frames will be averaged to a coarser grid, whose cells, not the pixels, are then the box: the
+            gradient in the pitch is that of the reads alone.
     """
-    pixel = replace(sensor, pitch_um=float(pitch_um.detach()))  # the full well is that of this pitch
-    mean = camera.mean_electrons(irradiance, sample_um, sensor=pixel, pitch_um=pitch_um)
-    bright = not exact and float(mean.detach().mean()) > 20
-    electrons = _normal(mean, pixel, generator) if bright else camera.expose(mean, sensor=pixel, generator=generator)
+    here, moves = float(pitch_um.detach()), pitch_um.requires_grad
+    pixel = replace(sensor, pitch_um=here)  # the full well is that of this pitch
+    box, grid_um = (pitch_um, here) if moves and not resized else (pitch_um.detach(), None)
+    mean = camera.mean_electrons(irradiance, sample_um, sensor=pixel, pitch_um=box, grid_um=grid_um)
+    reads = (here / pitch_um) ** 2
+    if not exact and float(mean.detach().mean()) > 20:
+        electrons = _normal(mean, pixel, generator, reads)
+    else:
+        electrons = camera.expose(mean, sensor=pixel, generator=generator, reads=reads)
     frames = camera.digitise(electrons, sensor=pixel)
     centred = frames - frames.mean((-2, -1), keepdim=True)
     return (centred / centred.std((-2, -1), keepdim=True).clamp_min(1e-6))[:, None].to(torch.float32)
 
 
-def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None) -> Tensor:
+def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None, reads: Tensor) -> Tensor:
     """Electrons of mean and variance as :func:`metalens.sensor.expose`, up to the full well, from one normal draw."""
     well = sensor.full_well_e * float(camera.kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = mean.clamp(max=well)
     share, size = parallel.ranks(), len(mean)  # the noise of the whole batch, whoever takes which part of it
     noise = torch.randn((share * size, *mean.shape[1:]), generator=generator, dtype=mean.dtype, device=mean.device)
     noise = noise[parallel.rank() * size : (parallel.rank() + 1) * size]
-    return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 + 1e-6)
+    return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6)
 
 
 def network_macs(net: Supernet | Baseline, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ that is stopped anywhere goes on bit for bit. Optics, pitch and weights have the
 gradients of phase coefficients are a hundred times smaller than those of weights, and one shared clip never acts.
 """
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -72,7 +73,7 @@ class InnerConfig:
 
     steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest (sandwich rule); with
         ``architecture`` fixed, that one alone is trained.
-    weights, optics, pitch: schedules of the three groups.
+    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image.
     slip_weight, optics_weight, budget_weight: of Eq. 10. energy: encircled share that the optics loss keeps.
     budget_mmacs: C_budget; 0 for none. Members lower their resolution to keep it (:func:`sandwich`); the hinge acts on
         those that cannot.
@@ -177,6 +178,7 @@ class Trainer:
         }
         self.step, self.skipped, self.bad_run = 0, 0, 0
         self._imager: Imager | None = None
+        self._finest = min(math.log(optics.sample_um), float(made.log_pitch.detach()))
 
     def run(self, *, until: int | None = None) -> Iterator[Record]:
         """Train to ``until`` (the end of the run without it), yielding a record a step.
@@ -234,15 +236,21 @@ class Trainer:
             optics, optics_loss = self._light(batch.frames, live)
             light = irradiance(batch.frames, optics, margin=self.scenes.margin)
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
-        noise = self._generator(1)
-        frames = read_out(light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False)
         scale = torch.tensor(self.inner.slip_scale_mm)
         size = light.shape[-1] * self.optics.sample_um
         members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
-        parts = [
-            losses.task(self.model.net(frames, a), batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight)
-            for a in members
-        ]
+
+        @functools.cache
+        def seen(resized: bool) -> Tensor:
+            noise = self._generator(1)
+            return read_out(
+                light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False, resized=resized
+            )
+
+        parts = []
+        for a in members:
+            answer = self.model.net(seen(pitch_moves and a.resolution < 1), a)
+            parts.append(losses.task(answer, batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight))
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), optics_loss, macs
 
@@ -305,6 +313,9 @@ class Trainer:
                 for group in optimiser.param_groups:
                     group["lr"] = rates[name]
                 optimiser.step()
+        if rates["pitch"] > 0:
+            with torch.no_grad():
+                self.model.log_pitch.clamp_(min=self._finest)  # pixels finer than the image's samples show nothing new
 
     def _culprits(self) -> str:
         bad = [

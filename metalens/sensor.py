@@ -54,7 +54,13 @@ def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
 
 
 def pixel_weights(
-    samples: int, sample_um: float, *, pitch_um: float | Tensor, count: int | None = None, shift_um: float = 0.0
+    samples: int,
+    sample_um: float,
+    *,
+    pitch_um: float | Tensor,
+    count: int | None = None,
+    shift_um: float = 0.0,
+    grid_um: float | None = None,
 ) -> Tensor:
     """(pixels, samples) share of each sample's light that falls on each pixel, in float64.
 
@@ -67,17 +73,27 @@ def pixel_weights(
         pitch_um: float, or a tensor that the weights are differentiable in.
         count: of pixels; by default as many as cover the image.
         shift_um: of the pixel row towards + along the axis.
+        grid_um: distance of the pixels, the pitch by default. Where it is given the places stay and ``pitch_um`` is
+            the width of the box alone (the paper's learnable box filter), in the light of a box of ``grid_um``.
 
     Accuracy:
         Column sums are 1 to rounding where the pixels reach one sample beyond the image. A pixel cut by an
         isolated bright sample takes up to -0.075 of it: the overshoot of the cubic; none on sampled PSFs.
     """
     pitch = torch.as_tensor(pitch_um, dtype=torch.float64)
-    pixels = pixel_count(samples, sample_um, float(pitch.detach())) if count is None else count
-    edge = (torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2) * pitch + shift_um
-    position = edge / sample_um + samples / 2
-    step = _smooth_step(position[:, None] - torch.arange(samples, dtype=torch.float64))
-    return step[1:] - step[:-1]
+    pixels = pixel_count(samples, sample_um, float(pitch.detach()) if grid_um is None else grid_um)
+    pixels = pixels if count is None else count
+    place = torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2
+
+    def light(edge_um: Tensor) -> Tensor:
+        position = (edge_um + shift_um) / sample_um + samples / 2
+        return _smooth_step(position[:, None] - torch.arange(samples, dtype=torch.float64))
+
+    if grid_um is None:
+        step = light(place * pitch)
+        return step[1:] - step[:-1]
+    middle = (place[:-1] + 0.5) * grid_um
+    return (light(middle + pitch / 2) - light(middle - pitch / 2)) * (grid_um / pitch)
 
 
 def integrate(
@@ -87,6 +103,7 @@ def integrate(
     pitch_um: float | Tensor,
     shape: tuple[int, int] | None = None,
     shift_um: tuple[float, float] = (0.0, 0.0),
+    grid_um: float | None = None,
 ) -> Tensor:
     """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's area.
 
@@ -94,20 +111,27 @@ def integrate(
         image: (..., y, x).
         shape: (rows, columns) of pixels; by default as many as cover the image.
         shift_um: (y, x) of the pixel grid.
+        grid_um: see :func:`pixel_weights`.
 
     Returns:
         (..., rows, columns) in the dtype of ``image``; differentiable in image and pitch.
     """
     sizes = (None, None) if shape is None else shape
     rows, columns = (
-        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift).to(image)
+        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um).to(image)
         for n, count, shift in zip(image.shape[-2:], sizes, shift_um, strict=True)
     )
     return rows @ image @ columns.mT
 
 
 def mean_electrons(
-    irradiance: Tensor, sample_um: float, *, sensor: Sensor, pitch_um: Tensor | None = None, count: int | None = None
+    irradiance: Tensor,
+    sample_um: float,
+    *,
+    sensor: Sensor,
+    pitch_um: Tensor | None = None,
+    count: int | None = None,
+    grid_um: float | None = None,
 ) -> Tensor:
     """Expected electrons of every pixel, before noise and saturation.
 
@@ -115,14 +139,16 @@ def mean_electrons(
         irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e`` electrons.
         pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
         count: pixels along each axis.
+        grid_um: see :func:`pixel_weights`; light and ambient are then those of a pixel of this size.
 
     Returns:
         (..., rows, columns): kappa times (exposure times mean irradiance plus ambient), at least 0.
     """
     pitch = torch.as_tensor(sensor.pitch_um, dtype=torch.float64) if pitch_um is None else pitch_um
     shape = None if count is None else (count, count)
-    light = integrate(irradiance, sample_um, pitch_um=pitch, shape=shape) * (sample_um / sensor.base_pitch_um) ** 2
-    scale = torch.as_tensor(kappa(pitch, sensor.base_pitch_um)).to(irradiance)
+    light = integrate(irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um)
+    light = light * (sample_um / sensor.base_pitch_um) ** 2
+    scale = torch.as_tensor(kappa(pitch if grid_um is None else grid_um, sensor.base_pitch_um)).to(irradiance)
     return (sensor.exposure_e * light + sensor.ambient_e * scale).clamp_min(0)
 
 
@@ -138,15 +164,17 @@ def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     return count + slope * (mean - mean.detach())
 
 
-def expose(mean: Tensor, *, sensor: Sensor, generator: torch.Generator | None = None) -> Tensor:
-    """Electrons read from pixels that expect ``mean``: photon noise, full well, read noise.
+def expose(
+    mean: Tensor, *, sensor: Sensor, generator: torch.Generator | None = None, reads: float | Tensor = 1.0
+) -> Tensor:
+    """Electrons read from pixels that expect ``mean``: photon noise, full well, read noise of ``reads`` reads each.
 
     Saturated pixels have gradient 0.
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = photons(mean, generator).clamp(max=well)
     noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
-    return collected + sensor.read_noise_e * noise
+    return collected + sensor.read_noise_e * torch.as_tensor(reads).to(noise).sqrt() * noise
 
 
 def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
