@@ -101,11 +101,8 @@ def report(work: Path) -> None:
     errors = {
         v: np.stack([np.load(stem(work, v, line["seed"]))["ambiguous"] for line in mine]) for v, mine in lines.items()
     }
-    text = (
-        HEAD
-        + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um | pixels of the network / um |\n"
-    )
-    text += "|---|---|---|---|---|---|---|---|---|\n"
+    text = HEAD + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um "
+    text += "| pixels that the network sees / um |\n|---|---|---|---|---|---|---|---|---|\n"
     rows = []
     for variant, mine in lines.items():
         means = {k: float(np.mean([m[k] for m in mine])) for k in ("ambiguous_iou", "mmacs", "pitch_um")}

@@ -50,7 +50,7 @@ class Case:
     """Conditions that all lenses of a comparison share.
 
     pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of 32 frames.
-    width: of the elastic network. network: it, or a baseline in its place.
+    width: of the elastic network. network: it, or a baseline in its place. angle_deg: field angle of the frames.
     """
 
     pitch_um: float
@@ -58,6 +58,7 @@ class Case:
     steps: int = 800
     width: float = 0.5
     network: Name = "supernet"
+    angle_deg: float = 0.0
 
 
 CASES = {
@@ -66,6 +67,7 @@ CASES = {
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
     "p9dim": Case(9.0, electrons=400.0),
+    "p9field": Case(9.0, angle_deg=10.0),
     "p18small": Case(18.0, steps=2400, width=0.25),
     "p18nvgaze": Case(18.0, steps=2400, network="nvgaze"),
     "p18popovic": Case(18.0, steps=2400, network="popovic"),
@@ -73,14 +75,14 @@ CASES = {
 }
 
 
-def optics_of(lens: str) -> tuple[OpticsConfig, Schedule]:
+def optics_of(lens: str, *, angle_deg: float = 0.0) -> tuple[OpticsConfig, Schedule]:
     """Optics and their schedule.
 
     hyperF: fixed, focused at F mm. helixN: fixed double helix of N zones. jointF, swiftF, rushF: trained from hyperF,
     at three learning rates of the phase. jointhelixN: trained from helixN.
     """
     kind, number = lens.rstrip("0123456789"), float(lens.lstrip("abcdefghijklmnopqrstuvwxyz"))
-    fixed = OpticsConfig(polynomials=0, depth_count=20)
+    fixed = OpticsConfig(polynomials=0, depth_count=20, angle_deg=angle_deg)
     if kind == "hyper":
         return replace(fixed, focus_mm=number), Schedule(0.0)
     if kind == "helix":
@@ -150,7 +152,7 @@ def _natural(scenes: EyeScenes, count: int) -> States:
 
 def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
     """The trainer at the end of its run, with the batch statistics of the final lens."""
-    optics, moving = optics_of(lens)
+    optics, moving = optics_of(lens, angle_deg=case.angle_deg)
     settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
     scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
     made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE, network=case.network)
@@ -172,9 +174,8 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     seconds = time.perf_counter() - start
     net, architecture = trainer.model.net, architecture_of(case.width)
     frames = case.steps * trainer.inner.batch
-    macs = float(
-        network_macs(net, architecture, SCENES.pixels * optics_of(lens)[0].sample_um, torch.tensor(case.pitch_um))
-    )
+    window_um = SCENES.pixels * trainer.optics.sample_um
+    macs = float(network_macs(net, architecture, window_um, torch.tensor(case.pitch_um)))
     line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
     line |= tested(work, name, trainer, architecture, count=TESTED)
     response = depth_response(trainer, kept(work, "ambiguous", TESTED), net, architecture, batches=8)
@@ -203,7 +204,8 @@ def tested(work: Path, name: str, trainer: Trainer, architecture: Architecture, 
 def restored(work: Path, line: dict[str, Any], scenes: Scenes) -> Trainer:
     """A run of the study as it ended, from its line and the weights beside it."""
     case_name, lens, _ = line["run"].split("/")
-    case, (optics, _) = CASES[case_name], optics_of(lens)
+    case = CASES[case_name]
+    optics, _ = optics_of(lens, angle_deg=case.angle_deg)
     made = inner.model(optics, pitch_um=case.pitch_um, seed=0, space=SPACE, network=case.network)
     made.net.load_state_dict(load_file(stem(work, line["run"]).with_suffix(".safetensors")))
     with torch.no_grad():
@@ -265,6 +267,7 @@ PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
+PLAN += [f"p9field/{lens}/{seed}" for seed in range(2) for lens in (*MAIN, "hyper28", "hyper40")]
 PLAN += [f"p18{network}/{lens}/{seed}" for network in BASELINES for seed in range(3) for lens in ("hyper33", "hyper20")]
 
 

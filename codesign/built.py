@@ -17,6 +17,7 @@ from characterize.parameters import ABERRATIONS, BIAS, PLACE, aberrations, vecto
 from characterize.pillars import Sensitivity, process, sensitivity, transmission
 from codesign.optics import OpticsConfig, Stack
 from metalens import profiles
+from metalens.errors import TrainingError
 from metalens.lens import Lens
 from metalens.profiles import Focus
 from metalens.pupil import Pupil, amplitude, coordinates, spherical_path
@@ -59,6 +60,8 @@ class MadeLens:
     """
 
     def __init__(self, design: Lens, settings: OpticsConfig, *, response: Sensitivity | None = None) -> None:
+        if settings.angle_deg:
+            raise TrainingError(f"the run sees its lens at {settings.angle_deg:g} deg: a made lens is known on axis")
         self.design, self.settings, self.response = design, settings, response or sensitivity(design)
         d = design.diameters
         self.focus = Focus(design.wavelength_um, design.sensor_distance_um, design.source_distance_um)

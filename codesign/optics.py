@@ -17,6 +17,7 @@ from metalens.design import PhaseOf
 from metalens.errors import ConfigError, TrainingError
 from metalens.profiles import Focus
 from metalens.pupil import Pupil, amplitude, coordinates, radius, spherical_path
+from metalens.pupil_oblique import Field, Seen, oblique_path, view
 from metalens.scene import Imager, PsfBasis, basis, imager
 from metalens.store import Array
 
@@ -84,6 +85,7 @@ class OpticsConfig:
 
     aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
     focus_mm: source distance that the hyperbolic part images onto the sensor.
+    angle_deg: field angle, towards +x, of the whole image: sources and window lie around that chief ray.
     polynomials: orthonormal radial-angular terms of order 2 and above that training moves; 0 for a fixed lens.
     zones: rings of a double helix added to the hyperbolic phase; 0 for none.
     depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at equal steps of 1/z.
@@ -97,6 +99,7 @@ class OpticsConfig:
     sensor_distance_mm: float = 2.0
     wavelength_nm: float = 850.0
     focus_mm: float = 20.0
+    angle_deg: float = 0.0
     polynomials: int = 35
     zones: int = 0
     depths_mm: tuple[float, float] = (12.0, 50.0)
@@ -114,6 +117,8 @@ class OpticsConfig:
             )
         if min(self.aperture_mm, self.sensor_distance_mm, self.wavelength_nm, self.focus_mm, self.sample_um) <= 0:
             raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")
+        if not abs(self.angle_deg) <= 40:
+            raise ConfigError(f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees")
         if self.window_samples < 3 or self.window_samples % 2 == 0:
             raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
 
@@ -194,8 +199,7 @@ def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
     """(nodes, nodes) phase on top of the hyperbolic focus: vortices of the double helix, and the polynomials."""
     phase = _vortices(settings)
     if settings.polynomials:
-        terms, _ = _polynomials(settings.pupil, settings.polynomials)
-        phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), terms)
+        phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), _modes(settings))
     return phase
 
 
@@ -249,16 +253,39 @@ def _polynomials(pupil: Pupil, count: int) -> tuple[Tensor, Tensor]:
 
 
 @functools.lru_cache(maxsize=8)
-def _vortex_phase(pupil: Pupil, zones: int) -> Tensor:
-    x, y = coordinates(pupil)
-    fraction = torch.hypot(x, y) / pupil.radius_um
-    ring = torch.ceil(zones * fraction**2).clamp(1, zones)
+def _modes(settings: OpticsConfig) -> Tensor:
+    """(polynomials, nodes, nodes) terms where the rays of the nodes leave the lens."""
+    terms, mix = _polynomials(settings.pupil, settings.polynomials)
+    if not settings.angle_deg:
+        return terms
+    seen, rim = _seen(settings), settings.pupil.radius_um
+    raw = torch.from_numpy(np.stack(_terms((seen.x_um / rim).numpy(), (seen.y_um / rim).numpy(), len(mix))))
+    return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
+
+
+@functools.lru_cache(maxsize=8)
+def _vortices(settings: OpticsConfig) -> Tensor:
+    x, y = _seen(settings).x_um, _seen(settings).y_um
+    if not settings.zones:
+        return torch.zeros_like(x)
+    fraction = torch.hypot(x, y) / settings.pupil.radius_um
+    ring = torch.ceil(settings.zones * fraction**2).clamp(1, settings.zones)
     return (2 * ring - 1) * torch.atan2(y, x)
 
 
-def _vortices(settings: OpticsConfig) -> Tensor:
-    pupil = settings.pupil
-    return _vortex_phase(pupil, settings.zones) if settings.zones else torch.zeros_like(radius(pupil))
+def _field(settings: OpticsConfig) -> Field:
+    return Field(math.radians(settings.angle_deg))
+
+
+@functools.lru_cache(maxsize=8)
+def _seen(settings: OpticsConfig) -> Seen:
+    """The pupil from where the chief ray meets the sensor; its nodes are those of the lens on axis."""
+    pupil, focus_um = settings.pupil, settings.focus_mm * 1e3
+    if settings.angle_deg:
+        return view(pupil, _field(settings), focus_um)
+    k = 2 * math.pi / pupil.wavelength_um
+    node = torch.arange(pupil.nodes**2).reshape(pupil.nodes, pupil.nodes)
+    return Seen(*coordinates(pupil), amplitude(pupil), node, -k * spherical_path(radius(pupil), focus_um))
 
 
 @functools.lru_cache(maxsize=8)
@@ -267,12 +294,11 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
 
     The size leaves the autocorrelation free of wrap-around at all frequencies that are kept. complex64.
     """
-    pupil = settings.pupil
-    k = 2 * math.pi / pupil.wavelength_um
-    inward = spherical_path(radius(pupil), settings.focus_mm * 1e3)
-    angle = torch.stack([k * (spherical_path(radius(pupil), float(z)) - inward) for z in settings.depths_um])
-    size = scipy.fft.next_fast_len(pupil.nodes + _frequencies(settings) + 1)
-    return torch.polar(amplitude(pupil), torch.remainder(angle, 2 * math.pi)).to(torch.complex64), (size, size)
+    seen, k = _seen(settings), 2 * math.pi / settings.pupil.wavelength_um
+    paths = [oblique_path(seen.x_um, seen.y_um, _field(settings), -float(z)) for z in settings.depths_um]
+    angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
+    size = scipy.fft.next_fast_len(settings.pupil.nodes + _frequencies(settings) + 1)
+    return torch.polar(seen.weight.double(), angle).to(torch.complex64), (size, size)
 
 
 def _frequencies(settings: OpticsConfig) -> int:
@@ -289,14 +315,14 @@ def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
     half = torch.exp(2j * math.pi * place[:, None] * harmonic) * torch.sinc(harmonic * settings.sample_um)
     rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
     columns = half * torch.where(harmonic == 0, 1.0, 2.0)  # the other half of the frequencies is its conjugate
-    nodes_light = float((amplitude(pupil) ** 2).sum()) * _carriers(settings)[1][0] ** 2
+    nodes_light = float((_seen(settings).weight.double() ** 2).sum()) * _carriers(settings)[1][0] ** 2
     scale = (settings.sample_um / pupil.period_um) ** 2 / nodes_light
     return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
 
 
 def _error_phase(settings: OpticsConfig, error: Tensor) -> Tensor:
     pupil = settings.pupil
-    x, y = (c / pupil.radius_um for c in coordinates(pupil))
+    x, y = (c / pupil.radius_um for c in (_seen(settings).x_um, _seen(settings).y_um))
     rho2 = x**2 + y**2
     focus_um, tilt, astigmatism = error[:3].double().unbind()
     k = 2 * math.pi / pupil.wavelength_um

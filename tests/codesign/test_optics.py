@@ -57,9 +57,9 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
     assert float((got - want).norm() / want.norm()) < 1e-3  # light outside the window of the reference
 
 
-@pytest.mark.parametrize("zones", [0, 3])
-def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones):
-    settings = replace(SMALL, zones=zones)
+@pytest.mark.parametrize(("zones", "angle_deg"), [(0, 0.0), (3, 0.0), (0, 12.0), (3, -12.0)])
+def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
+    settings = replace(SMALL, zones=zones, angle_deg=angle_deg)
     coefficients = _coefficients()
     quick = optics.stack(settings, coefficients).intensity
     n, pitch = 500, 0.4
@@ -75,6 +75,7 @@ def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones):
         wavelength_um=0.85,
         sensor_distance_um=400.0,
         depths_um=settings.depths_um.numpy(),
+        angle_rad=math.radians(angle_deg),
         window_um=settings.window_samples * settings.sample_um,
         samples=samples,
         tolerance=1e-4,
@@ -97,15 +98,17 @@ def test_polynomials_are_orthonormal_over_the_aperture():
     assert mix.shape == (12, 12)
 
 
-def test_gradient_agrees_with_a_finite_difference():
+@pytest.mark.parametrize("angle_deg", [0.0, 10.0])
+def test_gradient_agrees_with_a_finite_difference(angle_deg):
+    settings = replace(SMALL, angle_deg=angle_deg)
     coefficients = _coefficients().requires_grad_()
     weight = torch.randn(3, 17, 17, generator=torch.Generator().manual_seed(5))
-    value = (optics.stack(SMALL, coefficients).intensity * weight).sum()
+    value = (optics.stack(settings, coefficients).intensity * weight).sum()
     (gradient,) = torch.autograd.grad(value, coefficients)
     direction = torch.randn(12, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     step = 1e-3
     ahead, behind = (
-        float((optics.stack(SMALL, coefficients.detach() + s * direction).intensity.double() * weight).sum())
+        float((optics.stack(settings, coefficients.detach() + s * direction).intensity.double() * weight).sum())
         for s in (step, -step)
     )
     # the intensity is float32: 1e-7 / 1e-3 of rounding, and the third derivative times step²
