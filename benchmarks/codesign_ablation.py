@@ -37,6 +37,7 @@ TABLE: dict[str, Any] = {
     "preset": "laptop",
     "ambiguity_pairs": 256,
     "scenes": {"pool": 4096},
+    "space": {"resolution": [0.3, 1.0]},
     "optics": {"focus_mm": 33.0},
     "sensor": {"exposure_e": 2000.0, "full_well_e": 4000.0},
     "inner": {"steps": 1200, "optics_weight": 0.0, "budget_mmacs": 4.0, "pitch": {"rate": 0.005}},

@@ -73,15 +73,14 @@ def evolve(
     budget: float,
     seed: int,
     start: Search | None = None,
-    uniform: bool = False,
 ) -> Iterator[Search]:
     """Search state after every birth; give the last one as ``start`` to go on exactly where it stopped.
+
+    The first candidate is the one that :func:`sandwich` trains at every step (:func:`top`).
 
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
         count: its multiply-accumulates; only candidates within ``budget`` are evaluated.
-        uniform: the first candidate is the largest uniform network within the budget (:func:`within`); otherwise the
-            one that :func:`sandwich` trains at every step (:func:`top`).
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -92,10 +91,7 @@ def evolve(
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
-        if state.history:
-            chosen = _next(space, plan, state, count, budget, generator)
-        else:
-            chosen = within(space, count, budget) if uniform else top(space, count, budget)
+        chosen = _next(space, plan, state, count, budget, generator) if state.history else top(space, count, budget)
         key = active(space, chosen)
         if key not in known:
             known[key] = float(evaluate(chosen))
@@ -176,8 +172,8 @@ def sandwich(
 ) -> list[Architecture]:
     """Members of one training step: the largest, the smallest and ``subnets`` drawn ones.
 
-    With a budget above 0 each sees its input at the highest resolution that the budget allows, and the largest is the
-    largest uniform one: what is never chosen is not trained. Where nothing fits, the smallest at least resolution.
+    With a budget above 0 each sees its input at the highest resolution that the budget allows, and the largest is that
+    of :func:`top`: what is never chosen is not trained. Where nothing fits, the smallest at least resolution.
     """
     if not budget:
         return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
@@ -190,9 +186,12 @@ def sandwich(
 
 
 def top(space: Space, count: Count, budget: float) -> Architecture:
-    """The largest network, at the highest resolution within the budget; the largest uniform one where none is."""
-    whole = fitted(space, largest(space), count, budget)
-    return whole if count(whole) <= budget else within(space, count, budget)
+    """The largest uniform network that fits at any resolution, at the highest that the budget allows."""
+    for candidate in uniform(space):
+        made = fitted(space, candidate, count, budget)
+        if count(made) <= budget:
+            return made
+    return smallest(space)
 
 
 def fitted(space: Space, architecture: Architecture, count: Count, budget: float) -> Architecture:
@@ -207,15 +206,12 @@ def fitted(space: Space, architecture: Architecture, count: Count, budget: float
     return dataclasses.replace(architecture, resolution=low)
 
 
-def within(space: Space, count: Count, budget: float) -> Architecture:
-    """The largest uniform network inside the budget: width, then depth, then the rest is reduced."""
-    top, bottom = largest(space), smallest(space)
+def uniform(space: Space) -> Iterator[Architecture]:
+    """Networks alike in all stages, large ones first: width, then depth, then kernel and expansion are reduced."""
+    whole, least = largest(space), dataclasses.replace(smallest(space), resolution=space.resolution[1])
+    shallow = dataclasses.replace(whole, depths=least.depths)
     for width in sorted(space.widths, reverse=True):
-        for part in (top, dataclasses.replace(top, depths=bottom.depths), dataclasses.replace(bottom, resolution=1.0)):
-            candidate = dataclasses.replace(part, width=width)
-            if count(candidate) <= budget:
-                return candidate
-    return bottom
+        yield from (dataclasses.replace(part, width=width) for part in (whole, shallow, least))
 
 
 def dumps(search: Search) -> str:

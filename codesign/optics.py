@@ -85,7 +85,6 @@ class OpticsConfig:
 
     aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
     focus_mm: source distance that the hyperbolic part images onto the sensor.
-    angle_deg: field angle, towards +x, of the whole image: sources and window lie around that chief ray.
     polynomials: orthonormal radial-angular terms of order 2 and above that training moves; 0 for a fixed lens.
     zones: rings of a double helix added to the hyperbolic phase; 0 for none.
     depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at equal steps of 1/z.
@@ -93,13 +92,13 @@ class OpticsConfig:
     window_samples: of the PSFs.
     tolerance: of the low-rank PSF basis.
     spread: of the lenses that are made.
+    angle_deg: field angle, towards +x, of the whole image: sources and window lie around that chief ray.
     """
 
     aperture_mm: float = 1.0
     sensor_distance_mm: float = 2.0
     wavelength_nm: float = 850.0
     focus_mm: float = 20.0
-    angle_deg: float = 0.0
     polynomials: int = 35
     zones: int = 0
     depths_mm: tuple[float, float] = (12.0, 50.0)
@@ -108,6 +107,7 @@ class OpticsConfig:
     window_samples: int = 33
     tolerance: float = 3e-3
     spread: Spread = field(default_factory=Spread)
+    angle_deg: float = 0.0
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm

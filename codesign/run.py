@@ -32,8 +32,8 @@ class Budgets:
 
     pitch_um: effective pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
     budgets_mmacs: one search each; the results together are the Pareto set.
-    frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest uniform one
-        within each budget.
+    frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest
+        uniform one, at the resolution that each budget allows.
     finetune_steps: of further training of the weights of each budget's network, on its own.
     """
 
@@ -207,7 +207,6 @@ def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
             budget=budget * 1e6,
             seed=settings.inner.seed + i,
             start=before,
-            uniform="architecture" in settings.run.frozen,
         )
         for state in states:
             yield budget, state.history[-1]

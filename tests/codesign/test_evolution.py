@@ -104,10 +104,15 @@ def test_foreign_state_is_refused():
         evolution.loads(text, SPACE)
 
 
-def test_the_uniform_network_fits_its_budget():
-    for budget in (1e7, 5e7, 2e8):
-        assert _count(evolution.within(SPACE, _count, budget)) <= budget
-    assert dataclasses.replace(evolution.within(SPACE, _count, 1e12), width=1.0) == arch.largest(SPACE)
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.1, 0.3, 0.9])
+def test_the_largest_network_uses_its_budget(share):
+    """A finer pitch or a smaller budget takes resolution first, then depth and width; one pixel more may cost a third,
+    where it adds a row to every late feature map.
+    """
+    budget = share * _at_resolution(arch.largest(SPACE))
+    made = evolution.top(SPACE, _at_resolution, budget)
+    assert 0.65 * budget < _at_resolution(made) <= budget
+    assert len(set(made.kernels)) == len(set(made.expansions)) == len(set(made.depths)) == 1
 
 
 def test_a_whole_search_is_the_end_of_its_states_and_public():
@@ -117,12 +122,10 @@ def test_a_whole_search_is_the_end_of_its_states_and_public():
     assert codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1) == _run(plan)[-1].history
 
 
-def test_a_uniform_start_is_the_largest_uniform_network_within_the_budget():
+def test_a_search_begins_with_the_network_that_every_step_trains():
     budget = 20 * _count(arch.smallest(SPACE))
-    states = list(evolution.evolve(SPACE, Plan(1, 1, 1), _distance, _count, budget=budget, seed=1, uniform=True))
-    (only,) = states[-1].history
-    assert only.architecture == evolution.within(SPACE, _count, budget)
-    assert len(set(only.architecture.kernels)) == 1
+    (only,) = _run(plan=Plan(1, 1, 1), budget=budget)[-1].history
+    assert only.architecture == evolution.top(SPACE, _count, budget)
 
 
 def _at_resolution(architecture):
