@@ -72,10 +72,10 @@ def run(options: Options) -> int:
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
-    parallel.leave()
     for budget, born in runs.search(going, folder / CHECKPOINT):
         _log(folder, {"kind": "birth", "budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6})
         console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
+    parallel.leave()
     ends = finished(going)
     rows = [row for row, _ in ends]
     _keep(folder, going, ends)
@@ -84,11 +84,13 @@ def run(options: Options) -> int:
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
-    """Another process of ``torchrun``: trains along from the same checkpoint, writes nothing."""
+    """Another process of ``torchrun``: trains and searches along from the same checkpoint, writes nothing."""
     parallel.wait()
     going = runs.resume(folder / CHECKPOINT, settings)
     place(going.trainer, device)
     for _ in runs.train(going, folder / CHECKPOINT):
+        pass
+    for _ in runs.search(going, folder / CHECKPOINT):
         pass
     parallel.leave()
     return 0

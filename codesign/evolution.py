@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign import parallel
 from codesign.architecture import Architecture, Space, active, check, largest, mutate, sample, smallest
 from metalens.errors import TrainingError, nearest
 
@@ -29,14 +30,19 @@ class Plan:
     tournament: members that compete to be the parent.
     rounds: evaluations in all, the first population included.
     mutation: chance that one entry changes.
+    together: candidates that are born before any of them is judged, so that the processes of ``torchrun`` can share
+        them. The result depends on this number, not on how many processes there are.
     """
 
     population: int = 16
     tournament: int = 4
     rounds: int = 64
     mutation: float = 0.15
+    together: int = 1
 
     def __post_init__(self) -> None:
+        if self.together < 1:
+            raise TrainingError(f"together = {self.together}: need 1 or more candidates at once")
         if not (self.population >= 1 and 1 <= self.tournament <= self.population <= self.rounds):
             raise TrainingError(
                 f"population {self.population}, tournament {self.tournament}, rounds {self.rounds}: need "
@@ -74,9 +80,9 @@ def evolve(
     seed: int,
     start: Search | None = None,
 ) -> Iterator[Search]:
-    """Search state after every birth; give the last one as ``start`` to go on exactly where it stopped.
+    """Search state after every round of births; give the last one as ``start`` to go on exactly where it stopped.
 
-    The first candidate is the one that :func:`sandwich` trains at every step (:func:`top`).
+    The first two candidates are those that :func:`sandwich` trains at every step (:func:`ends`).
 
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
@@ -91,12 +97,15 @@ def evolve(
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
-        chosen = _next(space, plan, state, count, budget, generator) if state.history else top(space, count, budget)
-        key = active(space, chosen)
-        if key not in known:
-            known[key] = float(evaluate(chosen))
-        born = Candidate(chosen, known[key], float(count(chosen)))
-        state = Search((*state.history, born), dict(generator.bit_generator.state))
+        here = len(state.history)
+        births = min(plan.together, plan.rounds - here)
+        born = list(ends(space, count, budget)[here : here + births])
+        while len(born) < births:
+            born.append(_next(space, plan, state, count, budget, generator))
+        fresh = {active(space, a): a for a in born if active(space, a) not in known}
+        known |= dict(zip(fresh, parallel.each(evaluate, list(fresh.values())), strict=True))
+        judged = (Candidate(a, known[active(space, a)], float(count(a))) for a in born)
+        state = Search((*state.history, *judged), dict(generator.bit_generator.state))
         yield state
 
 
@@ -172,33 +181,34 @@ def sandwich(
 ) -> list[Architecture]:
     """Members of one training step: the largest, the smallest and ``subnets`` drawn ones.
 
-    With a budget above 0 each sees its input at the highest resolution that the budget allows, and the largest is that
-    of :func:`top`: what is never chosen is not trained. Where nothing fits, the smallest at least resolution.
+    With a budget above 0 each sees its input at the highest resolution that the budget allows (:func:`ends`): what is
+    never chosen is not trained. Where nothing fits, the smallest at least resolution.
     """
     if not budget:
         return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
-    least = smallest(space)
+    large, small = ends(space, count, budget)
     drawn = [
         _within(lambda: fitted(space, sample(space, generator), count, budget), count, budget, tries=20)
         for _ in range(subnets)
     ]
-    return [top(space, count, budget), least, *(one or least for one in drawn)]
+    return [large, small, *(one or small for one in drawn)]
 
 
-def top(space: Space, count: Count, budget: float) -> Architecture:
-    """The largest uniform network that fits at any resolution, at the highest that the budget allows."""
-    for candidate in uniform(space):
-        made = fitted(space, candidate, count, budget)
-        if count(made) <= budget:
-            return made
-    return smallest(space)
+def ends(space: Space, count: Count, budget: float) -> tuple[Architecture, Architecture]:
+    """The largest uniform network that fits at any resolution, and the smallest: most weights, most pixels.
+
+    Both at the highest resolution that the budget allows; the smallest at least resolution where nothing fits.
+    """
+    made = [fitted(space, candidate, count, budget) for candidate in uniform(space)]
+    return next((a for a in made if count(a) <= budget), made[-1]), made[-1]
 
 
 def fitted(space: Space, architecture: Architecture, count: Count, budget: float) -> Architecture:
-    """The architecture at the highest resolution that the budget allows, its own at most; at the least if none does."""
-    if count(architecture) <= budget:
-        return architecture
-    low, high = space.resolution[0], architecture.resolution
+    """The architecture at the highest resolution that the budget allows; at the least if none does."""
+    low, high = space.resolution
+    whole = dataclasses.replace(architecture, resolution=high)
+    if count(whole) <= budget:
+        return whole
     for _ in range(7):  # to a hundredth of the range
         middle = (low + high) / 2
         fits = count(dataclasses.replace(architecture, resolution=middle)) <= budget
@@ -207,7 +217,7 @@ def fitted(space: Space, architecture: Architecture, count: Count, budget: float
 
 
 def uniform(space: Space) -> Iterator[Architecture]:
-    """Networks alike in all stages, large ones first: width, then depth, then kernel and expansion are reduced."""
+    """Networks alike in all stages, large to smallest: width, then depth, then kernel and expansion are reduced."""
     whole, least = largest(space), dataclasses.replace(smallest(space), resolution=space.resolution[1])
     shallow = dataclasses.replace(whole, depths=least.depths)
     for width in sorted(space.widths, reverse=True):

@@ -1,11 +1,12 @@
-"""Data-parallel training under ``torchrun``: every process takes its part of each batch, and all move alike.
+"""Training and search under ``torchrun``: every process takes its part of each batch, and all move alike.
 
 Gradients are averaged and batch statistics taken over the whole batch, so two processes do what one does, to rounding.
+Candidates of a search are judged by one process each.
 Outside ``torchrun`` there is one process and nothing here costs anything.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -84,6 +85,14 @@ def mean_of(values: list[float]) -> list[float]:
     if ranks() == 1:
         return values
     return [float(v) for v in _reduced(torch.tensor(values, dtype=torch.float64)) / ranks()]
+
+
+def each(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
+    """``work`` of every item, done by one process each; all get all answers, in order."""
+    found = torch.zeros(len(items), dtype=torch.float64)
+    for i in range(rank(), len(items), ranks()):
+        found[i] = work(items[i])
+    return [float(v) for v in (_reduced(found) if ranks() > 1 else found)]
 
 
 def batch_norm(x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5) -> Tensor:

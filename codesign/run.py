@@ -181,7 +181,7 @@ def train(run: Run, path: Path) -> Iterator[Record]:
 
 
 def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
-    """Advance the searches to their end, budget by budget, with a checkpoint after every birth.
+    """Advance the searches to their end, budget by budget, with a checkpoint after every round of births.
 
     Yields:
         (budget in MMACs, the candidate that was born).
@@ -208,8 +208,10 @@ def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
             seed=settings.inner.seed + i,
             start=before,
         )
+        told = len(before.history) if before else 0
         for state in states:
-            yield budget, state.history[-1]
+            yield from ((budget, born) for born in state.history[told:])
+            told = len(state.history)
             run.searches[i:] = [state]
             save(path, run)
 

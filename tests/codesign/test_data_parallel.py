@@ -39,8 +39,31 @@ parallel.leave()
 """
 
 
-def _run(script, target, count):
-    script.write_text(WORKER)
+SEARCHER = """
+import sys
+from codesign import architecture as arch
+from codesign import evolution, parallel
+from codesign.evolution import Plan
+
+parallel.join()
+judged = []
+
+def error(architecture):
+    judged.append(architecture)
+    return sum(architecture.kernels) / 7 + abs(architecture.width - 1.0)
+
+count = lambda a: 1e6 * sum(a.depths)
+history = evolution.search(arch.Space(), Plan(8, 3, 40, together=4), error, count, budget=1e9, seed=5)
+mine = parallel.mean_of([float(len(judged))])
+if parallel.rank() == 0:
+    import torch
+    torch.save([evolution.dumps(evolution.Search(history)), mine[0]], sys.argv[1])
+parallel.leave()
+"""
+
+
+def _run(script, target, count, text=WORKER):
+    script.write_text(text)
     plain = [sys.executable, str(script), str(target)]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", *plain[1:]]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -57,6 +80,12 @@ def test_two_processes_equal_one_to_rounding(tmp_path):
     # Adam divides by the gradient's own size, so rounding of small gradients shows: 1 % of a step of 0.02
     torch.testing.assert_close(two[0], one[0], rtol=0.0, atol=5e-4)
     assert float((two[1] - one[1]).norm() / one[1].norm()) < 2e-3
+
+
+def test_processes_share_the_candidates_of_a_search_and_find_the_same(tmp_path):
+    (one, alone), (two, shared) = (_run(tmp_path / "search.py", tmp_path / f"{n}.pt", n, SEARCHER) for n in (1, 2))
+    assert one == two
+    assert shared == alone / 2
 
 
 def test_one_process_takes_the_whole_batch():

@@ -54,6 +54,17 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
     assert _run(plan=Plan(8, 3, 30), start=middle)[-1] == states[-1]
 
 
+def test_candidates_born_together_do_not_know_of_each_other():
+    """Four at once: the population of the first four births is the same as one at a time, and rounds are kept."""
+    one, four = _run(plan=Plan(8, 3, 30)), _run(plan=Plan(8, 3, 30, together=4))
+    assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
+    assert four[1].history == one[7].history  # the first population is drawn, whoever is judged when
+    middle = evolution.loads(evolution.dumps(four[3]), SPACE)
+    assert _run(plan=Plan(8, 3, 30, together=4), start=middle)[-1] == four[-1]
+    with pytest.raises(TrainingError, match="together = 0"):
+        Plan(together=0)
+
+
 def test_equal_networks_are_evaluated_once():
     seen = []
 
@@ -110,9 +121,12 @@ def test_the_largest_network_uses_its_budget(share):
     where it adds a row to every late feature map.
     """
     budget = share * _at_resolution(arch.largest(SPACE))
-    made = evolution.top(SPACE, _at_resolution, budget)
+    made, least = evolution.ends(SPACE, _at_resolution, budget)
     assert 0.65 * budget < _at_resolution(made) <= budget
     assert len(set(made.kernels)) == len(set(made.expansions)) == len(set(made.depths)) == 1
+    assert _at_resolution(least) <= budget
+    assert least.resolution >= made.resolution
+    assert dataclasses.replace(least, resolution=SPACE.resolution[0]) == arch.smallest(SPACE)
 
 
 def test_a_whole_search_is_the_end_of_its_states_and_public():
@@ -122,10 +136,11 @@ def test_a_whole_search_is_the_end_of_its_states_and_public():
     assert codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1) == _run(plan)[-1].history
 
 
-def test_a_search_begins_with_the_network_that_every_step_trains():
-    budget = 20 * _count(arch.smallest(SPACE))
-    (only,) = _run(plan=Plan(1, 1, 1), budget=budget)[-1].history
-    assert only.architecture == evolution.top(SPACE, _count, budget)
+def test_a_search_begins_with_the_networks_that_every_step_trains():
+    budget = 20 * _at_resolution(arch.smallest(SPACE))
+    found = evolution.search(SPACE, Plan(2, 1, 2), _distance, _at_resolution, budget=budget, seed=1)
+    trained = evolution.sandwich(SPACE, _at_resolution, budget, np.random.default_rng(0), subnets=0)
+    assert [c.architecture for c in found] == trained
 
 
 def _at_resolution(architecture):
