@@ -32,6 +32,7 @@ VARIANTS: dict[str, tuple[Part, ...]] = {
     "pitch frozen": ("pitch",),
     "architecture frozen": ("architecture",),
 }
+MEANS = ("ambiguous_iou", "mmacs", "pitch_um", "effective_pitch_um")
 ALIKE = (("nothing frozen", "architecture frozen"), ("optics frozen",), ("pitch frozen",))  # of one training each
 TABLE: dict[str, Any] = {
     "preset": "laptop",
@@ -85,7 +86,7 @@ def run_one(work: Path, variant: str, seed: int, state: dict[str, object]) -> di
     error = (answers.slip_mm - seen.slip_mm).abs().numpy()
     np.savez_compressed(stem(work, variant, seed), ambiguous=error)
     pitch = float(going.trainer.model.pitch_um.detach())
-    line = {"variant": variant, "seed": seed, "pitch_um": pitch, "resolution": best.architecture.resolution}
+    line = {"variant": variant, "seed": seed, "pitch_um": pitch}
     return line | {"seconds": time.perf_counter() - begun} | row
 
 
@@ -106,8 +107,7 @@ def report(work: Path) -> None:
     text += "| pixels that the network sees / um |\n|---|---|---|---|---|---|---|---|---|\n"
     rows = []
     for variant, mine in lines.items():
-        means = {k: float(np.mean([m[k] for m in mine])) for k in ("ambiguous_iou", "mmacs", "pitch_um")}
-        means["effective_pitch_um"] = float(np.mean([m["pitch_um"] / m["resolution"] for m in mine]))
+        means = {k: float(np.mean([m[k] for m in mine])) for k in MEANS}
         axial, lateral = errors[variant][..., 2], float(errors[variant][..., :2].mean())
         against = ratio(axial, errors["nothing frozen"][..., 2])
         by_seed = [round(float(e), 4) for e in axial.mean(1)]

@@ -30,6 +30,7 @@ def finish(run: Run) -> list[dict[str, Any]]:
 def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
     """Rows of :func:`finish`, each with the model that reached it (fine-tuned where that is asked for).
 
+    ``effective_pitch_um``: distance of the cells that the network sees, pixels binned to its resolution (the paper's p).
     Batch statistics are measured on training frames through the final lens, never on those that are judged.
     """
     settings = run.settings
@@ -46,6 +47,7 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
         net, architecture = trainer.model.net, best.architecture
         recalibrate(net, architecture, assess.parts(measured))
         row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": best.macs / 1e6}
+        row["effective_pitch_um"] = float(run.trainer.model.pitch_um.detach()) / architecture.resolution
         for name, seen in tests.items():
             row |= _errors(name, assess.predict(net, architecture, seen, settings.inner), seen)
         response = depth_response(
