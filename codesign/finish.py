@@ -30,7 +30,7 @@ def finish(run: Run) -> list[dict[str, Any]]:
 def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
     """Rows of :func:`finish`, each with the model that reached it (fine-tuned where that is asked for).
 
-    ``effective_pitch_um``: distance of the cells that the network sees, pixels binned to its resolution (the paper's p).
+    ``effective_pitch_um``: distance of the cells that the network sees: of pixels binned to its resolution.
     Batch statistics are measured on training frames through the final lens, never on those that are judged.
     """
     settings = run.settings
