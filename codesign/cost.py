@@ -17,6 +17,7 @@ from metalens.errors import ConfigError
 from metalens.store import Array
 
 # widths of the heads; the networks and the count share them
+LEAST_SIZE = 16  # pixels along the edge of an input
 MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN = 24, 16, 8, 64
 
 
@@ -89,9 +90,16 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
     if not (pitch_um > 0 and window_um > 0 and 0 < resolution <= 1):
         raise ConfigError(f"window {window_um} um, pitch {pitch_um} um, resolution {resolution}: need all above 0")
     size = window_um / pitch_um * resolution
-    if size < 16:
-        raise ConfigError(f"pitch {pitch_um} um leaves {size:.1f} pixels of a {window_um} um window, need 16 or more")
+    if size < LEAST_SIZE:
+        raise ConfigError(
+            f"pitch {pitch_um} um leaves {size:.1f} pixels of a {window_um} um window, need {LEAST_SIZE} or more"
+        )
     return size
+
+
+def coarsest_um(window_um: float, resolution: float) -> float:
+    """Largest pitch that :func:`input_size` takes."""
+    return window_um * resolution / LEAST_SIZE
 
 
 def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:

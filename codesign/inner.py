@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign import losses, parallel
+from codesign import cost, losses, parallel
 from codesign import optics as lens
 from codesign.architecture import Architecture, Space, smallest
 from codesign.baselines import Baseline, Name, make
@@ -73,10 +73,11 @@ class InnerConfig:
 
     steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest (sandwich rule); with
         ``architecture`` fixed, that one alone is trained.
-    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image.
+    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image, nor
+        so coarse that least resolution leaves a network less than 16 pixels.
     slip_weight, optics_weight, budget_weight: of Eq. 10. energy: encircled share that the optics loss keeps.
-    budget_mmacs: C_budget; 0 for none. Members lower their resolution to keep it (:func:`sandwich`); the hinge acts on
-        those that cannot.
+    budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their resolution to keep it
+        (:func:`sandwich`); the hinge acts on those that cannot.
     slip_scale_mm: spread of the slippage, the unit of the network's answer.
     patience: steps without a finite gradient, one after the other, that end the run.
     """
@@ -161,8 +162,13 @@ class Trainer:
         *,
         architecture: Architecture | None = None,
         stacks: Sequence[Stack] = (),
+        budgets_mmacs: Sequence[float] = (),
     ) -> None:
-        """``stacks``: PSFs of a lens that is already made; every step draws one of them, and no optics move."""
+        """``stacks``: PSFs of a lens that is already made; every step draws one of them, and no optics move.
+
+        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none.
+        """
+        self.budgets_mmacs = (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
         self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
         self.architecture, self.stacks = architecture, tuple(stacks)
         self._imagers: dict[int, Imager] = {}
@@ -178,7 +184,8 @@ class Trainer:
         }
         self.step, self.skipped, self.bad_run = 0, 0, 0
         self._imager: Imager | None = None
-        self._finest = min(math.log(optics.sample_um), float(made.log_pitch.detach()))
+        self._begins_um = float(made.pitch_um.detach())
+        self._coarsest_um = math.inf  # until the first frames say how wide they are
 
     def run(self, *, until: int | None = None) -> Iterator[Record]:
         """Train to ``until`` (the end of the run without it), yielding a record a step.
@@ -220,8 +227,8 @@ class Trainer:
             live=rates["optics"] > 0 and "optics" in self.optimisers, pitch_moves=rates["pitch"] > 0
         )
         total, macs = task + self.inner.optics_weight * optics_loss, each.mean()
-        if self.inner.budget_mmacs:
-            total = total + self.inner.budget_weight * losses.over_budget(each, self.inner.budget_mmacs * 1e6).mean()
+        if self._budget:
+            total = total + self.inner.budget_weight * losses.over_budget(each, self._budget).mean()
         total.backward()  # type: ignore[no-untyped-call]
         parallel.average(p for _, ps in self.groups.values() for p in ps)
         self._apply(rates, finite=math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite())
@@ -238,6 +245,7 @@ class Trainer:
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
         scale = torch.tensor(self.inner.slip_scale_mm)
         size = light.shape[-1] * self.optics.sample_um
+        self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
         members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
 
         @functools.cache
@@ -285,8 +293,12 @@ class Trainer:
         if isinstance(self.model.net, Baseline):
             return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
-        budget = self.inner.budget_mmacs * 1e6
-        return sandwich(space, count, budget, generator, subnets=self.inner.subnets)
+        return sandwich(space, count, self._budget, generator, subnets=self.inner.subnets)
+
+    @property
+    def _budget(self) -> float:
+        """Multiply-accumulates that this step's members may take; 0 for any."""
+        return self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6 if self.budgets_mmacs else 0.0
 
     def _generator(self, stream: int) -> torch.Generator:
         seed = int(np.random.SeedSequence([self.inner.seed, self.step, stream]).generate_state(1, np.uint64)[0])
@@ -313,9 +325,10 @@ class Trainer:
                 for group in optimiser.param_groups:
                     group["lr"] = rates[name]
                 optimiser.step()
-        if rates["pitch"] > 0:
+        if rates["pitch"] > 0:  # pixels finer than the image's samples show nothing new
             with torch.no_grad():
-                self.model.log_pitch.clamp_(min=self._finest)  # pixels finer than the image's samples show nothing new
+                finest, coarsest = min(self.optics.sample_um, self._begins_um), max(self._coarsest_um, self._begins_um)
+                self.model.log_pitch.clamp_(math.log(finest), math.log(coarsest))
 
     def _culprits(self) -> str:
         bad = [

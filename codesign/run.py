@@ -31,7 +31,7 @@ class Budgets:
     """Where the run starts, and what it is searched under.
 
     pitch_um: effective pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
-    budgets_mmacs: one search each; the results together are the Pareto set.
+    budgets_mmacs: one search each; the results together are the Pareto set. Training keeps to them in turn.
     frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest
         uniform one, at the resolution that each budget allows.
     finetune_steps: of further training of the weights of each budget's network, on its own.
@@ -145,10 +145,24 @@ def start(settings: RunConfig) -> Run:
         scenes = PoolScenes(fill(fresh, settings.scenes.pool), fresh.margin, settings.scenes.scale, seed)
     if parallel.ranks() > 1 and settings.network != "supernet":
         raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
-    run = Run(settings, Trainer(inner, settings.optics, settings.sensor, scenes, made), [])
-    if settings.network == "supernet" and inner.pitch.rate == 0:
-        evolution.affordable(settings.space, run.macs, min(settings.run.budgets_mmacs) * 1e6)
+    budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
+    trainer = Trainer(inner, settings.optics, settings.sensor, scenes, made, budgets_mmacs=budgets)
+    run = Run(settings, trainer, [])
+    if settings.network == "supernet":
+        _affordable(run, moves=inner.pitch.rate > 0)
     return run
+
+
+def _affordable(run: Run, *, moves: bool) -> None:
+    """Refuse a budget that no network keeps, at the run's pitch or, if that moves, at any."""
+    settings, net = run.settings, run.trainer.model.net
+    coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])
+    pitch = torch.tensor(coarsest if moves else settings.run.pitch_um, dtype=torch.float64)
+
+    def count(architecture: Architecture) -> float:
+        return float(network_macs(net, architecture, run.window_um, pitch))
+
+    evolution.affordable(settings.space, count, min(settings.run.budgets_mmacs) * 1e6)
 
 
 def save(path: Path, run: Run) -> None:

@@ -43,7 +43,7 @@ class Discs:
 
 def _trainer(config=None, *, optics=OPTICS, architecture=None):
     config = config or InnerConfig(steps=6, batch=2, subnets=0)
-    made = inner.model(optics, pitch_um=9.0, seed=config.seed)
+    made = inner.model(optics, pitch_um=10.0, seed=config.seed)
     return Trainer(config, optics, SENSOR, Discs(), made, architecture=architecture)
 
 
@@ -92,7 +92,7 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
     list(trainer.run(until=5))
     lens, pitch = trainer.model.coefficients_rad.detach().clone(), float(trainer.model.log_pitch.detach())
     assert float(lens.abs().max()) > 0
-    assert pitch != math.log(9.0)
+    assert pitch != math.log(10.0)
     list(trainer.run())
     torch.testing.assert_close(trainer.model.coefficients_rad.detach(), lens, rtol=0, atol=0)
     assert float(trainer.model.log_pitch.detach()) == pitch
@@ -101,7 +101,28 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
 def test_a_budget_drives_the_pitch_up():
     trainer = _trainer(replace(MOVING, budget_weight=100.0), architecture=smallest(Space()))
     list(trainer.run())
-    assert float(trainer.model.pitch_um) > 9.0
+    assert float(trainer.model.pitch_um.detach()) > 10.0
+
+
+def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
+    """Driven hard to either side: a budget far below every network, and light that only finer pixels would resolve."""
+    fast = replace(MOVING, steps=40, pitch=Schedule(0.5), optics=Schedule(0.0), budget_mmacs=1e-3)
+    space = Space(resolution=(0.6, 1.0))
+    for budget, limit in ((1e-3, SIZE * OPTICS.sample_um * 0.6 / 16), (0.0, OPTICS.sample_um)):
+        made = inner.model(OPTICS, pitch_um=10.0, seed=2, space=space)
+        config = replace(fast, budget_mmacs=budget)
+        member = replace(smallest(space), resolution=1.0)
+        *_, last = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member).run()
+        assert last.pitch_um == pytest.approx(limit, rel=1e-9)
+
+
+def test_budgets_of_a_run_are_trained_in_turn():
+    made = inner.model(OPTICS, pitch_um=9.0, seed=0)
+    still = replace(MOVING, budget_mmacs=0.0, pitch=Schedule(0.0), subnets=0)
+    trainer = Trainer(still, OPTICS, SENSOR, Discs(), made, budgets_mmacs=(3.0, 1.0))
+    spent = [record.mmacs for record in trainer.run()]
+    assert all(a > 1.2 * b for a, b in zip(spent[::2], spent[1::2], strict=True))
+    assert max(spent[1::2]) <= 1.0
 
 
 def test_a_bad_gradient_is_skipped_and_counted():
