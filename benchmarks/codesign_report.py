@@ -27,7 +27,7 @@ scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
 - `hyperF`: hyperbolic, focused at F mm (20 is mid-range). `helixN`: double helix of N zones, focused at 20 mm.
   `obliqueF`: focused at F mm and free of aberrations at the field angle of its case.
 - `jointF`, `swiftF`, `rushF`: trained with the network from `hyperF`, at three learning rates of the phase (0.02, 0.05
-  and 0.15 rad).
+  and 0.15 rad). `swiftobliqueF`: from `obliqueF`.
 - `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18long`: three times the frames. `p18dim`:
   100 electrons. `p9dim`: 400 electrons. `p9field`: 10 degrees off axis. `p18small`: `p18long` with half the width.
   `p18nvgaze`, `p18popovic`, `p18de2gaze`: `p18long` with the networks of those papers in place of ours. `p9wide`:

@@ -83,7 +83,7 @@ def optics_of(lens: str, *, angle_deg: float = 0.0) -> tuple[OpticsConfig, Sched
 
     hyperF: fixed, focused at F mm. obliqueF: fixed, free of aberrations at F mm at the field angle (:func:`oblique`).
     helixN: fixed double helix of N zones. jointF, swiftF, rushF: trained from hyperF, at three learning rates of the
-    phase. jointhelixN: trained from helixN.
+    phase. swiftobliqueF: trained from obliqueF. jointhelixN: trained from helixN.
     """
     kind, number = lens.rstrip("0123456789"), float(lens.lstrip("abcdefghijklmnopqrstuvwxyz"))
     fixed = OpticsConfig(polynomials=0, depth_count=20, angle_deg=angle_deg)
@@ -91,6 +91,8 @@ def optics_of(lens: str, *, angle_deg: float = 0.0) -> tuple[OpticsConfig, Sched
         return replace(fixed, focus_mm=number), Schedule(0.0)
     if kind == "oblique":
         return replace(fixed, polynomials=35, focus_mm=number), Schedule(0.0)
+    if kind == "swiftoblique":
+        return replace(fixed, polynomials=35, focus_mm=number), SWIFT
     if kind == "helix":
         return replace(fixed, zones=int(number)), Schedule(0.0)
     if kind == "joint":
@@ -101,7 +103,9 @@ def optics_of(lens: str, *, angle_deg: float = 0.0) -> tuple[OpticsConfig, Sched
         return replace(fixed, polynomials=35, focus_mm=number), RUSH
     if kind == "jointhelix":
         return replace(fixed, polynomials=35, zones=int(number)), FREE
-    raise SystemExit(f"no lens {lens!r}: need hyperF, obliqueF, helixN, jointF, swiftF, rushF or jointhelixN")
+    raise SystemExit(
+        f"no lens {lens!r}: need hyperF, obliqueF, helixN, jointF, swiftF, rushF, swiftobliqueF or jointhelixN"
+    )
 
 
 def oblique(settings: OpticsConfig) -> torch.Tensor:
@@ -181,7 +185,7 @@ def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
     settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
     scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
     made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE, network=case.network)
-    if lens.startswith("oblique"):
+    if "oblique" in lens:
         with torch.no_grad():
             made.coefficients_rad.copy_(oblique(optics))
     trainer = Trainer(settings, optics, sensor_of(case), scenes, made, architecture=architecture_of(case.width))
@@ -295,7 +299,7 @@ PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
-PLAN += [f"p9field/{lens}/{seed}" for seed in range(2) for lens in (*MAIN, "oblique33", "hyper28")]
+PLAN += [f"p9field/{lens}/{seed}" for seed in range(2) for lens in (*MAIN, "oblique33", "swiftoblique33")]
 PLAN += [f"p18{network}/{lens}/{seed}" for network in BASELINES for seed in range(3) for lens in ("hyper33", "hyper20")]
 
 
