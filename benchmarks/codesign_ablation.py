@@ -7,7 +7,6 @@ Each is what ``metalens codesign RUN.toml --freeze PART`` does: joint training, 
 """
 
 import argparse
-import copy
 import json
 import time
 from collections import defaultdict
@@ -33,7 +32,6 @@ VARIANTS: dict[str, tuple[Part, ...]] = {
     "architecture frozen": ("architecture",),
 }
 MEANS = ("ambiguous_iou", "mmacs", "pitch_um", "effective_pitch_um")
-ALIKE = (("nothing frozen", "architecture frozen"), ("optics frozen",), ("pitch frozen",))  # of one training each
 TABLE: dict[str, Any] = {
     "preset": "laptop",
     "ambiguity_pairs": 256,
@@ -61,22 +59,15 @@ def settings_of(variant: str, seed: int) -> RunConfig:
     return replace(made, inner=replace(made.inner, seed=seed), run=replace(made.run, frozen=VARIANTS[variant]))
 
 
-def trained(work: Path, variant: str, seed: int) -> run.Run:
-    """The joint training of one variant."""
-    going = run.start(settings_of(variant, seed))
-    for record in run.train(going, work / "going.safetensors"):
-        if record.step % 100 == 0:
-            print(f"{variant}-{seed} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um", flush=True)
-    return going
-
-
-def run_one(work: Path, variant: str, seed: int, state: dict[str, object]) -> dict[str, Any]:
-    """Search, fine-tune and test one variant from the end of its training; its line, every frame's error beside it."""
+def run_one(work: Path, variant: str, seed: int) -> dict[str, Any]:
+    """Train, search, fine-tune and test one run; its line, the error of every frame beside it."""
     begun = time.perf_counter()
     settings = settings_of(variant, seed)
-    going = run.start(settings)
-    going.trainer.restore(copy.deepcopy(state))
-    for _ in run.search(going, work / "going.safetensors"):
+    going, path = run.start(settings), work / "going.safetensors"
+    for record in run.train(going, path):
+        if record.step % 100 == 0:
+            print(f"{variant}-{seed} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um", flush=True)
+    for _ in run.search(going, path):
         pass
     ((row, model),) = finish.finished(going)
     best = evolution.best(going.searches[0].history)
@@ -136,13 +127,10 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     there = {(line["variant"], line["seed"]) for line in kept_lines(options.work / LINES)}
     for seed in options.seeds:
-        for alike in ALIKE:
-            missing = [v for v in alike if (v, seed) not in there]
-            state = trained(options.work, alike[0], seed).trainer.state() if missing else {}
-            for variant in missing:
-                line = run_one(options.work, variant, seed, state)
-                keep_line(options.work / LINES, line)
-                print(json.dumps(line), flush=True)
+        for variant in (v for v in VARIANTS if (v, seed) not in there):
+            line = run_one(options.work, variant, seed)
+            keep_line(options.work / LINES, line)
+            print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

@@ -163,11 +163,13 @@ class Trainer:
         architecture: Architecture | None = None,
         stacks: Sequence[Stack] = (),
         budgets_mmacs: Sequence[float] = (),
+        largest_only: bool = False,
     ) -> None:
         """``stacks``: PSFs of a lens that is already made; every step draws one of them, and no optics move.
 
-        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none.
+        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none. ``largest_only``: of a step's members.
         """
+        self.largest_only = largest_only
         self.budgets_mmacs = (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
         self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
         self.architecture, self.stacks = architecture, tuple(stacks)
@@ -293,7 +295,8 @@ class Trainer:
         if isinstance(self.model.net, Baseline):
             return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
-        return sandwich(space, count, self._budget, generator, subnets=self.inner.subnets)
+        members = sandwich(space, count, self._budget, generator, subnets=self.inner.subnets)
+        return members[:1] if self.largest_only else members
 
     @property
     def _budget(self) -> float:

@@ -30,10 +30,10 @@ Part = Literal["optics", "pitch", "architecture"]
 class Budgets:
     """Where the run starts, and what it is searched under.
 
-    pitch_um: effective pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
+    pitch_um: pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
     budgets_mmacs: one search each; the results together are the Pareto set. Training keeps to them in turn.
     frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest
-        uniform one, at the resolution that each budget allows.
+        uniform one, at the resolution that each budget allows, trained alone.
     finetune_steps: of further training of the weights of each budget's network, on its own.
     """
 
@@ -146,7 +146,15 @@ def start(settings: RunConfig) -> Run:
     if parallel.ranks() > 1 and settings.network != "supernet":
         raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
     budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
-    trainer = Trainer(inner, settings.optics, settings.sensor, scenes, made, budgets_mmacs=budgets)
+    trainer = Trainer(
+        inner,
+        settings.optics,
+        settings.sensor,
+        scenes,
+        made,
+        budgets_mmacs=budgets,
+        largest_only="architecture" in frozen,
+    )
     run = Run(settings, trainer, [])
     if settings.network == "supernet":
         _affordable(run, moves=inner.pitch.rate > 0)
