@@ -21,6 +21,7 @@ from codesign.inner import InnerConfig, Schedule, Trainer
 from codesign.optics import OpticsConfig
 from codesign.pool import PoolScenes
 from codesign.supernet import Supernet
+from metalens import sensor as camera
 from metalens.pupil import psf
 from metalens.sensor import Sensor
 
@@ -122,13 +123,31 @@ def _stages(threads: int, made: pool.Pool) -> list[Row]:
     render = fastest(lambda: SCENES.rendered(1, 8)) / 8
     one, two = (fastest(partial(irradiance, f, lens, margin=16)) / n for f, n in ((batch.frames, BATCH), (sheets, 8)))
     fast, slow = (fastest(partial(sensor, e)) / BATCH for e in (False, True))
+    slope, slope_error = _pitch_slope(light)
     return [
         Row("a frame of 160²: render", "once for a pool", render, NONE, "see topic scene", threads, goal=_rate(render)),
         Row("a frame: optics", "two sheets", two, 0.0, "itself", threads, goal=_rate(two)),
         Row("a frame: optics", "flat", one, error, "two sheets, of the contrast", threads, goal=_rate(one)),
         Row("a frame: sensor", "Poisson", slow, 0.0, "itself", threads, goal=_rate(slow)),
         Row("a frame: sensor", "normal", fast, NONE, "mean and variance are exact", threads, goal=_rate(fast)),
+        Row("d frame / d pitch", "autograd", slope, slope_error, "central difference, asked 1e-4", threads),
     ]
+
+
+def _pitch_slope(light: torch.Tensor) -> tuple[float, float]:
+    """Seconds a frame of the derivative of a weighted sum of pixels in their box's width, and its relative error."""
+    light = light.double()
+
+    def value(pitch_um: torch.Tensor) -> torch.Tensor:
+        pixels = camera.mean_electrons(light, 9.0, sensor=SENSOR, pitch_um=pitch_um, grid_um=14.0)
+        return (pixels * torch.arange(pixels.numel()).reshape(pixels.shape).cos()).sum()
+
+    def slope() -> float:
+        pitch = torch.tensor(14.0, dtype=torch.float64, requires_grad=True)
+        return float(torch.autograd.grad(value(pitch), pitch)[0])
+
+    ahead, behind = (float(value(torch.tensor(14.0 + s, dtype=torch.float64))) for s in (1e-4, -1e-4))
+    return fastest(slope) / len(light), abs(slope() / ((ahead - behind) / 2e-4) - 1)
 
 
 def _rate(seconds: float) -> str:
@@ -136,15 +155,14 @@ def _rate(seconds: float) -> str:
 
 
 def _trainer(made: pool.Pool, member: Architecture | None, *, live: bool, network: Name = "supernet") -> Trainer:
-    settings = InnerConfig(
-        steps=10_000, batch=BATCH, optics=Schedule(0.02 if live else 0.0, 0.0, 0.9), optics_weight=0.0
-    )
+    lens, pitch = (Schedule(rate if live else 0.0, 0.0, 0.9) for rate in (0.02, 0.005))
+    settings = InnerConfig(steps=10_000, batch=BATCH, optics=lens, pitch=pitch, optics_weight=0.0)
     fresh = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE, network=network)
     return Trainer(settings, OPTICS, SENSOR, PoolScenes(made, 16, 0.2, 0), fresh, architecture=member)
 
 
 def _training(threads: int, made: pool.Pool) -> list[Row]:
-    """Whole steps, the lens fixed and moving, and the network alone: the rest of a step is data generation."""
+    """Whole steps, lens and pitch fixed and moving, and the network alone: the rest of a step is data generation."""
     out = []
     for width, depth in SIZES:
         member = _member(width, depth)
@@ -158,7 +176,7 @@ def _training(threads: int, made: pool.Pool) -> list[Row]:
         out += [
             Row(case, "network, forward", forward, NONE, "-", threads, goal=_rate(forward)),
             Row(case, "training step, lens fixed", fixed, NONE, "-", threads, goal=goal),
-            Row(case, "training step, lens moving", joint, NONE, "-", threads, goal=_rate(joint)),
+            Row(case, "training step, lens and pitch moving", joint, NONE, "-", threads, goal=_rate(joint)),
         ]
     for name in get_args(Name)[1:]:
         net = baselines.make(name)
