@@ -47,8 +47,8 @@ HEAD = """# Ablations
 Whole co-design runs under one budget of 4 MMACs, from a hyperbolic lens in focus at 33 mm and pixels of 14 um: 1200
 joint steps of 32 frames, search over 24 architectures, 300 steps of fine-tuning. Errors on the
 frames of [the study](results.md), where blur alone tells depth. Ratios with 95 % intervals of a paired bootstrap over
-pairs of frames and over runs. A frozen architecture is the largest one, trained alone, at the resolution that the budget
-leaves it: its last column says why it reads no depth. Knowing nothing scores 1.67 mm. Made by
+pairs of frames and over runs. A frozen architecture is the largest one, trained alone, at the resolution that the
+budget leaves it: its last column says why it reads no depth. Knowing nothing scores 1.67 mm. Made by
 `python -m benchmarks.codesign_ablation run --work DIR` and `report --work DIR`.
 
 """
