@@ -5,7 +5,7 @@ BIN     = $(VENV)/bin
 READY   = $(VENV)/.ready
 OUT    ?= demo
 
-.PHONY: setup demo test test-slow check bench peers bench-peers test-peers notebooks clean
+.PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow mutants check bench peers bench-peers test-peers notebooks site clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -20,6 +20,17 @@ demo: setup
 
 test: setup
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not peers'
+
+# The numeric tests under the arithmetic of other processors; -all: the whole default suite under each of them.
+test-arithmetic: setup
+	$(BIN)/python tests/arithmetic.py
+
+test-arithmetic-all: setup
+	$(BIN)/python tests/arithmetic.py all
+
+# One-line mutants of the numeric code: which of them no test sees.
+mutants: setup
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.mutation --count 300
 
 test-slow: setup
 	$(BIN)/python -m pytest -m 'slow and not peers'
@@ -47,6 +58,10 @@ test-peers: peers
 
 notebooks: setup
 	$(BIN)/python -m examples.run
+
+# The documentation, in build/site: opens from the disk, needs no network. Broken links and keys without a text stop it.
+site: setup
+	$(BIN)/mkdocs build --strict --quiet
 
 # The wheel, installed where nothing of this folder can be seen, runs the demo.
 wheel-check: setup

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize import bench
-from characterize.asbuilt import AsBuilt
-from characterize.bench import Camera, Truth
-from characterize.capture import Capture
-from characterize.forward import ForwardModel, Setting
-from characterize.parameters import Known
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures.capture import Capture
+from characterize.inference.asbuilt import AsBuilt
+from characterize.model.forward import ForwardModel, Setting
+from characterize.model.parameters import Known
 from metalens import design, profiles
-from metalens.cell import Cell
-from metalens.lens import Lens
+from metalens.cell.record import Cell
+from metalens.lens.record import Lens
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "characterize"))
 import bench_lens

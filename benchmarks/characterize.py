@@ -9,12 +9,14 @@ import torch
 
 from benchmarks import Row, fastest
 from benchmarks import _millimetre as millimetre
-from characterize import bench, capture, sem
-from characterize.estimate import Options, fit
-from characterize.forward import ForwardModel, Setting
-from characterize.parameters import vector
-from characterize.pupil import PupilSpec
-from characterize.pupilfit import fit_pupil
+from characterize.bench import bench
+from characterize.captures import capture
+from characterize.inference.estimate import Options, fit
+from characterize.measure import sem
+from characterize.model.forward import ForwardModel, Setting
+from characterize.model.parameters import vector
+from characterize.pupil.fit import fit_pupil
+from characterize.pupil.record import PupilSpec
 
 ROOT = Path(__file__).parents[1]
 BEADS = ROOT.parent / "shared" / "captures" / "bead_stack" / "psf_wl520nm_z300nm_x130nm_na0.85_n1.0.tif"

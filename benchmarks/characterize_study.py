@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from characterize import bench
-from characterize.asbuilt import AsBuilt
-from characterize.bench import Camera, Truth
-from characterize.capture import Capture
-from characterize.estimate import Options, fit
-from characterize.forward import ForwardModel, Setting
-from characterize.parameters import PLACE, Known
-from metalens import store
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures.capture import Capture
+from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.estimate import Options, fit
+from characterize.model.forward import ForwardModel, Setting
+from characterize.model.parameters import PLACE, Known
+from metalens.ground import store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "characterize"))
 FOLDER = Path(__file__).parent / "results" / "characterize_study"

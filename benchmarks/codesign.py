@@ -11,19 +11,22 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks import Row, fastest
-from codesign import architecture, baselines, cost, inner, losses, optics, pool
-from codesign.architecture import Architecture, Space
-from codesign.baselines import Name
-from codesign.eye_scenes import EyeScenes, SceneConfig
-from codesign.flat import flattened, irradiance
-from codesign.formation import read_out
-from codesign.inner import InnerConfig, Schedule, Trainer
-from codesign.optics import OpticsConfig
-from codesign.pool import PoolScenes
-from codesign.supernet import Supernet
-from metalens import sensor as camera
-from metalens.pupil import psf
-from metalens.sensor import Sensor
+from codesign.batches import pool
+from codesign.batches.flat import flattened, irradiance
+from codesign.batches.pool import PoolScenes
+from codesign.batches.scenes import EyeScenes, SceneConfig
+from codesign.network import architecture, baselines, cost, losses
+from codesign.network.architecture import Architecture, Space
+from codesign.network.baselines import Name
+from codesign.network.supernet import Supernet
+from codesign.optics import stack as optics
+from codesign.optics.stack import OpticsConfig
+from codesign.train import inner
+from codesign.train.formation import read_out
+from codesign.train.inner import InnerConfig, Schedule, Trainer
+from metalens.image import sensor as camera
+from metalens.image.pupil import psf
+from metalens.image.sensor import Sensor
 
 NONE, BATCH = float("nan"), 32
 SCENES = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)

@@ -19,10 +19,10 @@ import torch
 
 from benchmarks import keep_line, kept_lines
 from benchmarks.codesign_report import ROOT, ratio
-from codesign import ambiguity, assess, evolution, finish, run
-from codesign.eye_scenes import TEST
-from codesign.run import Part, RunConfig
-from metalens import config, store
+from codesign.batches.scenes import TEST
+from codesign.train import ambiguity, assess, evolution, finish, run
+from codesign.train.run import Part, RunConfig
+from metalens.ground import config, store
 
 LINES = "ablation.jsonl"
 VARIANTS: dict[str, tuple[Part, ...]] = {

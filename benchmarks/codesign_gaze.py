@@ -13,11 +13,12 @@ import torch
 
 from benchmarks import kept_lines
 from benchmarks.codesign_study import CASES, SCENES, architecture_of, restored, scenes_of, stem
-from codesign import assess, gaze_test
-from codesign.eye_scenes import TEST
-from codesign.flat import flattened
-from codesign.gaze_test import People
-from codesign.inner_batch import Batch
+from codesign.batches.batch import Batch
+from codesign.batches.flat import flattened
+from codesign.batches.scenes import TEST
+from codesign.gaze import bench as gaze_test
+from codesign.gaze.bench import People
+from codesign.train import assess
 
 ROOT = Path(__file__).parents[1]
 PEOPLE, EACH, BATCH = 16, 40, 32

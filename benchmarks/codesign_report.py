@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmarks import kept_lines
 from benchmarks.codesign_study import BASELINES
-from metalens import report, store
+from metalens.ground import report, store
+from metalens.ground.arrays import Array
 
 ROOT = Path(__file__).parents[1]
-Array = np.ndarray[Any, np.dtype[Any]]
 HEAD = """# Results of the study
 
 Mean absolute error of the axial slippage on 512 test frames in 256 pairs that share a pupil position. The depth of
@@ -60,6 +60,22 @@ class Runs:
     def slip(self) -> Array:
         """(seeds, frames) mm, mean over the three axes."""
         return np.asarray(self.errors["ambiguous"].mean(-1))
+
+    def means(self) -> dict[str, Any]:
+        """What every table says of the runs; no ``iou`` of a network that draws no mask."""
+        iou, response = (
+            float(np.mean([line[part][key] for line in self.lines]))
+            for part, key in (("ambiguous", "iou"), ("depth_response", "mm_per_mm"))
+        )
+        return {
+            "seeds": len(self.lines),
+            "mmacs": self.lines[0]["mmacs"],
+            "axial_mm": float(self.axial().mean()),
+            "axial_by_seed_mm": [round(float(e), 4) for e in self.axial().mean(1)],
+            "lateral_mm": float(self.errors["ambiguous"][..., :2].mean()),
+            "iou": iou if iou == iou else None,
+            "response_mm_per_mm": response,
+        }
 
 
 def load(work: Path) -> dict[str, dict[str, Runs]]:
@@ -109,14 +125,9 @@ def summaries(runs: dict[str, Runs]) -> list[dict[str, Any]]:
     """One row a lens, least axial error first."""
     best, out = best_focus(runs), []
     for lens, mine in runs.items():
-        row: dict[str, Any] = {"lens": lens, "seeds": len(mine.lines), "frames": mine.lines[0]["frames"]}
-        row |= {"mmacs": mine.lines[0]["mmacs"], "axial_mm": float(mine.axial().mean())}
-        row["axial_by_seed_mm"] = [round(float(e), 4) for e in mine.axial().mean(1)]
-        row["lateral_mm"] = float(mine.errors["ambiguous"][..., :2].mean())
+        row = {"lens": lens, "frames": mine.lines[0]["frames"], **mine.means()}
         row["slip_mm"] = float(mine.slip().mean())
         row["natural_axial_mm"] = float(mine.axial("natural").mean())
-        row["iou"] = _mean_iou(mine)
-        row["response_mm_per_mm"] = float(np.mean([line["depth_response"]["mm_per_mm"] for line in mine.lines]))
         for name, reference in (("mid_range", "hyper20"), ("best_focus", best)):
             if reference in runs and lens != reference:
                 row[f"to_{name}"] = ratio(mine.axial(), runs[reference].axial())
@@ -130,15 +141,15 @@ def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs
     """Markdown."""
     parts = []
     for case, mine in found.items():
+        best = best_focus(runs[case])
+        references = {"to_mid_range": "hyper20", "to_best_focus": best, "slip_to_best_focus": best}
         line = f"## {case}: {mine[0]['mmacs']:.1f} MMACs, {mine[0]['frames']} training frames a run, best focus: "
-        parts.append(line + f"`{best_focus(runs[case])}`\n")
+        parts.append(line + f"`{best}`\n")
         parts.append(
             "| lens | seeds | axial / mm | to mid-range (20 mm) | to best focus | lateral / mm | all axes, to best "
             "focus | IoU | mm per mm of PSF depth |\n|---|---|---|---|---|---|---|---|---|"
         )
         for row in mine:
-            best = best_focus(runs[case])
-            references = {"to_mid_range": "hyper20", "to_best_focus": best, "slip_to_best_focus": best}
             ratios = ["1" if row["lens"] == name else _interval(row.get(key)) for key, name in references.items()]
             parts.append(
                 f"| {row['lens']} | {row['seeds']} | {row['axial_mm']:.3f} | {ratios[0]} | {ratios[1]} | "
@@ -146,12 +157,6 @@ def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs
             )
         parts.append("")
     return "\n".join(parts)
-
-
-def _mean_iou(runs: Runs) -> float | None:
-    """Over the seeds; None of a network that draws no mask."""
-    mean = float(np.mean([line["ambiguous"]["iou"] for line in runs.lines]))
-    return mean if mean == mean else None
 
 
 def _share(value: float | None) -> str:
@@ -201,11 +206,7 @@ def networks(runs: dict[str, dict[str, Runs]], *, lens: str = "hyper33") -> list
     out = []
     for name, case in cases.items():
         mine = runs[case][lens]
-        row = {"network": name, "seeds": len(mine.lines), "mmacs": mine.lines[0]["mmacs"]}
-        row |= {"axial_by_seed_mm": [round(float(e), 4) for e in mine.axial().mean(1)]}
-        row |= {"axial_mm": float(mine.axial().mean()), "lateral_mm": float(mine.errors["ambiguous"][..., :2].mean())}
-        row["iou"] = _mean_iou(mine)
-        row["response_mm_per_mm"] = float(np.mean([line["depth_response"]["mm_per_mm"] for line in mine.lines]))
+        row = {"network": name, **mine.means()}
         out.append(row if name == "elastic" else row | {"to_elastic": ratio(mine.axial(), ours.axial())})
     return out
 

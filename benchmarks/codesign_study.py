@@ -15,29 +15,31 @@ import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
 from benchmarks import keep_line, kept_lines
-from codesign import ambiguity, assess, dataset, inner, pool
-from codesign.architecture import Architecture, Space
-from codesign.baselines import Name
-from codesign.depth_test import depth_response
-from codesign.eye import States
-from codesign.eye_scenes import TEST, TRAINING, EyeScenes, SceneConfig
-from codesign.formation import network_macs
-from codesign.inner import Batch, InnerConfig, Scenes, Schedule, Trainer
-from codesign.optics import OpticsConfig, added_phase
-from codesign.pool import PoolScenes
-from codesign.renderer import render
-from codesign.supernet import recalibrate
-from metalens.pupil import coordinates
-from metalens.pupil_oblique import Field, oblique_path
-from metalens.scene import Frames
-from metalens.sensor import Sensor
+from codesign.batches import pool
+from codesign.batches.pool import PoolScenes
+from codesign.batches.scenes import TEST, TRAINING, EyeScenes, SceneConfig
+from codesign.eye import dataset
+from codesign.eye.population import States
+from codesign.eye.renderer import render
+from codesign.network.architecture import Architecture, Space
+from codesign.network.baselines import Name
+from codesign.network.supernet import recalibrate
+from codesign.optics.stack import OpticsConfig, added_phase
+from codesign.train import ambiguity, assess, inner
+from codesign.train.depth_test import depth_response
+from codesign.train.formation import network_macs
+from codesign.train.inner import Batch, InnerConfig, Scenes, Schedule, Trainer
+from metalens.ground.paths import source_path
+from metalens.image.pupil import Field, coordinates
+from metalens.image.scene import Frames
+from metalens.image.sensor import Sensor
 
 LINES = "runs.jsonl"
 TESTED, WIDE = 512, 2048  # frames of either test, and of a retest
@@ -119,8 +121,9 @@ def oblique(settings: OpticsConfig) -> torch.Tensor:
     x, y = coordinates(pupil)
     inside = torch.hypot(x, y) <= pupil.radius_um
     field = Field(math.radians(settings.angle_deg))
-    ends = (pupil.sensor_distance_um, -settings.focus_mm * 1e3)
-    paths = sum(oblique_path(x, y, field, z) - oblique_path(x, y, Field(), z) for z in ends)
+    (tx, ty), flat = field.tangents, (0.0, 0.0)
+    ends = ((-tx, -ty), 1 / pupil.sensor_distance_um), ((tx, ty), 1e-3 / settings.focus_mm)
+    paths = sum(source_path(x, y, slope, inverse) - source_path(x, y, flat, inverse) for slope, inverse in ends)
     wanted = -2 * math.pi / pupil.wavelength_um * torch.as_tensor(paths)
     unit = torch.eye(settings.polynomials, dtype=torch.float64)
     modes = torch.stack([added_phase(axial, one)[inside] for one in unit] + [torch.ones_like(x)[inside]], 1)
@@ -147,7 +150,7 @@ def pool_of(work: Path) -> pool.Pool:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Kept:
-    """Test frames with both sheets, rendered once; see :class:`codesign.inner.Scenes`."""
+    """Test frames with both sheets, rendered once; see :class:`codesign.train.inner.Scenes`."""
 
     frames: Frames
     mask: torch.Tensor
@@ -290,7 +293,7 @@ def main() -> None:
 SCAN = ("hyper12", "hyper24", "hyper28", "hyper40", "hyper50", "helix1", "helix3")  # chooses focus and helix: one seed
 LENSES = ("hyper33", "joint33", "swift20", "hyper20", "helix2", "swift33")
 MAIN = ("hyper33", "swift33", "hyper20")
-BASELINES = ("nvgaze", "popovic", "de2gaze")
+BASELINES = get_args(Name)[1:]
 LONG = ("hyper33", "swift33", "hyper40", "swift40", "hyper20")
 PLAN = [f"p18long/{lens}/{seed}" for seed in range(5) for lens in LONG]
 PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28")]
@@ -300,6 +303,7 @@ PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
 PLAN += [f"p9field/{lens}/{seed}" for seed in range(2) for lens in (*MAIN, "oblique33", "swiftoblique33")]
+PLAN += [f"p9field/{lens}/0" for lens in ("hyper40", "hyper50")]
 PLAN += [f"p18{network}/{lens}/{seed}" for network in BASELINES for seed in range(3) for lens in ("hyper33", "hyper20")]
 
 

@@ -20,9 +20,9 @@ import torch
 
 from benchmarks import Row
 from benchmarks.loop_runs import Recipe, finished
-from codesign import retraining
-from codesign.experiment import ExperimentConfig, Points, experiment
-from metalens import store
+from codesign.adapt import train as retraining
+from codesign.evaluate.gaze_experiment import ExperimentConfig, Points, experiment
+from metalens.ground import store
 
 RESULT = Path(__file__).parent / "results" / "experiment_study.json"
 WIDE = {
@@ -84,7 +84,7 @@ def main() -> None:
     if given.what == "train":
         finished(given.work / given.name, replace(LENSES[given.name], steps=given.steps))
         return
-    from codesign import command_experiment
+    from codesign.commands import experiment as command_experiment
 
     names = tuple(name for name in LENSES if (given.work / name / "result.json").is_file())
     folders = tuple(given.work / name for name in names)

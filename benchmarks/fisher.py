@@ -8,12 +8,15 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from metalens import baselines, design_fisher, fisher, pupil
-from metalens.design_coarse import coarse_climb
-from metalens.design_fisher import Fisher
-from metalens.profiles import Focus, hyperbolic
+from benchmarks.rivals.coarse_design import coarse_climb
+from metalens import fisher
+from metalens.design.free_form import search as design_fisher
+from metalens.design.free_form import simple_lenses as baselines
+from metalens.design.free_form.search import Fisher
+from metalens.design.profiles import Focus, hyperbolic
+from metalens.image import pupil
+from metalens.image.pupil import Pupil
 from metalens.psf import psf_stack
-from metalens.pupil import Pupil
 
 NONE = float("nan")
 ASKED = (1.4, 1.7, 2.05)

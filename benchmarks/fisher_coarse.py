@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from metalens.design_coarse import Claim, coarse_climb
-from metalens.pupil import Pupil
-from metalens.report import canvas, png
+from benchmarks.rivals.coarse_design import Claim, coarse_climb
+from metalens.ground.report import canvas, png
+from metalens.image.pupil import Pupil
 
 ITERATIONS, LOOKS = 60, 20
 PICTURE = Path(__file__).parents[1] / "docs" / "fisher" / "coarse.png"

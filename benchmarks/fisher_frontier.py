@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from metalens import baselines, design, design_fisher
-from metalens.design_fisher import Fisher
-from metalens.profiles import Focus
-from metalens.pupil import Pupil
+from metalens import design
+from metalens.design.free_form import search as design_fisher
+from metalens.design.free_form import simple_lenses as baselines
+from metalens.design.free_form.search import Fisher
+from metalens.design.profiles import Focus
+from metalens.image.pupil import Pupil
 
 PUPIL = Pupil(nodes=160)
 ENERGIES = (0.5, 0.3, 0.7, 0.85)
@@ -99,7 +101,7 @@ def fringe(binning: int) -> dict[str, float]:
 
 def pillars(folder: Path, lens_file: str) -> None:
     """The designs for angles and at energy 0.5, and tuned lenses, on the pillars of a lens, through the PSF engine."""
-    from codesign.evaluate_optics import Setting, axial
+    from codesign.evaluate.optics import Setting, axial
     from metalens import lens
 
     like = lens.load(lens_file)
@@ -161,7 +163,7 @@ def collect(folder: Path) -> None:
 
 def picture(values: dict[str, Any]) -> bytes:
     """Information against encircled energy, a panel for each binning."""
-    from metalens.report import canvas, png
+    from metalens.ground.report import canvas, png
 
     figure, panels = canvas(1, 3, size=(11, 3.6))
     for k, panel in enumerate(panels):

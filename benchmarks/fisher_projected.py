@@ -18,11 +18,11 @@ import torch
 
 from benchmarks.codesign_study import SCENES, optics_of
 from benchmarks.fisher_ranking import DOCS, PUPIL, frame_information
-from codesign import optics
-from codesign.evaluate_tables import ratio
-from codesign.eye_scenes import TEST, EyeScenes
-from codesign.optics import Stack
-from metalens import pupil, sensor
+from codesign.batches.scenes import TEST, EyeScenes
+from codesign.evaluate.tables import ratio
+from codesign.optics import stack as optics
+from codesign.optics.stack import Stack
+from metalens.image import pupil, sensor
 
 SIMPLE = ("hyper20", "hyper24", "hyper28", "hyper33", "hyper40", "helix2")
 FRAMES = 16

@@ -14,20 +14,23 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.stats import rankdata
+from torch import Tensor
 
 from benchmarks.codesign_study import CASES, SCENES, optics_of
-from codesign import optics
-from codesign.design_scenes import SceneObjective
-from codesign.eye_scenes import TEST, EyeScenes
-from codesign.flat import irradiance
-from metalens import baselines, blind_texture, fisher, pupil
-from metalens.blind_texture import Texture
-from metalens.design_fisher import Fisher, score
-from metalens.pupil import Pupil
-from metalens.scene import Frames
-from metalens.sensor import Sensor, mean_electrons, variance
+from benchmarks.rivals import blind_texture
+from benchmarks.rivals.blind_texture import Texture
+from codesign.batches.flat import irradiance
+from codesign.batches.scenes import TEST, EyeScenes
+from codesign.evaluate.scenes import SceneObjective
+from codesign.optics import stack as optics
+from metalens import fisher
+from metalens.design.free_form import simple_lenses as baselines
+from metalens.design.free_form.search import Fisher, score
+from metalens.image import pupil
+from metalens.image.pupil import Pupil
+from metalens.image.scene import Frames
+from metalens.image.sensor import Sensor, mean_electrons, variance
 
-Tensor = torch.Tensor
 LENSES = ("hyper20", "hyper24", "hyper28", "hyper33", "hyper40", "hyper50", "helix2", "helix3")
 ROOT = Path(__file__).parents[1]
 STUDY = ROOT / "benchmarks" / "results" / "codesign_study.json"

@@ -15,11 +15,15 @@ import numpy as np
 
 import layout
 from benchmarks import Row, fastest
-from layout import drc, gdsii_write, oasis_write, polygon, verify
-from layout.mask import Lattice, MaskPlan, pillar_classes
-from layout.process import Rules
-from metalens import store
-from metalens.store import Array
+from layout.files import verify
+from layout.gdsii import write as gdsii_write
+from layout.mask.plan import Lattice, MaskPlan, pillar_classes
+from layout.oasis import write as oasis_write
+from layout.process.process import Rules
+from layout.rules import check as drc
+from layout.shapes import polygon
+from metalens.ground import store
+from metalens.ground.arrays import Array
 
 PITCH = 400
 SIZES = np.arange(100, 302, 2)
@@ -193,7 +197,7 @@ def _streaming_rows(target: Path) -> list[Row]:
 def _command_rows(target: Path) -> list[Row]:
     """The whole command on a lens file."""
     from benchmarks.process import lens
-    from layout import command
+    from layout.commands import layout as command
     from metalens import lens as lenses
 
     lenses.save(target / "lens.h5", lens())

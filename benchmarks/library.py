@@ -8,11 +8,14 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from metalens import library, proxy_fit, rcwa, reduced, workers
-from metalens.cell import Cell, Index
-from metalens.library import DEFAULT_CELL, PillarLibrary, Sweep
-from metalens.proxy import Proxy
-from metalens.response import Response
+from metalens import library, rcwa
+from metalens.cell.record import Cell, Index
+from metalens.cell.response import Response
+from metalens.ground import executor
+from metalens.pillars import curve as reduced
+from metalens.pillars import fit as proxy_fit
+from metalens.pillars.proxy import Proxy
+from metalens.pillars.record import DEFAULT_CELL, PillarLibrary, Sweep
 
 HARD = Cell(0.40, 0.7, Index(3.6))
 SPAN = (0.08, 0.32)
@@ -59,7 +62,7 @@ def _sweep(case: str, sweep: Sweep) -> tuple[Row, PillarLibrary]:
     seconds = time.perf_counter() - start
     against = f"largest error bar; {int((made.t_error <= sweep.tolerance).sum())} of {made.t.size} within the tolerance"
     method = f"{made.solves} solves, {made.engine}"
-    return Row(case, method, seconds, float(made.t_error.max()), against, threads=workers.cores()), made
+    return Row(case, method, seconds, float(made.t_error.max()), against, threads=executor.cores()), made
 
 
 def _table() -> Row:
@@ -109,7 +112,7 @@ def _evaluations(proxy: Proxy) -> list[Row]:
         for method, call, off, against, goal in work:
             seconds = fastest(call, repeats=3)
             told = f"{goal}: {'met' if seconds <= 0.5 else 'missed'}" if goal else ""
-            found.append(Row(f"10^7 pillars, {name}", method, seconds, off, against, workers.cores(), goal=told))
+            found.append(Row(f"10^7 pillars, {name}", method, seconds, off, against, executor.cores(), goal=told))
     return found
 
 

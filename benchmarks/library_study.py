@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from metalens import reduced, workers
-from metalens.cell import Cell, Index
-from metalens.engines import Light, smooth
-from metalens.library import DEFAULT_CELL
+from metalens.cell.record import Cell, Index
+from metalens.cell.response import Response
+from metalens.ground.arrays import Array
 from metalens.modal.engine import case_of, evaluate
 from metalens.modal.ladder import RUNGS
-from metalens.reduced import Curve, Nodes
-from metalens.response import Response
-from metalens.store import Array
+from metalens.pillars import curve as reduced
+from metalens.pillars import workers
+from metalens.pillars.curve import Curve, Nodes
+from metalens.pillars.engines import Light, smooth
+from metalens.pillars.record import DEFAULT_CELL
 
 FILE = Path(__file__).parent / "results" / "library_study.json"
 HELD_OUT = 2500  # diameters a curve
@@ -51,7 +52,7 @@ def finer(cell: Cell, light: Light, largest_um: float, mesh: int) -> Any:
     def at(diameter_um: float) -> Response:
         case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
         found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
-        error = rung.error(found.spread, found.drift, case.rho)
+        error = rung.error(found, case.rho)
         t, r = complex(found.matrix[1, 0]), complex(found.matrix[0, 0])
         return Response(t, r, error, found.unknowns, found.energy, "modal", True, rung.name)
 

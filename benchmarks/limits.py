@@ -17,8 +17,8 @@ from pathlib import Path
 
 from benchmarks import Row
 from benchmarks.__main__ import table
-from metalens import chain
-from metalens.chain import Stage
+from metalens.chain import stages as chain
+from metalens.chain.stages import Stage
 
 NAN = float("nan")
 BUDGET = ("budget", "lens.h5", "--library", "library.h5", "--process", "process.toml", "-o", "budget.h5")

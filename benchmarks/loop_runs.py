@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign import optics as trained
-from codesign import run as runs
-from codesign.architecture import largest
-from codesign.evolution import Candidate, Search
-from codesign.finish import finish
-from metalens import design, lens, library, store
+from codesign.network.architecture import largest
+from codesign.optics import stack as trained
+from codesign.train import run as runs
+from codesign.train.evolution import Candidate, Search
+from codesign.train.finish import finish
+from metalens import design, lens, library
+from metalens.ground import store
 
 TEXT = """
 preset = "smoke"

@@ -11,7 +11,7 @@ import numpy as np
 
 import metalens
 from benchmarks import Row, fastest
-from metalens.cell import Cell, Index
+from metalens.cell.record import Cell, Index
 from metalens.modal import gradient, solve, solve_many
 from metalens.modal.engine import basis, case_of, evaluate, geometry
 from metalens.modal.ladder import RUNGS

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import metalens
-from metalens.cell import Cell, Index
+from metalens.cell.record import Cell, Index
 from metalens.modal.engine import case_of, evaluate
 from metalens.modal.mesh import MeshPlan, build
 from metalens.modal.spaces import select

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from codesign import plan
-from codesign.plan import Chain, Choice, PlanConfig
-from codesign.task import TaskSetting
+from codesign.budget import plan
+from codesign.budget.plan import Chain, Choice, PlanConfig
+from codesign.budget.task import TaskSetting
 
 GOALS = 20
 CONFIG = PlanConfig(aperture_mm=0.3, led_fwhm_nm=30.0, stacks=20, frames=1000, task=TaskSetting(scenes=4))

@@ -10,19 +10,25 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import Row, fastest
-from layout import cells, dose, fields, focus, solid, stitching, tolerance, tolerant
-from layout.process import Etch, Exposure, Process
-from layout.sensitivity import Sensitivities
-from metalens.cell import Cell
-from metalens.lens import DiameterMap, Lens
-from metalens.proxy import Proxy
+from layout.dose import correct as dose
+from layout.mask import cells, fields
+from layout.process.process import Etch, Exposure, Process
+from layout.solid import verbs as solid
+from layout.study import focus, stitching, tolerance, tolerant
+from layout.study.sensitivity import Sensitivities
+from metalens.cell.record import Cell
+from metalens.lens.record import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
 
 PROXY = Proxy(np.array([[4.6, 4.2, 0.5, 0.3]]), np.array([[0.9, 0.02, 0.04]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
 TABLE_UM = np.arange(100, 301, 2) * 1e-3
 SENS = Sensitivities(
-    TABLE_UM, 8j + 30j * (TABLE_UM - 0.1) - 1, 0.2 + 5j * (TABLE_UM - 0.2), 0.3j + 25j * (TABLE_UM - 0.1), 0.0
+    TABLE_UM,
+    np.array([8j + 30j * (TABLE_UM - 0.1) - 1, 0.3j + 25j * (TABLE_UM - 0.1), 0.2 + 5j * (TABLE_UM - 0.2)]),
+    0.0,
 )
-PROCESS = Process(etch=Etch(sidewall_deg=1.0))
+BEAM = Exposure(alpha_um=0.010, beta_um=31.0, eta=0.6)
+PROCESS = Process(etch=Etch(sidewall_deg=1.0), exposure=BEAM)
 BIASED = dataclasses.replace(
     PROCESS,
     bias=dataclasses.replace(PROCESS.bias, table_nm=((80.0, -6.0), (180.0, -1.0), (340.0, 1.0)), isolated_nm=-2.0),
@@ -63,7 +69,7 @@ def _process_rows() -> list[Row]:
         "fields": fastest(lambda: fields.split(written, BIASED)),
     }
     result = dose.correct(written, BIASED)
-    wide = dataclasses.replace(BIASED, exposure=Exposure(maximum_classes=4))
+    wide = dataclasses.replace(BIASED, exposure=dataclasses.replace(BEAM, maximum_classes=4))
     few = dose.correct(written, wide)
     total = sum(times.values())
     case, exact = "4.9 M pillars", "exposure against exact discs, relative"

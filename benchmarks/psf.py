@@ -18,10 +18,11 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from metalens import lowrank, propagate, psf
-from metalens.propagate_estimate import draw, scan, square_error
-from metalens.propagate_radial import Radial, field_radial
-from metalens.propagate_spectrum import transfer
+from benchmarks.rivals import lowrank
+from benchmarks.rivals.radial import Radial, field_radial
+from metalens import propagate, psf
+from metalens.propagate.estimate import draw, scan, square_error
+from metalens.propagate.textbook import transfer
 
 PITCH, WAVELENGTH, D, SOURCE, RADIUS = 0.4, 0.85, 2000.0, 20e3, 500.0
 K = 2 * np.pi / WAVELENGTH

@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from metalens import modal, rcwa
-from metalens.cell import Cell, Film, Index
-from metalens.response import Response
+from metalens.cell.record import Cell, Film, Index
+from metalens.cell.response import Response
 
 DIAMETERS = np.round(np.arange(0.08, 0.3201, 0.02), 3)
 CELLS = {
@@ -39,7 +39,7 @@ def reference(cell: Cell, wavelength_um: float) -> np.ndarray[Any, np.dtype[Any]
 
 def truncated_row(cell: Cell, wavelength_um: float, exact: Any, harmonics: int) -> Row:
     """Error and estimate at one truncation; the time is that of this truncation alone."""
-    from metalens.rcwa.case import case
+    from metalens.rcwa.conditions import case
     from metalens.rcwa.solver import truncated
 
     found = rcwa.solve_many(cell, DIAMETERS, wavelength_um, harmonics=harmonics)

@@ -7,12 +7,13 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from benchmarks.retrain_study import RESULT
-from characterize import made
-from characterize.parameters import PLACE, vector
-from characterize.pillars import sensitivity
-from codesign.built import MadeLens, of_lens
-from codesign.optics import OpticsConfig
-from metalens import design, library, psf, psf_metrics
+from characterize.model import made
+from characterize.model.parameters import PLACE, vector
+from codesign.optics.built import MadeLens, of_lens
+from codesign.optics.stack import OpticsConfig
+from metalens import design, library, psf
+from metalens.made import sensitivity
+from metalens.psf import metrics as psf_metrics
 
 SETTINGS = OpticsConfig(aperture_mm=0.4, focus_mm=28.0, polynomials=0, sample_um=18.0, window_samples=17, depth_count=6)
 TRUE = {"bias_nm": 5.0, "bias_x_nm": 3.0, "bias_r_nm": 4.0, "height_nm": -8.0, "coma_x_rad": 0.3, "spherical_rad": 0.2}

@@ -25,18 +25,22 @@ import torch
 
 from benchmarks import keep_line, kept_lines
 from benchmarks.loop_runs import Recipe, finished
-from characterize import asbuilt, bench, capture, command_capture
-from characterize.asbuilt import AsBuilt
-from characterize.bench import Camera, Truth
-from characterize.estimate import Options, fit
-from characterize.parameters import PARAMETERS, Known, vector
-from characterize.pillars import sensitivity
-from codesign import optics as trained
-from codesign import retraining
-from codesign.built import OF_LENS, MadeLens, psf_error
-from codesign.optics import Stack
-from codesign.retraining import Held, Lenses, RetrainConfig, Source
-from metalens import lens, store
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures import capture
+from characterize.commands import capture as command_capture
+from characterize.inference import asbuilt
+from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.estimate import Options, fit
+from characterize.model.parameters import PARAMETERS, Known, vector
+from codesign.adapt import train as retraining
+from codesign.adapt.train import Held, Lenses, RetrainConfig, Source
+from codesign.optics import stack as trained
+from codesign.optics.built import OF_LENS, MadeLens, psf_error
+from codesign.optics.stack import Stack
+from metalens import lens
+from metalens.ground import store
+from metalens.made import sensitivity
 
 BASE = Recipe(33.0, moves=True, steps=3000)
 SPREAD = {"bias_nm": 4.0, "bias_x_nm": 3.0, "bias_y_nm": 3.0, "bias_r_nm": 2.0, "height_nm": 7.0, "distance_um": 15.0}

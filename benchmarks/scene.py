@@ -6,11 +6,12 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from codesign import dataset, renderer
-from codesign.eye import Rig, parameters
-from codesign.renderer import Camera
-from metalens import pupil, scene, sensor
-from metalens.pupil import Pupil
+from benchmarks.rivals import layered
+from codesign.eye import dataset, renderer
+from codesign.eye.population import Rig, parameters
+from codesign.eye.renderer import Camera
+from metalens.image import pupil, scene, sensor
+from metalens.image.pupil import Pupil
 
 NONE = float("nan")
 
@@ -87,14 +88,14 @@ def _imaging(threads: int) -> list[Row]:
     stack = stack / stack.sum((1, 2), keepdim=True)
     layers = scene.cut(frames, depths)
     order = [int((depths - d).abs().argmin()) for d in layers.depth_um]
-    exact = scene.image_layers(layers, stack[order])[:, 16:144, 16:144]
+    exact = layered.image_layers(layers, stack[order])[:, 16:144, 16:144]
     empty = torch.zeros(8, 21, 160, 160)
     all_layers = scene.Layers(empty, empty, depths, torch.zeros(21, dtype=torch.bool))
-    plain = fastest(lambda: scene.published(all_layers, stack)) / 8
+    plain = fastest(lambda: layered.published(all_layers, stack)) / 8
     start = time.perf_counter()
     others = renderer.render(dataset.states_at(torch.arange(100, 104), 2), camera=Camera()).frames
-    basis = scene.trimmed(scene.basis(stack, depths, tolerance=2e-4), others, tolerance=1e-3, margin=16)
-    made = scene.imager(basis, (160, 160), margin=16)
+    basis = layered.trimmed(scene.basis(stack, depths, tolerance=2e-4), others, tolerance=1e-3, margin=16)
+    made = scene.uniform_imager(basis, (160, 160), margin=16)
     prepare = time.perf_counter() - start
     image = scene.image(frames, made, margin=16)
     fast = fastest(lambda: scene.image(frames, made, margin=16), repeats=12) / 8
@@ -105,7 +106,7 @@ def _imaging(threads: int) -> list[Row]:
     whole = scene.Layers(
         layers.coverage[:, sorted_], layers.coverage[:, sorted_], layers.depth_um[sorted_], layers.near[sorted_]
     )
-    lost = 1 - scene.published(whole, stack[[order[i] for i in sorted_]])
+    lost = 1 - layered.published(whole, stack[[order[i] for i in sorted_]])
     goal = f"{plain / fast:.1f} x plain; {1 / fast:.0f}/s; asked 5 x at 1e-3 and 400/s"
     kernels = f"{len(basis.kernels)} kernels (made in {1e3 * prepare:.0f} ms; expected error {basis.error:.1g})"
     against = "layer by layer, relative L2"

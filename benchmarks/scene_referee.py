@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from benchmarks import Row
-from codesign import dataset, pathtraced
+from codesign.eye import dataset
+from codesign.referee import pathtraced
 
 STATES = (1, 3, 5, 8)
 SAMPLES = 512

@@ -24,13 +24,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row, keep_line, kept_lines
-from characterize import asbuilt, bench, capture, command_capture
-from characterize.bench import Truth
-from characterize.estimate import Options, fit
-from characterize.pillars import sensitivity
-from metalens import config, lens, store
+from characterize.bench import bench
+from characterize.bench.bench import Truth
+from characterize.captures import capture
+from characterize.commands import capture as command_capture
+from characterize.inference import asbuilt
+from characterize.inference.estimate import Options, fit
+from metalens import lens
 from metalens.cli import main as run_verb
-from metalens.errors import MetalensError
+from metalens.ground import config, store
+from metalens.ground.errors import MetalensError
+from metalens.made import sensitivity
 
 RESULT = Path(__file__).parent / "results" / "soak_study.json"
 CELLS = (  # (wavelength in nm, text): silicon in the near infrared, titania in green, nitride in red

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from characterize import leastsquares, zernike
-from characterize.leastsquares import Data, Prior, Settings
-from characterize.pupil import PupilModel, PupilSpec
+from characterize.inference import leastsquares
+from characterize.inference.leastsquares import Data, Prior, Settings
+from characterize.pupil import zernike
+from characterize.pupil.record import PupilModel, PupilSpec
 
 WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = 0.85, 0.02, 2.0, 48, 24, 7, 2e5, 5
 DEFOCUS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0)  # rms of the defocus term

@@ -3,27 +3,26 @@
 Names load when first used: ``import characterize; characterize.fit(capture, lens)``.
 """
 
-import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-_VERBS = {
-    "Capture": "capture",
-    "load": "capture",
-    "fit": "estimate",
-    "AsBuilt": "asbuilt",
-    "fit_pupil": "pupilfit",
-    "PupilSpec": "pupil",
-}
+from metalens.ground.lazy import attach
 
+if TYPE_CHECKING:
+    from characterize.captures.capture import Capture as Capture
+    from characterize.captures.capture import load as load
+    from characterize.inference.asbuilt import AsBuilt as AsBuilt
+    from characterize.inference.estimate import fit as fit
+    from characterize.pupil.fit import fit_pupil as fit_pupil
+    from characterize.pupil.record import PupilSpec as PupilSpec
 
-def __getattr__(name: str) -> Any:
-    if name.startswith("_"):
-        raise AttributeError(name)
-    if name in _VERBS:
-        return getattr(importlib.import_module(f"{__name__}.{_VERBS[name]}"), name)
-    try:
-        return importlib.import_module(f"{__name__}.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != f"{__name__}.{name}":
-            raise
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "AsBuilt": "characterize.inference.asbuilt",
+        "Capture": "characterize.captures.capture",
+        "PupilSpec": "characterize.pupil.record",
+        "fit": "characterize.inference.estimate",
+        "fit_pupil": "characterize.pupil.fit",
+        "load": "characterize.captures.capture",
+    },
+)

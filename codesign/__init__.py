@@ -3,26 +3,24 @@
 Names load when first used: ``import codesign; codesign.render(states)``.
 """
 
-import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-_PUBLIC = {
-    "render": "renderer",
-    "Supernet": "supernet",
-    "macs": "cost",
-    "search": "evolution",
-    "retrain": "retraining",
-}  # name: submodule that defines it
+from metalens.ground.lazy import attach
 
+if TYPE_CHECKING:
+    from codesign.adapt.train import retrain as retrain
+    from codesign.eye.renderer import render as render
+    from codesign.network.cost import macs as macs
+    from codesign.network.supernet import Supernet as Supernet
+    from codesign.train.evolution import search as search
 
-def __getattr__(name: str) -> Any:
-    if name.startswith("_"):
-        raise AttributeError(name)
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
-    try:
-        return importlib.import_module(f"{__name__}.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != f"{__name__}.{name}":
-            raise
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Supernet": "codesign.network.supernet",
+        "macs": "codesign.network.cost",
+        "render": "codesign.eye.renderer",
+        "retrain": "codesign.adapt.train",
+        "search": "codesign.train.evolution",
+    },
+)

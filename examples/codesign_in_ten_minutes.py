@@ -16,15 +16,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from codesign import assess, cost, inner, optics, pool
-from codesign.architecture import Architecture, Space
-from codesign.depth_test import depth_response
-from codesign.eye_scenes import TEST, EyeScenes, SceneConfig
-from codesign.inner import InnerConfig, Schedule, Trainer
-from codesign.optics import OpticsConfig
-from codesign.pool import PoolScenes
-from codesign.supernet import recalibrate
-from metalens.sensor import Sensor
+from codesign.batches import pool
+from codesign.batches.pool import PoolScenes
+from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
+from codesign.network import cost
+from codesign.network.architecture import Architecture, Space
+from codesign.network.supernet import recalibrate
+from codesign.optics import stack as optics
+from codesign.optics.stack import OpticsConfig
+from codesign.train import assess, inner
+from codesign.train.depth_test import depth_response
+from codesign.train.inner import InnerConfig, Schedule, Trainer
+from metalens.image.sensor import Sensor
 
 # %% [markdown]
 # ## Eyes

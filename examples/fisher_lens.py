@@ -14,9 +14,11 @@
 import matplotlib.pyplot as plt
 import torch
 
-from metalens import design_fisher, fisher, pupil
-from metalens.design_fisher import Fisher
-from metalens.pupil import Pupil
+from metalens import fisher
+from metalens.design.free_form import search as design_fisher
+from metalens.design.free_form.search import Fisher
+from metalens.image import pupil
+from metalens.image.pupil import Pupil
 
 optics = Pupil(nodes=160)
 x, y = (a.numpy() for a in pupil.coordinates(optics))

@@ -14,15 +14,15 @@
 # %%
 import numpy as np
 
-from characterize import bench
-from characterize.bench import Camera, Truth
-from characterize.capture import Capture
-from characterize.estimate import Options, fit
-from characterize.parameters import Known
-from characterize.slopes import slopes
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures.capture import Capture
+from characterize.inference.estimate import Options, fit
+from characterize.model.parameters import Known
+from characterize.model.pillar_slopes import slopes
 from metalens import design, profiles
-from metalens.cell import Cell
-from metalens.proxy import Proxy
+from metalens.cell.record import Cell
+from metalens.pillars.proxy import Proxy
 
 # %% [markdown]
 # A small lens. Yours comes from `metalens design`, its proxy from `metalens library`.

@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from metalens import library, modal, rcwa
-from metalens.cell import Cell, Index
+from metalens.cell.record import Cell, Index
 
 cell = Cell(pitch_um=0.40, height_um=0.7, pillar=Index(3.6), substrate=Index(1.4525))
 WAVELENGTH_UM = 0.85

@@ -21,24 +21,19 @@ import numpy as np
 from IPython.display import Image, display
 from scipy.signal import resample
 
-from layout import (
-    build,
-    dose,
-    drc,
-    fields,
-    oasis_read,
-    oasis_write,
-    process,
-    sensitivity,
-    solid,
-    stitching,
-    tolerance,
-    tolerant,
-    verify,
-)
+from layout.dose import correct as dose
+from layout.files import verify
+from layout.mask import build, fields
+from layout.oasis import read as oasis_read
+from layout.oasis import write as oasis_write
+from layout.process import process
+from layout.rules import check as drc
+from layout.solid import verbs as solid
+from layout.study import sensitivity, stitching, tolerance, tolerant
 from metalens import design, library
-from metalens.lens import DiameterMap
-from metalens.profiles import Focus
+from metalens.design.profiles import Focus
+from metalens.lens.record import DiameterMap
+from metalens.made import Spread
 
 rules = process.load("process.toml")
 focus = Focus(wavelength_um=0.85, sensor_distance_um=600.0, source_distance_um=20_000.0)
@@ -189,7 +184,7 @@ plt.show()
 # tolerance:
 
 # %%
-bias_only = process.Process(spread=process.Spread(8.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+bias_only = process.Process(spread=Spread.only(bias_nm=8.0))
 plain = tolerance.analyse(lens, bias_only, sens=answers, draws=10).effects[0]
 print("phase tolerance   phase error   |T|     spread per nm    phase at ±8 nm   PSF change")
 print(

@@ -24,8 +24,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from metalens import lowrank, propagate, psf, psf_metrics
-from metalens.propagate_radial import Radial, field_radial
+from benchmarks.rivals import lowrank
+from benchmarks.rivals.radial import Radial, field_radial
+from metalens import propagate, psf
+from metalens.psf import metrics as psf_metrics
 
 torch.set_num_threads(2)
 WAVELENGTH, PITCH, D, SOURCE, RADIUS = 0.85, 0.4, 400.0, 4000.0, 100.0

@@ -18,16 +18,21 @@ from pathlib import Path
 
 from IPython.display import Image, display
 
-from characterize import asbuilt, bench, command_capture
-from characterize import capture as captures
-from characterize.bench import Camera, Truth
-from characterize.estimate import Options, fit
-from characterize.parameters import Known
-from characterize.pillars import sensitivity
-from codesign import built, correction, retrain_report, retraining
-from codesign.retraining import RetrainConfig
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures import capture as captures
+from characterize.commands import capture as command_capture
+from characterize.inference import asbuilt
+from characterize.inference.estimate import Options, fit
+from characterize.model.parameters import Known
+from codesign.adapt import correction
+from codesign.adapt import report as retrain_report
+from codesign.adapt import train as retraining
+from codesign.adapt.train import RetrainConfig
+from codesign.optics import built
 from metalens import lens as lenses
 from metalens.cli import main
+from metalens.made import sensitivity
 
 work = Path(tempfile.mkdtemp())
 

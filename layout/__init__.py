@@ -3,35 +3,30 @@
 Names load when first used: ``import layout; layout.write_oasis(layout.plan(lens, process), path)``.
 """
 
-import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-# public name: (module, name there)
-_FUNCTIONS = {
-    "plan": ("layout.build", "plan"),
-    "check": ("layout.drc", "check"),
-    "compare": ("layout.verify", "compare"),
-    "write_oasis": ("layout.oasis_write", "write"),
-    "read_oasis": ("layout.oasis_read", "read"),
-    "write_gdsii": ("layout.gdsii_write", "write"),
-    "read_gdsii": ("layout.gdsii_read", "read"),
-    "write_dxf": ("layout.dxf", "write"),
-}
+from metalens.ground.lazy import attach
 
+if TYPE_CHECKING:
+    from layout.files.dxf import write as write_dxf
+    from layout.files.verify import compare as compare
+    from layout.gdsii.read import read as read_gdsii
+    from layout.gdsii.write import write as write_gdsii
+    from layout.mask.build import plan as plan
+    from layout.oasis.read import read as read_oasis
+    from layout.oasis.write import write as write_oasis
+    from layout.rules.check import check as check
 
-def __getattr__(name: str) -> Any:
-    if name in _FUNCTIONS:
-        module, function = _FUNCTIONS[name]
-        return getattr(importlib.import_module(module), function)
-    if name.startswith("_"):
-        raise AttributeError(name)
-    try:
-        return importlib.import_module(f"{__name__}.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != f"{__name__}.{name}":
-            raise
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_FUNCTIONS])
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "check": "layout.rules.check",
+        "compare": "layout.files.verify",
+        "plan": "layout.mask.build",
+        "read_gdsii": "layout.gdsii.read:read",
+        "read_oasis": "layout.oasis.read:read",
+        "write_dxf": "layout.files.dxf:write",
+        "write_gdsii": "layout.gdsii.write:write",
+        "write_oasis": "layout.oasis.write:write",
+    },
+)

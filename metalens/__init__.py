@@ -3,18 +3,42 @@
 Submodules load when first used: ``import metalens; metalens.psf.psf_stack(...)``.
 """
 
-import importlib
-from types import ModuleType
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
 
 __version__ = "0.1.0"
 
+if TYPE_CHECKING:
+    from metalens import cell as cell
+    from metalens import design as design
+    from metalens import fisher as fisher
+    from metalens import image as image
+    from metalens import lens as lens
+    from metalens import library as library
+    from metalens import materials as materials
+    from metalens import modal as modal
+    from metalens import profiles as profiles
+    from metalens import propagate as propagate
+    from metalens import proxy as proxy
+    from metalens import psf as psf
+    from metalens import rcwa as rcwa
 
-def __getattr__(name: str) -> ModuleType:
-    if name.startswith("_"):
-        raise AttributeError(name)
-    try:
-        return importlib.import_module(f"{__name__}.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != f"{__name__}.{name}":
-            raise
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "cell": "",
+        "design": "",
+        "fisher": "",
+        "image": "",
+        "lens": "",
+        "library": "",
+        "materials": "",
+        "modal": "",
+        "profiles": "",
+        "propagate": "",
+        "proxy": "",
+        "psf": "",
+        "rcwa": "",
+    },
+)

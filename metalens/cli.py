@@ -5,14 +5,20 @@ the verb that is asked for is imported. A module with a table ``PARTS`` in place
 ``part_of(word)`` may name the one that a path is meant for.
 """
 
+import atexit
 import importlib
+import io
 import os
+import shutil
 import signal
 import sys
+import tempfile
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.errors import FitRefused, MetalensError, nearest
+from metalens.ground import lock
+from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT = 0, 1, 2
 
@@ -29,28 +35,49 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "psf": (
         "metalens.commands.psf",
-        "lens.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
+        "lens.h5 or asbuilt.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
-    "scene": ("codesign.command_scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
-    "evaluate": ("codesign.command_evaluate", "optics and more: the paper's tables and figures for your own files"),
-    "layout": ("layout.command", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
+    "scene": ("codesign.commands.scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
+    "evaluate": ("codesign.commands.evaluate", "optics and more: the paper's tables and figures for your own files"),
+    "layout": ("layout.commands.layout", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
+    "check": ("layout.commands.check", "MASK.gds|oas + PROCESS.toml -> design rules on a mask made anywhere"),
     "capture": (
-        "characterize.command_capture",
+        "characterize.commands.capture",
         "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",
     ),
-    "fit": ("characterize.command_fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
-    "codesign": ("codesign.command_codesign", "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together"),
-    "retrain": ("codesign.command_retrain", "RUN_DIR + asbuilt.h5 -> network for the lens as built, and the next mask"),
-    "budget": ("codesign.command_budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
-    "plan": ("codesign.command_plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
+    "measure": (
+        "characterize.commands.measure",
+        "CAPTURES or MICROGRAPH -> MTF, Strehl, spot sizes; or every pillar's diameter and a bias table",
+    ),
+    "fit": ("characterize.commands.fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
+    "codesign": ("codesign.commands.codesign", "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together"),
+    "retrain": (
+        "codesign.commands.retrain",
+        "RUN_DIR + asbuilt.h5 -> network for the lens as built, the next mask",
+    ),
+    "budget": ("codesign.commands.budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
+    "plan": ("codesign.commands.plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
+    "view": ("metalens.commands.view", "one self-contained page to explore any artefact"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
 }
+
+# objective of ``metalens design``: module with its ``SceneObjective(pupil, settings)``
+OBJECTIVES = {"scenes": "codesign.evaluate.scenes"}
+# and the module that turns PROCESS.toml into its limits
+OBJECTIVES["process"] = "layout.process.limits"
+# source of ``metalens psf`` by kind of file: module with its ``stack(path, view, tolerance)``
+PSF_SOURCES = {"asbuilt": "characterize.commands.psf"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a locale of ASCII alone
     if not words or words[0] in ("-h", "--help"):
         sys.stdout.write(_help(VERBS))
         return SUCCESS if words else BAD_INPUT
@@ -61,18 +88,72 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return SUCCESS
     if words[0] not in VERBS:
         return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
-    signal.signal(signal.SIGTERM, _stop)
+    for name in ("SIGTERM", "SIGHUP"):  # a lost terminal ends a command as Ctrl-C does, unless under nohup
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _stop)
     # Threads of OpenMP that wait give their core away early: beside another busy program training is ten times slower
     # where they spin as long as they do by default; alone it is a tenth slower so.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    _numba_cache()
+    told = lock.COMMAND.set(" ".join(words))
     try:
+        if debug:
+            return _shown(words)
         return _dispatch(words[0], words[1:])
     except FitRefused as error:
-        return _refuse(str(error), FAILED_CHECK)
+        return _refuse(_said(error), FAILED_CHECK)
     except (MetalensError, OSError) as error:
-        return _refuse(str(error))
-    except KeyboardInterrupt:
-        return _refuse("interrupted; nothing half-written is left", 130)
+        return _refuse(_said(error))
+    except ModuleNotFoundError as error:
+        told_of = missing_extra(error)
+        if told_of is None:
+            raise
+        return _refuse(told_of)
+    except KeyboardInterrupt as error:
+        return _refuse(_said(error, "interrupted; the output is as it was before"), 130)
+    except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
+        return _refuse(f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}")
+    finally:
+        lock.COMMAND.reset(told)
+
+
+def _shown(words: list[str]) -> int:
+    """Run with --debug: the traceback of any error is shown before its one line."""
+    try:
+        return _dispatch(words[0], words[1:])
+    except BaseException:
+        traceback.print_exc()
+        raise
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:300] or "no words"
+
+
+def _reported(words: list[str]) -> str:
+    """Write what a maintainer needs to a file in the folder for temporary files; where it lies."""
+    try:
+        handle, name = tempfile.mkstemp(prefix="metalens-error-", suffix=".txt")
+        with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(f"metalens {' '.join(words)}\npython {sys.version}\n\n{traceback.format_exc()}")
+    except OSError:
+        return "run it again with --debug to see where"
+    return f"please report {name} (--debug shows it)"
+
+
+def _numba_cache() -> None:
+    """Where neither the installation nor the home can be written, compiled loops are kept among temporary files."""
+    here, home = os.path.dirname(__file__), os.path.expanduser("~")
+    if "NUMBA_CACHE_DIR" in os.environ or os.access(here, os.W_OK) or os.access(home, os.W_OK):
+        return
+    os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="metalens-numba-")
+    atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
+
+
+def _said(error: BaseException, words: str = "") -> str:
+    """The words of an error, with what was noted on its way up."""
+    return "; ".join([words or str(error), *getattr(error, "__notes__", ())])
 
 
 def _dispatch(verb: str, words: list[str]) -> int:
@@ -89,13 +170,20 @@ def _dispatch(verb: str, words: list[str]) -> int:
             return _refuse(f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}")
         module = importlib.import_module(parts[meant][0])
         verb, words = f"{verb} {meant}", words[words[0] in parts :]
+    if verb == "design":
+        module.OBJECTIVES.update(OBJECTIVES)
+    if verb == "psf":
+        module.SOURCES.update(PSF_SOURCES)
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
     return int(module.run(options))
 
 
 def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
     rows = "\n".join(f"  {verb:<10} {summary}" for verb, (_, summary) in verbs.items())
-    return f"usage: {name} COMMAND ... ({name} COMMAND --help for its options)\n\n{rows}\n"
+    return (
+        f"usage: {name} COMMAND ... ({name} COMMAND --help for its options; --debug shows where an error came from)\n\n"
+        f"{rows}\n"
+    )
 
 
 def _refuse(message: str, status: int = BAD_INPUT) -> int:

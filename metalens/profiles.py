@@ -1,115 +1,29 @@
-"""Phase profiles of lenses: hyperbolic, double helix, cubic, and a map from file.
+"""Phase profiles: hyperbolic, double helix, cubic, own map."""
 
-All focus a point source on the axis at ``source_distance_um`` before the lens onto the sensor at
-``sensor_distance_um`` behind it; the last three add their own term to that hyperbolic phase.
-"""
+from typing import TYPE_CHECKING
 
-import math
-from dataclasses import dataclass
-from pathlib import Path
+from metalens.ground.lazy import attach
 
-import numpy as np
+if TYPE_CHECKING:
+    from metalens.design.profiles import Cubic as Cubic
+    from metalens.design.profiles import DoubleHelix as DoubleHelix
+    from metalens.design.profiles import Focus as Focus
+    from metalens.design.profiles import PhaseMap as PhaseMap
+    from metalens.design.profiles import cubic as cubic
+    from metalens.design.profiles import double_helix as double_helix
+    from metalens.design.profiles import hyperbolic as hyperbolic
+    from metalens.ground.paths import path_difference as path_difference
 
-from metalens.errors import ConfigError, LensError
-from metalens.store import Array
-
-
-@dataclass(frozen=True, slots=True)
-class Focus:
-    """What the lens images onto what.
-
-    source_distance_um: object distance of best focus; inf for a collimated beam.
-    """
-
-    wavelength_um: float
-    sensor_distance_um: float
-    source_distance_um: float = math.inf
-
-    def __post_init__(self) -> None:
-        for name in ("wavelength_um", "sensor_distance_um", "source_distance_um"):
-            if not getattr(self, name) > 0:
-                raise LensError(f"{name} = {getattr(self, name)}: need a length above 0")
-
-
-@dataclass(frozen=True, slots=True)
-class DoubleHelix:
-    """Annular vortices: ring l of ``zones`` carries the charge 2l - 1 (after Pavani et al. 2009, Prasad 2013).
-
-    zones: number of rings.
-    exponent: ring l ends at radius R (l / zones)**exponent; 1/2 gives rings of equal area.
-    """
-
-    zones: int = 4
-    exponent: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.zones < 1 or not self.exponent > 0:
-            raise ConfigError(f"double helix of {self.zones} zones, exponent {self.exponent}: need both above 0")
-
-
-@dataclass(frozen=True, slots=True)
-class Cubic:
-    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey 1995)."""
-
-    strength_rad: float = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class PhaseMap:
-    """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see :mod:`metalens.phase_map`.
-
-    file: its path (.npy, .mat, a Zemax grid phase .dat, else text).
-    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the phasor exp(i phase).
-    add_focus: whether the hyperbolic focus is added to the map.
-    variable: name of the matrix in a .mat file that holds several.
-    conjugate: change the sign, for maps made with exp(+iwt).
-    """
-
-    file: Path
-    pitch_um: float | None = None
-    add_focus: bool = False
-    variable: str | None = None
-    conjugate: bool = False
-
-    def __post_init__(self) -> None:
-        if self.pitch_um is not None and not self.pitch_um > 0:
-            raise ConfigError(f"pitch_um = {self.pitch_um} of the phase map: need a length above 0")
-
-
-def path_difference(radius2_um2: Array, distance_um: float) -> Array:
-    """Extra path from an axial point out to radius r, sqrt(r² + z²) - z, from r² without cancellation.
-
-    Args:
-        radius2_um2: (*shape) squared distance from the axis.
-        distance_um: axial distance; inf gives 0.
-    """
-    if math.isinf(distance_um):
-        return np.zeros_like(radius2_um2)
-    return radius2_um2 / (np.sqrt(radius2_um2 + distance_um**2) + distance_um)
-
-
-def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
-    """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both sides).
-
-    Args:
-        x_um, y_um: positions that broadcast to (y, x).
-
-    Returns:
-        (y, x) phase in rad, 0 on the axis and negative outwards, float64.
-    """
-    radius2 = x_um**2 + y_um**2
-    path = path_difference(radius2, focus.sensor_distance_um) + path_difference(radius2, focus.source_distance_um)
-    return np.asarray(-2 * np.pi / focus.wavelength_um * path)
-
-
-def double_helix(x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float) -> Array:
-    """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes that turn with depth."""
-    fraction = np.hypot(x_um, y_um) / radius_um
-    ring = np.clip(np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones)
-    return np.asarray(hyperbolic(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um))
-
-
-def cubic(x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float) -> Array:
-    """Hyperbolic phase plus :class:`Cubic`."""
-    x, y = x_um / radius_um, y_um / radius_um
-    return np.asarray(hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3))
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Cubic": "metalens.design.profiles",
+        "DoubleHelix": "metalens.design.profiles",
+        "Focus": "metalens.design.profiles",
+        "PhaseMap": "metalens.design.profiles",
+        "cubic": "metalens.design.profiles",
+        "double_helix": "metalens.design.profiles",
+        "hyperbolic": "metalens.design.profiles",
+        "path_difference": "metalens.ground.paths",
+    },
+)

@@ -1,8 +1,19 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests, and the one hypothesis profile."""
 
+import os
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# No clock decides a test: no deadline, no complaint of slow data. With CI set, as .ci/run does, every run draws alike.
+hypothesis.settings.register_profile(
+    "house",
+    deadline=None,
+    derandomize="CI" in os.environ,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+)
+hypothesis.settings.load_profile("house")
 
 
 @pytest.fixture(scope="session")

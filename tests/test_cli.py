@@ -86,7 +86,7 @@ def test_an_existing_file_is_kept_without_force(tmp_path):
 def test_info_shows_kind_and_provenance(tmp_path):
     import numpy as np
 
-    from metalens import store
+    from metalens.ground import store
 
     made = store.Provenance(config="x = 1\n", inputs={"a.toml": "0" * 64})
     store.save(tmp_path / "f.h5", "psf", {"image": np.eye(20)}, attributes={"pitch_um": 0.4}, provenance=made)
@@ -143,7 +143,7 @@ def test_a_filled_folder_is_not_written_into_without_force(demo):
     folder, _ = demo
     done = run("demo", folder)
     assert done.returncode == cli.BAD_INPUT
-    assert "not empty" in done.stderr
+    assert "exists; give --force" in done.stderr
 
 
 @pytest.mark.parametrize(

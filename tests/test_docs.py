@@ -1,33 +1,39 @@
 """The pages of docs/: every Python block runs, every settings file is accepted, every link leads somewhere."""
 
+import functools
+import importlib.util
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
 
-from metalens import config
-from metalens.chain import ChainFiles
+from metalens.chain.stages import ChainFiles
 from metalens.cli import VERBS
 from metalens.commands.design import Design
 from metalens.commands.library import CellFile
 from metalens.commands.psf import Settings
+from metalens.ground import config
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")])
+MADE = re.compile(r"(\.\./)?reference/(\w+)\.md")  # pages that the site makes from the code
 TEXTS = [*PAGES, ROOT / "README.md", ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]
 
 
 def _blocks(path, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+    found = re.findall(rf"^ *```{language}\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.M | re.S)
+    return [textwrap.dedent(block) for block in found]
 
 
 def _records():
-    from characterize.bench import Truth
-    from characterize.pupil import PupilSpec
-    from codesign.plan import PlanConfig
-    from layout.process import Process
+    from characterize.bench.bench import Truth
+    from characterize.bench.protocol import Protocol
+    from characterize.pupil.record import PupilSpec
+    from codesign.budget.plan import PlanConfig
+    from layout.process.process import Process
 
     return {
         "CELL.toml": CellFile,
@@ -35,10 +41,39 @@ def _records():
         "PSF.toml": Settings,
         "PROCESS.toml": Process,
         "TRUTH.toml": Truth,
+        "PROTOCOL.toml": Protocol,
         "PUPIL.toml": PupilSpec,
         "PLAN.toml": PlanConfig,
         "CHAIN.toml": ChainFiles,
     }
+
+
+@functools.cache
+def _site():
+    """The module that makes pages of the site from the code."""
+    pytest.importorskip("mkdocs")
+    spec = importlib.util.spec_from_file_location("site_reference", ROOT / "docs" / "site" / "reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        ("DESIGN.toml", "| `aperture_mm` | number | `1.0` | diameter of the round aperture, up to 10 |"),
+        ("PSF.toml", "| `window_um` | number | `144.0` | of the square window that follows the chief ray |"),
+    ],
+)
+def test_a_settings_page_shows_a_key_with_kind_default_and_text(name, row):
+    assert row in _site().settings_page(name).splitlines()
+
+
+@pytest.mark.parametrize("name", ["CELL.toml", "PROCESS.toml", "RUN.toml", "PLAN.toml", "CHAIN.toml"])
+def test_every_settings_page_can_be_made(name):
+    page = _site().settings_page(name)
+    assert page.startswith(f"# {name}")
+    assert all(line.count("|") >= 5 for line in page.splitlines() if line.startswith("| `"))
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if _blocks(p, "python")], ids=lambda p: p.stem)
@@ -62,6 +97,10 @@ def test_settings_of_a_page_are_accepted(page):
 def test_links_and_commands_of_a_page_exist(page):
     text = page.read_text(encoding="utf-8")
     for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", text):
-        assert (page.parent / target).exists(), target
-    for verb in re.findall(r"^metalens ([a-z]+)", text, re.M):
+        made = MADE.fullmatch(target)
+        if made:
+            assert f"{made[2].upper()}.toml" in _site().SETTINGS or made[2] in ("commands", "api"), target
+        else:
+            assert (page.parent / target).exists(), target
+    for verb in re.findall(r"^ *metalens ([a-z]+)", text, re.M):
         assert verb in VERBS, verb

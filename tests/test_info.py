@@ -12,10 +12,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
 import test_file_fuzz as artefacts
 
-from codesign import checkpoint
-from codesign.inner import InnerConfig
-from metalens import store
+from codesign.train import checkpoint
+from codesign.train.inner import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
+from metalens.ground import store
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("metalens", "layout", "characterize", "codesign")

@@ -7,10 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from metalens import cli, lens, store
-from metalens.cell import Cell, Index
-from metalens.lens import DiameterMap, Lens
-from metalens.proxy import Proxy
+import layout
+from layout.process import Process
+from metalens import cli, lens
+from metalens.cell.record import Cell, Index
+from metalens.ground import store
+from metalens.lens.record import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
 
 # verb: words after it, and the target that already exists; %s is the folder of inputs
 CASES = {
@@ -28,6 +31,9 @@ CASES = {
     "budget": ("lens.h5 -o out.h5", "out.h5"),
     "plan": ("--gaze-error 0.1deg -o out", "out"),
     "demo": ("out", "out"),
+    "check": ("mask.gds -o out.h5", "out.h5"),
+    "measure": ("captures -o out", "out"),
+    "view": ("lens.h5 -o out.h5", "out.h5"),
 }
 READS_ONLY = {"info"}
 
@@ -39,6 +45,7 @@ def folder(tmp_path):
     diameters = np.linspace(0.08, 0.21, 64, dtype=np.float32).reshape(8, 8)
     made = Lens(DiameterMap(diameters, 0.3), Cell(0.3, pillar=Index(3.6)), proxy, 0.85, 2000.0, 20_000.0, "map")
     lens.save(tmp_path / "lens.h5", made)
+    layout.write_gdsii(layout.plan(made, Process()), tmp_path / "mask.gds")
     (tmp_path / "cell.toml").write_text("[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n")
     (tmp_path / "design.toml").write_text("aperture_mm = 0.02\n")
     (tmp_path / "truth.toml").write_text("depths_um = [20000.0]\n")

@@ -1,6 +1,10 @@
 """The direction of imports, lazy start-up, and what the repository may hold."""
 
 import ast
+import collections
+import functools
+import graphlib
+import importlib
 import re
 import subprocess
 import sys
@@ -27,6 +31,71 @@ def _imports(path):
             yield node.module or ""
 
 
+MODULES = {
+    path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in (ROOT / package).rglob("*.py")
+}
+MOST_MODULES = 16  # of a folder
+TABLES = {"metalens.cli"}  # names the verbs of every package: the one place that knows them all
+
+
+def _folder(module):
+    return module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
+
+
+def _tree(module):
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _face(package):
+    """{public name: (module, name there)} of a folder, and the same as its TYPE_CHECKING block has it."""
+    table, typed = {}, {}
+    for node in ast.walk(_tree(package)):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "attach":
+            for key, value in zip(node.args[1].keys, node.args[1].values, strict=True):
+                module, _, there = value.value.partition(":")
+                module = module if "." in module else f"{package}.{module}".rstrip(".")
+                table[key.value] = (module, there or key.value)
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            typed |= {a.asname: (line.module, a.name) for line in node.body for a in line.names}
+    return table, typed
+
+
+FACES = [name for name in MODULES if _face(name)[0]]
+
+
+@functools.cache
+def _uses(module):
+    """(where the import points, module that defines it, name) of what one module takes from the project."""
+    found = []
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, alias.name, "") for alias in node.names if alias.name in MODULES]
+        elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
+            for alias in node.names:
+                full, table = f"{node.module}.{alias.name}", _face(node.module)[0]
+                home = full if full in MODULES else table.get(alias.name, (node.module,))[0]
+                found.append((node.module, home, alias.name))
+    return found
+
+
+def _arrows(of):
+    """{from: {to}} over the modules (faces aside), each mapped by ``of``."""
+    out = {}
+    for module, path in MODULES.items():
+        if path.name != "__init__.py":
+            here = {of(home) for _, home, _ in _uses(module) if home not in (module, *PACKAGES)}
+            out.setdefault(of(module), set()).update(here - {of(module)})
+    return out
+
+
+@pytest.mark.parametrize("of", [str, _folder], ids=["files", "folders"])
+def test_nothing_imports_in_a_circle(of):
+    graphlib.TopologicalSorter(_arrows(of)).prepare()  # CycleError names the circle
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_imports_run_one_way(package):
     found = {
@@ -37,6 +106,58 @@ def test_imports_run_one_way(package):
     }
     wrong = {(path, name) for path, name in found if name.split(".")[0] not in MAY_IMPORT[package]}
     assert not wrong
+
+
+def test_no_string_names_a_module_of_a_package_above():
+    up = {
+        (module, node.value)
+        for module in MODULES.keys() - TABLES
+        for node in ast.walk(_tree(module))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for name in re.findall(r"\b(?:metalens|layout|characterize|codesign)(?:\.\w+)+", node.value)
+        if name in MODULES
+        and name.split(".")[0] not in {module.split(".")[0], *MAY_IMPORT[module.split(".")[0]]}
+        and not re.search(r"\s", node.value)  # prose may point anywhere
+    }
+    assert not up
+
+
+def test_no_folder_is_crowded():
+    counts = collections.Counter(_folder(m) for m, path in MODULES.items() if path.name != "__init__.py")
+    assert not {folder: count for folder, count in counts.items() if count > MOST_MODULES}
+
+
+def test_what_crosses_folders_is_public():
+    wrong = set()
+    for module in MODULES:
+        for source, home, name in _uses(module):
+            folder = _folder(home)
+            if folder in (_folder(module), *PACKAGES) or module in FACES:
+                continue
+            public, last = _face(folder)[0], home.rpartition(".")[2]
+            offered = name in public or last in public or MODULES[home].name == "__init__.py"
+            if name.startswith("_") or not offered:
+                wrong.add((module, source, name))
+    assert not wrong
+
+
+@pytest.mark.parametrize("package", FACES)
+def test_a_face_shows_what_is_public_and_nothing_else(package):
+    table, typed = _face(package)
+    as_typed = {
+        n: (f"{module}.{n}", n) if not there or f"{module}.{n}" in MODULES else (module, there)
+        for n, (module, there) in typed.items()
+    }
+    as_table = {
+        n: (f"{module}.{n}", n) if module == package else (module, there) for n, (module, there) in table.items()
+    }
+    assert as_typed == as_table
+    loaded = importlib.import_module(package)
+    assert dir(loaded) == sorted(table) == loaded.__all__
+    for name, (module, _) in as_table.items():
+        shadowed = f"{package}.{name}" in MODULES and module != f"{package}.{name}"
+        assert not shadowed, f"{package}.{name} is a module and a public name: whoever loads one hides the other"
+        assert getattr(loaded, name) is not None
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -57,6 +178,7 @@ IMPORTED_AS = {  # the last three come with the package that they are named afte
     "OCP": "build123d",
     "cycler": "matplotlib",
     "mpl_toolkits": "matplotlib",
+    "yaml": "PyYAML",
 }
 
 

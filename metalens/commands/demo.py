@@ -11,11 +11,14 @@ from typing import Any
 
 import tyro
 
-from metalens import chain, module_view, report
-from metalens.chain import ChainFiles, Stage
+from metalens.chain import ChainFiles, Stage, module_view
+from metalens.chain import stages as chain
 from metalens.cli import main as run_verb
-from metalens.commands import Common
-from metalens.errors import ConfigError, MetalensError
+from metalens.commands.common import Common
+from metalens.ground import report, store
+from metalens.ground.errors import ConfigError, MetalensError
+
+OUTCOMES = "outcomes.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,35 +39,42 @@ class Options(Common):
         output: folder for everything that is made; report.html is the page to open.
         config: CHAIN.toml of your own (cell, design, process; psf, bench_design, bench_truth, bench_metrology, run):
             the same chain unattended, at any size.
+        resume: go on after the last stage that was finished.
         aperture_mm: diameter of the lens, in place of the one in the design.
     """
 
     output: tyro.conf.Positional[Path]
     config: Path | None = None
     aperture_mm: float | None = None
+    resume: bool = False
 
 
 def run(options: Options) -> int:
     """Run the chain; exit 0 when every stage passed its own check, else the status of the first that did not."""
-    folder = options.output
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not options.force:
-        raise ConfigError(f"{folder} is not empty; give --force to write into it")
     if options.aperture_mm is not None and not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
     wanted = chain.shipped() if options.config is None else chain.load(options.config)
-    folder.mkdir(parents=True, exist_ok=True)
     source = None if options.config is None else options.config.parent
-    files = chain.lay_out(folder, wanted, source, aperture_mm=options.aperture_mm)
-    outcomes: list[Outcome] = []
-    for outcome in _chain(folder, files):
-        outcomes.append(outcome)
-        words = " ".join(outcome.stage.words)
-        options.console.say(f"{outcome.seconds:6.1f} s  metalens {words}  {'ok' if outcome.status == 0 else 'FAILED'}")
-    _write(folder, outcomes)
-    page = folder / "report.html"
+    with options.claim_work(options.output, keep=(OUTCOMES,), resume=options.resume) as draft:
+        folder, before = draft.path, _settings(draft.path)
+        files = chain.lay_out(folder, wanted, source, aperture_mm=options.aperture_mm)
+        if before and before != _settings(folder):
+            raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
+        outcomes: list[Outcome] = []
+        for outcome in _chain(folder, files):
+            outcomes.append(outcome)
+            words, verdict = " ".join(outcome.stage.words), "ok" if outcome.status == 0 else "FAILED"
+            options.console.say(f"{outcome.seconds:6.1f} s  metalens {words}  {verdict}")
+        _write(folder, outcomes)
+    page = options.output / "report.html"
     values = {_name(o.stage): {"status": o.status, "seconds": o.seconds, **o.values} for o in outcomes}
     options.console.result({"report": str(page), **values}, f"open {page}")
     return next((o.status for o in outcomes if o.status), 0)
+
+
+def _settings(folder: Path) -> dict[str, bytes]:
+    """The settings files of the chain."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.toml"))}
 
 
 def _name(stage: Stage) -> str:
@@ -73,16 +83,30 @@ def _name(stage: Stage) -> str:
 
 
 def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
-    """Run the verbs in the chain's folder until one refuses its input."""
+    """Run the verbs in the chain's folder until one refuses its input; what an earlier run did is not done again."""
+    done = dict(_done(folder / OUTCOMES))
     with contextlib.chdir(folder):
         for stage in chain.stages(files):
+            if stage.words in done:
+                yield Outcome(stage, *done[stage.words])
+                continue
             start, shown = time.perf_counter(), io.StringIO()
             with contextlib.redirect_stdout(shown):
                 status = run_verb([*stage.words, "--json", "--force"])
             values = json.loads(shown.getvalue()) if shown.getvalue().strip() else {}
-            yield Outcome(stage, status, values, time.perf_counter() - start)
+            seconds = time.perf_counter() - start
+            if status in (0, 1):
+                store.append_line(Path(OUTCOMES), json.dumps([stage.words, status, values, seconds]))
+            yield Outcome(stage, status, values, seconds)
             if status not in (0, 1):
                 raise MetalensError(f"the chain stopped: `metalens {' '.join(stage.words)}` refused its input")
+
+
+def _done(path: Path) -> Iterator[tuple[tuple[str, ...], tuple[int, dict[str, Any], float]]]:
+    """Stages that an earlier run finished, by their words."""
+    for line in store.whole_lines(path):
+        words, status, values, seconds = json.loads(line)
+        yield tuple(words), (status, values, seconds)
 
 
 def _write(folder: Path, outcomes: list[Outcome]) -> None:

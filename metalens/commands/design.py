@@ -8,19 +8,20 @@ from typing import Any, Literal
 
 import tyro
 
-from metalens import config, design, lens, lens_plot, library, store
+from metalens import design, lens, library
 from metalens.cell import Cell
-from metalens.commands import Common, Output
-from metalens.console import Console
-from metalens.design import Limits, PhaseOf, Quality
-from metalens.design_fisher_settings import Fisher
-from metalens.errors import ConfigError
-from metalens.focus_check import FocusCheck, check_focus
-from metalens.profiles import Cubic, DoubleHelix, Focus, PhaseMap
-from metalens.proxy import Proxy
-from metalens.store import write_bytes
+from metalens.commands.common import Common, Output
+from metalens.design import Cubic, DoubleHelix, Focus, FocusCheck, Limits, PhaseMap, PhaseOf, Quality, check_focus
+from metalens.design.free_form import Fisher
+from metalens.ground import config, store
+from metalens.ground.console import Console
+from metalens.ground.errors import ConfigError
+from metalens.ground.store import write_bytes
+from metalens.lens import picture as lens_plot
+from metalens.pillars import Proxy
 
 MOST_SUMMED = 60_000_000  # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
+OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
 
@@ -42,7 +43,7 @@ class Design:
     aperture_mm: float = 1.0
     wavelength_nm: float = 850.0
     sensor_distance_mm: float = 2.0
-    source_distance_mm: float = 20.0
+    source_distance_mm: float = field(default=20.0, metadata={"may_be_inf": True})
     library: Path | None = None
     cell: Cell | None = None
     limits: Limits = field(default_factory=Limits)
@@ -72,19 +73,43 @@ class Options(Common):
     Attributes:
         config: DESIGN.toml.
         output: the lens file to write.
+        process: PROCESS.toml whose printable pillars and gaps bound the diameters, in place of [limits].
         skip_focus_check: leave out the exact diffraction sum around the focus.
+        accept_partial_turn: where the pillars cover less than a turn, take the nearest; the loss is stated.
     """
 
     config: tyro.conf.Positional[Path]
     output: Output = Path("lens.h5")
+    process: Path | None = None
     skip_focus_check: bool = False
+    accept_partial_turn: bool = False
 
 
 def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where the light does not focus where it should."""
     wanted = config.load(options.config, Design)
-    target = options.claim(options.output)
+    target, read = options.output, _read(wanted, options.config)
+    with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
+        quality, check, judged = _make(wanted, options, draft.path)
+    values, text = _values(quality, check), _text(target, wanted, quality, check)
+    if judged is not None:
+        values["fisher"], text = judged.values, f"{text}\n\n{judged.text}"
+    options.console.result(values, text)
+    return 0 if check is None or check.passed else 1
+
+
+def _read(wanted: Design, where: Path) -> list[Path]:
+    """The files that the config names."""
+    own = _located(wanted, where)
+    return ([where.parent / wanted.library] if wanted.library else []) + ([own.file] if own else [])
+
+
+def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusCheck | None, "_Judged | None"]:
+    """Design, check and write the lens with its pictures."""
     cell, proxy, inputs = _pillars(wanted, options.config, options.console)
+    if options.process is not None:
+        wanted = replace(wanted, limits=_printable(options.process, cell))
+        inputs[options.process.name] = store.sha256(options.process)
     inputs[options.config.name] = store.sha256(options.config)
     own = _located(wanted, options.config)
     if wanted.profile == "map" and own is not None and own.file.is_file():
@@ -100,16 +125,14 @@ def run(options: Options) -> int:
         limits=wanted.limits,
         profile=wanted.profile,
         provenance=store.Provenance(config=config.dumps(wanted), inputs=inputs),
+        accept_partial_turn=options.accept_partial_turn,
     )
     check = check_focus(made) if _checkable(wanted, options, quality) else None
-    lens.save(target, made)
-    write_bytes(target.with_suffix(".png"), lens_plot.picture(made))
-    values, text = _values(quality, check), _text(target, wanted, quality, check)
+    lens.save(path, made)
+    write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
-        values["fisher"], text = judged.values, f"{text}\n\n{judged.text}"
-        write_bytes(target.with_name(f"{target.stem}_fisher.png"), judged.picture)
-    options.console.result(values, text)
-    return 0 if check is None or check.passed else 1
+        write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
+    return quality, check, judged
 
 
 def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
@@ -144,8 +167,8 @@ def _phase(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf,
 
 def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[PhaseOf, Focus, _Judged | None]:
     """A designed phase; where it was made for axial information, beside simple lenses tuned as hard."""
-    from metalens import design_fisher_report as reports
-    from metalens.design_fisher import design_pupil, fisher_profile
+    from metalens.design.free_form import design_pupil, fisher_profile
+    from metalens.design.free_form import report as reports
 
     console, settings = options.console, wanted.fisher
     objective = _scene_objective(wanted, radius_um) if settings.objective == "scenes" else None
@@ -165,10 +188,10 @@ def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[Phas
 
 
 def _scene_objective(wanted: Design, radius_um: float) -> Any:
-    """Eq. 6 on rendered eyes: named here, as the verbs are, and loaded only when asked for."""
-    from metalens.design_fisher import design_pupil
+    """Eq. 6 on rendered eyes, of a package above this one: named by the command line, loaded only when asked for."""
+    from metalens.design.free_form import design_pupil
 
-    module = importlib.import_module("codesign.design_scenes")
+    module = importlib.import_module(OBJECTIVES["scenes"])
     return module.SceneObjective(design_pupil(wanted.focus, radius_um), wanted.fisher)
 
 
@@ -181,6 +204,13 @@ def _pillars(wanted: Design, where: Path, console: Console) -> tuple[Cell, Proxy
     cell = wanted.cell or library.DEFAULT_CELL
     made = library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console)
     return cell, library.proxy_of(made), {}
+
+
+def _printable(path: Path, cell: Cell) -> Limits:
+    """The limits of a process file, through a package above this one that the command line names."""
+    module = importlib.import_module(OBJECTIVES["process"])
+    thinnest, gap = module.printable(path, pitch_um=cell.pitch_um, height_um=cell.height_um)
+    return Limits(min_diameter_nm=thinnest, min_gap_nm=gap)
 
 
 def _located(wanted: Design, where: Path) -> PhaseMap | None:
@@ -199,6 +229,8 @@ def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
         "transmission": quality.transmission,
         "strehl": quality.strehl,
         "max_phase_error_rad": quality.max_phase_error_rad,
+        "rms_phase_error_rad": quality.rms_phase_error_rad,
+        "turns": quality.turns,
     }
     if check is not None:
         along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
@@ -216,6 +248,11 @@ def _text(target: Path, wanted: Design, quality: Quality, check: FocusCheck | No
         f"  focusing efficiency {quality.efficiency:.3f}, mean |T|² {quality.transmission:.3f}, "
         f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
     ]
+    if quality.turns < 1:
+        lines.append(
+            f"  the pillars cover {quality.turns:.3f} of a turn: the nearest stands in for the phases that none has, "
+            f"{quality.rms_phase_error_rad:.2g} rad rms off, which costs {1 - quality.strehl:.1%} of the peak"
+        )
     if check is not None:
         lines.append(f"  exact diffraction sum: {check.text}")
     return "\n".join(lines)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from metalens import store
-from metalens.commands import Common
-from metalens.errors import StoreError
+from metalens.commands.common import Common
+from metalens.ground import manifest, store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import StoreError
 
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
@@ -21,7 +22,7 @@ class Options(Common):
     """Options of ``metalens info``.
 
     Attributes:
-        file: an artefact of this toolchain: HDF5, or a network or checkpoint (safetensors).
+        file: an artefact of this toolchain: HDF5, a network or checkpoint (safetensors), or a folder with a manifest.
     """
 
     file: tyro.conf.Positional[Path]
@@ -29,6 +30,10 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Print what the file holds; exit 0."""
+    if options.file.is_dir():
+        told = folder(options.file)
+        options.console.result(told, _folder_text(told))
+        return 0
     if options.file.suffix == NETWORK:
         told = network(options.file)
         options.console.result(told, _network_text(told))
@@ -52,6 +57,27 @@ def run(options: Options) -> int:
     return 0
 
 
+def folder(path: Path) -> dict[str, Any]:
+    """The manifest of a folder, after its files were compared with it.
+
+    Raises:
+        StoreError: no manifest, unfinished, or a file that is missing or differs.
+    """
+    found = manifest.read(path)
+    if found is None:
+        raise StoreError(
+            f"{path}: no {manifest.NAME} in it, not made by this toolchain; give a file, or a folder of ours"
+        )
+    manifest.check(path)
+    return {"folder": str(path), **found}
+
+
+def _folder_text(told: dict[str, Any]) -> str:
+    lines = [f"{told['folder']}: {len(told['files'])} files, each as it was written", f"  metalens {told['command']}"]
+    lines += [f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…" for name, e in told["files"].items()]
+    return "\n".join([*lines, "made with " + ", ".join(f"{k} {v}" for k, v in told["versions"].items())])
+
+
 def network(path: Path) -> dict[str, Any]:
     """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of its length, then JSON).
 
@@ -71,7 +97,7 @@ def network(path: Path) -> dict[str, Any]:
         arrays = {name: f"{entry['dtype']} {tuple(entry['shape'])}" for name, entry in sorted(tensors.items())}
     except FileNotFoundError:
         raise StoreError(f"{path}: no such file") from None
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise StoreError(f"{path}: cut short or no safetensors file ({error}); make it again") from None
     if 8 + length + max(ends, default=0) != size:
         raise StoreError(f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again")
@@ -110,7 +136,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-def sketch(array: store.Array, *, columns: int = 48) -> list[str]:
+def sketch(array: Array, *, columns: int = 48) -> list[str]:
     """Lines of characters that show a (…, y, x) array, its first image, darkest for the largest value."""
     image = np.asarray(array.reshape(-1, *array.shape[-2:])[0], float)
     rows = max(1, round(columns * image.shape[0] / image.shape[1] / 2))
@@ -120,5 +146,5 @@ def sketch(array: store.Array, *, columns: int = 48) -> list[str]:
     return ["".join(_SHADES[int(v)] for v in row) for row in level]
 
 
-def _spread(length: int, count: int) -> store.Array:
+def _spread(length: int, count: int) -> Array:
     return np.linspace(0, length - 1, min(length, count)).astype(int)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import tyro
 
-from metalens import config, library, proxy_fit, store
-from metalens.cell import Cell
-from metalens.commands import Common, Output
-from metalens.errors import DomainError
-from metalens.library import DEFAULT_CELL, PillarLibrary, Sweep
-from metalens.proxy_fit import ProxyFit, Wanted
+from metalens import library
+from metalens.cell import Blend, Cell
+from metalens.commands.common import Distributed, Output
+from metalens.ground import config, store
+from metalens.ground.errors import DomainError
+from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted
+from metalens.pillars import fit as proxy_fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,34 +31,37 @@ class CellFile:
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Distributed):
     """Options of ``metalens library``.
 
     Attributes:
         config: CELL.toml.
+        accept_partial_turn: a proxy of less than a turn is no failure (``metalens design`` has the same option).
         output: the library file to write; NAME.resume beside it keeps finished curves until it is complete.
     """
 
     config: tyro.conf.Positional[Path]
     output: Output = Path("library.h5")
+    accept_partial_turn: bool = False
 
 
 def run(options: Options) -> int:
     """Sweep, fit, write; exit 1 where an error bar misses the tolerance or no full turn is covered."""
     wanted = config.load(options.config, CellFile)
     library.check(wanted.cell, wanted.sweep)
-    target = options.claim(options.output)
-    start = time.perf_counter()
-    journal = target.with_name(target.name + ".resume")
-    made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)
-    seconds = time.perf_counter() - start
-    fitted, refusal = _fit(made, wanted.proxy)
-    notes = fitted.notes if fitted else (refusal,)
-    about = store.Provenance(config.dumps(wanted), _inputs(options.config, wanted.cell))
-    made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
-    library.save(target, made)
-    _draw(target, made, fitted)
-    failures = _failures(made, fitted, refusal)
+    target, inputs = options.output, _inputs(options.config, wanted.cell)
+    with options.claim(target, beside=(".png",)) as draft, options.workers():
+        start = time.perf_counter()
+        journal = target.with_name(target.name + ".resume")
+        made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)
+        seconds = time.perf_counter() - start
+        fitted, refusal = _fit(made, wanted.proxy)
+        notes = fitted.notes if fitted else (refusal,)
+        about = store.Provenance(config.dumps(wanted), inputs)
+        made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
+        library.save(draft.path, made)
+        _draw(draft.path, made, fitted)
+    failures = _failures(made, fitted, refusal, accept_partial_turn=options.accept_partial_turn)
     options.console.result(_values(made, fitted, seconds, failures), _text(target, made, fitted, seconds, failures))
     return 1 if failures else 0
 
@@ -65,7 +69,10 @@ def run(options: Options) -> int:
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     """Hashes of the config and of the material tables that the cell names."""
     names = (cell.pillar, cell.substrate, cell.cover, cell.between, *(f.material for f in (*cell.under, *cell.over)))
-    tables = [Path(name) for name in names if isinstance(name, str) and name.lower().endswith(".csv")]
+    plain = [part for name in names for part in ((name.base, name.other) if isinstance(name, Blend) else (name,))]
+    tables = [
+        Path(name) for name in plain if isinstance(name, str) and name.lower().endswith((".csv", ".yml", ".yaml"))
+    ]
     return {file.name: store.sha256(file) for file in (path, *tables)}
 
 
@@ -77,12 +84,14 @@ def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:
 
 
 def _draw(target: Path, made: PillarLibrary, fitted: ProxyFit | None) -> None:
-    from metalens.cell_plots import library_figure
+    from metalens.pillars import library_figure
 
     library_figure(target.with_suffix(".png"), made, fitted)
 
 
-def _failures(made: PillarLibrary, fitted: ProxyFit | None, refusal: str) -> list[str]:
+def _failures(
+    made: PillarLibrary, fitted: ProxyFit | None, refusal: str, *, accept_partial_turn: bool = False
+) -> list[str]:
     failures = []
     if not made.converged:
         missed = made.t_error > made.sweep.tolerance
@@ -92,7 +101,7 @@ def _failures(made: PillarLibrary, fitted: ProxyFit | None, refusal: str) -> lis
         )
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
-    elif fitted.turns < 1:
+    elif fitted.turns < 1 and not accept_partial_turn:
         failures.append(
             f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: take a smaller pitch, taller pillars or "
             "a material of higher index (metalens study compares cells)"

@@ -1,23 +1,30 @@
-"""lens.h5 to psf.h5: PSF stack over depth, field angle and wavelength to a stated error, with plots beside it."""
+"""lens.h5 or asbuilt.h5 to psf.h5: PSFs over depth, field angle and wavelength to a stated error, with plots."""
 
+import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from metalens import config, lens, propagate, psf, psf_export, psf_plots, spectrum, store
-from metalens.commands import Common, Output
-from metalens.errors import ConfigError
-from metalens.report import Figure, KeyFigure, Section, Table, write
-from metalens.store import Provenance, write_bytes
+from metalens import lens, propagate, psf
+from metalens.commands.common import Common, Output
+from metalens.ground import config, store, transaction
+from metalens.ground.errors import ConfigError
+from metalens.ground.report import Figure, KeyFigure, Section, Table, write
+from metalens.ground.store import Provenance, write_bytes
+from metalens.psf import export as psf_export
+from metalens.psf import plots as psf_plots
+from metalens.psf import spectrum
 
+SOURCES: dict[str, str] = {}  # module with ``stack(path, view, tolerance)`` by kind of file, filled by the command line
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
     "montage": "PSFs over depth (across) and field angle (down); square root of intensity.",
     "mtf": "Modulation transfer along x (thick) and y (thin), and the share of the window's light inside a circle.",
     "information": "I(z) of Eq. 11 under two normalisations and three binnings; the normalisation decides the ranking.",
 }
+MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +52,15 @@ class Settings:
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
             )
+        if not (2 <= self.samples <= MOST_SAMPLES and 0 < self.window_um < np.inf):
+            raise ConfigError(
+                f"samples = {self.samples}, window_um = {self.window_um}: need 2 to {MOST_SAMPLES} samples, window > 0"
+            )
+        if (far - near) / step > MOST_DEPTHS or max(map(abs, (*self.angles_deg, *self.angles_y_deg, 0.0))) >= 90:
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
+                "angles within 90 degrees"
+            )
         if not self.angles_deg or (self.angles_y_deg and len(self.angles_y_deg) != len(self.angles_deg)):
             raise ConfigError(
                 f"{len(self.angles_deg)} angles along x, {len(self.angles_y_deg)} along y: need one for each"
@@ -70,7 +86,7 @@ class Options(Common):
     """Options of ``metalens psf``.
 
     Attributes:
-        lens: lens.h5.
+        lens: lens.h5, or asbuilt.h5 for the lens that was made (its process and wave front included).
         output: the PSF file to write, .h5 (which all other commands read), .tif or .mat; plots are written beside it as
             NAME_xz.png and so on.
         config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance; without
@@ -91,23 +107,44 @@ def run(options: Options) -> int:
     settings = Settings() if options.config is None else config.load(options.config, Settings)
     if options.tolerance is not None:
         settings = replace(settings, tolerance=options.tolerance)
-    made = lens.load(options.lens)
     psf_export.check(options.output)
-    target = options.claim(options.output)
-    nodes = _spectrum(made, settings)
-    provenance = Provenance(config.dumps(settings), {options.lens.name: store.sha256(options.lens)})
-    stack = psf.from_lens(made, settings.view, tolerance=settings.tolerance, spectrum=nodes, provenance=provenance)
-    psf_export.write(target, stack)
-    pictures = psf_plots.pictures(stack)
-    for name, image in pictures.items():
-        write_bytes(target.with_name(f"{target.stem}_{name}.png"), image)
-    if options.report:
-        _report(target.with_suffix(".html"), stack, pictures)
+    target, view = options.output, settings.view
+    pixels = len(view.depths_um) * len(view.angles_rad) * settings.samples**2
+    ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
+    with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
+        stack = _make(options, settings, draft.path)
     shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}"
     options.console.result(_summary(stack), text)
     return 0 if stack.converged else 1
+
+
+def _make(options: Options, settings: Settings, path: Path) -> psf.PsfStack:
+    """Compute, write, draw."""
+    stack = _stack(options.lens, settings)
+    psf_export.write(path, stack)
+    pictures = psf_plots.pictures(stack)
+    for name, image in pictures.items():
+        write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
+    if options.report:
+        _report(path.with_suffix(".html"), stack, pictures)
+    return stack
+
+
+def _stack(path: Path, settings: Settings) -> psf.PsfStack:
+    """PSFs of a lens file, or of another kind of file that the command line knows a source for."""
+    kind, provenance = store.load(path).kind, Provenance(config.dumps(settings), {path.name: store.sha256(path)})
+    if kind in SOURCES:
+        if settings.led_fwhm_nm:
+            raise ConfigError(
+                f"{path}: led_fwhm_nm is for a design; this {kind} file has the wavelength that was fitted"
+            )
+        found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
+        return replace(found, provenance=provenance)
+    made = lens.load(path)
+    nodes = _spectrum(made, settings)
+    return psf.from_lens(made, settings.view, tolerance=settings.tolerance, spectrum=nodes, provenance=provenance)
 
 
 def _spectrum(made: lens.Lens, settings: Settings) -> spectrum.Nodes | None:

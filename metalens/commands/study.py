@@ -5,14 +5,14 @@ from pathlib import Path
 
 import tyro
 
-from metalens import cell_study, config
-from metalens.cell_study import Study
-from metalens.commands import Common, Output
-from metalens.errors import ConfigError
+from metalens.commands.common import Distributed, Output
+from metalens.ground import config
+from metalens.pillars import Study, study_plots
+from metalens.pillars import study as cell_study
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Distributed):
     """Options of ``metalens study``.
 
     Attributes:
@@ -27,15 +27,11 @@ class Options(Common):
 def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
     study = Study() if options.config is None else config.load(options.config, Study)
-    target = options.output
-    if target.exists() and (not target.is_dir() or any(target.iterdir())) and not options.force:
-        raise ConfigError(f"{target} is not empty; give --force to overwrite what it holds")
-    if not options.output.parent.is_dir():
-        raise ConfigError(f"{options.output}: folder {options.output.parent} does not exist")
-    verdicts = cell_study.run(study, options.console)
-    options.output.mkdir(exist_ok=True)
     given = "" if options.config is None else f" {options.config.name}"
-    cell_study.write(options.output, study, verdicts, command=f"metalens study{given} -o {options.output.name}")
+    command = f"metalens study{given} -o {options.output.name}"
+    with options.claim_folder(options.output) as draft, options.workers():
+        verdicts = cell_study.run(study, options.console)
+        study_plots.write_study(draft.path, study, verdicts, command=command)
     best = cell_study.choice(study, verdicts)
     values = {"pitch_um": best and best[0], "height_um": best and best[1], "cells": len(verdicts)}
     text = "no cell covers a full turn at all wavelengths"

@@ -4,8 +4,34 @@
 polarisations, ``gradient`` the exact derivatives of t.
 """
 
-from metalens.modal.derivatives import Gradient, gradient
-from metalens.modal.engine import solve
-from metalens.modal.table import Table, solve_many
+from typing import TYPE_CHECKING
 
-__all__ = ["Gradient", "Table", "gradient", "solve", "solve_many"]
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.modal.derivatives import Gradient as Gradient
+    from metalens.modal.derivatives import gradient as gradient
+    from metalens.modal.engine import case_of as case_of
+    from metalens.modal.engine import evaluate as evaluate
+    from metalens.modal.engine import solve as solve
+    from metalens.modal.ladder import RUNGS as RUNGS
+    from metalens.modal.ladder import Rung as Rung
+    from metalens.modal.ladder import first_rung as first_rung
+    from metalens.modal.table import Table as Table
+    from metalens.modal.table import solve_many as solve_many
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Gradient": "derivatives",
+        "RUNGS": "ladder",
+        "Rung": "ladder",
+        "Table": "table",
+        "case_of": "engine",
+        "evaluate": "engine",
+        "first_rung": "ladder",
+        "gradient": "derivatives",
+        "solve": "engine",
+        "solve_many": "table",
+    },
+)

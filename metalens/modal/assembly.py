@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.errors import CellError
+from metalens.ground.errors import CellError
 from metalens.modal.mesh import Mesh, MeshPlan, Patch, build
 
 

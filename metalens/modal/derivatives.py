@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell
-from metalens.materials import index, slope
+from metalens.cell import Cell, index, slope
 from metalens.modal.engine import Case, basis, case_of, check_tolerance, climb, geometric_mean, geometry
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes

@@ -2,14 +2,14 @@
 
 import cmath
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from metalens.cell import Cell
-from metalens.errors import CellError
-from metalens.materials import index
+from metalens.cell import Cell, Response, index
+from metalens.ground.errors import CellError
 from metalens.modal.assembly import Geometry, assemble
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
@@ -19,7 +19,6 @@ from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_s
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space
-from metalens.response import Response
 
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
@@ -55,7 +54,8 @@ class Solution:
 
     matrix: (2, 2) zero-order scattering matrix, mean of both forms. spread: how far the forms are apart, half the
     difference. drift: change of the matrix per relative error of the transverse wavenumbers squared of the layer
-    modes, which both forms share. energy: mean of both forms. unknowns: of both forms.
+    modes, which both forms share. grazing: change of the matrix for what the mesh misplaces cutoffs. bloch: half
+    the Bloch phase. energy: mean of both forms. unknowns: of both forms.
     """
 
     matrix: np.ndarray
@@ -63,6 +63,8 @@ class Solution:
     drift: float
     energy: float
     unknowns: int
+    grazing: float = 0.0
+    bloch: float = 0.0
 
 
 @lru_cache(maxsize=4)
@@ -108,19 +110,20 @@ def determinant(matrix: np.ndarray) -> complex:
 class Form:
     """What one form gives: zero-order matrix (2, 2), power out per unit power in, size; and of the layer modes that
     travel, by falling axial wavenumber, q (m,) and, for the electric form, the derivative of the matrix in each
-    (m, 2, 2)."""
+    (m, 2, 2). grazing: change of the matrix when orders near their cutoff take the wavenumbers of the mesh."""
 
     matrix: np.ndarray
     energy: float
     unknowns: int
     q: np.ndarray
     by_q: np.ndarray
+    grazing: float
 
 
 def layer_between(
-    b: Basis, case: Case, halves: tuple[HalfSpace, HalfSpace], *, magnetic: bool, weak: float
-) -> tuple[np.ndarray, Match, bool]:
-    """Axial wavenumbers of the carrying modes, the match, and whether it is that of the dual unknown.
+    b: Basis, case: Case, *, magnetic: bool, weak: float
+) -> tuple[np.ndarray, Callable[[HalfSpace, HalfSpace], Match], bool]:
+    """Axial wavenumbers of the carrying modes, the match between half-spaces, and whether it is of the dual unknown.
 
     Few modes where the layer is without loss and thick enough that few carry, else all.
     """
@@ -129,10 +132,11 @@ def layer_between(
         pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
         modes = few_modes(pencil, case.height, weak=weak)
         if modes is not None:
-            return modes.q, few_scattering(pencil, modes, case.height, *halves), magnetic
+            few = modes
+            return few.q, lambda foot, top: few_scattering(pencil, few, case.height, foot, top), magnetic
     layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
-    match = scattering(layer, case.height, *halves)
-    return layer.q[match.carry], match, False
+    carry = np.flatnonzero(np.abs(np.exp(1j * layer.q * case.height)) > CARRY)
+    return layer.q[carry], lambda foot, top: scattering(layer, case.height, foot, top), False
 
 
 def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY) -> Form:
@@ -140,22 +144,38 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
     # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
     b = basis(case.rho, plan, case.p == magnetic if case.bloch else False, case.bloch, weak > QUICK)
     te = case.p == magnetic if case.bloch else True
-    below, above = (half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above))
-    q, match, dual = layer_between(b, case, (below, above), magnetic=magnetic, weak=weak)
-    foot = zero_order(b, below, case.bloch, te=te)
-    pair = [foot, len(below.ports) + zero_order(b, above, case.bloch, te=te)]
+    q, between, dual = layer_between(b, case, magnetic=magnetic, weak=weak)
+    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic and not dual else np.ones((2, 2))
+
+    def matched(bloch: float | None) -> tuple[Match, int, list[int], tuple[HalfSpace, HalfSpace]]:
+        below, above = (half_space(b, case.k0, e, magnetic=magnetic, bloch=bloch) for e in (case.below, case.above))
+        foot = zero_order(b, below, case.bloch, te=te)
+        return (
+            between(below, above),
+            foot,
+            [foot, len(below.ports) + zero_order(b, above, case.bloch, te=te)],
+            (below, above),
+        )
+
+    match, foot, pair, halves = matched(case.bloch)
+    matrix = match.matrix[pair][:, pair] * sign
+    plain = [half_space(b, case.k0, e, magnetic=magnetic).admittance for e in (case.below, case.above)]
+    grazing = 0.0
+    if any((half.admittance != other).any() for half, other in zip(halves, plain, strict=True)):
+        other, _, ports, _ = matched(None)
+        grazing = float(np.abs(matrix - other.matrix[ports][:, ports] * sign).max())
     travelling = np.flatnonzero(np.abs(match.travel) > SEEN)
     travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
     moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
     moved = moved[:0] if magnetic else moved
-    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic and not dual else np.ones((2, 2))
     return Form(
-        matrix=match.matrix[pair][:, pair] * sign,
+        matrix=matrix,
         energy=float((np.abs(match.matrix[:, foot]) ** 2).sum()),
         unknowns=b.size,
         q=q[travelling],
         by_q=match.rate(moved)[:, pair][:, :, pair] * sign,
+        grazing=grazing,
     )
 
 
@@ -165,8 +185,17 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
     weak: modes weaker than this over the height end at the interface they start from, and the matrix root of the
     others is this accurate.
     Their difference is split into what the axial wavenumbers explain and the rest, so that the two cannot cancel.
+
+    Raises:
+        CellError: a disc so thin or so wide that the matrices of its elements are singular.
     """
-    first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
+    try:
+        first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
+    except np.linalg.LinAlgError as singular:
+        raise CellError(
+            f"a diameter of {case.rho:.3g} pitches: the elements that follow the disc degenerate ({singular}); "
+            "use metalens.rcwa for this pillar"
+        ) from singular
     m = min(len(first.q), len(second.q))
     explained = first.by_q[:m] * (first.q[:m] - second.q[:m])[:, None, None]
     rest = first.matrix - second.matrix - explained.sum(0)
@@ -179,6 +208,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         drift=float((np.abs(first.by_q) * slack[:, None, None]).sum(0).max(initial=0.0)),
         energy=(first.energy + second.energy) / 2,
         unknowns=first.unknowns + second.unknowns,
+        grazing=max(first.grazing, second.grazing),
+        bloch=case.bloch,
     )
 
 
@@ -198,7 +229,7 @@ def climb(case: Case, tolerance: float) -> Climb:
     best: Climb | None = None
     for rung in RUNGS[first_rung(tolerance) :]:
         solution = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
-        error = rung.error(solution.spread, solution.drift, case.rho)
+        error = rung.error(solution, case.rho)
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"
             return Climb(solution, rung, error, True, reason)
@@ -256,7 +287,10 @@ def case_of(
     )
     for name, n in (("substrate", below), ("cover", above)):
         if n.imag:
-            raise CellError(f"{name} absorbs (index {n}): the orders of a half-space need a real index")
+            raise CellError(
+                f"{name} absorbs (index {n}): the modal engine needs real half-spaces; use metalens.rcwa, "
+                "or take the absorbing part as a film"
+            )
     k0 = 2 * math.pi / wavelength_um
     sine = abs(math.sin(angle_rad))
     if sine >= min(below.real, above.real):
@@ -280,6 +314,10 @@ def case_of(
 
 def check_shape(cell: Cell, diameter_um: float) -> None:
     """Refuse what the elements cannot follow."""
+    if not cell.round:
+        raise CellError(
+            f"the modal engine takes round pillars on a square lattice, not {cell.described}; use metalens.rcwa"
+        )
     if cell.under or cell.over or cell.sidewall_rad:
         raise CellError("the modal engine takes an upright pillar without films; use metalens.rcwa for this cell")
     if not (math.isfinite(diameter_um) and 0 < diameter_um < cell.pitch_um):

@@ -6,6 +6,7 @@ So each interface is one linear solve with a few right-hand sides, kept real whe
 propagates enters through a small complex correction (Woodbury).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import LayerModes, axial
 from metalens.modal.pencil import Pencil
 
+NEAR = 0.1  # relative distance of k² from its cutoff within which an order takes its exact wavenumber
+KNOWN = 0.02  # relative error of k² up to which a mode of the mesh is that order
 CARRY = 1e-13  # modes that decay below this over the height cannot change a result of double precision
 
 
@@ -26,17 +29,42 @@ class HalfSpace:
     ports: np.ndarray
 
 
-def half_space(basis: Basis, k0: float, permittivity: float, *, magnetic: bool) -> HalfSpace:
+def half_space(
+    basis: Basis, k0: float, permittivity: float, *, magnetic: bool, bloch: float | None = None
+) -> HalfSpace:
     """Admittances p / u: electric form i kz (TE), i k0² eps / kz (TM); magnetic form i kz / eps, i k0² / kz.
 
     A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance stays finite.
+    bloch: if given, orders near their cut-off get the wavenumbers of the lattice with this kx, see ``near_cutoff``.
     """
-    kz = axial(np.concatenate([k0**2 * permittivity - basis.te_exact, k0**2 * permittivity - basis.tm_exact]))
+    square = np.concatenate([basis.te_exact, basis.tm_exact])
+    if bloch is not None:
+        square = near_cutoff(square, k0**2 * permittivity, bloch)
+    kz = axial(k0**2 * permittivity - square)
     kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
     a = len(basis.te)
     te, tm = (1 / permittivity, 1.0) if magnetic else (1.0, permittivity)
     admittance = np.concatenate([1j * kz[:a] * te, 1j * k0**2 * tm / kz[a:]])
     return HalfSpace(admittance, np.flatnonzero(kz.real > 0))
+
+
+def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
+    """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the lattice has them.
+
+    Near its cutoff an order's admittance is the root of a small difference, in which the error of the mesh weighs as
+    one over the axial wavenumber. The exact values are (bloch + pi m)² + (pi n)²; each takes the nearest.
+    """
+    close = np.flatnonzero((np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9)))
+    if not len(close):
+        return square
+    reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
+    along, across = bloch + np.pi * np.arange(-reach, reach + 1), np.pi * np.arange(reach + 1)
+    exact = (along[:, None] ** 2 + across**2).ravel()
+    nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
+    known = np.abs(nearest - square[close]) < KNOWN * nearest
+    out = square.copy()
+    out[close[known]] = nearest[known]
+    return out
 
 
 @dataclass(frozen=True, eq=False, slots=True)

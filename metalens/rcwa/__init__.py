@@ -1,111 +1,30 @@
-"""Rigorous coupled-wave analysis of one round pillar on a square lattice.
+"""Rigorous coupled-wave analysis of one pillar cell.
 
-``solve`` gives the zero-order response of one cell with an error estimate, ``solve_many`` shares the work over
-diameters. Light comes from the substrate, phases run from the foot of the pillar (or the outer face of the films under
-it) to its top, time factor exp(-iwt).
+``jones`` gives both polarisations of a cell of any shape, lattice and layers. ``solve`` gives the zero-order response
+with an error estimate, ``solve_many`` shares the work over diameters, ``derivatives`` differentiates it exactly (round
+pillars). Light comes from the substrate.
 """
 
-import math
-from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import numpy as np
+from metalens.ground.lazy import attach
 
-from metalens.cell import Cell
-from metalens.errors import CellError
-from metalens.rcwa.case import Polarization, case, check_diameter
-from metalens.rcwa.derivative import Derivatives, differentiate
-from metalens.rcwa.solver import solve_case
-from metalens.response import Response
+if TYPE_CHECKING:
+    from metalens.rcwa.any_shape import Jones as Jones
+    from metalens.rcwa.any_shape import jones as jones
+    from metalens.rcwa.any_shape import most_harmonics as most_harmonics
+    from metalens.rcwa.verbs import derivatives as derivatives
+    from metalens.rcwa.verbs import solve as solve
+    from metalens.rcwa.verbs import solve_many as solve_many
 
-
-def solve(
-    cell: Cell,
-    diameter_um: float,
-    wavelength_um: float,
-    *,
-    angle_rad: float = 0.0,
-    azimuth_rad: float = 0.0,
-    polarization: Polarization = "x",
-    tolerance: float = 1e-3,
-    harmonics: int | None = None,
-) -> Response:
-    """Zero-order response of a pillar, at the least number of harmonics that meets the tolerance.
-
-    Args:
-        diameter_um: at half height, 0 (no pillar) to the pitch (touching pillars).
-        angle_rad: of the light outside, in vacuum: its tangential wave vector is k0 sin(angle_rad).
-        azimuth_rad: of the plane of incidence, from +x to +y.
-        polarization: s or p; x and y where the plane of incidence contains an axis. At normal incidence all are
-            the same.
-        tolerance: wanted bound of |t - exact|; beyond what the largest truncation reaches, the result comes with its
-            larger ``t_error`` and ``converged`` False.
-        harmonics: fix the largest order instead, and take the estimate there.
-
-    Accuracy: ``t_error`` estimates the truncation, from how t moves between truncations; the number of
-        steps of a tilted wall is chosen likewise. Lossless energy and reciprocity hold to rounding.
-
-    Raises:
-        CellError: an impossible diameter, angle, polarisation or tolerance.
-        MaterialError: a wavelength outside the range of a material.
-    """
-    return solve_many(
-        cell,
-        (diameter_um,),
-        wavelength_um,
-        angle_rad=angle_rad,
-        azimuth_rad=azimuth_rad,
-        polarization=polarization,
-        tolerance=tolerance,
-        harmonics=harmonics,
-    )[0]
-
-
-def solve_many(
-    cell: Cell,
-    diameter_um: Iterable[float],
-    wavelength_um: float,
-    *,
-    angle_rad: float = 0.0,
-    azimuth_rad: float = 0.0,
-    polarization: Polarization = "x",
-    tolerance: float = 1e-3,
-    harmonics: int | None = None,
-) -> list[Response]:
-    """As :func:`solve`, for several diameters at once; each stops at its own truncation."""
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
-    if harmonics is not None and harmonics < 1:
-        raise CellError(f"harmonics = {harmonics}: need at least 1")
-    diameters = np.array([float(diameter) for diameter in diameter_um])
-    for diameter in diameters:
-        check_diameter(cell, float(diameter))
-    this = case(cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
-    return solve_case(this, diameters, tolerance=tolerance, harmonics=harmonics)
-
-
-def derivatives(
-    cell: Cell,
-    diameter_um: float,
-    wavelength_um: float,
-    *,
-    angle_rad: float = 0.0,
-    azimuth_rad: float = 0.0,
-    polarization: Polarization = "x",
-    harmonics: int = 9,
-) -> Derivatives:
-    """Transmission at a fixed truncation, with its exact derivatives in every number of the cell.
-
-    Args: as for :func:`solve`.
-
-    Accuracy: rounding (1e-10 of the derivative) with respect to the truncated result; as the result itself with
-        respect to the exact one. A tilted wall is taken in eight steps of fourth order.
-
-    Raises:
-        CellError, MaterialError: as :func:`solve`; also where substrate or cover absorb.
-    """
-    check_diameter(cell, float(diameter_um))
-    if harmonics < 1:
-        raise CellError(f"harmonics = {harmonics}: need at least 1")
-    this = case(cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
-    steps = 8 if cell.sidewall_rad else 0
-    return differentiate(this, float(diameter_um), harmonics=harmonics, steps=steps, angle_rad=float(angle_rad))
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Jones": "any_shape",
+        "derivatives": "verbs",
+        "jones": "any_shape",
+        "most_harmonics": "any_shape",
+        "solve": "verbs",
+        "solve_many": "verbs",
+    },
+)

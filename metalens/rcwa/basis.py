@@ -7,12 +7,13 @@ transverse waves of a homogeneous medium are made (p from Ez, s from Hz).
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.special import j0, j1, jv
 
-Array = np.ndarray[Any, np.dtype[Any]]
+from metalens.ground.arrays import Array
+
 Symmetry = Literal["x", "p", "s", "none"]  # E along x at normal incidence; E in, or across, the mirror plane y = 0
 _PARITY: dict[str, tuple[tuple[int, int], ...]] = {  # of Ex, Ey, Ez, Hz under x -> -x and y -> -y; 0: no such mirror
     "x": ((1, 1), (-1, -1), (-1, 1), (1, -1)),

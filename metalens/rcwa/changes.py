@@ -1,15 +1,13 @@
 """How the operators of a layer change with pattern, indices and wave vector."""
 
-from typing import Any
-
 import numpy as np
 
+from metalens.ground.arrays import Array
 from metalens.rcwa import basis as fourier
-from metalens.rcwa.case import Case
+from metalens.rcwa.conditions import Case
 from metalens.rcwa.layer import factored, join
 from metalens.rcwa.waves import Waves
 
-Array = np.ndarray[Any, np.dtype[Any]]
 Change = tuple[Array, Array]  # dP, dQ of a layer; dK, dR of the wave vectors
 
 

@@ -13,23 +13,21 @@ its power is fixed.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from metalens import materials
-from metalens.cell import Film, Material
-from metalens.errors import CellError
+from metalens.cell import Film, Material, materials
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
 from metalens.rcwa import changes
-from metalens.rcwa.case import Case, case_waves
 from metalens.rcwa.changes import Change
+from metalens.rcwa.conditions import Case, case_waves
 from metalens.rcwa.layer import Layer, layer
 from metalens.rcwa.solver import homogeneous, mixed
 from metalens.rcwa.stack import Fields, match, outgoing
 from metalens.rcwa.taper import Section, sections, widening
 from metalens.rcwa.waves import Waves, half_space, normal_component
 
-Array = np.ndarray[Any, np.dtype[Any]]
 _GRAZING = 1e-8  # |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh anomaly
 
 

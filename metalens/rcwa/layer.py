@@ -7,14 +7,12 @@ The tangential field is split at the rim into a normal part, where D is continuo
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from metalens.ground.arrays import Array
 from metalens.rcwa import basis as fourier
 from metalens.rcwa.waves import Waves
-
-Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,6 +22,7 @@ class Layer:
     P, Q: (*batch, n, n) u' = i P w, w' = i Q u.
     q: (*batch, n) propagation constants over k0, imaginary part >= 0, the longest-lived first.
     W, V: (*batch, n, n) columns u and w of the upward modes (u, -w: downward).
+    symmetric: whether P and Q are (sections alike under a half turn).
     """
 
     P: Array
@@ -31,9 +30,10 @@ class Layer:
     q: Array
     W: Array
     V: Array
+    symmetric: bool = True
 
 
-def layer(P: Array, Q: Array) -> Layer:
+def layer(P: Array, Q: Array, *, symmetric: bool = True) -> Layer:
     """The modes of a layer with these operators. Everything stays real where nothing absorbs, but for q and V."""
     q2, W = np.linalg.eig(P @ Q)
     q = np.sqrt(q2.astype(complex))
@@ -42,7 +42,7 @@ def layer(P: Array, Q: Array) -> Layer:
     order = np.argsort(q.imag, axis=-1, kind="stable")
     q = np.take_along_axis(q, order, axis=-1)
     W = np.take_along_axis(W, order[..., None, :], axis=-1)
-    return Layer(P, Q, q, W, (Q @ W) / q[..., None, :])
+    return Layer(P, Q, q, W, (Q @ W) / q[..., None, :], symmetric)
 
 
 _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincide

@@ -3,18 +3,17 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from metalens.rcwa.case import Case, case_waves
+from metalens.cell import Response
+from metalens.ground.arrays import Array
+from metalens.rcwa.conditions import Case, case_waves
 from metalens.rcwa.layer import layer, operators
 from metalens.rcwa.stack import respond
 from metalens.rcwa.taper import Section, sections, widening
 from metalens.rcwa.waves import Waves
-from metalens.response import Response
 
-Array = np.ndarray[Any, np.dtype[Any]]
 _ROUNDING = 1e-13
 _ENTRIES = 1_500_000  # of a matrix of all diameters that are solved together: below 0.5 GB with all its companions
 

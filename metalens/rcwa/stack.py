@@ -7,14 +7,13 @@ factors only.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from metalens.ground.arrays import Array
 from metalens.rcwa.layer import Layer
 from metalens.rcwa.waves import Waves, half_space, normal_component
 
-Array = np.ndarray[Any, np.dtype[Any]]
 Pair = tuple[Array, Array]
 
 
@@ -108,6 +107,10 @@ def _reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Arr
     exponent = part.q * height
     kept = int(np.count_nonzero(exponent.imag < _FADED, axis=-1).max())
     fade = np.exp(1j * exponent[..., :kept])
+    if not part.symmetric:  # up + down = W⁻¹ U a and up - down = V⁻¹ V' a of the pair (U, V') above
+        U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
+        both, apart = np.linalg.solve(part.W, U), np.linalg.solve(part.V, V)
+        return ((both - apart) @ np.linalg.inv(both + apart))[:, :kept] * fade, kept, fade
     wv, vw = _across(pair[0], part.V), _across(pair[1], part.W)
     return np.linalg.solve(wv + vw, (wv - vw)[..., :kept] * fade[..., None, :]), kept, fade
 

@@ -11,13 +11,11 @@ kz² = eps - |k|²:   p: u = kz / n, w = n;   s: u = 1, w = kz.  No form divides
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from metalens.ground.arrays import Array
 from metalens.rcwa.basis import Basis, Orders
-
-Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

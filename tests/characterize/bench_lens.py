@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from characterize import bench
-from characterize.bench import Camera, Truth
-from characterize.capture import Capture
-from characterize.parameters import Known
-from characterize.pillars import Sensitivity
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.captures.capture import Capture
+from characterize.model.parameters import Known
 from metalens import design, profiles
-from metalens.cell import Cell
-from metalens.lens import Lens
-from metalens.proxy import Proxy
+from metalens.cell.record import Cell
+from metalens.lens.record import Lens
+from metalens.made import Sensitivity
+from metalens.pillars.proxy import Proxy
 
 DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)
 VALUES = {

@@ -6,18 +6,18 @@ import math
 
 import numpy as np
 
-from characterize.asbuilt import AsBuilt
-from characterize.parameters import NAMES
-from characterize.pillars import sensitivity
-from codesign import evolution, run
-from codesign.architecture import smallest
-from codesign.evolution import Candidate, Search
-from codesign.optics import OpticsConfig
+from characterize.inference.asbuilt import AsBuilt
+from characterize.model.parameters import NAMES
+from codesign.network.architecture import smallest
+from codesign.optics.stack import OpticsConfig
+from codesign.train import evolution, run
+from codesign.train.evolution import Candidate, Search
 from metalens import design, lens
-from metalens.cell import Cell, Index
-from metalens.profiles import Focus
-from metalens.proxy import Proxy
-from metalens.store import Provenance
+from metalens.cell.record import Cell, Index
+from metalens.design.profiles import Focus
+from metalens.ground.store import Provenance
+from metalens.made import sensitivity
+from metalens.pillars.proxy import Proxy
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt; |T| of 0.9 that varies a little
 PROXY = Proxy(np.array([[6.0, 3 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)

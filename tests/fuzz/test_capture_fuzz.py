@@ -5,15 +5,16 @@ import math
 import numpy as np
 import pytest
 import tifffile
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterize import capture
-from layout import bias, exposure
-from layout.process import Exposure
-from metalens.errors import MetalensError
+from characterize.captures import capture
+from layout.dose import exposure
+from layout.process.process import Exposure
+from metalens.ground.errors import MetalensError
+from metalens.made import bias
 
-LIMITS = dict(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LIMITS = dict(max_examples=60)
 FRAMES = (np.arange(2 * 6 * 5).reshape(2, 6, 5) * 37 % 1000).astype(np.uint16)
 STAGE = "file,page,depth_mm,angle_deg,exposure_s\nf.tif,0,18.0,0.0,0.01\nf.tif,1,22.5,1.5,0.01\n"
 ABOUT = 'pixel_um = 3.0\nwavelength_um = 0.85\nbits = 10\ncamera = "x"\n'

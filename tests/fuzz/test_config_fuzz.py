@@ -1,21 +1,22 @@
 """Damaged settings: TOML of every command and CSV tables, with flipped bytes or odd values, are refused by type."""
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterize.bench import Truth
-from characterize.command_fit import Metrology
-from characterize.pupil import PupilSpec
-from codesign import run as runs
-from codesign.plan import PlanConfig
-from layout import process as processes
-from metalens import config, materials
-from metalens.chain import ChainFiles
+from characterize.bench.bench import Truth
+from characterize.commands.fit import Metrology
+from characterize.pupil.record import PupilSpec
+from codesign.budget.plan import PlanConfig
+from codesign.train import run as runs
+from layout.process import process as processes
+from metalens import materials
+from metalens.chain.stages import ChainFiles
 from metalens.commands.design import Design
 from metalens.commands.library import CellFile
 from metalens.commands.psf import Settings
-from metalens.errors import MetalensError
+from metalens.ground import config
+from metalens.ground.errors import MetalensError
 
 TEXTS = {
     "cell": ("[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n[sweep]\nwavelengths_um = [0.85]\nsamples = 200\n", CellFile),
@@ -29,7 +30,7 @@ TEXTS = {
     "chain": ('cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\n', ChainFiles),
     "run": ('preset = "smoke"\n[inner]\nsteps = 3\n[run]\npitch_um = 18.0\n', None),
 }  # fmt: skip
-LIMITS = dict(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LIMITS = dict(max_examples=40)
 
 
 def _load(kind, path):

@@ -5,19 +5,21 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterize import asbuilt
-from characterize.pillars import Sensitivity
-from codesign import command_budget, dataset
-from codesign.budget import Entry
-from metalens import lens, library, psf, store
-from metalens.cell import Cell, Index
-from metalens.errors import MetalensError
-from metalens.lens import DiameterMap, Lens
-from metalens.library import PillarLibrary, Sweep
-from metalens.proxy import Proxy
+from characterize.inference import asbuilt
+from codesign.budget.links import Entry
+from codesign.commands import budget as command_budget
+from codesign.eye import dataset
+from metalens import lens, library, psf
+from metalens.cell.record import Cell, Index
+from metalens.ground import store
+from metalens.ground.errors import MetalensError
+from metalens.lens.record import DiameterMap, Lens
+from metalens.made import Sensitivity
+from metalens.pillars.proxy import Proxy
+from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.psf import PsfStack
 
 CELL = Cell(pitch_um=0.30, pillar=Index(3.6))
@@ -81,7 +83,7 @@ def _same(one, other):
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50)
 @given(data=st.data())
 def test_damaged_artefacts_are_refused_or_read_as_they_were(tmp_path_factory, kind, data):
     path = tmp_path_factory.mktemp("fuzz") / "file.h5"

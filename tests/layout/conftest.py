@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.mask import Figure, Lattice, MaskPlan, pillar_classes
+from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
 
 
 def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=100):

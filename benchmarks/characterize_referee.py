@@ -1,0 +1,173 @@
+"""Hidden lenses of the referee bench, fitted with default priors: coverage by parameter, and faults that no fit knows.
+
+``python -m benchmarks.characterize_referee small 200 --minutes 60`` fits the seeds that are still missing of a case
+(small: 40 um; fifth: 0.2 mm; whole: 1 mm; faults: the small one with every fault in turn) and keeps each at once in
+``benchmarks/results/characterize_referee``; what is there is printed by ``python -m benchmarks characterize_referee``.
+
+The bench (``tests/referees``) sums over every pillar in float64 with the modal library's t(D) at five heights, has a
+camera of its own, and draws its truths from wider than, and shifted against, what the fit assumes.
+"""
+
+import functools
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import Row
+from characterize.inference.estimate import Options, fit
+from characterize.model import slopes
+from metalens.ground import store
+from metalens.ground.errors import FitError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "referees"))
+FOLDER = Path(__file__).parent / "results" / "characterize_referee"
+CASES: dict[str, dict[str, Any]] = {
+    "small": {"lens": (40.0, 110.0, 600.0), "scale": 1.0, "session": {}},
+    "fifth": {
+        "lens": (200.0, 900.0, 6000.0),
+        "scale": 8.0,
+        "session": {"depths_um": (4300.0, 4900.0, 5600.0, 6300.0, 7400.0, 9200.0), "pixel_um": 2.4, "pixels": 32},
+    },
+    "whole": {
+        "lens": (1000.0, 2000.0, 20000.0),
+        "scale": 10.0,
+        "session": {
+            "depths_um": tuple((1 / np.linspace(1 / 15e3, 1 / 28e3, 11)).tolist()),
+            "pixel_um": 3.0,
+            "pixels": 32,
+            "peak_e": 8000.0,
+        },
+    },
+}
+FAULTS: dict[str, dict[str, float]] = {
+    "cover glass 100 um": {"glass_um": 100.0},
+    "cover glass 100 um, tilted 10 deg": {"glass_um": 100.0, "glass_tilt_deg": 10.0},
+    "stitching 60 nm": {"stitch_nm": 60.0},
+    "side wall 1.5 deg": {"sidewall_deg": 1.5},
+    "2 % of the pillars missing": {"missing": 0.02},
+    "wavelength drift 1.5 nm": {"drift_nm": 1.5},
+    "LED of 20 nm": {"led_nm": 20.0},
+    "vibration 0.7 px in every second frame": {"vibration_px": 0.7},
+    "ghost 5 %": {"ghost": 0.05},
+    "pixel pitch 1 % off": {"pixel_error": 0.01},
+    "saturated at 4000 e": {"full_well_e": 4000.0},
+    "stage 10 um a frame": {"stage_um": 10.0},
+    "illumination 15 % uneven": {"gradient": 0.15},
+    "source of 8 um": {"source_um": 8.0},
+}
+
+
+@functools.cache
+def _lens(case: str) -> tuple[Any, Any]:
+    import hidden_lens
+
+    lens = hidden_lens.lens(*CASES[case]["lens"])
+    return lens, slopes(lens)
+
+
+def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[str, Any]:
+    """One hidden lens: capture, fit, compare."""
+    import hidden_lens
+    import pillar_bench
+
+    lens, response = _lens(case)
+    about = CASES[case]
+    values = hidden_lens.hidden(seed, scale=about["scale"])
+    session = hidden_lens.session(seed, values=values, **about["session"])
+    session = pillar_bench.with_faults(session, **(faults or {}))
+    seen = pillar_bench.shoot(lens, session)
+    start = time.process_time()
+    try:
+        found = fit(seen.capture, lens, Options(insist=True), response=response)
+    except FitError as refusal:
+        return {"seed": seed, "refused": str(refusal), "seconds": time.process_time() - start}
+    seconds = time.process_time() - start
+    inside, error = {}, {}
+    for i, name in enumerate(found.names):
+        if name in hidden_lens.TRUTHS:
+            low, high = found.interval(name)
+            inside[name] = bool(low <= values[name] <= high)
+            error[name] = float((found.value[i] - values[name]) / math.sqrt(found.covariance[i, i]))
+    words = [w for w in found.cautions if "residuals" in w or "left out" in w or "fitted too" in w or "phase of" in w]
+    return {
+        "seed": seed,
+        "seconds": seconds,
+        "inside": inside,
+        "z": error,
+        "parabolic": len(found.draws) == 0,
+        "chi2_per_dof": found.chi2_per_dof,
+        "problems": list(found.problems),
+        "words": words,
+        "verdicts": list(found.verdicts),
+    }
+
+
+def rows() -> list[Row]:
+    """What is stored."""
+    out = [row for case in CASES for row in _rows(case, list(_stored(case).values()))]
+    return out + [_fault_row(name, run) for name, run in _stored("faults").items()]
+
+
+def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:
+    good = [run for run in runs if "inside" in run and not run["problems"]]
+    if not good:
+        return []
+    seconds = float(np.mean([run["seconds"] for run in good]))
+    head = f"{len(runs)} hidden lenses, {case}"
+    names = list(good[0]["inside"])
+    every = [run["inside"][name] for run in good for name in names]
+    plain = [run["z"][name] for run in good if run["parabolic"] for name in names]
+    out = [
+        Row(head, "all parameters covered", seconds, float(np.mean(every)), "truth", goal="0.93 to 0.97"),
+        Row(head, "refused", seconds, 1 - len(good) / len(runs), "none", goal="0"),
+    ]
+    if plain:
+        rms = float(np.sqrt(np.mean(np.square(plain))))
+        out.append(Row(head, "error over sigma, parabolic ones, rms", seconds, rms, "truth", goal="<= 1.15"))
+    for name in names:
+        share = float(np.mean([run["inside"][name] for run in good]))
+        out.append(Row(head, f"{name} covered", seconds, share, "truth", goal="0.93 to 0.97"))
+    return out
+
+
+def _fault_row(name: str, run: dict[str, Any]) -> Row:
+    """Share of the parameters outside their intervals; none where the fault was found or the fit refused."""
+    if "inside" not in run or run["problems"]:
+        return Row(f"fault: {name}", "refused", run["seconds"], 0.0, "truth", goal="found, inside, or refused")
+    outside = 1 - float(np.mean(list(run["inside"].values())))
+    told = "spoken of" if run["words"] else "silent"
+    return Row(f"fault: {name}", told, run["seconds"], outside, "truth", goal="found, inside, or refused")
+
+
+def _stored(case: str) -> dict[str, Any]:
+    path = FOLDER / f"{case}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def _keep(case: str, key: str, run: dict[str, Any]) -> None:
+    FOLDER.mkdir(exist_ok=True)
+    store.write_text(FOLDER / f"{case}.json", json.dumps(_stored(case) | {key: run}, indent=1) + "\n")
+
+
+def main(words: list[str]) -> None:
+    """Fit what is missing until the time is up."""
+    minutes = float(words[words.index("--minutes") + 1]) if "--minutes" in words else math.inf
+    count = next((int(w) for w in words if w.isdigit()), 20)
+    end = time.monotonic() + 60 * minutes
+    if "faults" in words:
+        for name, fault in FAULTS.items():
+            if name not in _stored("faults") and time.monotonic() < end:
+                _keep("faults", name, study("small", 0, fault))
+    for case in CASES:
+        for seed in range(count if case in words else 0):
+            if str(seed) not in _stored(case) and time.monotonic() < end:
+                _keep(case, str(seed), study(case, seed))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,120 @@
+"""Error bars on hard cells drawn at random: how many lie below the error, and how wide the bars are.
+
+``python -m benchmarks hard_cells`` draws 1000 cells (an hour or two); ``python -m benchmarks.hard_cells
+N [SEED]`` fewer, without RCWA. Two referees: the mesh of 2.5e-5 of the modal engine (another mesh, both forms on it),
+and RCWA at its largest truncation, which shares no code: the answers must agree within both bars.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from benchmarks import Row
+from metalens import modal, rcwa
+from metalens.cell import Cell, Index
+from metalens.ground.errors import CellError
+from metalens.modal import RUNGS
+from metalens.modal.engine import case_of, evaluate
+
+COUNT = 1000
+SEED = 21
+FINER = 4  # rung of the referee
+EXACT = 5e-5  # error of the referee, added to every bar
+TOLERANCES = (1e-2, 1e-3)
+Drawn = tuple[Cell, float, float, float, str]  # cell, diameter, wavelength, angle, polarisation
+
+
+def _any(rng: np.random.Generator, *, n: tuple[float, float] = (1.8, 3.8), k: float = 0.0) -> dict[str, Index]:
+    return {
+        "pillar": Index(rng.uniform(*n), k),
+        "substrate": Index(rng.uniform(1.3, 1.8)),
+        "cover": Index(rng.uniform(1.0, 1.3)),
+        "between": Index(rng.uniform(1.0, 1.3)),
+    }
+
+
+def _cutoff(rng: np.random.Generator) -> Drawn:
+    """Within 1 % of the cutoff of an order of substrate or cover, on either side of it; half of them oblique."""
+    about = _any(rng)
+    n = about[str(rng.choice(["substrate", "cover"]))].n
+    angle = float(rng.choice([0.0, rng.uniform(0.05, 0.4)]))
+    pitch, offset = rng.uniform(0.3, 0.6), rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2)
+    wavelength = pitch * (n + math.sin(angle)) * (1 + offset)
+    return Cell(pitch, rng.uniform(0.2, 1.0), **about), pitch * rng.uniform(0.25, 0.85), wavelength, angle, "s"
+
+
+def _resonant(rng: np.random.Generator) -> Drawn:
+    """High index, slightly oblique: resonances that normal incidence does not excite are sharp."""
+    pitch = rng.uniform(0.35, 0.42)
+    cell = Cell(pitch, rng.uniform(0.5, 1.0), **_any(rng, n=(3.2, 3.8)))
+    return cell, pitch * rng.uniform(0.5, 0.85), 0.85, rng.uniform(0.01, 0.15), str(rng.choice(["s", "p"]))
+
+
+def _shaped(low: float, high: float, heights: tuple[float, float], k: float) -> Callable[[np.random.Generator], Drawn]:
+    def draw(rng: np.random.Generator) -> Drawn:
+        pitch = rng.uniform(0.3, 0.45)
+        cell = Cell(pitch, rng.uniform(*heights), **_any(rng, k=k * 10 ** rng.uniform(-2, 0)))
+        return cell, pitch * rng.uniform(low, high), rng.uniform(0.83, 0.95), 0.0, "x"
+
+    return draw
+
+
+KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
+    "at a cutoff": _cutoff,
+    "at a resonance": _resonant,
+    "nearly touching": _shaped(0.9, 0.985, (0.3, 0.9), 0.0),
+    "thin": _shaped(0.05, 0.2, (0.3, 0.9), 0.0),
+    "tall": _shaped(0.3, 0.8, (1.2, 2.5), 0.0),
+    "absorbing": _shaped(0.2, 0.8, (0.3, 0.9), 1.0),
+}
+
+
+def judged(kind: str, count: int, tolerance: float, seed: int, *, other_solver: bool) -> Row:
+    """One row: bars below the error, and the median of bar over error."""
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    ratios, seconds, apart, refused = [], 0.0, 0, 0
+    for _ in range(count):
+        cell, diameter, wavelength, angle, polarization = KINDS[kind](rng)
+        light = {"angle_rad": angle, "polarization": polarization}
+        start = time.perf_counter()
+        try:
+            got = modal.solve(cell, diameter, wavelength, **light, tolerance=tolerance)
+        except CellError:  # no zero order on one side, or elements that degenerate: refused, not wrong
+            refused += 1
+            continue
+        seconds += time.perf_counter() - start
+        case = case_of(cell, diameter, wavelength, angle, 0.0, polarization)
+        want = complex(evaluate(case, RUNGS[FINER].choice(case.rho).plan).matrix[1, 0])
+        error = abs(got.t - want)
+        ratios.append((got.t_error + EXACT) / max(error, 1e-12))
+        if other_solver:
+            against = rcwa.solve(cell, diameter, wavelength, **light, tolerance=1e-9)
+            apart += abs(against.t - got.t) > against.t_error + got.t_error
+    below = int(np.count_nonzero(np.array(ratios) < 1))
+    text = f"{below} of {len(ratios)} bars below the error, median bar {np.median(ratios):.1f} errors"
+    text += f", {refused} refused" if refused else ""
+    text += f", {apart} outside both bars of RCWA" if other_solver else ""
+    return Row(
+        case=f"cells {kind}, tolerance {tolerance:g}: {text}",
+        method="modal",
+        seconds=seconds / max(1, len(ratios)),
+        error=1 / min(ratios, default=math.inf),
+        against="largest error over bar, mesh of 2.5e-5" + (" and RCWA" if other_solver else ""),
+        goal="0 below the error, median at most 4",
+    )
+
+
+def rows(count: int = COUNT, seed: int = SEED, *, other_solver: bool = True) -> list[Row]:
+    """Every kind at every tolerance; ``count`` cells in all."""
+    each = max(1, count // (len(KINDS) * len(TOLERANCES)))
+    return [judged(kind, each, tol, seed, other_solver=other_solver) for kind in KINDS for tol in TOLERANCES]
+
+
+if __name__ == "__main__":
+    from benchmarks.__main__ import table
+
+    words = [int(word) for word in sys.argv[1:]]
+    sys.stdout.write(table(rows(*words, other_solver=False)) + "\n")

@@ -1,0 +1,161 @@
+"""Which frames to take: source depths, field angles and exposures that tell most about the lens (optimal design).
+
+Every candidate frame has a Fisher information J^T W J at the nominal lens; that of a set of frames is the sum, on
+top of what metrology says. Frames are picked greedily for the largest determinant (D) or the least trace of the
+covariance in typical units (A), then exchanged one by one as long as that helps (Fedorov 1972).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from characterize.inference import invert
+from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.lens import Lens
+from metalens.made import Sensitivity
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """What the bench can do; TOML of ``metalens capture --protocol``.
+
+    depths_um: (nearest, farthest) source depth; depth_count: candidates between them, even in 1/z.
+    angles_deg: field angles along x. exposures: relative exposure times.
+    frames: how many may be taken. criterion: D (determinant) or A (mean variance).
+    peak_e: electrons in the brightest pixel of all candidates at exposure 1. full_well_e, read_noise_e: of the sensor.
+    pixel_um, pixels: of the sensor and of the window about the image.
+    free, known: as in the metrology of ``metalens fit``.
+    """
+
+    depths_um: tuple[float, float]
+    depth_count: int = 13
+    angles_deg: tuple[float, ...] = (0.0,)
+    exposures: tuple[float, ...] = (1.0,)
+    frames: int = 8
+    criterion: Literal["D", "A"] = "A"
+    peak_e: float = 8000.0
+    full_well_e: float = 10000.0
+    read_noise_e: float = 2.0
+    pixel_um: float = 3.0
+    pixels: int = 32
+    free: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
+
+    def __post_init__(self) -> None:
+        near, far = self.depths_um
+        if not (0 < near < far and self.depth_count >= 2 and self.frames >= 1):
+            raise FitError(
+                f"depths_um {self.depths_um}, depth_count {self.depth_count}, frames {self.frames}: need "
+                "0 < nearest < farthest, two depths or more and one frame or more"
+            )
+        if not (self.angles_deg and self.exposures and min(self.exposures) > 0 and min(self.peak_e, self.pixel_um) > 0):
+            raise FitError("need at least one of angles_deg and exposures; exposures, peak_e and pixel_um above 0")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """Frames to take, in the order of what each adds.
+
+    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,) expected standard errors with them.
+    even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and the first angle.
+    gain: (n,) criterion after each frame, relative to the last (1 at the end).
+    """
+
+    depth_um: Array
+    angle_deg: Array
+    exposure: Array
+    names: tuple[str, ...]
+    sigma: Array
+    even_sigma: Array
+    gain: Array
+
+
+def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
+    """The best frames for a lens and what they will tell.
+
+    Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change the weights in second order.
+
+    Raises:
+        FitError: as :class:`ForwardModel`.
+    """
+    names, prior = _parameters(protocol)
+    candidates, information = candidate_information(lens, protocol, response, names)
+    chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names)
+    even = _even(candidates, protocol)
+    values = [score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names) for i in range(len(chosen))]
+    covariances = [invert(prior + information[pick].sum(0)) for pick in (chosen, even)]
+    sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
+    depth, angle, exposure = candidates[chosen].T
+    return Plan(depth, angle, exposure, names, sigma, even_sigma, np.array(values) / values[-1])
+
+
+def candidate_information(
+    lens: Lens, protocol: Protocol, response: Sensitivity, names: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every candidate frame."""
+    near, far = protocol.depths_um
+    depths = 1 / np.linspace(1 / near, 1 / far, protocol.depth_count)
+    pairs = np.array([(z, a) for a in protocol.angles_deg for z in depths])
+    angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
+    setting = Setting(pairs[:, 0], angles, np.ones(len(pairs)), protocol.pixel_um, protocol.pixels, protocol.pixels)
+    model = ForwardModel(lens, setting, response)
+    x = vector({k.name: k.value for k in protocol.known})
+    x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
+    images, slopes = model.images(x, names)
+    if slopes is None:
+        raise FitError("the model gave no derivatives")
+    rows, information = [], []
+    for exposure in protocol.exposures:
+        light = np.maximum(images * exposure, 0)
+        weight = (light < protocol.full_well_e) / (light + protocol.read_noise_e**2) * exposure**2
+        information.append(np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True))
+        rows.append(np.column_stack([pairs, np.full(len(pairs), exposure)]))
+    return np.concatenate(rows), np.concatenate(information)
+
+
+def choose(information: Array, prior: Array, count: int, *, criterion: str, names: tuple[str, ...]) -> list[int]:
+    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as long as they help."""
+    chosen: list[int] = []
+    total = prior.copy()
+
+    def best(base: Array) -> int:
+        return int(np.argmax([score(base + one, criterion, names) for one in information]))
+
+    for _ in range(count):
+        chosen.append(best(total))
+        total = total + information[chosen[-1]]
+    for _ in range(10):
+        before = list(chosen)
+        for i, old in enumerate(before):
+            base = total - information[old]
+            chosen[i] = best(base)
+            total = base + information[chosen[i]]
+        if chosen == before:
+            break
+    return chosen
+
+
+def score(information: Array, criterion: str, names: tuple[str, ...]) -> float:
+    """What is to be large: det^(1/p) in typical units (D), or p over the sum of variances in typical units (A)."""
+    unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    values = np.maximum(np.linalg.eigvalsh(information * np.outer(unit, unit)), 1e-12)
+    return float(np.exp(np.log(values).mean()) if criterion == "D" else len(values) / (1 / values).sum())
+
+
+def _parameters(protocol: Protocol) -> tuple[tuple[str, ...], Array]:
+    """Names of what will be fitted, and what is known of it beforehand as (p, p) information."""
+    known = {k.name: k for k in protocol.known}
+    held = {k.name for k in protocol.known if k.sigma == 0}
+    wanted = {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)
+    names = tuple(name for name in NAMES if name in wanted - held)
+    sigma = [known[n].sigma if n in known else PARAMETERS[PLACE[n]].sigma for n in names]
+    return names, np.diag([s**-2.0 for s in sigma])
+
+
+def _even(candidates: Array, protocol: Protocol) -> list[int]:
+    usual = np.flatnonzero((candidates[:, 1] == protocol.angles_deg[0]) & (candidates[:, 2] == protocol.exposures[0]))
+    return [int(usual[i]) for i in np.linspace(0, len(usual) - 1, protocol.frames).round().astype(int)]

@@ -1,0 +1,25 @@
+"""Frames, stage, dark, flat -> electrons."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from characterize.captures import capture as capture
+    from characterize.captures.capture import Capture as Capture
+    from characterize.captures.electrons import Frames as Frames
+    from characterize.captures.electrons import Gain as Gain
+    from characterize.captures.electrons import clean as clean
+    from characterize.captures.electrons import merge_brackets as merge_brackets
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Capture": "capture",
+        "Frames": "electrons",
+        "Gain": "electrons",
+        "capture": "",
+        "clean": "electrons",
+        "merge_brackets": "electrons",
+    },
+)

@@ -1,0 +1,319 @@
+"""Bench captures as they lie on disk: frames, stage positions, dark and flat, with their bit depth found out."""
+
+import dataclasses
+import math
+import re
+import struct
+import warnings
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from characterize.captures import stage, tiff_tags
+from metalens.ground import manifest, store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+
+TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
+_DEPTHS = (8, 10, 12, 14, 16)
+_DENSEST, _MOST_BYTES = 1040, 1 << 34  # values' bytes for a byte of the file, at best; of all frames of a file
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Capture:
+    """Frames of a bench run in counts, right-aligned, and all that was written down with them.
+
+    frames: (n, y, x) counts, +x right, +y down.
+    position_um: (n,) of the stage as read (the depth of the source on a lens bench); nan where unknown.
+    angle_rad: (n, 2) field angle of the source towards (+x, +y).
+    exposure_s: (n,) nan where unknown.
+    names: of every frame, for messages.
+    bits: of the converter; the largest count is 2**bits - 1.
+    pixel_um, wavelength_um: nan where unknown.
+    dark, flat: (k, y, x) counts, or None.
+    about: further entries of the capture's description (numbers and words).
+    corrections: what was changed on the way in, in words.
+    """
+
+    frames: Array
+    position_um: Array
+    angle_rad: Array
+    exposure_s: Array
+    names: tuple[str, ...]
+    bits: int
+    pixel_um: float = math.nan
+    wavelength_um: float = math.nan
+    dark: Array | None = None
+    flat: Array | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+    corrections: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, shape = len(self.frames), self.frames.shape[1:]
+        if self.frames.ndim != 3 or n == 0 or min(shape) < 3:
+            raise CaptureError(f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3")
+        for name, wanted in (("position_um", (n,)), ("angle_rad", (n, 2)), ("exposure_s", (n,))):
+            if getattr(self, name).shape != wanted:
+                raise CaptureError(f"{name} has shape {getattr(self, name).shape}, need {wanted} for {n} frames")
+        for name in ("dark", "flat"):
+            image = getattr(self, name)
+            if image is not None and image.shape[1:] != shape:
+                raise CaptureError(f"{name} frames are {image.shape[1:]}, the frames {shape}; crop them alike")
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count of the converter."""
+        return int((1 << self.bits) - 1)
+
+
+def load(path: str | Path) -> Capture:
+    """Read a capture: a TIFF, PNG or HDF5 file, or a folder of them.
+
+    A folder holds frames (named in ``stage.csv`` or ``stage.json``, else every image that is not dark or flat, in
+    the order of their names, numbers counted), and may hold ``dark.tif``, ``flat.tif`` and ``capture.toml`` or
+    ``capture.json`` (pixel_um, step_um, wavelength_um, bits, and what else is known; ``voxel_um`` as z, y, x). A single
+    file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its ImageJ or OME tags.
+
+    Raises:
+        CaptureError: nothing there, lossy or truncated images, frames of different size, non-finite values,
+            stage rows that do not match the frames; file, row and frame are named.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise CaptureError(f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)")
+    return _load_folder(path) if path.is_dir() else _load_file(path)
+
+
+def read_images(path: Path) -> Array:
+    """(n, y, x) images of one file, in its own number type.
+
+    Raises:
+        CaptureError: unknown, lossy, truncated or non-finite.
+    """
+    suffix = path.suffix.lower()
+    if suffix in LOSSY:
+        raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
+    readers = {TIFF: _read_tiff, PNG: _read_png, HDF5: _read_hdf5}
+    reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
+    if reader is None:
+        raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
+    images = reader(path)
+    images = images[None] if images.ndim == 2 else images
+    if images.ndim != 3:
+        raise CaptureError(f"{path}: images of shape {images.shape}; need grey frames (n, y, x), not colour")
+    _check_values(images, path)
+    return images
+
+
+def right_align(images: Array, bits: int | None, where: str) -> tuple[Array, int, str]:
+    """Undo a left shift of 10 to 14-bit counts in 16-bit words and find the depth of the converter.
+
+    Args:
+        bits: as stated with the capture; None finds it from the counts.
+
+    Returns:
+        (counts, bits, note in words).
+
+    Raises:
+        CaptureError: the counts do not fit into the stated bits, shifted or not.
+    """
+    if images.dtype.kind == "f" or images.min() < 0:
+        return images, bits or 16, "counts are real numbers: taken as they are"
+    used = int(np.bitwise_or.reduce(images.astype(np.int64), axis=None))
+    shift = (used & -used).bit_length() - 1 if used else 0
+    width = used.bit_length()
+    if bits is not None and width - shift > bits:
+        raise CaptureError(
+            f"{where}: counts use {width - shift} bits, the capture states {bits}; correct bits, or the bit shift"
+        )
+    if bits is not None and width <= bits:
+        return images, bits, f"{bits} bits as stated"
+    if bits is not None:
+        return images >> (16 - bits), bits, f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
+    if shift and width > 12 and images.dtype.itemsize == 2:
+        depth = 16 - shift
+        return images >> shift, depth, f"lowest {shift} bits never used: {depth}-bit counts shifted back"
+    depth = next((d for d in _DEPTHS if width <= d), 16) if images.dtype.itemsize > 1 else 8
+    return images, depth, f"largest count {int(images.max())}: taken as a {depth}-bit converter"
+
+
+def _load_file(path: Path) -> Capture:
+    about, images = stage.read_beside(path), read_images(path)
+    tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
+    images, bits, note = right_align(images, about.pop("bits", None), str(path))
+    n = len(images)
+    step = about.get("step_um", math.nan)
+    position = np.arange(n) * step if math.isfinite(step) else tags.position_um
+    notes = [note, *tags.notes]
+    return Capture(
+        images,
+        position if len(position) == n else np.full(n, np.nan),
+        np.zeros((n, 2)),
+        np.full(n, np.nan),
+        tuple(f"{path.name}[{i}]" for i in range(n)),
+        bits,
+        pixel_um=about.pop("pixel_um", tags.pixel_um),
+        wavelength_um=about.pop("wavelength_um", math.nan),
+        about=about,
+        corrections=tuple(notes),
+    )
+
+
+def _load_folder(folder: Path) -> Capture:
+    manifest.check(folder)
+    about = stage.read_about(folder)
+    rows = stage.read_stage(folder)
+    files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
+    special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
+    files = [p for p in files if p not in special.values()]
+    if rows is None:
+        names, frames = _all_frames(files, folder)
+        rows = stage.Rows.unknown(names)
+    else:
+        frames = _listed_frames(folder, rows)
+    stacks = {name: read_images(p) for name, p in special.items()}
+    bits = about.pop("bits", None)
+    frames, depth, note = right_align(frames, bits, str(folder))
+    if "step_um" in about and not np.isfinite(rows.position_um).any():
+        rows = dataclasses.replace(rows, position_um=np.arange(len(frames)) * float(about["step_um"]))
+    extra = {name: right_align(s, depth, str(special[name]))[0] for name, s in stacks.items()}
+    return Capture(
+        frames,
+        rows.position_um,
+        rows.angle_rad,
+        rows.exposure_s,
+        rows.files,
+        depth,
+        pixel_um=about.pop("pixel_um", math.nan),
+        wavelength_um=about.pop("wavelength_um", math.nan),
+        dark=extra.get("dark"),
+        flat=extra.get("flat"),
+        about=about,
+        corrections=(note,),
+    )
+
+
+def _all_frames(files: Sequence[Path], folder: Path) -> tuple[tuple[str, ...], Array]:
+    if not files:
+        raise CaptureError(f"{folder}: no frames; need TIFF, PNG or HDF5 images in it")
+    names: list[str] = []
+    stacks = []
+    for path in files:
+        images = read_images(path)
+        names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
+        stacks.append(images)
+    return tuple(names), _join(stacks, files)
+
+
+def _listed_frames(folder: Path, rows: stage.Rows) -> Array:
+    """The frames that the stage file names, in its order; pages of a stack where it names one file for all."""
+    stacks: dict[str, Array] = {}
+    images = []
+    for row, (name, page) in enumerate(zip(rows.files, rows.page, strict=True), 2):
+        path = folder / name
+        if not path.is_file():
+            raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
+        stack = stacks.setdefault(name, read_images(path))
+        if not 0 <= page < len(stack):
+            raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
+        images.append(stack[page][None])
+    return _join(images, [folder / name for name in rows.files])
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key that counts: frame_2 before frame_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
+
+
+def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
+    for stack, path in zip(stacks, files, strict=True):
+        if stack.shape[1:] != stacks[0].shape[1:] or stack.dtype != stacks[0].dtype:
+            raise CaptureError(
+                f"{path}: frame of {stack.shape[1:]} {stack.dtype}, others {stacks[0].shape[1:]} {stacks[0].dtype}"
+            )
+    return np.concatenate(stacks)
+
+
+def _read_tiff(path: Path) -> Array:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            size = path.stat().st_size
+            claimed = 0
+            for number, page in enumerate(file.pages):
+                claimed += page.nbytes
+                if page.nbytes > _DENSEST * sum(page.databytecounts) + 65536 or claimed > _MOST_BYTES:
+                    raise CaptureError(f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes")
+                ends = [a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)]
+                if not ends or max(ends) > size:
+                    raise CaptureError(
+                        f"{path}: truncated in frame {number} ({size} bytes, need {max(ends, default=0)})"
+                    )
+                if int(page.compression) in (6, 7, 33003, 33005, 34712):
+                    raise CaptureError(f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain")
+            images = np.stack([page.asarray() for page in file.pages])
+            planar = (
+                getattr(file.pages[0], "planarconfig", 1) == 2
+            )  # few frames that a writer took for separate colour planes
+            return np.asarray(images.reshape(-1, *images.shape[-2:]) if planar else images)
+    except CaptureError:
+        raise
+    except (tifffile.TiffFileError, *store.DAMAGE, IndexError, ArithmeticError, struct.error, zlib.error) as error:
+        raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
+
+
+def _read_png(path: Path) -> Array:
+    import cv2
+
+    with open(path, "rb") as file:
+        head, size = file.read(33), path.stat().st_size
+    wide, high = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if len(head) < 33 or wide * high > _DENSEST * 8 * size:
+        raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes for {wide} x {high} pixels)")
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise CaptureError(f"{path}: not a readable PNG file ({error.err})") from None
+    if image is None:
+        raise CaptureError(f"{path}: truncated or not a PNG file")
+    if image.ndim != 2:
+        raise CaptureError(f"{path}: a colour image of shape {image.shape}; need grey frames, straight from the sensor")
+    return np.asarray(image)
+
+
+def _read_hdf5(path: Path) -> Array:
+    try:
+        with h5py.File(path, "r") as file:
+            if "frames" not in file:
+                raise CaptureError(
+                    f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}"
+                )
+            frames = file["frames"]
+            if not isinstance(frames, h5py.Dataset):
+                raise CaptureError(f"{path}: 'frames' is a group, need a data set (n, y, x)")
+            store.check_claim(path, frames, "frames")
+            return np.asarray(frames[...])
+    except CaptureError:
+        raise
+    except store.DAMAGE as error:
+        raise CaptureError(f"{path}: truncated or not an HDF5 file ({error})") from error
+
+
+def _check_values(images: Array, path: Path) -> None:
+    if images.dtype.kind not in "uif" or images.dtype.itemsize > 8:
+        raise CaptureError(f"{path}: values of type {images.dtype}; need whole or real numbers")
+    if images.dtype.kind == "f" and not np.isfinite(images).all():
+        frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
+        raise CaptureError(f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}")
+
+
+def describe(capture: Capture, **known: Any) -> Capture:
+    """The capture with fields filled in that its files left open (pixel_um, wavelength_um, position_um ...)."""
+    return dataclasses.replace(capture, **known)

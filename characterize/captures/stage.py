@@ -1,0 +1,178 @@
+"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or .json with what else is known."""
+
+import csv
+import json
+import math
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError, nearest
+
+_LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3}
+_POSITIONS = {f"{name}_{unit}": scale for name in ("depth", "z", "position") for unit, scale in _LENGTHS.items()}
+_ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
+_ALIASES = {
+    f"{name}_{unit}": (entry, scale)
+    for entry, names in {
+        "pixel_um": ("pixel", "pixel_size"),
+        "step_um": ("step", "z_step"),
+        "wavelength_um": ("wavelength", "emission"),
+    }.items()
+    for name in names
+    for unit, scale in (("um", 1.0), ("nm", 1e-3))
+    if f"{name}_{unit}" != entry
+}
+_COLUMNS = {"file", "page", "exposure_s", "angle_y_deg", "angle_y_rad"} | set(_POSITIONS) | set(_ANGLES)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rows:
+    """One row a frame, as listed in the stage file.
+
+    files: image names; page: index inside that image file; source: the stage file, for messages.
+    """
+
+    files: tuple[str, ...]
+    page: tuple[int, ...]
+    position_um: Array
+    angle_rad: Array
+    exposure_s: Array
+    source: str
+
+    @classmethod
+    def unknown(cls, names: tuple[str, ...]) -> "Rows":
+        """Rows for frames of which nothing but the name is known."""
+        n = len(names)
+        return cls(names, (0,) * n, np.full(n, np.nan), np.zeros((n, 2)), np.full(n, np.nan), "")
+
+
+def read_stage(folder: Path) -> Rows | None:
+    """The stage file of a capture folder; None where there is none.
+
+    Columns: ``file``, ``page`` (default 0), one of depth/z/position with unit (``depth_um``, ``z_nm``,
+    ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``. JSON: a list of such objects.
+
+    Raises:
+        CaptureError: unknown column, no column ``file``, a value that is no number; file and row are named.
+    """
+    for path in (folder / "stage.csv", folder / "stage.json"):
+        if path.is_file():
+            table = _read_csv(path) if path.suffix == ".csv" else _read_json(path)
+            return _rows(table, path)
+    return None
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """Entries of ``capture.toml`` or ``capture.json`` in a capture folder; empty where there is none.
+
+    Raises:
+        CaptureError: not TOML or JSON, or a number that must be above 0 is not.
+    """
+    paths = [folder / "capture.toml", folder / "capture.json"]
+    return _about(next((path for path in paths if path.is_file()), None))
+
+
+def read_beside(path: Path) -> dict[str, Any]:
+    """Entries of the TOML or JSON file of the same name beside an image file; empty where there is none.
+
+    Raises:
+        CaptureError: as :func:`read_about`.
+    """
+    paths = [path.with_suffix(suffix) for suffix in (".toml", ".json")]
+    return _about(next((p for p in paths if p.is_file()), None))
+
+
+def _about(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        text = path.read_text(encoding="utf-8")
+        about = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
+    if not isinstance(about, dict):
+        raise CaptureError(f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)")
+    for name, (entry, scale) in _ALIASES.items():
+        if name in about and entry not in about:
+            value = about.pop(name)
+            about[entry] = value * scale if isinstance(value, int | float) else value
+    if "voxel_um" in about:
+        voxel = about.pop("voxel_um")
+        if not isinstance(voxel, list) or len(voxel) != 3:
+            raise CaptureError(f"{path}: voxel_um = {voxel!r}, need [z, y, x]")
+        about = {"step_um": voxel[0], "pixel_um": voxel[2]} | about
+    for name in ("pixel_um", "wavelength_um", "bits", "step_um"):
+        value = about.get(name, 1)
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0 < (abs(value) if name == "step_um" else value) < math.inf:
+            raise CaptureError(f"{path}: {name} = {value!r}, need a number above 0")
+    return about
+
+
+def ome_positions(xml: str) -> Array:
+    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default um)."""
+    planes = re.findall(r'PositionZ="([^"]+)"(?:[^>]*PositionZUnit="([^"]+)")?', xml)
+    return np.array([float(z) * _LENGTHS.get(unit.replace("µ", "u"), 1.0) for z, unit in planes])
+
+
+def _read_csv(path: Path) -> list[dict[str, Any]]:
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            return list(csv.DictReader(file, skipinitialspace=True))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not a table in UTF-8 text: {error}") from None
+
+
+def _read_json(path: Path) -> list[dict[str, Any]]:
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not valid JSON: {error}") from None
+    if not isinstance(table, list) or not all(isinstance(row, dict) for row in table):
+        raise CaptureError(f"{path}: need a list of objects, one a frame")
+    return table
+
+
+def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
+    if not table:
+        raise CaptureError(f"{path}: no rows; need one a frame")
+    for row, entries in enumerate(table, 2):
+        for key in entries:
+            if key not in _COLUMNS:
+                raise CaptureError(f"{path}, row {row}: unknown column {key!r}{nearest(str(key), _COLUMNS)}")
+        if not entries.get("file"):
+            raise CaptureError(f"{path}, row {row}: no 'file'; name the image of every row")
+    head = table[0].keys()
+    place = next((key for key in _POSITIONS if key in head), None)
+    angle = [next((k for k in names if k in head), None) for names in (_ANGLES, ("angle_y_deg", "angle_y_rad"))]
+    scales = [_ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle]
+    columns = [_column(table, key, path) * s for key, s in zip(angle, scales, strict=True)]
+    return Rows(
+        files=tuple(str(entries["file"]) for entries in table),
+        page=tuple(int(v) for v in _column(table, "page" if "page" in head else None, path)),
+        position_um=_column(table, place, path, np.nan) * _POSITIONS.get(place or "", 1.0),
+        angle_rad=np.stack(columns, 1),
+        exposure_s=_column(table, "exposure_s" if "exposure_s" in head else None, path, np.nan),
+        source=str(path),
+    )
+
+
+def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0) -> Array:
+    if key is None:
+        return np.full(len(table), default)
+    values = []
+    for row, entries in enumerate(table, 2):
+        try:
+            value = float(entries[key])
+        except (TypeError, ValueError, KeyError):
+            raise CaptureError(f"{path}, row {row}: {key} is {entries.get(key)!r}, need a number") from None
+        if not math.isfinite(value):
+            raise CaptureError(f"{path}, row {row}: {key} is {value}, need a finite number")
+        values.append(value)
+    return np.array(values)

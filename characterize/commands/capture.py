@@ -1,0 +1,107 @@
+"""Virtual bench: lens.h5 and a hidden truth -> a capture folder (TIFF frames, stage.csv, dark, flat, capture.toml)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from characterize.bench import Plan, Protocol, Shots, Truth, bench, protocol
+from characterize.model import slopes
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.ground import config, store, transaction
+from metalens.ground.errors import ConfigError
+from metalens.lens import Lens
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens capture``: either --truth or --protocol.
+
+    Attributes:
+        lens: the designed lens.
+        output: folder of captures to write; with --protocol the stage.csv of the frames to take.
+        truth: TOML of the hidden as-built lens and of its captures (depths_um, parameter, camera ...).
+        protocol: TOML of what a real bench can do (depths_um, angles_deg, exposures, frames, peak_e ...): nothing is
+            captured, the frames that tell most about the lens are listed, with the errors to expect.
+    """
+
+    lens: tyro.conf.Positional[Path]
+    output: Output
+    truth: Path | None = None
+    protocol: Path | None = None
+
+
+def run(options: Options) -> int:
+    """Shoot and write, or plan; exit 0."""
+    if (options.truth is None) == (options.protocol is None):
+        raise ConfigError("give either --truth truth.toml (a virtual bench) or --protocol protocol.toml (a plan)")
+    if options.protocol is not None:
+        return _plan(options, options.protocol)
+    return _shoot(options, options.truth or Path())
+
+
+def _plan(options: Options, path: Path) -> int:
+    target, wanted, design = options.output, config.load(path, Protocol), lenses.load(options.lens)
+    with options.claim(target) as draft:
+        found = protocol.plan(design, wanted, slopes(design))
+        store.write_text(draft.path, _listed(found))
+    rows = _rows(found)
+    values = {"file": str(target), "frames": rows, "gain": found.gain.tolist()}
+    values |= {"sigma": dict(zip(found.names, found.sigma.tolist(), strict=True))}
+    values |= {"even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))}
+    told = [f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}" for z, angle, time in rows]
+    table = zip(found.names, found.sigma, found.even_sigma, strict=True)
+    told += [f"  {n:<24} +- {s:.2g}  (evenly spread: {even:.2g})" for n, s, even in table]
+    options.console.result(values, "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]))
+    return 0
+
+
+def _rows(found: Plan) -> list[tuple[float, float, float]]:
+    """Depth, angle and exposure of the frames to take."""
+    return list(zip(found.depth_um.tolist(), found.angle_deg.tolist(), found.exposure.tolist(), strict=True))
+
+
+def _listed(found: Plan) -> str:
+    """The frames to take as a stage.csv."""
+    lines = ["file,depth_um,angle_deg,exposure_s"]
+    lines += [f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}" for i, (z, angle, time) in enumerate(_rows(found))]
+    return "\n".join(lines) + "\n"
+
+
+def _shoot(options: Options, path: Path) -> int:
+    target = options.output
+    truth = config.load(path, Truth)
+    design = lenses.load(options.lens)
+    with options.claim_folder(target) as draft:
+        shots = bench.shoot(design, truth, slopes(design, wanted=[k.name for k in truth.parameter if k.value]))
+        _fill(draft.path, shots, truth, design)
+    values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}
+    options.console.result(values, f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons")
+    return 0
+
+
+def write(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+    """A capture folder as :func:`characterize.load` reads it, whole or not at all; one of ours is replaced."""
+    with transaction.folder(folder, terms=transaction.Terms(force=True)) as draft:
+        _fill(draft.path, shots, truth, lens)
+
+
+def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+    import tifffile
+
+    depths, angles = truth.stated
+    lines = ["file,depth_um,angle_deg"]
+    for i, (frame, z, angle) in enumerate(zip(shots.frames, depths, angles, strict=True)):
+        name = f"frame_{i:03d}.tif"
+        tifffile.imwrite(folder / name, frame, photometric="minisblack", metadata=None)
+        lines.append(f"{name},{z:.10g},{np.degrees(angle[0]):.10g}")
+    (folder / "stage.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for name, stack in (("dark", shots.dark), ("flat", shots.flat)):
+        tifffile.imwrite(folder / f"{name}.tif", stack, photometric="minisblack", metadata=None)
+    about = {"pixel_um": truth.camera.pixel_um, "wavelength_um": lens.wavelength_um, "bits": truth.camera.bits}
+    pinhole = [k.value for k in truth.parameter if k.name == "pinhole_um" and k.value > 0]
+    about |= {"pinhole_um": pinhole[0]} if pinhole else {}
+    text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
+    (folder / "capture.toml").write_text(text, encoding="utf-8")

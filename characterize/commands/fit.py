@@ -1,0 +1,147 @@
+"""Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from characterize.captures import capture as captures
+from characterize.commands import report
+from characterize.inference import AsBuilt, asbuilt, fit
+from characterize.inference import Options as FitOptions
+from characterize.model import Known
+from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.ground import config, store
+from metalens.ground.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Metrology:
+    """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma), and of how to fit."""
+
+    known: tuple[Known, ...] = ()
+    free: tuple[str, ...] = ()
+    window: int = 48
+    scan_um: float | None = None
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens fit``: either --design or --pupil.
+
+    Attributes:
+        capture: folder, or TIFF, PNG or HDF5 stack.
+        design: lens file of the metalens that was captured.
+        metrology: TOML of other measurements (``[[known]]`` name, value, sigma) and of what to fit beyond the usual.
+        pupil: TOML of what is known of a generic lens (numerical_aperture, wavelength_um, pixel_um, step_um ...).
+        insist: write a result that fails its checks too (exit 1, problems listed).
+        output: file to write; a report lies beside it as .html.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    output: Output
+    design: Path | None = None
+    metrology: Path | None = None
+    pupil: Path | None = None
+    insist: bool = False
+
+
+def run(options: Options) -> int:
+    """Fit; exit 0 when all checks passed, 1 when a result fails its own checks."""
+    target = options.output
+    if target.suffix != ".h5":
+        raise ConfigError(f"{target}: need a name that ends in .h5")
+    if (options.design is None) == (options.pupil is None):
+        raise ConfigError("give either --design lens.h5 (a metalens) or --pupil pupil.toml (any other lens)")
+    if options.pupil is not None:
+        return _run_pupil(options, options.pupil, target)
+    return _run_lens(options, options.design or Path(), target)
+
+
+def _run_lens(options: Options, design: Path, target: Path) -> int:
+    lens, shots = lenses.load(design), captures.load(options.capture)
+    told = config.load(options.metrology, Metrology) if options.metrology else Metrology()
+    choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
+    with options.claim(target, beside=report.BESIDE) as draft:
+        result = dataclasses.replace(fit(shots, lens, choice), provenance=_provenance(options, design))
+        asbuilt.save(draft.path, result)
+        report.asbuilt_report(draft.path.with_suffix(".html"), result)
+    options.console.result(_lens_values(result), _lens_text(result, target))
+    return 0 if result.trusted else 1
+
+
+def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
+    spec = config.load(pupil, PupilSpec)
+    shots = captures.load(options.capture)
+    with options.claim(target, beside=report.BESIDE) as draft:
+        found = fit_pupil(shots, spec, insist=options.insist)
+        save(draft.path, found, _provenance(options, pupil))
+        report.pupil_report(draft.path.with_suffix(".html"), found)
+    options.console.result(_values(found), _text(found, target))
+    return 1 if found.problems else 0
+
+
+def _provenance(options: Options, source: Path) -> store.Provenance:
+    path = options.capture
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    files += [source] + ([options.metrology] if options.metrology else [])
+    texts = [p.read_text(encoding="utf-8") for p in (options.pupil, options.metrology) if p is not None]
+    return store.Provenance(config="\n".join(texts), inputs={p.name: store.sha256(p) for p in files})
+
+
+def _lens_values(result: AsBuilt) -> dict[str, object]:
+    rows = zip(result.names, result.value, result.sigma, strict=True)
+    words = {
+        name: list(getattr(result, name))
+        for name in ("verdicts", "identifiable", "degeneracies", "cautions", "problems")
+    }
+    return {
+        "parameters": {name: [float(v), float(s)] for name, v, s in rows},
+        "intervals": {name: list(result.interval(name)) for name in result.names},
+        "chi2_per_dof": result.chi2_per_dof,
+        "converged": result.converged,
+        "reason": result.reason,
+        **words,
+    }
+
+
+def _lens_text(result: AsBuilt, target: Path) -> str:
+    lines = [
+        f"{target}: fitted to {len(result.measured)} frames, chi² / dof {result.chi2_per_dof:.3f}; {result.reason}"
+    ]
+    lines += [f"  {words}" for words in result.verdicts]
+    for name, v in zip(result.names, result.value, strict=True):
+        low, high = result.interval(name)
+        lines.append(f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}")
+    for label, words in (("cannot tell", result.degeneracies), ("note", result.cautions), ("PROBLEM", result.problems)):
+        lines += [f"  {label}: {text}" for text in words]
+    return "\n".join(lines)
+
+
+def _values(found: PupilFit) -> dict[str, object]:
+    scores = {"agreement": found.agreement, "held_out": found.held_out}
+    return {
+        **{key: dataclasses.asdict(score) for key, score in scores.items() if score is not None},
+        "chi2_per_dof": found.chi2_per_dof,
+        "converged": found.converged,
+        "reason": found.reason,
+        "parameters": {n: [float(v), float(s)] for n, v, s in zip(found.names, found.value, found.sigma, strict=True)},
+        "cautions": list(found.cautions),
+        "problems": list(found.problems),
+    }
+
+
+def _text(found: PupilFit, target: Path) -> str:
+    lines = [f"{target}: pupil fitted to {len(found.measured)} planes; {found.reason}"]
+    for label, score in (("all planes fitted", found.agreement), ("odd planes predicted from even", found.held_out)):
+        if score is not None:
+            numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
+            lines.append(f"  {label}: {numbers}")
+    lines += [
+        f"  {n} = {v:.4g} +- {s:.2g}" for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
+    ]
+    lines += ["  note: " + words for words in found.cautions]
+    return "\n".join(lines + ["  PROBLEM: " + words for words in found.problems])

@@ -1,0 +1,202 @@
+"""Captures -> MTF, Strehl, spot sizes, distortion; a micrograph -> every pillar's diameter and a bias table."""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from characterize.captures import capture as captures
+from characterize.commands import measure_page
+from characterize.measure import frames, overlay, sem
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError, ConfigError
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens measure``: a micrograph where its scale is given, else captures.
+
+    Attributes:
+        source: capture folder or stack; or one picture of pillars from above (TIFF, PNG), with --pixel-nm or --bar-nm.
+        output: folder to write: measure.json, a table of frames or pillars, a page; of a micrograph on a design the
+            bias table of PROCESS.toml too.
+        design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a micrograph.
+        reference_e: electrons of the beam through an empty aperture of the lens's size, for the focusing efficiency.
+        pixel_nm: size of a micrograph's pixel; bar_nm: length of its white scale bar, where the pixel is unknown.
+        pitch_nm: distance of neighbouring pillars; found in the picture without it.
+        edge_bias_nm: by which edges appear outside the true ones, from a calibration sample.
+        crop: rows and columns of the picture to look at (top, bottom, left, right), to leave out bars of text.
+    """
+
+    source: tyro.conf.Positional[Path]
+    output: Output
+    design: Path | None = None
+    reference_e: float = math.nan
+    pixel_nm: float | None = None
+    bar_nm: float | None = None
+    pitch_nm: float = 0.0
+    edge_bias_nm: float = 0.0
+    crop: tuple[int, int, int, int] | None = None
+
+
+def run(options: Options) -> int:
+    """Measure and write; exit 0, or 1 where no pillar could be measured."""
+    target = options.output
+    if options.pixel_nm is None and options.bar_nm is None:
+        return _frames(options, target)
+    return _micrograph(options, target)
+
+
+def _frames(options: Options, target: Path) -> int:
+    shots = captures.load(options.source)
+    design = lenses.load(options.design) if options.design else None
+    found = frames.measure(shots, design=design, reference_e=options.reference_e)
+    rows = [_plain(row) for row in found.frames]
+    values: dict[str, object] = {
+        "frames": rows,
+        "best_depth_um": found.best_depth_um,
+        "distortion": found.distortion,
+        "notes": list(found.notes),
+    }
+    with options.claim_folder(target) as draft:
+        store.write_text(draft.path / "frames.csv", _table(rows))
+        store.write_text(draft.path / "measure.json", _json(values))
+        measure_page.frames_page(draft.path / "measure.html", found)
+    lines = [f"{target}: {len(rows)} frames"]
+    lines += [
+        f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, MTF50 {r.mtf50_x_per_um:.3g} / "
+        f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
+        for r in found.frames
+    ]
+    lines += [f"  sharpest at {angle:g} deg: {z:.5g} um" for angle, z in found.best_depth_um.items()]
+    lines += [f"  distortion at {angle:g} deg: {d:+.3%}" for angle, d in found.distortion.items()]
+    options.console.result(values, "\n".join(lines))
+    return 0
+
+
+def _micrograph(options: Options, target: Path) -> int:
+    pictures = captures.read_images(options.source)
+    if len(pictures) != 1:
+        raise CaptureError(f"{options.source}: {len(pictures)} pictures; a micrograph is one")
+    whole = np.asarray(pictures[0])
+    pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
+    image = _cropped(whole, options.crop)
+    found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))
+    laid: overlay.Overlay | None = None
+    table: overlay.Table = []
+    if options.design is not None:
+        laid = overlay.overlay(found, lenses.load(options.design).diameters)
+        table = overlay.bias_table(laid)
+        found = overlay.numbered(found, laid)
+    values = _summary(found, laid, table, pixel)
+    with options.claim_folder(target) as draft:
+        store.write_text(draft.path / "pillars.csv", _table(_pillars(found, laid)))
+        store.write_text(draft.path / "measure.json", _json(values))
+        if table:
+            pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
+            store.write_text(draft.path / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
+        measure_page.micrograph_page(draft.path / "measure.html", image, found, laid, table, pixel_nm=pixel)
+    options.console.result(values, _words(found, laid, table, target))
+    return 0 if np.isfinite(found.diameter_nm).any() else 1
+
+
+def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
+    if crop is None:
+        return image
+    top, bottom, left, right = crop
+    part = image[top:bottom, left:right]
+    if min(part.shape) < 20:
+        raise ConfigError(f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 pixels or more")
+    return part
+
+
+def _summary(
+    found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Table, pixel: float
+) -> dict[str, object]:
+    values: dict[str, object] = {
+        "pillars": len(found.diameter_nm),
+        "missing": int(found.missing.sum()),
+        "collapsed": int(found.collapsed.sum()),
+        "lattice": found.lattice.kind,
+        "pixel_nm": pixel,
+        "pitch_nm": found.lattice.pitch_px * pixel,
+        "mean_nm": found.mean_nm,
+        "three_sigma_nm": found.three_sigma_nm,
+    }
+    if laid is not None:
+        values |= {
+            "mask_row": laid.row,
+            "mask_column": laid.column,
+            "place_is_clear": laid.clearly,
+            "outliers": int(laid.outlier.sum()),
+            "bias_nm": [list(row) for row in table],
+        }
+    return values
+
+
+def _pillars(found: sem.Diameters, laid: overlay.Overlay | None) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = []
+    for k in range(len(found.diameter_nm)):
+        state = "missing" if found.missing[k] else "collapsed" if found.collapsed[k] else "good"
+        row: dict[str, object] = {
+            "site_row": int(found.site[k, 0]),
+            "site_column": int(found.site[k, 1]),
+            "row_px": round(float(found.row[k]), 3),
+            "column_px": round(float(found.column[k]), 3),
+            "diameter_nm": round(float(found.diameter_nm[k]), 3),
+            "sigma_nm": round(float(found.sigma_nm[k]), 3),
+            "state": state,
+        }
+        if laid is not None:
+            row |= {
+                "designed_nm": round(float(laid.designed_nm[k]), 3),
+                "error_nm": round(float(laid.error_nm[k]), 3),
+                "outlier": bool(laid.outlier[k]),
+            }
+        rows.append(row)
+    return rows
+
+
+def _words(found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Table, target: Path) -> str:
+    gone, fallen = int(found.missing.sum()), int(found.collapsed.sum())
+    lines = [
+        f"{target}: {len(found.diameter_nm)} sites of a {found.lattice.kind} lattice, {gone} missing, {fallen} "
+        f"collapsed; mean {found.mean_nm:.2f} nm, 3 sigma {found.three_sigma_nm:.2f} nm"
+    ]
+    if laid is not None:
+        sure = "" if laid.clearly else " (not clear: other places fit nearly as well; take a wider picture)"
+        lines.append(f"  on the mask from row {laid.row}, column {laid.column}{sure}")
+        lines += [f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)" for d, b, s, n in table]
+    return "\n".join(lines)
+
+
+def _plain(row: frames.Frame) -> dict[str, object]:
+    values: dict[str, object] = dataclasses.asdict(row)
+    del values["spot"]
+    spot: dict[str, object] = dataclasses.asdict(row.spot)
+    del spot["d4sigma_um"], spot["centroid_um"]
+    (major, minor), (cx, cy) = row.spot.d4sigma_um, row.spot.centroid_um
+    widths = {"d4sigma_major_um": major, "d4sigma_minor_um": minor}
+    return values | spot | widths | {"centroid_x_um": cx, "centroid_y_um": cy}
+
+
+def _json(values: dict[str, object]) -> str:
+    return json.dumps(values, indent=1, default=float) + "\n"
+
+
+def _table(rows: Sequence[dict[str, object]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

@@ -1,0 +1,119 @@
+"""Pages of ``metalens measure``: frames with their numbers, and a micrograph with every pillar drawn on it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from characterize.measure import frames, overlay, sem
+from metalens.ground import report
+from metalens.ground.arrays import Array
+
+
+def frames_page(path: Path, found: frames.Quality) -> None:
+    """Every frame with its numbers, and encircled energy over the radius."""
+    from characterize.measure import metrics
+
+    head = (
+        "frame",
+        "depth / um",
+        "angle / deg",
+        "FWHM / um",
+        "EE80 / um",
+        "MTF50 x",
+        "MTF50 y",
+        "Strehl",
+        "efficiency",
+    )
+    rows = [
+        (
+            row.name,
+            row.depth_um,
+            row.angle_deg,
+            row.spot.fwhm_um,
+            row.spot.ee80_um,
+            row.mtf50_x_per_um,
+            row.mtf50_y_per_um,
+            row.strehl,
+            row.efficiency,
+        )
+        for row in found.frames
+    ]
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3))
+    mtf, energy = figure.subplots(1, 2)
+    radius = np.linspace(0, min(found.light.shape[1:]) / 2 * found.step_um, 60)
+    for row, image in zip(found.frames, found.light, strict=True):
+        curve = metrics.mtf_of_psf(image, step_um=found.step_um)
+        keep = curve.frequency_per_um <= 0.5 / found.step_um
+        mtf.plot(curve.frequency_per_um[keep], curve.modulation[keep], linewidth=0.8)
+        energy.plot(radius, metrics.encircled_energy(image, step_um=found.step_um, radius_um=radius), label=row.name)
+    mtf.set_xlabel("cycles / um")
+    mtf.set_ylabel("modulation along x")
+    energy.set_xlabel("radius / um")
+    energy.set_ylabel("share of the light")
+    sections = [
+        report.Section("Frames", "", [report.Table(head, rows)]),
+        report.Section("Curves", "", [report.Figure(report.png(figure), "One line a frame.", wide=True)]),
+    ]
+    fields = [(angle, depth) for angle, depth in found.best_depth_um.items()]
+    if fields:
+        sections.append(report.Section("Field curvature", "", [report.Table(("angle / deg", "sharpest / um"), fields)]))
+    if found.distortion:
+        table = report.Table(("angle / deg", "distortion"), [(a, f"{d:+.3%}") for a, d in found.distortion.items()])
+        sections.append(report.Section("Distortion", "", [table]))
+    sections.append(report.Section("Put right or assumed on the way", "\n\n".join(found.notes)))
+    report.write(path, "Image quality of the captures", sections)
+
+
+def micrograph_page(
+    path: Path,
+    image: Array,
+    found: sem.Diameters,
+    laid: overlay.Overlay | None,
+    table: overlay.Table,
+    *,
+    pixel_nm: float,
+) -> None:
+    """The picture with a circle on every pillar, coloured by its error; the bias table."""
+    caption = "Circles: measured edges, coloured by the error against the design (diameter where there is none); "
+    caption += "crosses: missing; squares: collapsed; thick: outliers."
+    sections = [
+        report.Section("Pillars", "", [report.Figure(_drawn(image, found, laid, pixel_nm), caption, wide=True)])
+    ]
+    if table:
+        head = ("drawn / nm", "made less drawn / nm", "standard error / nm", "pillars")
+        sections.append(report.Section("Bias table", "", [report.Table(head, [tuple(row) for row in table])]))
+    report.write(path, "Diameters of the pillars", sections)
+
+
+def _drawn(image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pixel_nm: float) -> bytes:
+    from matplotlib.collections import EllipseCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.5, 6.0))
+    axis = figure.add_subplot()
+    axis.imshow(image, cmap="gray")
+    axis.set_axis_off()
+    good = np.isfinite(found.diameter_nm)
+    values = (found.diameter_nm if laid is None else laid.error_nm)[good]
+    wide = found.diameter_nm[good] / pixel_nm
+    thick = np.where(laid.outlier[good], 3.0, 1.0) if laid is not None else np.ones(int(good.sum()))
+    rings = EllipseCollection(
+        wide,
+        wide,
+        np.zeros(len(wide)),
+        units="xy",
+        offsets=np.stack([found.column[good], found.row[good]], 1),
+        offset_transform=axis.transData,
+        facecolors="none",
+        cmap="coolwarm",
+        linewidths=thick.tolist(),
+    )
+    rings.set_array(values)
+    axis.add_collection(rings)
+    rings.set_facecolor("none")
+    axis.plot(found.column[found.missing], found.row[found.missing], "x", color="yellow")
+    axis.plot(found.column[found.collapsed], found.row[found.collapsed], "s", color="yellow", fillstyle="none")
+    figure.colorbar(rings, ax=axis, label="diameter / nm" if laid is None else "error / nm", shrink=0.8)
+    return report.png(figure)

@@ -1,0 +1,180 @@
+"""One page on a fit: pictures of measured, predicted and residual, parameters with intervals, cautions in words."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from characterize.inference import AsBuilt, invert
+from characterize.model import PARAMETERS, PLACE
+from characterize.pupil import PupilFit
+from metalens.ground import report, store
+from metalens.ground.arrays import Array
+
+BESIDE = (".html", "_frames.png", "_parameters.png")  # endings of what lies beside a fit
+
+
+def pupil_report(path: Path, fit: PupilFit) -> None:
+    """Write the page of a generic pupil fit."""
+    score = fit.held_out or fit.agreement
+    keys = [
+        report.KeyFigure("NCC, " + ("held-out" if fit.held_out else "fitted"), f"{score.ncc:.4f}", score.ncc >= 0.975),
+        report.KeyFigure("NRMSE", f"{score.nrmse:.3f}", score.nrmse <= 0.2),
+        report.KeyFigure("chi² / dof", f"{fit.chi2_per_dof:.2f}"),
+    ]
+    images = report.Figure(
+        frames_figure((fit.measured, fit.predicted), fit.residual_sigma, ("measured", "fitted")),
+        "Every plane: measured, fitted (square root of the light), residual in standard deviations.",
+        wide=True,
+    )
+    maps = report.Figure(_maps(fit), "Phase (rad) and amplitude of the pupil.")
+    rows = [(n, float(v), float(s)) for n, v, s in zip(fit.names, fit.value, fit.sigma, strict=True)]
+    sections = [
+        report.Section("Images", f"{fit.reason}.", [images]),
+        report.Section("Pupil", "", [maps, report.Table(("parameter", "value", "1 sigma"), rows)]),
+        report.Section("Read with care", "\n\n".join(fit.cautions)),
+    ]
+    if fit.problems:
+        sections.insert(0, report.Section("Problems", "\n\n".join(fit.problems)))
+    report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
+
+
+def asbuilt_report(path: Path, result: AsBuilt) -> None:
+    """Write the page of an as-built lens, and its two pictures beside it (``_frames.png``, ``_parameters.png``).
+
+    As designed, measured, built and residual of every frame; intervals; correlations; what to measure next.
+    """
+    sure = float(np.mean([s < 0.5 * scale(name) for name, s in zip(result.names, result.sigma, strict=True)]))
+    keys = [
+        report.KeyFigure("verdict", "trusted" if result.trusted else "refused by its checks", result.trusted),
+        report.KeyFigure("chi² / dof", f"{result.chi2_per_dof:.3f}", 0.9 < result.chi2_per_dof < 1.15),
+        report.KeyFigure("frames", str(len(result.measured))),
+        report.KeyFigure("parameters", f"{len(result.names)}, {sure:.0%} well known"),
+    ]
+    pictures = {"frames": _every_frame(result), "parameters": _intervals(result)}
+    for name, picture in pictures.items():
+        store.write_bytes(path.with_name(f"{path.stem}_{name}.png"), picture)
+    low_high = [result.interval(name) for name in result.names]
+    rows = [
+        (name, float(v), float(s), f"{low:.4g} to {high:.4g}", PARAMETERS[PLACE[name]].meaning)
+        for name, v, s, (low, high) in zip(result.names, result.value, result.sigma, low_high, strict=True)
+    ]
+    head = ("parameter", "value", "1 sigma", "95 % interval", "meaning")
+    seen = (
+        "One column a frame. Square root of the light above background, one scale down each column; the residual runs "
+        "from -5 (blue) to 5 sigma (red): noise alone looks like even speckle, structure is what the model leaves over."
+    )
+    bars = "95 % intervals in the typical uncertainty of each parameter; grey: what was known beforehand."
+    correlated = report.Figure(
+        _correlation(result), "Correlation of the parameters: deep colours cannot be told apart."
+    )
+    sections = [
+        report.Section("What is known", "\n\n".join(result.verdicts)),
+        report.Section("Frames", result.reason + ".", [report.Figure(pictures["frames"], seen, wide=True)]),
+        report.Section(
+            "Parameters", "", [report.Figure(pictures["parameters"], bars, wide=True), report.Table(head, rows)]
+        ),
+        report.Section("What goes together", "", [correlated]),
+        report.Section("What the frames fix", "\n\n".join(result.identifiable)),
+        report.Section(
+            "What they cannot tell, and what to measure next", "\n\n".join(result.degeneracies) or "Nothing."
+        ),
+        report.Section("Put right or assumed on the way", "\n\n".join(result.cautions)),
+    ]
+    if result.problems:
+        sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
+    lead = "The lens that was really made, from what the bench saw: how it differs from the design, and how surely."
+    report.write(path, "The lens as built", sections, lead=lead, key_figures=keys)
+
+
+def scale(name: str) -> float:
+    """Typical uncertainty of a parameter."""
+    return PARAMETERS[PLACE[name]].scale
+
+
+def _every_frame(result: AsBuilt) -> bytes:
+    stacks = result.nominal, result.measured, result.predicted
+    titles = [f"{z / 1e3:.3g} mm" if z >= 1e3 else f"{z:.3g} um" for z in result.depth_um]
+    if np.ptp(result.angle_rad) > 0:
+        titles = [f"{t}\n{np.degrees(a[0]):.3g}°" for t, a in zip(titles, result.angle_rad, strict=True)]
+    return frames_figure(stacks, result.residual_sigma, ("as designed", "measured", "as built"), titles=titles)
+
+
+def _intervals(result: AsBuilt) -> bytes:
+    from matplotlib.figure import Figure
+
+    shown = [i for i, name in enumerate(result.names) if name != "log_gain" and not name.startswith("background")]
+    names = [result.names[i] for i in shown]
+    unit = np.array([scale(name) for name in names])
+    value = result.value[shown] / unit
+    told = np.diag(invert(result.covariance) - result.information)[shown]
+    prior = np.maximum(told, 1e-12) ** -0.5 / unit
+    figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
+    axis = figure.add_subplot()
+    rows = np.arange(len(names))[::-1]
+    axis.barh(rows, 2 * 1.96 * np.minimum(prior, 1e3), left=-1.96 * np.minimum(prior, 1e3), color="#e4e4e4")
+    ends = np.array([result.interval(name) for name in names]) / unit[:, None]
+    reach = np.abs(ends - value[:, None]).T
+    axis.errorbar(value, rows, xerr=reach, fmt="o", markersize=3, color="#1f6feb", capsize=2, linewidth=1.2)
+    axis.axvline(0, color="#444", linewidth=0.8)
+    axis.set_yticks(rows, [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)], fontsize=7)
+    axis.set_xscale("symlog", linthresh=1)
+    axis.set_xlim(-60, 60)
+    axis.set_xlabel("value less design, in typical uncertainties (linear inside +-1)", fontsize=8)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    return report.png(figure)
+
+
+def _correlation(result: AsBuilt) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 5.4))
+    axis = figure.add_subplot()
+    figure.colorbar(axis.imshow(result.correlation, cmap="RdBu_r", vmin=-1, vmax=1), ax=axis)
+    axis.set_xticks(range(len(result.names)), result.names, rotation=90, fontsize=6)
+    axis.set_yticks(range(len(result.names)), result.names, fontsize=6)
+    return report.png(figure)
+
+
+def frames_figure(
+    stacks: tuple[Array, ...], residual_sigma: Array, labels: tuple[str, ...], *, titles: Sequence[str] = ()
+) -> bytes:
+    """PNG of all frames, twelve to a band: one row for each stack, the last for the residual in sigma (-5 to 5)."""
+    from matplotlib.figure import Figure
+
+    total, each = len(residual_sigma), len(stacks) + 1
+    columns = min(12, total)
+    bands = -(-total // columns)
+    tall = residual_sigma.shape[1] / residual_sigma.shape[2]
+    figure = Figure(figsize=(1.15 * columns + 0.4, 1.2 * tall * each * bands + 0.25 * bands))
+    axes = figure.subplots(each * bands, columns, squeeze=False, gridspec_kw={"wspace": 0.04, "hspace": 0.06})
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for frame in range(total):
+        band, column = divmod(frame, columns)
+        cells = axes[band * each : (band + 1) * each, column]
+        floor = [float(np.median(stack[frame])) for stack in stacks]
+        top = max(float(stack[frame].max()) - low for stack, low in zip(stacks, floor, strict=True))
+        for cell, stack, low in zip(cells, stacks, floor, strict=False):
+            cell.imshow(np.sqrt(np.maximum(stack[frame] - low, 0)), cmap="magma", vmin=0, vmax=max(top, 1e-9) ** 0.5)
+        cells[-1].imshow(residual_sigma[frame], cmap="RdBu_r", vmin=-5, vmax=5)
+        cells[0].set_title(titles[frame] if titles else f"{frame}", fontsize=7, pad=3)
+        if column == 0:
+            for cell, label in zip(cells, (*labels, "residual / sigma"), strict=True):
+                cell.text(-0.06, 0.5, label, transform=cell.transAxes, rotation=90, ha="right", va="center", fontsize=7)
+    return report.png(figure)
+
+
+def _maps(fit: PupilFit) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 2.7))
+    for place, (values, title, colours) in enumerate(
+        ((fit.phase_rad, "phase / rad", "twilight"), (fit.amplitude, "amplitude", "viridis")), 1
+    ):
+        axis = figure.add_subplot(1, 2, place)
+        figure.colorbar(axis.imshow(values, cmap=colours), ax=axis)
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+    return report.png(figure)

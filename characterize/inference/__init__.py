@@ -1,0 +1,33 @@
+"""Frames + model -> AsBuilt."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from characterize.inference import asbuilt as asbuilt
+    from characterize.inference import leastsquares as leastsquares
+    from characterize.inference.asbuilt import AsBuilt as AsBuilt
+    from characterize.inference.estimate import Options as Options
+    from characterize.inference.estimate import fit as fit
+    from characterize.inference.leastsquares import Data as Data
+    from characterize.inference.leastsquares import Prior as Prior
+    from characterize.inference.leastsquares import Settings as Settings
+    from characterize.inference.leastsquares import Solution as Solution
+    from characterize.inference.leastsquares import invert as invert
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "AsBuilt": "asbuilt",
+        "Data": "leastsquares",
+        "Options": "estimate",
+        "Prior": "leastsquares",
+        "Settings": "leastsquares",
+        "Solution": "leastsquares",
+        "asbuilt": "",
+        "fit": "estimate",
+        "invert": "leastsquares",
+        "leastsquares": "",
+    },
+)

@@ -1,0 +1,208 @@
+"""Before the fit: how the frames lie. Orientation, order and stage zero, judged against the nominal lens."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, optimize
+
+from characterize.inference.leastsquares import Data
+from characterize.model import PLACE, ForwardModel, vector
+from metalens.ground.arrays import Array
+
+TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
+_ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
+_TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
+MIRRORED = tuple("mirrored, then " + words for words in TURNS)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Arrangement:
+    """What the nominal lens says about the frames.
+
+    stage_zero_um: best of the scan; shift_px: (y, x) mean displacement of the light.
+    likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage zero.
+    order: (n,) frame that fits the i-th stated depth best; reordered: whether it clearly differs from the stated one.
+    order_seen: whether the nominal images differ enough with depth to tell.
+    orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the stated one beyond doubt.
+    alike: turns (1 to 7) under which the nominal images do not change: these cannot be told from the chosen one.
+    """
+
+    stage_zero_um: float
+    shift_px: tuple[float, float]
+    likeness: float
+    order: Array
+    reordered: bool
+    order_seen: bool
+    orientation: int
+    clearly: bool
+    alike: tuple[int, ...]
+
+    @property
+    def words(self) -> str:
+        """The orientation in words."""
+        return (TURNS + MIRRORED)[self.orientation]
+
+
+def turn(frames: Array, orientation: int) -> Array:
+    """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation mod 4) times."""
+    turned = frames[..., ::-1] if orientation >= 4 else frames
+    return np.rot90(turned, orientation % 4, axes=(-2, -1))
+
+
+def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | None = None) -> Arrangement:
+    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth, in all eight orientations."""
+    light = _prepare(np.where(data.usable, data.electrons, np.nan))
+    noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
+    clipped = data.saturated.mean((1, 2))
+    start = vector() if start is None else start.copy()
+    nearest = float(model.setting.depth_um.min())
+    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, 17) if scan_um > 0 else np.zeros(1)
+    zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
+    scores, rough, back = [], model.rough(_ROUGH), _reversed(model)
+    for zero in zeros:
+        start[PLACE["stage_zero_um"]] = zero
+        expected = _expected(rough, start, clipped)
+        ways = (light, expected, noise), (light[back], expected, noise[back])
+        stated, turned_round = (_mean_likeness(*way) for way in ways)
+        scores.append(max(stated, turned_round - _TWIN))
+    best = int(np.argmax(scores))
+    start[PLACE["stage_zero_um"]] = zeros[best]
+    expected = _expected(model, start, clipped)
+    order, reordered, seen = _order(light, expected, noise, model)
+    orientation, clearly = _orientation(light, expected, noise)
+    if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
+        reordered, clearly = _plainest(light, expected, noise, order, orientation)
+    laid = turn(light, orientation) if clearly else light
+    found = _compare(laid[order] if reordered else laid, expected, noise)
+    possible = [k for k in range(1, 8) if k % 2 == 0 or expected.shape[1] == expected.shape[2]]
+    turned = {k: _mean_likeness(turn(expected, k), expected, 0 * noise) for k in possible}
+    shift = np.median([s for _, s in found], axis=0)
+    return Arrangement(
+        stage_zero_um=float(zeros[best]),
+        shift_px=(float(shift[0]), float(shift[1])),
+        likeness=float(scores[best]),
+        order=order,
+        reordered=reordered,
+        order_seen=seen,
+        orientation=orientation,
+        clearly=clearly,
+        alike=tuple(k for k, likeness in turned.items() if likeness >= 0.997),
+    )
+
+
+def _reversed(model: ForwardModel) -> Array:
+    """(n,) frames from the other end of the stage, at each field angle."""
+    back = np.arange(len(model.setting.depth_um))
+    for group in model.groups:
+        by_depth = group.index[np.argsort(model.setting.depth_um[group.index], kind="stable")]
+        back[by_depth] = by_depth[::-1]
+    return back
+
+
+def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
+    """Nominal frames without background, clipped in as large a share of their pixels as the measured ones."""
+    images = model.images(_bare(x))[0]
+    tops = [np.quantile(image, 1 - share) for image, share in zip(images, clipped, strict=True)]
+    return _prepare(np.minimum(images, np.array(tops)[:, None, None]))
+
+
+def _compare(light: Array, expected: Array, noise: Array) -> list[tuple[float, tuple[float, float]]]:
+    return [_likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
+
+
+def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
+    return float(np.mean([score for score, _ in _compare(light, expected, noise)]))
+
+
+def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
+    """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
+    n = len(light)
+    power = float((light**2).sum())
+    seen = max(power - float((noise**2).sum()), 0.1 * power)
+    # by their power: the sum of frames less a plane may be 0, or below
+    bright = expected * math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
+    apart = np.full((n, n), np.inf)
+    unlike = np.full((n, n), np.inf)
+    for group in model.groups:
+        for i in group.index:
+            for j in group.index:
+                apart[i, j] = _distance(light[j], bright[i]) / noise[j] ** 2
+                unlike[i, j] = _distance(bright[j], bright[i]) / noise[j] ** 2
+    finite = np.where(np.isfinite(apart), apart, 1e12)
+    rows, columns = optimize.linear_sum_assignment(finite)
+    stated, best = float(np.trace(apart)), float(finite[rows, columns].sum())
+    neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
+    distinct = bool(n > 1 and np.median(neighbours) > 0.2)
+    return columns, bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct), distinct
+
+
+def _distance(a: Array, b: Array) -> float:
+    """Squared difference of two images after the shift that makes them most alike."""
+    _, (dy, dx) = _likeness(a, b, 0.0)
+    return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
+
+
+def _plainest(light: Array, expected: Array, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
+    """(reordered, turned): the least that explains the frames, of reordering, turning and both."""
+    turned = turn(light, orientation)
+    ways = {(True, False): light[order], (False, True): turned, (True, True): turned[order]}
+    scores = {way: _mean_likeness(frames, expected, noise) for way, frames in ways.items()}
+    return next(way for way, score in scores.items() if score > max(scores.values()) - 5e-3)
+
+
+def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool]:
+    scores = []
+    square = light.shape[1] == light.shape[2]
+    for orientation in range(8):
+        if orientation % 2 and not square:
+            scores.append(-1.0)
+            continue
+        scores.append(_mean_likeness(turn(light, orientation), expected, noise))
+    best = int(np.flatnonzero(np.array(scores) > max(scores) - 2e-3)[0])  # of equals the plainest turn
+    return best, best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02
+
+
+def _bare(x: Array) -> Array:
+    """Parameters without background, at unit gain: only the shape matters here."""
+    out = x.copy()
+    for name in ("background_e", "background_x_e", "background_y_e"):
+        out[PLACE[name]] = 0.0
+    return out
+
+
+def _prepare(frames: Array) -> Array:
+    """Frames less a plane through their rim, holes filled by the frame's median."""
+    out = np.empty(frames.shape)
+    ny, nx = frames.shape[1:]
+    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
+    rim = np.ones((ny, nx), bool)
+    rim[2:-2, 2:-2] = False
+    for i, frame in enumerate(frames):
+        filled = np.where(np.isfinite(frame), frame, np.nanmedian(frame))
+        design = np.stack([np.ones(rim.sum()), x[rim], y[rim]], 1)
+        plane = np.linalg.lstsq(design, filled[rim], rcond=None)[0]
+        out[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
+    return out
+
+
+def _likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
+    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
+
+    The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
+    """
+    power = float((a**2).sum())
+    norm = math.sqrt(max(power - noise**2, 0.1 * power)) * float(np.linalg.norm(b))
+    if norm == 0:
+        return 0.0, (0.0, 0.0)
+    shape = [2 * s for s in a.shape]
+    cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
+    row, column = np.unravel_index(int(cross.argmax()), cross.shape)
+    shift = [int(i) - s if i >= s // 2 else int(i) for i, s in ((row, shape[0]), (column, shape[1]))]
+    return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
+
+
+def rearranged(values: Array, arrangement: Arrangement) -> Array:
+    """Frames turned and put in order as the arrangement says, where it is clear."""
+    out = turn(values, arrangement.orientation) if arrangement.clearly else values
+    return np.asarray(out[arrangement.order] if arrangement.reordered else out)

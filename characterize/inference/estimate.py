@@ -1,0 +1,244 @@
+"""Bench captures and a design to the lens that was made: every valley of the likelihood, checked, explained."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.captures import Capture, Gain, clean
+from characterize.inference import explore, knowable, residual, search, verdict
+from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
+from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.explore import Posterior
+from characterize.inference.leastsquares import Data, Solution
+from characterize.inference.prepare import check_depths, check_enough, data_of, merged, setting_of, stated
+from characterize.inference.search import Task, with_values
+from characterize.model import (
+    NAMES,
+    PLACE,
+    ForwardModel,
+    Known,
+    made,
+    slopes,
+    thinplate,
+    true_depth,
+    vector,
+)
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitRefused
+from metalens.lens import Lens
+from metalens.made import Sensitivity
+from metalens.psf import PsfStack, View
+
+LIKENESS = 0.45
+MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
+_LEFT_OUT = 1.25  # chi-square a pixel of frames left out, with what their prediction is uncertain by
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to fit.
+
+    free: parameters to fit beyond the usual ones. known: metrology, as priors.
+    window: largest side in pixels of what is fitted. scan_um: half range of the stage-zero search.
+    insist: return a result that fails its checks (problems filled) instead of refusing it.
+    """
+
+    free: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
+    window: int = 48
+    scan_um: float | None = None
+    insist: bool = False
+
+
+def fit(
+    capture: Capture, lens: Lens, options: Options | None = None, *, response: Sensitivity | None = None
+) -> AsBuilt:
+    """The as-built lens behind a capture.
+
+    Args:
+        response: what height, index and sidewall do to the pillars; from the cell solvers without it.
+
+    Raises:
+        CaptureError: depths, pixel or wavelength missing, or frames unusable.
+        FitError: refused, with the cause: another lens, a model that cannot explain the frames, a parameter at its
+            bound, no convergence.
+    """
+    options = options or Options()
+    capture, frames = merged(capture, clean(capture))
+    setting, window = setting_of(capture, options.window)
+    check_depths(setting.depth_um, lens)
+    data = data_of(frames, window)
+    known = {k.name: k for k in (*stated(capture, lens), *options.known)}
+    check_enough(data, search.names_of(known, options.free))
+    model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
+    start = vector({name: k.value for name, k in known.items()})
+    scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
+    found = arrange(model, data, scan_um=scan, start=start)
+    _check_likeness(found, lens)
+    cautions = [*frames.corrections, *_arranged_words(found)]
+    if model.response.error > 0.1:
+        cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
+    task = Task(model, _rearranged(data, found), start, known, found, options.free)
+    task, ends = _ends(task, frames.gain, cautions)
+    if frames.gain.known and verdict.left_over(ends[0]):
+        rest = residual.attempt(model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
+        if rest is not None:
+            task = dataclasses.replace(task, model=model.with_residual(rest.modes, thinplate.basis))
+            ends = [rest.solution]
+            cautions.append(
+                f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
+                f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
+            )
+    _refuse(_problems(task, ends[0], frames.gain), options)
+    result = _result(capture, task, explore.explore(task, ends), cautions, frames.gain)
+    _refuse(result.problems, options)
+    return result
+
+
+def _refuse(problems: Sequence[str], options: Options) -> None:
+    if problems and not options.insist:
+        raise FitRefused("fit refused: " + "; ".join(problems))
+
+
+def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solution]]:
+    """The valleys of the usual parameters, or of more where these do not explain the frames."""
+    ends = search.search(task)
+    if verdict.explained(ends[0], gain) or set(MORE) <= set(task.names):
+        return task, ends
+    more = dataclasses.replace(task, free=(*task.free, *MORE))
+    wide = search.wider(more, task.all_of(ends[0].value))
+    if wide is None or wide[0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
+        return task, ends
+    cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
+    return more, wide
+
+
+def _spoken_of(options: Options) -> set[str]:
+    """Parameters that the options free or know."""
+    return {*options.free, *(k.name for k in options.known)}
+
+
+def _check_likeness(found: Arrangement, lens: Lens) -> None:
+    if found.likeness < LIKENESS:
+        raise FitRefused(
+            f"fit refused: the frames look like no image of this lens (best correlation {found.likeness:.2f}); "
+            f"they are of another lens than this {lens.profile} one, far from the stated depths, or dark"
+        )
+
+
+def _arranged_words(found: Arrangement) -> list[str]:
+    words = []
+    if found.clearly:
+        words.append(f"frames fit the design only {found.words}: used so")
+    if found.reordered:
+        words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
+    if found.alike:
+        which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
+        words.append(
+            f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
+            "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
+        )
+    if not found.order_seen:
+        words.append(
+            "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
+        )
+    return words
+
+
+def _rearranged(data: Data, found: Arrangement) -> Data:
+    part = [rearranged(a, found) for a in (data.electrons, data.usable, data.saturated, data.variance_e2, data.scale)]
+    return Data(part[0], part[1], part[2], part[3], part[4])
+
+
+def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain) -> AsBuilt:
+    model, data, solution, names = task.model, task.data, found.best, task.names
+    fitted = dict(zip(names, solution.value.tolist(), strict=True))
+    bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
+    captured, between = explore.predicted_error(task, found)
+    unseen = explore.left_out(task, solution)
+    covariance = _with_gain(names, found, gain)
+    seen = verdict.structure(solution.residual_sigma) if gain.known else []
+    if gain.known and unseen > _LEFT_OUT:
+        seen.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
+    return AsBuilt(
+        design=model.lens,
+        response=model.response,
+        psf=_psf(model.lens, model, task.all_of(solution.value)),
+        names=names,
+        value=solution.value,
+        covariance=covariance,
+        information=solution.information,
+        held={name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted},
+        depth_um=model.setting.depth_um,
+        angle_rad=model.setting.angle_rad,
+        pixel_um=capture.pixel_um,
+        measured=data.electrons,
+        predicted=solution.image,
+        residual_modes=model.modes,
+        nominal=model.with_residual(np.empty(0), thinplate.basis).images(with_values(task.start, bench))[0],
+        residual_sigma=solution.residual_sigma,
+        chi2_per_dof=solution.chi2_per_dof,
+        converged=solution.converged,
+        reason=solution.reason,
+        identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
+        degeneracies=(*explore.words(task, found), *knowable.degeneracies(names, covariance, task.prior.sigma)),
+        cautions=(*cautions, *seen),
+        problems=tuple(_problems(task, solution, gain)),
+        low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
+        high=np.maximum(found.high, solution.value + explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
+        draws=found.draws,
+        verdicts=(
+            _psf_verdict(captured, between, unseen),
+            verdict.process_verdict(names, found.low, found.high, _told(task, found)),
+        ),
+    )
+
+
+def _named(names: tuple[str, ...]) -> Array:
+    return np.array([not name.startswith(("log_gain", "background")) for name in names])
+
+
+def _told(task: Task, found: Posterior) -> Array:
+    """(p,) width of the intervals over that of the prior."""
+    return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
+
+
+def _psf_verdict(captured: float, between: float, unseen: float) -> str:
+    tested = "" if np.isnan(unseen) else f"; frames left out agree within {unseen:.2f} times their noise"
+    return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them{tested}"
+
+
+def _problems(task: Task, solution: Solution, gain: Gain) -> list[str]:
+    problems = verdict.problems(task.names, solution, task.prior, gain)
+    clipped = float(task.data.saturated.mean())
+    if problems and clipped > 0.1:
+        problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
+    left = float(np.linalg.norm(task.model.modes))
+    if left > residual.MOST_RAD:
+        problems.append(f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens")
+    return problems
+
+
+def _psf(lens: Lens, model: ForwardModel, x: Array) -> PsfStack:
+    """PSFs of the as-built lens at the true depths of the frames, as fine as the light is, on the fitted window."""
+    s = model.setting
+    depths = np.unique(np.round(true_depth(x, s, model.stage_centre_um), 3))
+    side = max(s.rows, s.columns)
+    samples = side * model.grid.oversample
+    angles = tuple((float(a[0]), float(a[1])) for a in np.unique(s.angle_rad, axis=0))
+    view = View(tuple(depths.tolist()), angles, side * s.pixel_um, samples)
+    return made.psf_stack(lens, model.response, x, view, modes=model.modes, tolerance=1e-3)
+
+
+def _with_gain(names: tuple[str, ...], found: Posterior, gain: Gain) -> Array:
+    """Covariance with the error of the sensor's gain, which scales everything that is counted in electrons."""
+    relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
+    by_gain = np.zeros(len(names))
+    for i, name in enumerate(names):
+        if name.startswith("background"):
+            by_gain[i] = found.best.value[i] * relative
+        elif name == "log_gain":
+            by_gain[i] = relative
+    return np.asarray(found.covariance + np.outer(by_gain, by_gain))

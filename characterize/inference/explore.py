@@ -1,0 +1,207 @@
+"""The posterior of a fit: every valley, the profile of every named parameter, draws where one is bent, all in words."""
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.inference import posterior, residual
+from characterize.inference.leastsquares import Solution
+from characterize.inference.posterior import Profile, Valley
+from characterize.inference.search import Task, distinct, refine
+from characterize.model import ForwardModel
+from metalens.ground.arrays import Array
+
+REACH = posterior.REACH
+_RESTARTS = 2
+_OF_THE_BENCH = ("log_gain", "background")
+_SHOWN = 24  # draws whose images give the predicted error at depths in between
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Posterior:
+    """What is left open about the fitted parameters.
+
+    modes: the valleys, best first; share: (k,) probability of each.
+    low, high: (p,) 95 % intervals over all valleys. parabolic: (p,) whether the parabola gives the same.
+    draws: (m, p) of the posterior; none where a parabola is all of it.
+    profiles: of the parameters by name. covariance: (p, p) of the posterior.
+    """
+
+    modes: tuple[Solution, ...]
+    share: Array
+    low: Array
+    high: Array
+    parabolic: Array
+    draws: Array
+    profiles: dict[str, Profile]
+    covariance: Array
+
+    @property
+    def best(self) -> Solution:
+        """The valley of least misfit."""
+        return self.modes[0]
+
+
+def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
+    """Profiles from every valley; one that falls below its mode is followed to a better one first."""
+    modes = list(ends)
+    for _ in range(_RESTARTS):
+        valleys = [_valley(task, mode) for mode in modes]
+        profiles, better = _profiles(task, valleys[0], modes[0])
+        if better is None:
+            break
+        again = distinct([*modes, refine(task, better)])
+        if again[0].merit > modes[0].merit - 0.05:
+            break
+        modes = again
+    else:
+        valleys = [_valley(task, mode) for mode in modes]
+        profiles, _ = _profiles(task, valleys[0], modes[0])
+    return _joined(task, modes, valleys, profiles)
+
+
+def _valley(task: Task, mode: Solution) -> Valley:
+    return Valley(task.problem(), task.data, mode.value, task.prior)
+
+
+def _profiles(task: Task, valley: Valley, mode: Solution) -> tuple[dict[str, Profile], Array | None]:
+    level = posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
+    found = {}
+    for i, name in enumerate(task.names):
+        if not name.startswith(_OF_THE_BENCH):
+            found[name], better = posterior.profile(valley, i, level=level)
+            if better is not None:
+                return found, better
+    return found, None
+
+
+def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: dict[str, Profile]) -> Posterior:
+    best, names = modes[0], task.names
+    spread = max(1.0, best.chi2_per_dof)
+    sigma = valleys[0].sigma * np.sqrt(spread)
+    low, high = best.value - posterior.REACH * sigma, best.value + posterior.REACH * sigma
+    parabolic = np.ones(len(names), bool)
+    for i, name in enumerate(names):
+        if name in profiles:
+            low[i], high[i], parabolic[i] = profiles[name].low, profiles[name].high, profiles[name].parabolic
+    for mode, valley in zip(modes[1:], valleys[1:], strict=True):
+        room = np.sqrt(max(1 - (mode.merit - best.merit) / (posterior.REACH**2 * spread), 0.0))
+        if room > 0:
+            reach = room * posterior.REACH * valley.sigma * np.sqrt(spread)
+            low, high = np.minimum(low, mode.value - reach), np.maximum(high, mode.value + reach)
+    share = posterior.shares(valleys)
+    covariance = valleys[0].covariance * spread
+    draws = np.empty((0, len(names)))
+    if not parabolic.all() or share[0] < 0.99:
+        draws = posterior.draws(valleys)
+        covariance = _covariance(draws, valleys[0], (high - low) / (2 * posterior.REACH))
+    return Posterior(tuple(modes), share, low, high, parabolic, draws, profiles, covariance)
+
+
+def _covariance(draws: Array, valley: Valley, sigma: Array) -> Array:
+    """Correlation of the draws, a fifth of the parabola's mixed in to keep it regular, with the intervals' sigma."""
+    seen = np.cov(draws.T) + 1e-12 * np.diag(valley.sigma**2)
+    parts = []
+    for one in (seen, valley.covariance):
+        size = np.sqrt(np.diag(one))
+        parts.append(one / np.outer(size, size))
+    return np.asarray((0.8 * parts[0] + 0.2 * parts[1]) * np.outer(sigma, sigma))
+
+
+def words(task: Task, found: Posterior) -> list[str]:
+    """Bent and double posteriors, in words."""
+    out = []
+    for name, flat in zip(task.names, found.parabolic, strict=True):
+        if not flat:
+            i = task.names.index(name)
+            out.append(
+                f"{name} is bent: 95 % within {found.low[i]:.3g} to {found.high[i]:.3g} about "
+                f"{found.best.value[i]:.3g}, not the same on both sides; take draws, not value and sigma"
+            )
+    for mode, share in zip(found.modes[1:], found.share[1:], strict=True):
+        step = np.abs(mode.value - found.best.value) / np.sqrt(np.diag(found.best.covariance))
+        most = np.argsort(-step)[:3]
+        values = ", ".join(f"{task.names[i]} {mode.value[i]:.3g} for {found.best.value[i]:.3g}" for i in most)
+        out.append(
+            f"a second lens explains the frames nearly as well (misfit {mode.merit - found.best.merit:+.1f}, "
+            f"probability {share:.0%}): {values}; frames farther from focus on both sides tell them apart"
+        )
+    return out
+
+
+def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
+    """Expected NRMSE of the as-built images: at the captured depths, and half-way between them."""
+    model = task.model
+    rng = np.random.default_rng(0)
+    if len(found.draws):
+        values = found.draws[:_SHOWN]
+    else:
+        size, vectors = np.linalg.eigh(found.covariance)
+        normal = rng.standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
+        values = found.best.value + normal @ vectors.T
+    values = np.clip(values, task.prior.low, task.prior.high)
+    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
+
+
+def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> float:
+    """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
+    images = residual.problem(model, task.names, task.start)
+    dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
+
+    def light(x: Array) -> Array:
+        x = x.copy()
+        x[dark] = 0.0
+        return np.asarray(images(x, False)[0])
+
+    mean, total = light(best), 0.0
+    for x in values:
+        one = light(x)
+        one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
+        total += float(((one - mean) ** 2).sum())
+    return float(np.sqrt(total / len(values) / (mean**2).sum()))
+
+
+def between(model: ForwardModel) -> ForwardModel:
+    """The model half-way, in 1/z, between neighbouring depths at each angle; the farthest frame moves inwards."""
+    part, s = copy.copy(model), model.setting
+    depth = s.depth_um.copy()
+    for group in model.groups:
+        order = group.index[np.argsort(s.depth_um[group.index], kind="stable")]
+        if len(order) > 1:
+            inverse = 1 / s.depth_um[order]
+            middle = (inverse[1:] + inverse[:-1]) / 2
+            depth[order] = 1 / np.append(middle, middle[-1])
+    part.setting = dataclasses.replace(s, depth_um=depth)
+    return part
+
+
+def left_out(task: Task, mode: Solution) -> float:
+    """Chi-square a pixel of frames left out, every second depth and then the others, over that of the full fit.
+
+    About 1 + parameters over pixels where model and intervals hold; nan with fewer than four frames.
+    """
+    n = len(task.data.electrons)
+    if n < 4:
+        return float("nan")
+    order = np.argsort(task.model.setting.depth_um, kind="stable")
+    total, count = 0.0, 0
+    for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
+        seen, hidden = np.sort(seen), np.sort(hidden)
+        images = residual.problem(task.model.only(seen), task.names, task.start)
+        valley = Valley(images, task.data.planes(seen), mode.value, task.prior)
+        value, _ = valley.descend(mode.value, rounds=6)
+        rest = task.data.planes(hidden)
+        image, slopes = residual.problem(task.model.only(hidden), task.names, task.start)(value, True)
+        keep = rest.usable & ~rest.saturated
+        known = np.einsum("iN,ij,jN->N", _flat(slopes, keep), valley.covariance, _flat(slopes, keep), optimize=True)
+        variance = rest.variance(image)[keep] + known
+        total += float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum())
+        count += int(keep.sum())
+    return total / max(count, 1)
+
+
+def _flat(slopes: Array | None, keep: Array) -> Array:
+    return np.asarray(slopes)[:, keep]

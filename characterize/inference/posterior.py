@@ -1,0 +1,191 @@
+"""What the frames leave open: profiles of every parameter, and draws where a parabola does not hold.
+
+The profile of a parameter is the least misfit over all others as it is moved; where it rises by 3.84 lie the ends of
+its 95 % interval (Wilks 1938), however the valley bends. Draws solve the fit anew for perturbed data and prior means
+(randomised maximum likelihood: Kitanidis 1995, Oliver et al. 1996): exact where the model is linear, and along a bent
+valley as the frames allow. Noise and outlier weights are those at the mode; steps reuse its Jacobian, brought up to
+date by what each of them gave (Broyden 1965), so that one costs an image and no derivatives.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.inference.leastsquares import Data, Model, Prior
+from metalens.ground.arrays import Array
+
+REACH = 1.959964  # of a 95 % interval, in sigma
+BENT = 0.25  # sigma by which images may miss their linear prediction at 2 sigma: moves the ends of an interval by 6 %
+PARABOLIC = (0.85, 1.18)  # end of an interval over that of the parabola
+DRAWS = 96
+_CLOSE, _ROUNDS, _SOLVES = 0.08, 5, 5
+_HUBER = 6.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Profile:
+    """One parameter: 95 % interval, and the rise of -2 ln L at ``value`` (points,) with the rest fitted."""
+
+    low: float
+    high: float
+    value: Array
+    rise: Array
+    parabolic: bool
+
+
+class Valley:
+    """The misfit about a mode: -2 ln posterior less a constant, with the noise held."""
+
+    def __init__(self, model: Model, data: Data, mode: Array, prior: Prior) -> None:
+        image, jacobian = model(mode, True)
+        noise = np.sqrt(data.variance(image))
+        self._model, self._data, self.prior, self.mode = model, data, prior, np.array(mode, float)
+        self._root = np.where(data.usable, 1 / noise, 0.0).ravel()
+        first = np.abs(self._pixels(image))
+        self._root *= np.sqrt(np.minimum(1, _HUBER / np.maximum(first, _HUBER)))
+        silent = (data.saturated & (image >= data.electrons)).ravel()
+        self._pull = np.where(np.isfinite(prior.sigma), 1 / prior.sigma, 0.0)
+        columns = (np.asarray(jacobian).reshape(len(mode), -1) * (self._root * ~silent)).T
+        self.slopes = np.concatenate([columns, np.diag(self._pull)])
+        self.bottom = self.residual(self.mode, image)
+        self.least = float(self.bottom @ self.bottom)
+        curvature = self.slopes.T @ self.slopes
+        size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        values, vectors = np.linalg.eigh(curvature / np.outer(size, size))
+        self.covariance = (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(size, size)
+
+    @property
+    def sigma(self) -> Array:
+        """(p,) of the parabola."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def along(self, i: int) -> Array:
+        """(p,) how all parameters go when one is moved by one sigma and the rest are fitted, by the parabola."""
+        return np.asarray(self.covariance[:, i] / self.sigma[i])
+
+    def residual(self, x: Array, image: Array | None = None) -> Array:
+        """(pixels + p,) of which the sum of squares is the misfit."""
+        image = self._model(x, False)[0] if image is None else image
+        return np.concatenate([self._pixels(image), (x - self.prior.mean) * self._pull])
+
+    def inside(self, x: Array) -> Array:
+        """Within the bounds."""
+        return np.asarray(np.clip(x, self.prior.low, self.prior.high))
+
+    def bend(self, i: int) -> float:
+        """Sigma by which images 2 sigma to either side miss the parabola's prediction."""
+        ends = [self.residual(self.inside(self.mode + sign * 2 * self.along(i))) for sign in (1, -1)]
+        return float(np.linalg.norm((ends[0] + ends[1]) / 2 - self.bottom))
+
+    def descend(
+        self,
+        x: Array,
+        *,
+        held: int | None = None,
+        shift: Array | float = 0.0,
+        rounds: int = _SOLVES,
+        least: float = 0.02,
+    ) -> tuple[Array, float]:
+        """The least misfit from ``x`` on, one parameter ``held``: (place, misfit). ``shift``: added to the residual."""
+        free = np.array([j for j in range(len(x)) if j != held])
+        slopes, rest = self.slopes, self.residual(x) + shift
+        value, damping = float(rest @ rest), 1e-6
+        for _ in range(rounds):
+            part = slopes[:, free]
+            curvature, gradient = part.T @ part, part.T @ rest
+            size = np.diag(np.diag(curvature)) * damping
+            step = np.zeros(len(x))
+            step[free] = -np.linalg.lstsq(curvature + size, gradient, rcond=1e-14)[0]
+            there = self.inside(x + step)
+            step = there - x
+            expected = -float(step[free] @ (2 * gradient + curvature @ step[free]))
+            if expected < least:
+                break
+            after = self.residual(there) + shift
+            lower = float(after @ after)
+            measure = slopes.T @ (slopes @ step)
+            along = float(step @ measure)
+            if along > 0:
+                slopes = slopes + np.multiply.outer(after - rest - slopes @ step, measure / along)
+            if lower < value:
+                x, rest, value = there, after, lower
+            else:
+                damping = max(damping * 30, 1e-2)
+        return x, value
+
+    def _pixels(self, image: Array) -> Array:
+        rest = image - self._data.electrons
+        rest = np.where(self._data.saturated, np.minimum(rest, 0), rest)
+        return np.asarray(rest.ravel() * self._root)
+
+
+def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile, Array | None]:
+    """The profile of one parameter out to a rise of ``level``; second: a place below the mode, if one was met."""
+    goal, mode, sigma = math.sqrt(level), valley.mode, float(valley.sigma[i])
+    points, better, ends = [(float(mode[i]), 0.0)], None, []
+    straight = valley.bend(i) < BENT
+    for sign in (-1, 1):
+        end = mode[i] + sign * goal * sigma
+        bound = float(valley.prior.low[i] if sign < 0 else valley.prior.high[i])
+        if not straight:
+            end, seen, lower = _end(valley, i, sign, goal)
+            points += seen
+            better = lower if better is None else better
+        ends.append(float(max(end, bound) if sign < 0 else min(end, bound)))
+    if straight:
+        points += [(float(mode[i] + s * sigma), s * s) for s in (-2.5, -1.96, -1.0, 1.0, 1.96, 2.5)]
+    points.sort()
+    ratio = [(ends[1] - mode[i]) / (goal * sigma), (mode[i] - ends[0]) / (goal * sigma)]
+    plain = straight or all(PARABOLIC[0] < r < PARABOLIC[1] for r in ratio)
+    value, rise = np.array(points).T
+    return Profile(ends[0], ends[1], value, rise, plain), better
+
+
+def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tuple[float, float]], Array | None]:
+    """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
+    mode, sigma, along = valley.mode, float(valley.sigma[i]), sign * valley.along(i)
+    bound = valley.prior.low[i] if sign < 0 else valley.prior.high[i]
+    reach, direction, seen = goal, along, []
+    for _ in range(_ROUNDS):
+        x = valley.inside(mode + reach * direction)
+        x, misfit = valley.descend(x, held=i)
+        rise = misfit - valley.least
+        seen.append((float(x[i]), max(rise, 0.0)))
+        if rise < -0.5:
+            return float(x[i]), seen, x
+        root = math.sqrt(max(rise, 1e-6))
+        if abs(root - goal) < _CLOSE or (x[i] == bound and root < goal):
+            break
+        direction = (x - mode) / reach
+        reach *= float(np.clip(goal / root, 0.35, 2.0))
+    place, roots = np.array([p for p, _ in seen]), np.sqrt([r for _, r in seen])
+    nearest = int(np.argmin(np.abs(roots - goal)))
+    gained = goal / max(float(roots[nearest]), 1e-3)
+    end = mode[i] + (place[nearest] - mode[i]) * float(np.clip(gained, 0.8, 1.25))
+    return float(end if np.isfinite(end) else mode[i] + sign * goal * sigma), seen, None
+
+
+def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Array:
+    """(count, p) draws of the posterior around its modes, each mode as often as its share of the probability."""
+    rng = np.random.default_rng(seed)
+    share = shares(valleys)
+    out = []
+    for k in rng.choice(len(valleys), count, p=share):
+        valley = valleys[k]
+        shift = rng.standard_normal(len(valley.bottom))
+        start = valley.inside(valley.mode - valley.covariance @ (valley.slopes.T @ shift))
+        out.append(valley.descend(start, shift=shift, rounds=4, least=0.1)[0])
+    return np.array(out)
+
+
+def shares(valleys: Sequence[Valley]) -> Array:
+    """(k,) probability of every mode by Laplace's rule: exp(-misfit / 2) times the volume of its parabola."""
+    half = [-v.least / 2 + np.linalg.slogdet(_unit(v))[1] / 2 + np.log(v.sigma).sum() for v in valleys]
+    weight = np.exp(np.array(half) - max(half))
+    return np.asarray(weight / weight.sum())
+
+
+def _unit(valley: Valley) -> Array:
+    return np.asarray(valley.covariance / np.outer(valley.sigma, valley.sigma))

@@ -1,0 +1,131 @@
+"""From a capture to what a fit needs: brackets merged, the window about the light, what the capture itself states."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from characterize.captures import Capture, Frames, merge_brackets
+from characterize.inference.leastsquares import Data
+from characterize.model import Known, Setting
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+from metalens.lens import Lens
+
+MOST_OF_ONE_FRAME = 8
+
+
+def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
+    """Exposures of one depth and angle as one frame each, by inverse variance; as they are where none are known."""
+    place = np.column_stack([capture.position_um, capture.angle_rad])
+    group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
+    exposure = np.asarray(capture.exposure_s, float)
+    known = np.isfinite(exposure).all() and (exposure > 0).all() and np.isfinite(place).all()
+    if not known or len(set(group.tolist())) == len(group):
+        return capture, frames
+    merged, first = merge_brackets(frames, exposure, group)
+    longest = np.array([exposure[group == group[i]].max() for i in first])
+    kept = dataclasses.replace(
+        capture,
+        frames=capture.frames[first],
+        position_um=capture.position_um[first],
+        angle_rad=capture.angle_rad[first],
+        exposure_s=longest,
+        names=tuple(capture.names[i] for i in first),
+    )
+    return kept, merged
+
+
+def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, slice]]:
+    """The frames to predict, and the window (rows, columns) of at most ``largest`` pixels that is fitted.
+
+    Raises:
+        CaptureError: depths, pixel or wavelength missing.
+    """
+    if not np.isfinite(capture.position_um).all():
+        raise CaptureError("source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)")
+    if math.isnan(capture.pixel_um):
+        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+    if math.isnan(capture.wavelength_um):
+        raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
+    window = _window(capture, largest)
+    exposure = capture.exposure_s / np.nanmax(capture.exposure_s) if np.isfinite(capture.exposure_s).all() else 1.0
+    n = len(capture.frames)
+    rows, columns = (s.stop - s.start for s in window)
+    return Setting(
+        np.asarray(capture.position_um, float),
+        np.asarray(capture.angle_rad, float),
+        np.broadcast_to(np.asarray(exposure, float), n).copy(),
+        capture.pixel_um,
+        rows,
+        columns,
+    ), window
+
+
+def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
+    """The whole frame if small, else a square about the light's centre."""
+    frames = np.asarray(capture.frames, float)
+    light = np.median(frames, axis=0) - np.median(frames)
+    light = np.maximum(light - 0.2 * np.percentile(light, 99.9), 0)
+    total = max(light.sum(), 1e-9)
+    slices = []
+    for axis, size in enumerate(light.shape):
+        side = min(size, largest)
+        place = (light.sum(1 - axis) * np.arange(size)).sum() / total
+        first = int(np.clip(round(place) - side // 2, 0, size - side))
+        slices.append(slice(first, first + side))
+    return slices[0], slices[1]
+
+
+def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
+    """What is fitted, cut to the window."""
+    shape = frames.electrons.shape
+    cut = (slice(None), *window)
+    floor, scale = (np.broadcast_to(a, shape)[cut] for a in (frames.variance_e2, frames.scale))
+    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale)
+
+
+def check_enough(data: Data, names: Sequence[str]) -> None:
+    """Refuse what cannot fix its parameters however good the frames are.
+
+    Raises:
+        CaptureError: one frame for more parameters than one image can tell apart, or fewer pixels than parameters.
+    """
+    lens = [name for name in names if not name.startswith(("log_gain", "background", "crosstalk", "decentre"))]
+    frames, pixels = len(data.electrons), int((data.usable & ~data.saturated).sum())
+    if frames < 2 and len(lens) > MOST_OF_ONE_FRAME:
+        raise CaptureError(
+            f"one frame for {len(names)} parameters: defocus, wave front and bias look alike in one image; need frames "
+            "at two depths or more (five on both sides of focus are good), or hold all but "
+            f"{MOST_OF_ONE_FRAME} parameters with [[known]] (sigma = 0)"
+        )
+    if pixels < 3 * len(names):
+        raise CaptureError(f"{pixels} usable pixels for {len(names)} parameters; need three each: a larger window")
+
+
+def check_depths(depth_um: Array, lens: Lens) -> None:
+    """Refuse depths that are no micrometres: a thousand times nearer or farther than the lens is focused on.
+
+    Raises:
+        CaptureError: with the column that would be right.
+    """
+    middle, wanted = float(np.median(depth_um)), lens.source_distance_um
+    if not math.isfinite(wanted):
+        wanted = 10 * lens.sensor_distance_um
+    for factor, column in ((1e3, "depth_mm"), (1e-3, "depth_nm")):
+        if abs(math.log10(max(middle, 1e-9) * factor / wanted)) < 0.7 and abs(math.log10(factor)) > 2:
+            raise CaptureError(
+                f"depths about {middle:g} um, the design is focused on {wanted:g} um: they look like "
+                f"{column.removeprefix('depth_')}; rename the column depth_um of stage.csv to {column}"
+            )
+
+
+def stated(capture: Capture, lens: Lens) -> list[Known]:
+    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole."""
+    offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
+    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
+    if "pinhole_um" in capture.about:
+        size = float(capture.about["pinhole_um"])
+        known.append(Known("pinhole_um", size, 0.0))
+    return known

@@ -1,0 +1,215 @@
+"""Where a fit may end: short fits from many starts, the best of them to the end, and every other valley as good."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.inference import leastsquares, residual
+from characterize.inference.arrange import Arrangement
+from characterize.inference.constrained import Ball
+from characterize.inference.leastsquares import Data, Prior, Settings, Solution
+from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+
+WAVES_RAD = 0.9
+MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
+_LEANING_RAD = 0.3  # of the starts that look for a twin
+_ALONG_NM = 9.0  # bias by which starts are moved along the valley
+_PROMISING, _MOST, _ROUGH = 40.0, 2, 5e-3
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Task:
+    """What is searched: the model and its data, all start values, what is known, how the frames lie, what is free."""
+
+    model: ForwardModel
+    data: Data
+    start: Array
+    known: dict[str, Known]
+    found: Arrangement
+    free: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the fitted parameters."""
+        return names_of(self.known, self.free)
+
+    @property
+    def prior(self) -> Prior:
+        """Of the fitted parameters."""
+        return prior_of(self.names, self.known, self.model.lens.sensor_distance_um)
+
+    def problem(self, frames: Array | None = None) -> leastsquares.Model:
+        """Images of all frames, or roughly of some."""
+        model = self.model if frames is None else self.model.only(frames).rough(_ROUGH)
+        return residual.problem(model, self.names, self.start)
+
+    def all_of(self, value: Array) -> Array:
+        """All parameters where the fitted ones have a value."""
+        return with_values(self.start, dict(zip(self.names, value.tolist(), strict=True)))
+
+
+def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
+    """The valleys that explain the frames, best first, the others within ``MODES_WITHIN`` of it.
+
+    Short fits on a few frames from the nominal lens, the twins of its bias and leaning wave fronts, or from ``begins``;
+    the best to the end. Then from what it found with even aberrations reversed and moved along its weakest valley:
+    whatever of all these promises as much is fitted to the end too.
+    """
+    few = _few(task.model.setting)
+    plain = starts(task)
+    first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
+    best = _long(task, first[0].value)
+    tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
+    floor = min(tries[0].merit, first[0].merit)
+    promising = [t for t in tries if t.merit < floor + _PROMISING]
+    ends = [best]
+    for one in promising:
+        if len(ends) > _MOST:
+            break
+        if all(_apart(one.value, end) > 2.0 for end in ends):
+            ends.append(_long(task, one.value))
+    return distinct(ends)
+
+
+def refine(task: Task, value: Array) -> Solution:
+    """A fit to the end from values of the fitted parameters."""
+    return _long(task, value)
+
+
+def wider(task: Task, begin: Array) -> list[Solution] | None:
+    """A search with more parameters from where the usual ones led; None where they lead out of the model's range."""
+    try:
+        return search(task, begins=[begin])
+    except FitError:
+        return None
+
+
+def distinct(ends: Sequence[Solution]) -> list[Solution]:
+    """Ends that are not the same, best first, within ``MODES_WITHIN`` of the best."""
+    kept: list[Solution] = []
+    for one in sorted(ends, key=lambda e: e.merit):
+        near = one.merit < kept[0].merit + MODES_WITHIN if kept else True
+        if near and all(_apart(one.value, other) > 1.0 for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _apart(value: Array, end: Solution) -> float:
+    """Distance in sigma of the end's own parabola."""
+    step = value - end.value
+    return float(math.sqrt(max(step @ leastsquares.invert(end.covariance) @ step, 0.0)))
+
+
+def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
+    place = [PLACE[name] for name in task.names]
+    waves = Ball(np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]), WAVES_RAD)
+    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
+    part, seen = task.problem(few), task.data.planes(few)
+    opened = [with_values(x, _opened(task, x)) for x in begins]
+    tries = [leastsquares.fit(part, seen, x[place], prior=task.prior, settings=short) for x in opened]
+    return sorted(tries, key=lambda t: t.merit)
+
+
+def _long(task: Task, value: Array) -> Solution:
+    settings = Settings(iterations=80, secant=True)
+    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings)
+
+
+def _opened(task: Task, x: Array) -> dict[str, float]:
+    """Sizes that have no slope at 0 start off it."""
+    off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5}
+    return {name: size for name, size in off.items() if name in task.names and x[PLACE[name]] == 0}
+
+
+def names_of(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
+    """What is fitted: the usual, what is asked for, what is known with an error."""
+    for name in free:
+        vector({name: 0.0})
+    wanted = {p.name for p in PARAMETERS if p.free} | set(free)
+    wanted |= {k.name for k in known.values() if k.sigma > 0}
+    wanted -= {k.name for k in known.values() if k.sigma == 0 and k.name not in free}
+    return tuple(name for name in NAMES if name in wanted)
+
+
+def prior_of(names: Sequence[str], known: dict[str, Known], distance_um: float) -> Prior:
+    """Priors of the fitted parameters: metrology where there is, else what is usual.
+
+    distance_um: lens to sensor by design; it may be wrong by a quarter, so that no search runs into the lens.
+    """
+    table = [PARAMETERS[PLACE[name]] for name in names]
+    entries = [known.get(name) for name in names]
+    mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
+    sigma = [k.sigma if k and k.sigma > 0 else p.sigma for k, p in zip(entries, table, strict=True)]
+    reach = [distance_um / 4 if p.name == "distance_um" else math.inf for p in table]
+    low = [max(p.low, -r) for p, r in zip(table, reach, strict=True)]
+    high = [min(p.high, r) for p, r in zip(table, reach, strict=True)]
+    return Prior(np.array(mean), np.array(sigma), np.array(low), np.array(high))
+
+
+def _few(setting: Setting) -> Array:
+    """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
+    chosen: list[int] = []
+    for angle in np.unique(setting.angle_rad, axis=0):
+        index = np.flatnonzero((setting.angle_rad == angle).all(1))
+        by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
+        chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
+    return np.unique(chosen)
+
+
+def with_values(x: Array, values: dict[str, float]) -> Array:
+    """All parameters, some set by name."""
+    out = x.copy()
+    for name, value in values.items():
+        out[PLACE[name]] = value
+    return out
+
+
+def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
+    """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
+    model, data, found = task.model, task.data, task.found
+    pixel = model.setting.pixel_um
+    level = float(np.median(data.electrons[data.usable]))
+    base = with_values(
+        task.start,
+        {
+            "stage_zero_um": found.stage_zero_um,
+            "decentre_x_um": float(np.clip(-found.shift_px[1] * pixel, -50, 50)),
+            "decentre_y_um": float(np.clip(-found.shift_px[0] * pixel, -50, 50)),
+            "background_e": level,
+        },
+    )
+    out = []
+    for bias in biases_nm:
+        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias})
+        light = model.images(with_values(x, {"background_e": 0.0}))[0]
+        keep = data.usable & ~data.saturated
+        gain = float((light * (data.electrons - level))[keep].sum() / (light[keep] ** 2).sum())
+        out.append(with_values(x, {"log_gain": math.log(max(gain, 1e-12))}))
+    return out
+
+
+def _leaning(plain: Array) -> list[Array]:
+    """About its focus a lens with the opposite even aberrations gives nearly the same images.
+
+    The plain start lies between the two: either sign of both astigmatisms.
+    """
+    even = ("astigmatism_rad", "oblique_astigmatism_rad")
+    return [with_values(plain, {name: size}) for name in even for size in (_LEANING_RAD, -_LEANING_RAD)]
+
+
+def _twins(task: Task, best: Solution) -> list[Array]:
+    """What was found with its even aberrations reversed, and moved along the valley of the bias to either side."""
+    found = task.all_of(best.value)
+    even = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
+    out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]
+    if "bias_nm" in task.names:
+        i = task.names.index("bias_nm")
+        along = best.covariance[:, i] / best.covariance[i, i]
+        for sign in (1, -1):
+            moved = np.clip(best.value + sign * _ALONG_NM * along, task.prior.low, task.prior.high)
+            out.append(task.all_of(moved))
+    return out

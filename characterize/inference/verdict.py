@@ -1,0 +1,115 @@
+"""What a finished fit is worth: checks with their causes, structure in the residuals, and two verdicts in words."""
+
+import math
+
+import numpy as np
+
+from characterize.captures import Gain
+from characterize.inference.leastsquares import Prior, Solution
+from characterize.inference.search import WAVES_RAD
+from characterize.model import PARAMETERS, PLACE
+from metalens.ground.arrays import Array
+
+MISFIT, LEAST_PEAK_E = 1.15, 100.0
+_STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a thousand frames of noise reach 4
+
+
+def explained(solution: Solution, gain: Gain) -> bool:
+    """Whether chi-square is that of noise: within 15 %, or four of its own sigma where pixels or flats are few."""
+    chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
+    return solution.chi2_per_dof <= 1 + max(MISFIT - 1, min(chance, 0.5))
+
+
+def left_over(solution: Solution) -> bool:
+    """Whether the frames hold more than noise, but not so much that they are of something else."""
+    return 3 * chance_of(solution) < solution.chi2_per_dof - 1 < 30
+
+
+def chance_of(solution: Solution) -> float:
+    """Standard deviation of chi-square per degree of freedom over the pixels that count."""
+    return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
+
+
+def problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Gain) -> list[str]:
+    """Checks of a finished fit, each with the cause it points to."""
+    words = []
+    if not solution.converged:
+        words.append(f"not converged ({solution.reason})")
+    peak = float((solution.image - np.median(solution.image)).max())
+    if gain.known and peak < LEAST_PEAK_E:
+        words.append(
+            f"too little light: brightest pixel {peak:.0f} electrons above background, need {LEAST_PEAK_E:.0f} or more "
+            "for intervals that hold; expose longer, or average frames"
+        )
+    outliers = float((np.abs(solution.residual_sigma) > 6).mean())
+    if gain.known and not explained(solution, gain):
+        frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))
+        words.append(
+            f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, not 1: the model does not explain "
+            f"the frames (worst: frame {frame}); another lens, a shifted or repeated frame, a ghost, a wrong gain"
+        )
+    if gain.known and outliers > 0.02:
+        words.append(
+            f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
+        )
+    wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
+    if wave > WAVES_RAD:
+        words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
+    for name, value in at_bounds(names, solution, prior):
+        words.append(f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread")
+    return words
+
+
+def at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[tuple[str, float]]:
+    """Parameters that ended on a bound which is not the natural zero of a blur."""
+    ends = zip(names, solution.value.tolist(), prior.low, prior.high, strict=True)
+    blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px")
+    return [(n, v) for n, v, low, high in ends if v >= high or (v <= low and n not in blurs)]
+
+
+def structure(residual_sigma: Array) -> list[str]:
+    """What chi-square does not see, in words: residuals that go together from pixel to pixel or from frame to frame.
+
+    Of noise, the mean product of neighbours scatters about 0 by one over the root of their number.
+    """
+    r = np.clip(residual_sigma, -6, 6)
+    words = []
+    sides = np.array([_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])])
+    worst = int(np.argmax(sides.max(0)))
+    if sides.max() > _STRUCTURE:
+        words.append(
+            f"residuals of frame {worst} go together from pixel to pixel ({sides[:, worst].max():.1f} sigma): more "
+            "is there than the parameters describe; see the residual map"
+        )
+    if len(r) > 1:
+        frames = float((r[1:] * r[:-1]).sum() / math.sqrt(max((r[1:] * r[:-1] != 0).sum(), 1)))
+        if frames > _STRUCTURE:
+            words.append(f"residuals go together from frame to frame ({frames:.1f} sigma): the same is missed in each")
+    levels = r.mean((1, 2)) * math.sqrt(max(r[0].size, 1))
+    if np.abs(levels).max() > _STRUCTURE + 0.5:
+        at = int(np.argmax(np.abs(levels)))
+        words.append(
+            f"frame {at} is brighter or darker than the model by {abs(levels[at]):.1f} sigma: exposure or lamp"
+        )
+    return words
+
+
+def _together(one: Array, other: Array) -> Array:
+    """(n,) mean product of neighbours over its standard deviation."""
+    product = one * other
+    return np.asarray(product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1)))
+
+
+def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array) -> str:
+    """Which causes the frames fix, and which come from prior knowledge or only with others.
+
+    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing.
+    """
+    causes = [i for i, n in enumerate(names) if n.endswith(("_nm", "_rad", "_deg")) or n == "index"]
+    good = [i for i in causes if (high[i] - low[i]) / 3.92 <= PARAMETERS[PLACE[names[i]]].scale]
+    known = ", ".join(f"{names[i]} +- {(high[i] - low[i]) / 3.92:.2g}" for i in good) or "no cause alone"
+    prior = [names[i] for i in causes if told[i] > 0.7]
+    more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""
+    open_ = [i for i in causes if i not in good and told[i] <= 0.7]
+    wide = ", ".join(f"{names[i]} {low[i]:.3g} to {high[i]:.3g}" for i in open_)
+    return f"the process is known to {known}" + (f"; loosely: {wide}" if wide else "") + more

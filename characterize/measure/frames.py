@@ -1,0 +1,155 @@
+"""Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths; distortion, field curvature."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from characterize.captures import Capture, clean
+from characterize.measure import metrics
+from characterize.measure.metrics import Spot
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+from metalens.lens import Lens
+
+_FINE = 15  # samples a pixel side under the ideal spot
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a design. peak_e: background off.
+
+    mtf50_x_per_um, mtf50_y_per_um: of the spot, pixel included. efficiency: share of the reference's light within
+    ``circle_um`` (three times the FWHM) about the centroid, nan without a reference.
+    """
+
+    name: str
+    depth_um: float
+    angle_deg: float
+    spot: Spot
+    mtf50_x_per_um: float
+    mtf50_y_per_um: float
+    strehl: float
+    circle_um: float
+    efficiency: float
+    peak_e: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Quality:
+    """All frames, and what they say together.
+
+    best_depth_um: {field angle in degrees: source depth of the sharpest spot}: field curvature.
+    distortion: {field angle: (place on the sensor over d tan(angle)) - 1}, relative to the smallest angle; empty where
+    frames were taken at one angle, or windows move with the chief ray (``window`` in the capture's description).
+    light: (n, y, x) electrons above background. step_um: of a pixel.
+    """
+
+    frames: tuple[Frame, ...]
+    best_depth_um: dict[float, float]
+    distortion: dict[float, float]
+    light: Array
+    step_um: float
+    notes: tuple[str, ...]
+
+
+def measure(capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan) -> Quality:
+    """Quality of the frames as they are.
+
+    Args:
+        design: gives the aperture for the Strehl ratio.
+        reference_e: electrons of the same beam through an empty aperture of the lens's size, for the efficiency.
+
+    Raises:
+        CaptureError: pixel unknown, or a frame without light above its background.
+    """
+    if math.isnan(capture.pixel_um):
+        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml")
+    frames = clean(capture)
+    step = capture.pixel_um
+    light = np.stack([_above(f, u) for f, u in zip(frames.electrons, frames.usable, strict=True)])
+    notes = list(frames.corrections)
+    if frames.saturated.any():
+        notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
+    ideal = None if design is None else airy(design, capture, light.shape[1:])
+    rows = []
+    for i, image in enumerate(light):
+        spot = metrics.spot(image, step_um=step)
+        circle = 3 * spot.fwhm_um
+        share = math.nan
+        if math.isfinite(reference_e) and math.isfinite(circle):
+            inside = metrics.encircled_energy(image, step_um=step, radius_um=np.array([circle / 2]))[0]
+            share = float(inside * image.sum() / reference_e)
+        rows.append(
+            Frame(
+                capture.names[i],
+                float(capture.position_um[i]),
+                float(np.degrees(capture.angle_rad[i, 0])),
+                spot,
+                metrics.mtf_of_psf(image, step_um=step, axis="x").mtf50_per_um,
+                metrics.mtf_of_psf(image, step_um=step, axis="y").mtf50_per_um,
+                math.nan if ideal is None else metrics.strehl(image, ideal),
+                circle,
+                share,
+                float(image.max()),
+            )
+        )
+    return Quality(tuple(rows), _best(rows), _distortion(rows, capture, design), light, step, tuple(notes))
+
+
+def airy(design: Lens, capture: Capture, shape: tuple[int, ...]) -> Array:
+    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's pixels."""
+    wave = capture.wavelength_um if math.isfinite(capture.wavelength_um) else design.wavelength_um
+    sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.sensor_distance_um)
+    y, x = ((np.arange(n * _FINE) - (n * _FINE - 1) / 2) / _FINE for n in shape)
+    u = 2 * math.pi * sine / wave * capture.pixel_um * np.hypot(x[None], y[:, None])
+    safe = np.maximum(u, 1e-9)
+    fine = np.where(u > 1e-9, (2 * special.j1(safe) / safe) ** 2, 1.0)
+    return np.asarray(fine.reshape(shape[0], _FINE, shape[1], _FINE).mean((1, 3)))
+
+
+def _above(electrons: Array, usable: Array) -> Array:
+    """The frame above the median of its border, masked pixels from their neighbours' median."""
+    rim = np.concatenate([electrons[0], electrons[-1], electrons[1:-1, 0], electrons[1:-1, -1]])
+    light = electrons - np.median(rim)
+    light = np.where(usable, light, 0.0)
+    noise = 1.4826 * float(np.median(np.abs(rim - np.median(rim))))
+    if light.max() < 5 * max(noise, 1e-9):
+        raise CaptureError("a frame holds no spot above five times its background's noise; expose longer, or crop")
+    return np.asarray(light)
+
+
+def _best(rows: list[Frame]) -> dict[float, float]:
+    """Depth of the highest peak share at each angle, by a parabola in 1/z through the best three."""
+    out = {}
+    for angle in sorted({round(r.angle_deg, 6) for r in rows}):
+        own = sorted((r for r in rows if round(r.angle_deg, 6) == angle), key=lambda r: r.depth_um)
+        if len(own) < 3 or not all(math.isfinite(r.depth_um) for r in own):
+            continue
+        sharp = np.array([1 / r.spot.ee80_um**2 for r in own])
+        place = 1 / np.array([r.depth_um for r in own])
+        k = int(np.clip(np.argmax(sharp), 1, len(own) - 2))
+        a, b, _ = np.polyfit(place[k - 1 : k + 2], sharp[k - 1 : k + 2], 2)
+        top = -b / (2 * a) if a < 0 else place[int(np.argmax(sharp))]
+        out[angle] = float(1 / np.clip(top, place.min(), place.max()))
+    return out
+
+
+def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dict[float, float]:
+    """Only where the window stands still (``window = "fixed"`` in capture.toml) and the design gives the distance."""
+    if design is None or capture.about.get("window") != "fixed":
+        return {}
+    places: dict[float, list[float]] = {}
+    for row in rows:
+        places.setdefault(round(row.angle_deg, 6), []).append(row.spot.centroid_um[0])
+    zero = np.mean(places.get(0.0, [0.0]))
+    ratio = {
+        angle: float((np.mean(x) - zero) / (design.sensor_distance_um * math.tan(math.radians(angle))))
+        for angle, x in places.items()
+        if angle
+    }
+    if not ratio:
+        return {}
+    least = ratio[min(ratio, key=abs)]
+    return {angle: value / least - 1 for angle, value in sorted(ratio.items())}

@@ -1,0 +1,249 @@
+"""Quality of a PSF or an edge as numbers: MTF, Strehl ratio, encircled energy, ISO 11146 width, efficiency."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, ndimage, optimize
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Mtf:
+    """Modulation against spatial frequency along one direction; 1 at zero.
+
+    frequency_per_um: (f,) from 0. modulation: (f,).
+    """
+
+    frequency_per_um: Array
+    modulation: Array
+
+    @property
+    def mtf50_per_um(self) -> float:
+        """Lowest frequency at which the modulation falls through 1/2; nan where it does not."""
+        below = np.flatnonzero(self.modulation < 0.5)
+        if len(below) == 0 or below[0] == 0:
+            return math.nan
+        i = int(below[0])
+        high, low = self.modulation[i - 1], self.modulation[i]
+        share = (high - 0.5) / (high - low)
+        return float(self.frequency_per_um[i - 1] + share * (self.frequency_per_um[i] - self.frequency_per_um[i - 1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """Width numbers of one PSF.
+
+    fwhm_um: full width at half maximum of the radial mean about the peak.
+    ee80_um: radius about the centroid that holds 80 % of the light in the window.
+    d4sigma_um: (major, minor) beam widths of ISO 11146-1, window iterated to three times the width.
+    centroid_um: (x, y) from the window's centre.
+    """
+
+    fwhm_um: float
+    ee80_um: float
+    d4sigma_um: tuple[float, float]
+    centroid_um: tuple[float, float]
+
+
+def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> Mtf:
+    """MTF along x or y of a sampled PSF (background taken off): |FFT of the line spread| / its zero frequency.
+
+    Raises:
+        CaptureError: no light.
+    """
+    line = np.asarray(psf, float).sum(0 if axis == "x" else 1)
+    if not line.sum() > 0:
+        raise CaptureError("MTF of a PSF without light; take off less background")
+    size = 8 * len(line)
+    spectrum = np.abs(fft.rfft(line, size))
+    return Mtf(fft.rfftfreq(size, step_um), spectrum / spectrum[0])
+
+
+def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> Mtf:
+    """Slanted-edge MTF (ISO 12233): edge found by line centroids, profile oversampled, derivative windowed.
+
+    Args:
+        image: one straight edge, tilted 2 to 20 degrees from the rows or columns.
+
+    Accuracy: the finite difference and the bins are divided out; 1-2 % on noise-free edges to 0.7 Nyquist.
+
+    Raises:
+        CaptureError: no edge, or a tilt that leaves the phases of the pixels uncovered.
+    """
+    pixels = np.asarray(image, float)
+    gy, gx = np.gradient(pixels)
+    pixels = pixels if np.abs(gx).sum() >= np.abs(gy).sum() else pixels.T
+    rows = np.arange(len(pixels))
+    slope, offset = _edge_line(pixels, rows)
+    angle = math.degrees(math.atan(abs(slope)))
+    if not 1.5 <= angle <= 25:
+        raise CaptureError(f"edge tilted by {angle:.1f} degrees; need 2 to 20 to sample between the pixels")
+    distance = (np.arange(pixels.shape[1])[None] - (slope * rows + offset)[:, None]) * math.cos(math.atan(slope))
+    reach = int(min(distance.max(), -distance.min()))
+    place = np.round(distance * oversample).astype(int) + reach * oversample
+    keep = (place >= 0) & (place <= 2 * reach * oversample)
+    count = np.bincount(place[keep], minlength=2 * reach * oversample + 1)
+    total = np.bincount(place[keep], pixels[keep], minlength=2 * reach * oversample + 1)
+    profile = np.interp(np.arange(len(count)), np.flatnonzero(count), total[count > 0] / count[count > 0])
+    spread = np.diff(profile)
+    peak = int(np.argmax(np.abs(ndimage.gaussian_filter1d(spread, oversample))))
+    half = min(peak, len(spread) - 1 - peak)
+    spread = spread[peak - half : peak + half + 1] * np.hanning(2 * half + 3)[1:-1]
+    spectrum = np.abs(fft.rfft(spread, 8 * len(spread)))
+    frequency = fft.rfftfreq(8 * len(spread), pixel_um / oversample)
+    fold = np.sinc(frequency * pixel_um / oversample) ** 2  # difference of neighbours, and bins
+    keep_f = frequency <= 1 / pixel_um
+    return Mtf(frequency[keep_f], (spectrum / spectrum[0] / np.maximum(fold, 0.1))[keep_f])
+
+
+def strehl(psf: Array, ideal: Array) -> float:
+    """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled alike.
+
+    Peaks come from parabolas through the highest samples, so that their place under the grid does not matter.
+    """
+    return _peak(np.asarray(psf, float) / np.sum(psf)) / _peak(np.asarray(ideal, float) / np.sum(ideal))
+
+
+def spot(psf: Array, *, step_um: float) -> Spot:
+    """Widths of a PSF whose background is taken off.
+
+    Raises:
+        CaptureError: no light.
+    """
+    light = np.asarray(psf, float)
+    if not light.sum() > 0:
+        raise CaptureError("a PSF without light; take off less background")
+    y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    widths, (cx, cy) = _second_moments(light, x, y)
+    radius = np.hypot(x[None] - cx, y[:, None] - cy)
+    return Spot(
+        _fwhm(light) * step_um,
+        _encircled(light, radius, 0.8) * step_um,
+        (widths[0] * step_um, widths[1] * step_um),
+        (cx * step_um, cy * step_um),
+    )
+
+
+def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
+    """Share of the window's light within radii about the centroid; samples at the rim count by their share."""
+    light = np.maximum(np.asarray(psf, float), 0)
+    y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    total = light.sum()
+    cx, cy = (light.sum(0) * x).sum() / total, (light.sum(1) * y).sum() / total
+    distance = np.hypot(x[None] - cx, y[:, None] - cy)
+    inside = np.clip(np.asarray(radius_um)[:, None, None] / step_um - distance + 0.5, 0, 1)
+    return np.asarray((inside * light).sum((1, 2)) / total)
+
+
+def focusing_efficiency(
+    image_e: Array, reference_e: Array, *, step_um: float, aperture_um: float, exposure_ratio: float = 1.0
+) -> float:
+    """Light within a stated circle about the centroid over the light through an open aperture of the lens's size.
+
+    Args:
+        image_e, reference_e: electrons, background taken off; the reference is a frame of the same beam through an
+            empty aperture, whole on the sensor.
+        aperture_um: diameter of the circle (often three times the FWHM): always state it with the number.
+        exposure_ratio: exposure of the image over that of the reference.
+    """
+    share = encircled_energy(image_e, step_um=step_um, radius_um=np.array([aperture_um / 2]))[0]
+    return float(share * np.sum(image_e) / np.sum(reference_e) / exposure_ratio)
+
+
+def through_focus(stack: Array, *, step_um: float) -> list[Spot]:
+    """:func:`spot` of every frame of a stack (depth or field), background taken off."""
+    return [spot(frame, step_um=step_um) for frame in stack]
+
+
+def _second_moments(light: Array, x: Array, y: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """ISO 11146-1: widths 4 sigma along the principal axes, over a window three widths wide, iterated."""
+    cx = cy = 0.0
+    width = 2.0 * max(light.shape)
+    major = minor = 0.0
+    for _ in range(30):
+        mask = (np.abs(x[None] - cx) <= 1.5 * width) & (np.abs(y[:, None] - cy) <= 1.5 * width)
+        w = light * mask
+        total = w.sum()
+        cx, cy = float((w * x[None]).sum() / total), float((w * y[:, None]).sum() / total)
+        dx, dy = x[None] - cx, y[:, None] - cy
+        xx, yy, xy = ((w * m).sum() / total for m in (dx * dx, dy * dy, dx * dy))
+        root = math.hypot(xx - yy, 2 * xy)
+        major, minor = (4 * math.sqrt(max((xx + yy + s * root) / 2, 0)) for s in (1, -1))
+        if abs(major - width) < 1e-6 * width:
+            break
+        width = max(major, 1.0)
+    return (major, minor), (cx, cy)
+
+
+def _fwhm(light: Array) -> float:
+    row, column = np.unravel_index(int(light.argmax()), light.shape)
+    peak, (dy, dx) = _parabola(light, int(row), int(column))
+    y, x = np.indices(light.shape)
+    radius = np.hypot(y - row - dy, x - column - dx)
+    spline = ndimage.spline_filter(light, 3)
+    angle = np.linspace(0, 2 * math.pi, 72, endpoint=False)
+
+    def mean_at(r: float) -> float:
+        points = row + dy + r * np.sin(angle), column + dx + r * np.cos(angle)
+        return float(ndimage.map_coordinates(spline, points, prefilter=False, mode="nearest").mean())
+
+    radii = np.linspace(0, radius.max() / 2, 400)
+    below = next((r for r in radii if mean_at(float(r)) < peak / 2), None)
+    if below is None:
+        return math.nan
+    return 2 * float(optimize.brentq(lambda r: mean_at(r) - peak / 2, max(below - radii[1], 0), below))
+
+
+def _encircled(light: Array, radius: Array, share: float) -> float:
+    positive = np.maximum(light, 0)
+    total = positive.sum()
+
+    def excess(r: float) -> float:
+        return float((np.clip(r - radius + 0.5, 0, 1) * positive).sum() / total) - share
+
+    return float(optimize.brentq(excess, 0.0, float(radius.max()) + 1))
+
+
+def _peak(light: Array) -> float:
+    row, column = np.unravel_index(int(light.argmax()), light.shape)
+    return _parabola(light, int(row), int(column))[0]
+
+
+def _parabola(light: Array, row: int, column: int) -> tuple[float, tuple[float, float]]:
+    """Height and place (dy, dx) of the top of parabolas along y and x through the highest sample."""
+    top, place = float(light[row, column]), []
+    height = top
+    for axis, (i, n) in enumerate(((row, light.shape[0]), (column, light.shape[1]))):
+        if not 0 < i < n - 1:
+            place.append(0.0)
+            continue
+        before, after = (
+            (light[i - 1, column], light[i + 1, column]) if axis == 0 else (light[row, i - 1], light[row, i + 1])
+        )
+        bend = before - 2 * top + after
+        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+        height += -0.125 * (before - after) ** 2 / bend if bend < 0 else 0.0
+        place.append(float(shift))
+    return float(height), (place[0], place[1])
+
+
+def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:
+    """Slope and offset of the edge from the centroids of each row's derivative, fitted twice about the line."""
+    slope, offset = 0.0, pixels.shape[1] / 2
+    derivative = np.abs(ndimage.gaussian_filter1d(pixels, 1.0, axis=1, order=1))
+    columns = np.arange(pixels.shape[1])
+    near = np.ones_like(derivative)
+    for reach in (None, 12.0, 8.0, 6.0):
+        if reach is not None:
+            near = np.exp(-0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / reach) ** 2)
+        weight = near * np.maximum(derivative - np.median(derivative), 0) ** 2
+        total = weight.sum(1)
+        if not total.max() > 0:
+            raise CaptureError("no edge in the image")
+        good = total > 0.1 * np.median(total)
+        center = (weight * columns).sum(1)[good] / total[good]
+        slope, offset = (float(v) for v in np.polyfit(rows[good], center, 1))
+    return slope, offset

@@ -1,0 +1,113 @@
+"""Micrograph on design: which pillar of the mask each measured one is, its error, and the bias table of the process."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from characterize.measure.sem import Diameters
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+from metalens.lens import DiameterMap
+
+Table = list[tuple[float, float, float, int]]  # drawn nm, made less drawn nm, its standard error, pillars
+_CLEAR = 0.7  # scatter of the best place over that of the next best: below, the place is sure
+_LEAST = 12  # pillars
+OUTLIER = 4.0  # robust sigma
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Overlay:
+    """Measured pillars beside the design.
+
+    designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0, 0) of the lattice on the mask.
+    clearly: whether the place on the mask is beyond doubt. outlier: (p,) error beyond ``OUTLIER`` robust sigma.
+    """
+
+    designed_nm: Array
+    error_nm: Array
+    row: int
+    column: int
+    clearly: bool
+    outlier: Array
+
+
+def overlay(found: Diameters, design: DiameterMap) -> Overlay:
+    """Lay measured pillars on the design: the shift of whole sites where design and measurement differ most evenly.
+
+    A bias that is the same everywhere, or goes with the diameter, plays no part.
+    The picture's rows and columns are taken as the mask's.
+
+    Raises:
+        CaptureError: fewer than twelve good pillars, a lattice that is not the design's, or more pillars than it has.
+    """
+    good = np.isfinite(found.diameter_nm)
+    if good.sum() < _LEAST:
+        raise CaptureError(f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design")
+    if found.lattice.kind != "square":
+        raise CaptureError(f"the picture shows a {found.lattice.kind} lattice, the design is square")
+    first = found.site.min(0)
+    site = found.site - first
+    patch = np.zeros(site.max(0) + 1)
+    mask = np.zeros_like(patch)
+    patch[tuple(site[good].T)], mask[tuple(site[good].T)] = found.diameter_nm[good], 1.0
+    drawn = np.asarray(design.diameter_um, float) * 1e3
+    if (np.array(patch.shape) > drawn.shape).any():
+        raise CaptureError(f"the picture holds {patch.shape} sites, the design {drawn.shape}")
+    for _ in range(2):  # again without what went wrong: one fallen pillar is as much as all noise
+        scatter = _scatter(patch, mask, drawn)
+        row, column = (int(i) for i in np.unravel_index(int(np.argmin(scatter)), scatter.shape))
+        designed = drawn[site[:, 0] + row, site[:, 1] + column]
+        designed = np.where(designed > 0, designed, np.nan)
+        error = found.diameter_nm - designed
+        middle = np.nanmedian(error)
+        spread = 1.4826 * float(np.nanmedian(np.abs(error - middle)))
+        outlier = np.nan_to_num(np.abs(error - middle), nan=0.0) > OUTLIER * max(spread, 0.5)
+        mask[tuple(site[outlier].T)] = 0.0
+    ordered = np.sort(scatter[np.isfinite(scatter)])
+    sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
+    return Overlay(designed, error, row - int(first[0]), column - int(first[1]), bool(sure), outlier)
+
+
+def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
+    """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of the pillars, outliers left out.
+
+    Raises:
+        CaptureError: fewer than twelve pillars to take it from.
+    """
+    good = np.isfinite(laid.error_nm) & ~laid.outlier
+    if good.sum() < _LEAST:
+        raise CaptureError(f"{int(good.sum())} pillars on the design; need {_LEAST} or more for a bias table")
+    order = np.argsort(laid.designed_nm[good], kind="stable")
+    drawn, error = laid.designed_nm[good][order], laid.error_nm[good][order]
+    rows = []
+    for part in np.array_split(np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))):
+        spread = float(error[part].std(ddof=1)) if len(part) > 1 else float("nan")
+        rows.append((float(drawn[part].mean()), float(error[part].mean()), spread / len(part) ** 0.5, len(part)))
+    return rows
+
+
+def numbered(found: Diameters, laid: Overlay) -> Diameters:
+    """The same pillars with the mask's own row and column as their site."""
+    return dataclasses.replace(found, site=found.site + np.array([laid.row, laid.column]))
+
+
+def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
+    """Variance of the patch about a line in the drawn diameters at every shift; inf where no line of a process fits.
+
+    Least squares of made = a + b drawn under the mask, b within a third of 1; inf too where a pillar has no design.
+    """
+    turned, weight, count = (patch * mask)[::-1, ::-1], mask[::-1, ::-1], mask.sum()
+
+    def mean_of(one: Array, other: Array) -> Array:
+        return np.asarray(signal.fftconvolve(one, other, mode="valid") / count)
+
+    made = patch[mask > 0]
+    level = mean_of(drawn, weight)
+    spread = np.maximum(mean_of(drawn**2, weight) - level**2, 1e-9)
+    together = mean_of(drawn, turned) - level * made.mean()
+    slope = np.clip(together / spread, 2 / 3, 4 / 3)
+    rest = made.var() - 2 * slope * together + slope**2 * spread
+    there = mean_of((drawn > 0).astype(float), weight) > 1 - 0.5 / count
+    return np.where(there, np.maximum(rest, 0), np.inf)

@@ -1,0 +1,211 @@
+"""Electron micrographs to pillar diameters: radial edges to a fraction of a pixel, missing and collapsed pillars.
+
+Edges are found along many rays from each pillar's centre, as the place where the smoothed profile falls through half of
+the step from the pillar's rim to the dark gap, whether its top is bright or dark; a circle goes through them. Charging
+(slow shades), noise and drift of the scan are taken off or averaged over the rays. The lattice may be of any kind.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from characterize.measure.lattice import Lattice, find
+from characterize.model import Known
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+
+RAYS = 72
+
+
+@dataclass(frozen=True, slots=True)
+class Micrograph:
+    """What is known of a picture.
+
+    pixel_nm: size of a pixel. pitch_nm: lattice constant of the pillars.
+    edge_bias_nm: constant by which edges appear outside (above 0) the true ones, from a calibration sample.
+    """
+
+    pixel_nm: float
+    pitch_nm: float = 0.0
+    edge_bias_nm: float = 0.0
+
+    def __post_init__(self) -> None:
+        known = self.pitch_nm >= 6 * self.pixel_nm or self.pitch_nm == 0
+        if not (self.pixel_nm > 0 and known):
+            raise CaptureError(f"pixel_nm {self.pixel_nm}, pitch_nm {self.pitch_nm}: need 6 or more pixels in a pitch")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Diameters:
+    """Pillars found in a micrograph.
+
+    row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is missing or collapsed.
+    sigma_nm: (p,) standard error of each diameter from the scatter of its edges.
+    missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far from round.
+    site: (p, 2) lattice index j and i of each; lattice: where the sites are, in pixels.
+    """
+
+    row: Array
+    column: Array
+    diameter_nm: Array
+    sigma_nm: Array
+    missing: Array
+    collapsed: Array
+    site: Array
+    lattice: Lattice
+
+    @property
+    def mean_nm(self) -> float:
+        """Mean diameter of the good pillars."""
+        return float(np.nanmean(self.diameter_nm))
+
+    @property
+    def three_sigma_nm(self) -> float:
+        """Three standard deviations of the good pillars (CD uniformity)."""
+        return float(3 * np.nanstd(self.diameter_nm))
+
+    def bias(self, designed_nm: Array | float) -> Known:
+        """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with its standard error."""
+        difference = self.diameter_nm - np.asarray(designed_nm)
+        good = difference[np.isfinite(difference)]
+        if len(good) < 3:
+            raise CaptureError(f"{len(good)} good pillars: need three or more for a bias")
+        return Known("bias_nm", float(good.mean()), float(max(good.std(ddof=1) / math.sqrt(len(good)), 0.05)))
+
+
+def measure(image: Array, about: Micrograph) -> Diameters:
+    """Diameters of all whole pillars on the lattice of a top-down micrograph, rims brighter than the gaps.
+
+    Raises:
+        CaptureError: no lattice (of the stated pitch), or no picture of one channel.
+    """
+    picture = np.asarray(image, float)
+    if picture.ndim != 2 or not np.isfinite(picture).all():
+        raise CaptureError(f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values")
+    pitch = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
+    rough = _flattened(picture, pitch or min(picture.shape) / 4)
+    lattice = find(rough, pitch)
+    flat = _flattened(picture, lattice.pitch_px) if pitch is None else rough
+    place, site = lattice.sites(flat.shape)
+    steps = [_step(flat, row, column, lattice.pitch_px) for row, column in place]
+    usual = float(np.median(steps)) if steps else 0.0
+    results = [
+        _pillar(flat, row, column, lattice.pitch_px, there=step > 0.4 * usual)
+        for (row, column), step in zip(place, steps, strict=True)
+    ]
+    if not results:
+        raise CaptureError("no whole pillar in the picture; need a wider picture")
+    row, column, radius, sigma, missing, collapsed = (np.array(v) for v in zip(*results, strict=True))
+    diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
+    missing, collapsed = missing.astype(bool), collapsed.astype(bool)
+    diameter = np.where(missing | collapsed, np.nan, diameter)
+    return Diameters(row, column, diameter, 2 * sigma * about.pixel_nm, missing, collapsed, site, lattice)
+
+
+def level(image: Array, about: Micrograph) -> Array:
+    """Image without charging: row medians and a shade slower than two pitches taken off, contrast scaled to 1."""
+    return _flattened(image, about.pitch_nm / about.pixel_nm)
+
+
+def _flattened(image: Array, pitch: float) -> Array:
+    rows = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
+    steady = image - rows[:, None]
+    steady = steady - ndimage.gaussian_filter(steady, 1.5 * pitch)
+    low, high = np.percentile(steady, [10, 90])
+    return np.asarray((steady - low) / max(high - low, 1e-12))
+
+
+def scale_from_bar(image: Array, bar_nm: float) -> float:
+    """pixel_nm from a scale bar: the longest run of saturated pixels in a row of the lowest quarter.
+
+    Raises:
+        CaptureError: no bar of at least 20 pixels.
+    """
+    strip = np.asarray(image)[-max(len(image) // 4, 1) :]
+    bright = strip >= strip.max()
+    longest = 0
+    for line in bright:
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+        longest = max(longest, int((edges[1::2] - edges[::2]).max(initial=0)))
+    if longest < 20:
+        raise CaptureError(f"no scale bar: longest bright run is {longest} pixels; give pixel_nm instead")
+    return bar_nm / longest
+
+
+def _rays(flat: Array, row: float, column: float, pitch: float) -> tuple[Array, Array, Array]:
+    """(distance, angle, (distance, angle) levels smoothed along and across) about a place."""
+    angle = (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
+    fine = min(0.25, pitch / 120)
+    reach = np.arange(0, 0.5 * pitch + 1, fine)
+    points = row + reach[:, None] * np.sin(angle), column + reach[:, None] * np.cos(angle)
+    rays = ndimage.map_coordinates(flat, points, order=1, mode="nearest")
+    smooth = max(1.0, pitch / 150) / fine
+    return reach, angle, ndimage.gaussian_filter(rays, (smooth, 1.0), mode=("nearest", "wrap"))
+
+
+def _step(flat: Array, row: float, column: float, pitch: float) -> float:
+    """Height of the fall from a pillar's rim to the gap, in the mean over all rays."""
+    inner, outer, _ = _plateaus(_rays(flat, row, column, pitch)[2])
+    return inner - outer
+
+
+def _pillar(
+    flat: Array, row: float, column: float, pitch: float, *, there: bool
+) -> tuple[float, float, float, float, bool, bool]:
+    """(row, column, radius, its error, missing, collapsed) at a lattice site, in pixels."""
+    half = int(pitch / 2)
+    r0, c0 = int(round(row)), int(round(column))
+    patch = flat[max(r0 - half, 0) : r0 + half + 1, max(c0 - half, 0) : c0 + half + 1]
+    if not there:
+        fallen = bool((ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08)  # it lies elsewhere in its cell
+        return row, column, math.nan, math.nan, not fallen, fallen
+    y, x, radius, sigma, scatter = row, column, math.nan, math.nan, math.inf
+    for _ in range(4):
+        edges = _edges(flat, y, x, pitch)
+        if edges is None:
+            return y, x, math.nan, math.nan, False, True
+        dy, dx, radius, sigma, scatter = edges
+        y, x = y + dy, x + dx
+        if math.hypot(dy, dx) < 1e-3:
+            break
+    off = math.hypot(y - row, x - column) > 0.2 * pitch
+    return y, x, radius, sigma, False, bool(off or scatter > max(0.15 * radius, 1.5))
+
+
+def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float, float, float, float, float] | None:
+    """Circle through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges."""
+    reach, angle, rays = _rays(flat, row, column, pitch)
+    inner, outer, rim = _plateaus(rays)
+    found = np.full(RAYS, math.nan)
+    half = (inner + outer) / 2
+    for j in range(RAYS):
+        below = rim + np.flatnonzero(rays[rim:, j] < half)
+        if len(below) and below[0] > rim:
+            i = int(below[0])
+            high, low = rays[i - 1, j], rays[i, j]
+            found[j] = reach[i - 1] + (reach[1] - reach[0]) * (high - half) / (high - low)
+    good = np.isfinite(found)
+    if inner - outer < 0.2 or good.sum() < RAYS // 2:
+        return None
+    middle = np.median(found[good])
+    good &= np.abs(found - middle) < max(0.2 * middle, 2.0)
+    design = np.stack([np.ones(good.sum()), np.sin(angle[good]), np.cos(angle[good])], 1)
+    (radius, dy, dx), *_ = np.linalg.lstsq(design, found[good], rcond=None)
+    rest = found[good] - design @ np.array([radius, dy, dx])
+    scatter = float(rest.std())
+    return float(dy), float(dx), float(radius), scatter / math.sqrt(good.sum() / 4), scatter
+
+
+def _plateaus(rays: Array) -> tuple[float, float, int]:
+    """(level of the rim, of the gap, where the rim is brightest) about the steepest fall of the mean over the rays.
+
+    The rim is looked for just inside the fall, within a fifth of its radius: tops may be dark.
+    """
+    mean = rays.mean(1)
+    outer = float(np.sort(mean)[: max(len(mean) // 8, 2)].mean())
+    fall = int(np.argmin(np.diff(mean)))
+    first = max(fall - max(16, fall // 5), 0)
+    rim = first + int(np.argmax(mean[first : fall + 1]))
+    return float(mean[rim]), outer, rim

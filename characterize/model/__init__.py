@@ -1,0 +1,49 @@
+"""Parameters -> expected frames with derivatives."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from characterize.model import detector as detector
+    from characterize.model import made as made
+    from characterize.model import thinplate as thinplate
+    from characterize.model.forward import ForwardModel as ForwardModel
+    from characterize.model.forward import Setting as Setting
+    from characterize.model.forward import spectrum as spectrum
+    from characterize.model.forward import true_depth as true_depth
+    from characterize.model.parameters import NAMES as NAMES
+    from characterize.model.parameters import PARAMETERS as PARAMETERS
+    from characterize.model.parameters import PLACE as PLACE
+    from characterize.model.parameters import Known as Known
+    from characterize.model.parameters import state as state
+    from characterize.model.parameters import vector as vector
+    from characterize.model.pillar_slopes import slopes as slopes
+    from characterize.model.pillars import incidence_rad as incidence_rad
+    from characterize.model.thinplate import MODES as MODES
+    from characterize.model.thinplate import basis as basis
+    from characterize.model.thinplate import prior_rad as prior_rad
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "ForwardModel": "forward",
+        "Known": "parameters",
+        "MODES": "thinplate",
+        "NAMES": "parameters",
+        "PARAMETERS": "parameters",
+        "PLACE": "parameters",
+        "Setting": "forward",
+        "basis": "thinplate",
+        "detector": "",
+        "incidence_rad": "pillars",
+        "made": "",
+        "prior_rad": "thinplate",
+        "slopes": "pillar_slopes",
+        "spectrum": "forward",
+        "state": "parameters",
+        "thinplate": "",
+        "true_depth": "forward",
+        "vector": "parameters",
+    },
+)

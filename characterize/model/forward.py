@@ -1,0 +1,367 @@
+"""Expected frames of an as-built lens on its bench, with derivatives by every parameter, on coarse nodes."""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from characterize.model import detector
+from characterize.model.parameters import PLACE
+from characterize.model.pillars import Pillars, Range, change, incidence_rad
+from characterize.model.reduced import Bench, Operators, Reduced
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.ground.paths import sensor_path, source_path
+from metalens.lens import Lens
+from metalens.made import Answers, Bends, Sensitivity, Widens, maps, named, of_kind
+
+GEOMETRY = (
+    "distance_um",
+    "wavelength_nm",
+    "decentre_x_um",
+    "decentre_y_um",
+    "tilt_x_deg",
+    "tilt_y_deg",
+    "source_x_um",
+    "source_y_um",
+    "stage_zero_um",
+    "stage_scale",
+)
+WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
+_SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
+_LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
+_STEP: dict[str, Callable[[Bench], float]] = {
+    "distance_um": lambda bench: bench.distance_um,
+    "wavelength_nm": lambda bench: bench.wavelength_um * 1e3,
+}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Setting:
+    """The frames that are to be predicted.
+
+    depth_um: (n,) stated source depths. angle_rad: (n, 2). exposure: (n,) relative.
+    pixel_um: of the sensor; rows, columns: of the window about the chief ray.
+    margin: pixels around it that blur may reach in from.
+    tolerance: relative error of the field allowed to the reduction.
+    """
+
+    depth_um: Array
+    angle_rad: Array
+    exposure: Array
+    pixel_um: float
+    rows: int
+    columns: int
+    margin: int = 4
+    tolerance: float = 5e-4
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.depth_um).all() and (self.depth_um > 0).all()):
+            raise FitError("source depths must be finite and above 0; give them in stage.csv (depth_um)")
+        if not (math.isfinite(self.pixel_um) and self.pixel_um > 0):
+            raise FitError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Group:
+    """Frames of one field angle."""
+
+    index: Array
+    pillars: Pillars
+    reduced: Reduced
+    bending: Array
+    widening: Array
+    residual: Array
+
+    def turning(self, name: str) -> Array | None:
+        """Phase on the nodes for one unit of a wave-front parameter; None for any other."""
+        if name.startswith("residual_"):
+            return np.asarray(self.residual[int(name.removeprefix("residual_"))])
+        return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
+
+
+class ForwardModel:
+    """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
+
+    Accuracy: of the pillars ``Pillars.error`` in t, of the geometry ``setting.tolerance`` in the field; a test and the
+    benchmark hold both against the sum over all pillars.
+    """
+
+    def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
+        self.lens, self.setting = lens, setting
+        self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
+        sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
+        over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
+        self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
+        self.response, self._span, self._cut = response, span, 0.0
+        self.modes = np.empty(0)
+        self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
+        self._pillars: dict[float, Pillars] = {}
+        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
+        self.stage_centre_um = float(setting.depth_um.mean())
+        self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
+        self._edge_y = (np.arange(setting.rows) - setting.rows // 2)[:, None] / (setting.rows / 2)
+        self._edge_x = (np.arange(setting.columns) - setting.columns // 2)[None] / (setting.columns / 2)
+
+    def _group(self, angle_rad: Array) -> _Group:
+        setting = self.setting
+        index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
+        tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
+        bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
+        window = (max(setting.rows, setting.columns) + 2 * setting.margin) * setting.pixel_um + 20.0
+        depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
+        incidence = incidence_rad(self.lens.proxy, angle_rad)
+        if incidence not in self._pillars:
+            self._pillars[incidence] = Pillars(self.lens, self.response, span=self._span, angle_rad=incidence)
+        pillars = self._pillars[incidence]
+        reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
+        bending, widening = (maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens))
+        return _Group(index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape)))
+
+    def only(self, frames: Array) -> "ForwardModel":
+        """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
+        part, s = copy.copy(self), self.setting
+        part.setting = dataclasses.replace(
+            s, depth_um=s.depth_um[frames], angle_rad=s.angle_rad[frames], exposure=s.exposure[frames]
+        )
+        places = [np.flatnonzero(np.isin(frames, group.index)) for group in self.groups]
+        pairs = [(group, place) for group, place in zip(self.groups, places, strict=True) if len(place)]
+        part.groups = [dataclasses.replace(group, index=place) for group, place in pairs]
+        return part
+
+    def rough(self, tolerance: float) -> "ForwardModel":
+        """The same model with fields to a relative ``tolerance``: quick enough to scan with."""
+        part = copy.copy(self)
+        part._cut = tolerance
+        return part
+
+    def with_residual(self, modes: Array, basis: Callable[[Array, Array, int], Array]) -> "ForwardModel":
+        """The same lens with a phase of ``modes`` (m,) times ``basis`` (u, v, m) -> (m, *shape); see :mod:`thinplate`.
+
+        Their derivatives are wanted as ``residual_0`` and so on.
+        """
+        part = copy.copy(self)
+        part.modes = np.asarray(modes)
+        if len(modes):
+            part.groups = [dataclasses.replace(g, residual=self._shapes(g, len(modes), basis)) for g in self.groups]
+        return part
+
+    def _shapes(self, group: _Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
+        """(count, q, p) of a basis on the nodes of a group; kept, since a search asks again for every step."""
+        key = group.reduced, basis, count
+        if key not in self._kept:
+            self._kept[key] = basis(group.reduced.u, group.reduced.v, count)
+        return self._kept[key]
+
+    def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
+        """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
+        light, slopes = self._light(x, wanted)
+        scale = self._scale(x)
+        n, s = len(light), self.setting
+        sampled = scale[:, None, None] * light
+        image = sampled + x[PLACE["background_e"]]
+        image = image + x[PLACE["background_x_e"]] * self._edge_x + x[PLACE["background_y_e"]] * self._edge_y
+        if wanted is None:
+            return image, None
+        out = np.zeros((len(wanted), n, s.rows, s.columns))
+        plain: dict[str, Any] = {
+            "background_e": 1.0,
+            "background_x_e": self._edge_x,
+            "background_y_e": self._edge_y,
+            "log_gain": sampled,
+        }
+        for j, name in enumerate(wanted):
+            out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
+        if "stage_zero_um" in wanted or "stage_scale" in wanted:
+            depth = true_depth(x, self.setting, self.stage_centre_um)
+            rates: dict[str, Any] = {"stage_zero_um": 1.0, "stage_scale": self.setting.depth_um - self.stage_centre_um}
+            for name, rate in rates.items():
+                if name in wanted:  # light falls as the square of the depth
+                    out[list(wanted).index(name)] += (-2 * rate / depth)[:, None, None] * sampled
+        return image, out
+
+    def _scale(self, x: Array) -> Array:
+        """(n,) electrons in a pixel for unit |E|² density: gain, exposure, distance of the source, pixel area."""
+        depth = true_depth(x, self.setting, self.stage_centre_um)
+        share = self.setting.pixel_um**2 / self.area_um2
+        gain = np.exp(x[PLACE["log_gain"]])
+        return np.asarray(gain * self.setting.exposure * (self.reference_um / depth) ** 2 * share)
+
+    def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
+        """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
+        names = [] if wanted is None else list(wanted)
+        s = self.setting
+        light = np.zeros((len(s.depth_um), s.rows, s.columns))
+        slopes = {name: np.zeros_like(light) for name in names}
+        for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
+            for group in self.groups:
+                part, more = self._group_light(x, group, offset_nm, names)
+                light[group.index] += weight * part
+                for name in names:
+                    if name in more:
+                        slopes[name][group.index] += weight * more[name]
+        if "bandwidth_nm" in names:
+            up = x.copy()
+            up[PLACE["bandwidth_nm"]] += 0.02
+            slopes["bandwidth_nm"] = (self._light(up, None)[0] - light) / 0.02
+        return light, slopes
+
+    def _group_light(
+        self, x: Array, group: _Group, offset_nm: float, names: list[str]
+    ) -> tuple[Array, dict[str, Array]]:
+        x = x.copy()
+        x[PLACE["wavelength_nm"]] += offset_nm
+        phasor = np.exp(1j * self._phase(x, group))
+        pupil, by_bias, by_answers = self._pupil(x, group, bool(names))
+        operators = self._operators(x, group)
+        field = operators.field(pupil * phasor, tolerance=self._cut)
+        intensity = field.real**2 + field.imag**2
+        transfer, blurs = self._transfer(x, group, names)
+        light = self.grid.sample(intensity, transfer)
+        out: dict[str, Array] = {}
+        growth = self._growth(x, group)
+        conjugate = field.conj()
+        lit = (pupil * phasor).astype(np.complex64)
+        short, power = phasor.astype(np.complex64), np.vdot(lit, lit)
+
+        def sampled(change: Array, more: Array | float = 0.0) -> Array:
+            """Derivative of the light; the part of a change that is the light itself needs no sum, nor loses digits."""
+            same = np.vdot(lit, change) / power
+            field = operators.field(change - same * lit, tolerance=_SLOPE_TOLERANCE) + more
+            return np.asarray(self.grid.sample(2 * (conjugate * field).real, transfer) + 2 * same.real * light)
+
+        for name in names:
+            if name in WIDENING:
+                changed = by_bias * group.widening[WIDENING[name]]
+                out[name] = sampled(changed.astype(np.complex64) * short)
+            elif name in ANSWERING:
+                out[name] = sampled(by_answers[ANSWERING[name]].astype(np.complex64) * short)
+            elif (turning := group.turning(name)) is not None:
+                out[name] = sampled((1j * turning).astype(np.complex64) * lit)
+            elif name in GEOMETRY:
+                turned = 1j * self._phase_slope(x, group, name)
+                more = self._by_operators(x, group, name, lit, field) if name in _STEP else 0.0
+                out[name] = sampled(turned.astype(np.complex64) * lit, more)
+                if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
+                    disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+                    out[name] = out[name] + self.grid.sample(intensity, disc)
+            elif name in blurs:
+                out[name] = self.grid.sample(intensity, blurs[name])
+        return light, out
+
+    def _by_operators(self, x: Array, group: _Group, name: str, lit: Array, field: Array) -> Array:
+        """Derivative of the field through the window operators, and of the pillars where the wavelength changes."""
+        step = group.reduced.small_change(self.grid.axes_um()) * _STEP[name](group.reduced.bench)
+        up = x.copy()
+        up[PLACE[name]] += step
+        phasor = np.exp(1j * self._phase(x, group))
+        pupil = self._pupil(up, group, False)[0] if name == "wavelength_nm" else self._pupil(x, group, False)[0]
+        return np.asarray((self._operators(up, group).field(pupil * phasor) - field) / step)
+
+    def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array]:
+        """(q, p) complex lens on the nodes, its derivative by the bias per um, and by units of the answering causes."""
+        bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
+        reach = group.pillars.span.bias_um
+        weight, rate = group.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
+        gathered = group.reduced.gathered
+        r, b, shape = len(gathered), len(weight), gathered.shape[1:]
+        values = group.pillars.coefficients(change(x))
+
+        def combine(w: Array, c: Array) -> Array:
+            return np.asarray(((c.T @ w.reshape(b, -1)).reshape(r, *shape) * gathered).sum(0))
+
+        pupil = combine(weight, values)
+        if not slopes:
+            return pupil, pupil, pupil
+        rows = (row for _, row in of_kind(Answers))
+        by = [combine(weight, c) * row.unit for c, row in zip(group.pillars.slopes(change(x)), rows, strict=True)]
+        return pupil, combine(rate, values), np.stack(by)
+
+    def _phase(self, x: Array, group: _Group) -> Array:
+        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, plus aberrations."""
+        reduced, index = group.reduced, group.index
+        nominal = reduced.bench
+        k = 2 * math.pi / (nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
+        d = nominal.distance_um + x[PLACE["distance_um"]]
+        tilt = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
+        tx, ty = (t + extra for t, extra in zip(nominal.tangents, tilt, strict=True))
+        centre = d * tx + x[PLACE["decentre_x_um"]], d * ty + x[PLACE["decentre_y_um"]]
+        exit_path = sensor_path(reduced.x_um, reduced.y_um, centre, d)
+        known = reduced.k * reduced.path(reduced.x_um, reduced.y_um, nominal.distance_um, nominal)
+        depth = true_depth(x, self.setting, self.stage_centre_um)[index]
+        lateral = [x[PLACE[f"source_{a}_um"]] for a in "xy"]
+        out = np.empty((len(index), *reduced.x_um.shape))
+        for i, z in enumerate(depth):
+            tangents = tx - lateral[0] / z, ty - lateral[1] / z
+            out[i] = k * (source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path) - known
+        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
+        return out + np.tensordot(self.modes, group.residual, 1) if len(self.modes) else out
+
+    def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
+        """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""
+        step = {"stage_scale": 1e-5, "stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
+        up, down = x.copy(), x.copy()
+        up[PLACE[name]] += step
+        down[PLACE[name]] -= step
+        return (self._phase(up, group) - self._phase(down, group)) / (2 * step)
+
+    def _operators(self, x: Array, group: _Group) -> Operators:
+        nominal = group.reduced.bench
+        return group.reduced.operators(
+            wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+            distance_um=nominal.distance_um + x[PLACE["distance_um"]],
+            axes_um=self.grid.axes_um(),
+        )
+
+    def _growth(self, x: Array, group: _Group) -> dict[str, Array]:
+        """(frames,) relative growth of the source's image with the parameters that change its magnification."""
+        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        distance = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
+        from_centre = self.setting.depth_um[group.index] - self.stage_centre_um
+        return {
+            "distance_um": np.full(len(depth), 1 / distance),
+            "stage_zero_um": -1 / depth,
+            "stage_scale": -from_centre / depth,
+        }
+
+    def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[Array, dict[str, Array]]:
+        """(frames or 1, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
+        fy, fx = self.grid.frequencies()
+        pixel = self.setting.pixel_um
+        blur, by_blur = detector.gauss(fy, fx, x[PLACE["crosstalk_px"]] * pixel)
+        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
+        square = detector.pixel(fy, fx, pixel)
+        if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
+            return (square * blur)[None], {"crosstalk_px": (square * by_blur * pixel)[None]}
+        sizes, shared = x[PLACE["pinhole_um"]] * shrink, square * blur
+        discs = [detector.disc(fy, fx, size) for size in sizes]
+        disc = np.stack([value for value, _ in discs])
+        by_size = np.stack([slope for _, slope in discs]) * shrink[:, None, None]
+        some = np.maximum(sizes, _LEAST_DISC * pixel)
+        seen = np.stack([detector.disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
+        slopes = {
+            "crosstalk_px": square * by_blur * pixel * disc,
+            "pinhole_um": shared * seen,
+            "growth": shared * by_size,
+        }
+        return shared * disc, slopes
+
+
+def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
+    """(n,) source depths after stage zero and scale; the scale acts about the middle of the stage."""
+    stated = setting.depth_um
+    depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - centre_um)
+    return np.asarray(np.maximum(depth, 0.2 * stated))
+
+
+def spectrum(bandwidth_nm: float) -> list[tuple[float, float]]:
+    """(offset in nm, weight) of a Gaussian line by 5-point Gauss-Hermite quadrature; one line for no width."""
+    if bandwidth_nm <= 0:
+        return [(0.0, 1.0)]
+    place, weight = np.polynomial.hermite_e.hermegauss(5)
+    return [(float(p) * bandwidth_nm, float(w)) for p, w in zip(place, weight / weight.sum(), strict=True)]

@@ -1,0 +1,183 @@
+"""The kernel from a lens to a sensor window, split into factors of two coordinates and a rest as smooth as can be.
+
+With the path F(p, q, X, Y) = r - r_w, seen from the window's centre, and the lens's middle direction (a, b):
+F = F(p, b, X, 0) + F(a, q, 0, Y) + H(X, Y) + rest, where H makes the rest vanish at p = a, q = b, and wherever X = 0
+and q = b, or Y = 0 and p = a. The three factors are put on exactly; what the window bends by itself, and along each
+axis with the direction, is in them. The rest begins with X² q²: a window as wide as the lens is far needs few nodes.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import spherical_jn
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.ground.paths import longer
+
+SINGLE = 1e-4  # least tolerance of a field that single precision holds: :func:`least_tolerance` of 4000 columns is 4e-5
+_USUAL = 5e-4  # tolerance that the counts of nodes below are written for
+_COARSE = 9  # places a coordinate at which the rest's slopes are sampled
+_BLOCK = 24  # columns by which a range grows
+_STOP = 0.2  # share of the tolerance that may be left outside the range
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) of one wavelength and distance.
+
+    p, q: spans of direction cosines of the lens seen from the window's centre, at the nominal distance.
+    nominal_um, distance_um: lens to sensor. tangents: (x, y) of the chief ray.
+    """
+
+    k: float
+    p: Span
+    q: Span
+    nominal_um: float
+    distance_um: float
+    tangents: tuple[float, float] = (0.0, 0.0)
+
+    def path(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
+        """(r - r_w, r), um: to a point of the window and to its centre, without cancellation."""
+        d, (tx, ty) = self.distance_um, self.tangents
+        r_0 = self.nominal_um / np.sqrt(1 - np.square(p) - np.square(q))
+        dx, dy = (d - self.nominal_um) * tx - r_0 * p, (d - self.nominal_um) * ty - r_0 * q
+        r_w = np.sqrt(dx**2 + dy**2 + d**2)
+        path = longer(r_w, X * X + Y * Y + 2 * (X * dx + Y * dy))
+        return np.asarray(path), np.asarray(r_w + path)
+
+    def along_x(self, p: Array, X: Array) -> Array:
+        """exp(ik F(p, b, X, 0)); arguments broadcast."""
+        return np.asarray(np.exp(1j * self.k * self._by_x(p, X)))
+
+    def along_y(self, q: Array, Y: Array) -> Array:
+        """exp(ik F(a, q, 0, Y)); arguments broadcast."""
+        return np.asarray(np.exp(1j * self.k * self._by_y(q, Y)))
+
+    def window(self, X: Array, Y: Array) -> Array:
+        """exp(ik H(X, Y)); arguments broadcast."""
+        return np.asarray(np.exp(1j * self.k * self._by_window(X, Y)))
+
+    def rest(self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64) -> Array:
+        """What the three factors leave, with the amplitude, as ``kind`` complex numbers; arguments broadcast."""
+        path, r = self._left(p, q, X, Y)
+        real = np.empty(0, kind).real.dtype
+        size = (self.distance_um / (2 * np.pi * r**2)).astype(real)
+        fade = (1 / r).astype(real) - np.dtype(kind).type(1j * self.k)
+        return np.asarray(size * fade * turns(self.k * path, kind))
+
+    def counts(self, wy: float, wx: float, tolerance: float = _USUAL) -> tuple[int, int]:
+        """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx): of the window, of the directions.
+
+        exp(ist) needs s + O(s^(1/3)) terms, s the slope of the phase a half span. Path and amplitude branch where
+        r = 0, at imaginary X of about the distance, and at p² + q² = 1: there terms fall as exp(-n / branch).
+        """
+        more = digits(tolerance)
+        t = np.linspace(-1, 1, _COARSE)
+        Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
+        turn = self.k * self._left(p, q, X, Y)[0]
+        slopes = [float(np.abs(np.diff(turn, axis=axis)).max()) / (t[1] - t[0]) for axis in range(4)]
+        branch = 1 / math.asinh(self.distance_um / max(wy, wx))
+        beyond = _terms(max(slopes[:2]), tolerance) + (6 + more) * branch
+        window = max(12, math.ceil((14 + more) * branch), math.ceil(beyond))
+        aperture = int((10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + more / 8))
+        return window, max(aperture, _terms(max(slopes[2:]), tolerance))
+
+    def _left(self, p: Array, q: Array, X: Array, Y: Array) -> tuple[Array, Array]:
+        path, r = self.path(p, q, X, Y)
+        return path - self._by_x(p, X) - self._by_y(q, Y) - self._by_window(X, Y), r
+
+    def _by_x(self, p: Array | float, X: Array) -> Array:
+        return self.path(p, _middle(self.q), X, 0.0)[0]
+
+    def _by_y(self, q: Array | float, Y: Array) -> Array:
+        return self.path(_middle(self.p), q, 0.0, Y)[0]
+
+    def _by_window(self, X: Array, Y: Array) -> Array:
+        a, b = _middle(self.p), _middle(self.q)
+        return np.asarray(self.path(a, b, X, Y)[0] - self._by_x(a, X) - self._by_y(b, Y))
+
+
+def turns(phase: Array, kind: Any = np.complex64) -> Array:
+    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double."""
+    out = np.empty(np.shape(phase), kind)
+    whole = phase * (1 / (2 * np.pi))
+    small = (whole - np.rint(whole)).astype(out.real.dtype) * out.real.dtype.type(2 * np.pi)
+    out.real, out.imag = np.cos(small), np.sin(small)
+    return out
+
+
+def digits(tolerance: float) -> float:
+    """ln of how much more is asked than the usual 5e-4; 0 where less is."""
+    return max(0.0, math.log(_USUAL / tolerance))
+
+
+def precision(tolerance: float) -> Any:
+    """Complex numbers that hold a field to ``tolerance``.
+
+    Raises:
+        FitError: not even double precision does.
+    """
+    if not 1e-9 <= tolerance < 1:
+        raise FitError(f"tolerance {tolerance:g} of the field: need 1e-9 to 1; the pillars are not known better")
+    return np.complex64 if tolerance >= SINGLE else np.complex128
+
+
+def least_tolerance(table: Array) -> float:
+    """Tolerance that :func:`factors` can tell from rounding in the table's own precision.
+
+    A block of the range less what is found of it is a sum over a column, rounded to eps sqrt(rows) of the norm; the
+    search would take that noise for more range, and what is orthogonal to noise is not orthogonal to the range.
+    """
+    return float(np.finfo(table.dtype).eps) * math.sqrt(max(table.shape)) / _STOP
+
+
+def factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
+    """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but for ``tolerance`` of its norm.
+
+    Their number need not be known: the range is found by random blocks (Halko, Martinsson and Tropp 2011) until what
+    is left is a fifth of the tolerance. Third: (r,) share of the norm that is left out before each term.
+
+    Raises:
+        FitError: the tolerance is below what the table's precision holds; see :func:`least_tolerance`.
+    """
+    least = least_tolerance(table)
+    if tolerance < least:
+        raise FitError(f"{table.dtype} tables of {table.shape} hold {least:.1g} of their norm, not {tolerance:g}")
+    rng, total = np.random.default_rng(0), float(np.linalg.norm(table)) ** 2
+    found, most, missing = np.empty((len(table), 0), table.dtype), min(table.shape), total
+    while found.shape[1] < most:
+        count = min(_BLOCK, most - found.shape[1])
+        block = table @ rng.standard_normal((table.shape[1], count)).astype(table.real.dtype)
+        block -= found @ (found.conj().T @ block)
+        missing = float(np.linalg.norm(block)) ** 2 / count  # its expectation is the power that is left
+        if missing < (_STOP * tolerance) ** 2 * total:
+            break
+        block = np.linalg.qr(block)[0]  # twice is enough to be orthogonal to what is there
+        found = np.concatenate([found, np.linalg.qr(block - found @ (found.conj().T @ block))[0]], 1)
+        missing = 0.0
+    rows = found.conj().T @ table
+    # singular values from their own, not from their squares, which would lose half of the digits
+    size, turn = np.linalg.svd(np.linalg.qr(rows.conj().T.astype(complex))[1].conj().T)[1::-1]
+    remainder = np.sqrt((np.cumsum(size[::-1] ** 2)[::-1] + missing) / total)
+    rank = max(1, int((remainder > tolerance).sum()))
+    turn = turn[:, :rank].astype(table.dtype)
+    return found @ turn, turn.conj().T @ rows, remainder[:rank]
+
+
+def _terms(slope: float, tolerance: float) -> int:
+    """Legendre terms of exp(i slope t) on [-1, 1] to a fiftieth of ``tolerance``: its modes are (2n+1) j_n(slope)²."""
+    n = np.arange(int(slope + 60 + 8 * slope ** (1 / 3)))
+    power = (2 * n + 1) * spherical_jn(n, slope) ** 2
+    return 1 + int((np.sqrt(np.cumsum(power[::-1])[::-1]) > tolerance / 50).sum())
+
+
+def _middle(span: Span) -> float:
+    return (span[0] + span[1]) / 2
+
+
+def _on(span: Span, t: Array) -> Array:
+    return np.asarray(_middle(span) + (span[1] - span[0]) / 2 * t)

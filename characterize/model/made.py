@@ -1,0 +1,127 @@
+"""Every pillar of an as-built lens: its transmission, the lens it makes, and the PSFs of that lens."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from characterize.model import thinplate
+from characterize.model.parameters import PLACE, state
+from characterize.model.pillars import incidence_rad
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.lens import DiameterMap, Lens
+from metalens.made import Bends, Sensitivity, Widens, causes, transmission
+
+_TABLE = 1 << 16
+_NODES = max(causes.polynomials(kind).shape[-1] for kind in (Widens, Bends))
+
+if TYPE_CHECKING:
+    from metalens.psf import PsfStack, View
+
+
+def pillars(
+    lens: Lens,
+    response: Sensitivity,
+    x: Array,
+    *,
+    noise_um: Array | float = 0.0,
+    angle_rad: float = 0.0,
+    modes: Array | None = None,
+) -> Array:
+    """(y, x) complex transmission of every as-built pillar: diameter, process and wave-front aberrations.
+
+    Args:
+        x: all parameters, in the order of ``parameters.NAMES``.
+        noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence, where the proxy knows angles.
+        modes: of a residual phase (:mod:`thinplate`).
+
+    Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
+    """
+    d, made = lens.diameters, state(x)
+    bias = _on_pillars(d, made.bias_um)
+    wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
+    grown = np.where(d.diameter_um > 0, d.diameter_um + bias + noise_um, np.nan)
+    low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
+    place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
+    diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
+    t = transmission(lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad)
+    below = place.astype(np.int32)
+    t = t[below] + (place - below) * np.diff(t)[below]
+    if made.bends():
+        t *= np.exp(1j * _on_pillars(d, made.phase_rad))
+    if modes is not None and len(modes):
+        t *= np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
+    return np.asarray(np.where(d.diameter_um > 0, t, 0))
+
+
+def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Array]) -> Array:
+    """(y, x) values at every pillar of a polynomial in (u, v): exact from one node more than its degree in each."""
+    node = legendre.nodes(_NODES)[0]
+    axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
+    along_x, along_y = (legendre.interpolation(len(node), axis) for axis in axes)
+    return np.asarray(along_y @ low_order(*np.meshgrid(node, node)) @ along_x.T)
+
+
+def built_lens(design: Lens, x: Array) -> Lens:
+    """The design with the as-built diameters, wavelength and distance; they are clipped to the proxy's domain.
+
+    Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and :func:`psf_stack` hold them.
+    """
+    d = design.diameters
+    bias = _on_pillars(d, state(x).bias_um)
+    low, high = design.proxy.domain_um
+    grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
+    return Lens(
+        diameters=DiameterMap(np.where(d.diameter_um > 0, grown, 0.0), d.pitch_um),
+        cell=design.cell,
+        proxy=design.proxy,
+        wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+        sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
+        source_distance_um=design.source_distance_um,
+        profile="as-built",
+        provenance=design.provenance,
+    )
+
+
+def psf_stack(
+    lens: Lens,
+    response: Sensitivity,
+    x: Array,
+    view: "View",
+    *,
+    modes: Array | None = None,
+    offset_um: tuple[float, float] = (0.0, 0.0),
+    tolerance: float = 1e-4,
+) -> "PsfStack":
+    """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs: :func:`metalens.psf.psf_stack`.
+
+    Pillars, process, aberrations and distance enter; what belongs to one bench (stage, decentre, source size,
+    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the chief ray. Accuracy:
+    ``error`` of the record, relative L2.
+    """
+    from metalens import psf
+
+    parts = []
+    for angle in view.angles_rad:
+        t = pillars(lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes)
+        parts.append(
+            psf.psf_stack(
+                np.angle(t).astype(np.float32),
+                np.abs(t).astype(np.float32),
+                pitch_um=lens.diameters.pitch_um,
+                wavelength_um=lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+                sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
+                depths_um=np.array(view.depths_um),
+                angle_rad=[list(angle)],
+                window_um=view.window_um,
+                samples=view.samples,
+                tolerance=tolerance,
+                offset_um=offset_um,
+            )
+        )
+    worst = max(parts, key=lambda part: part.error)
+    fields = ("intensity", "energy_um2", "angles_rad", "centres_um")
+    join: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+    return dataclasses.replace(worst, **join)

@@ -1,0 +1,100 @@
+"""The parameters of an as-built lens and its bench: what each means, in which unit, and what is known beforehand.
+
+Those of the lens are the table of :mod:`metalens.made.causes`; those of the bench stand here.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, nearest
+from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, named
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number that describes lens or bench.
+
+    scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without any metrology (inf: none).
+    low, high: bounds. free: fitted unless told otherwise.
+    """
+
+    name: str
+    meaning: str
+    scale: float
+    sigma: float = math.inf
+    low: float = -math.inf
+    high: float = math.inf
+    start: float = 0.0
+    free: bool = True
+
+
+def _of(row: Cause) -> Parameter:
+    return Parameter(row.name, row.meaning, row.scale, row.sigma, row.low, row.high, free=row.free)
+
+
+_OF_LENS = {row.name: _of(row) for row in CAUSES}
+PARAMETERS: tuple[Parameter, ...] = (
+    *(_OF_LENS[name] for name in (*named(Widens), *named(Answers))),
+    Parameter("wavelength_nm", "wavelength minus stated", 0.3, 0.5, -5.0, 5.0),
+    Parameter("bandwidth_nm", "standard deviation of the spectrum", 0.5, 1.0, 0.0, 8.0, free=False),
+    Parameter("distance_um", "lens to sensor, minus design", 2.0, 100.0, -400.0, 400.0),
+    Parameter("decentre_x_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
+    Parameter("decentre_y_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
+    Parameter("tilt_x_deg", "tilt of the lens about the y axis", 0.2, 1.0, -3.0, 3.0, free=False),
+    Parameter("tilt_y_deg", "tilt of the lens about the x axis", 0.2, 1.0, -3.0, 3.0, free=False),
+    Parameter("source_x_um", "source off the stage's axis", 5.0, 50.0, -300.0, 300.0, free=False),
+    Parameter("source_y_um", "source off the stage's axis", 5.0, 50.0, -300.0, 300.0, free=False),
+    Parameter("stage_zero_um", "true source depth minus stated (with the substrate's plate shift)", 50.0, 1000.0),
+    Parameter("stage_scale", "true stage step over stated, minus 1", 1e-3, 0.01, -0.05, 0.05),
+    *(_OF_LENS[name] for name in named(Bends)),
+    Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False),
+    Parameter("crosstalk_px", "standard deviation of pixel crosstalk and vibration", 0.1, 0.3, 0.02, 3.0, start=0.2),
+    Parameter("log_gain", "logarithm of the electrons through the aperture in a frame at the reference depth", 0.02),
+    Parameter("background_e", "background at the window's centre", 2.0),
+    Parameter("background_x_e", "background at the right edge less that at the centre", 2.0),
+    Parameter("background_y_e", "background at the lower edge less that at the centre", 2.0),
+)
+NAMES = tuple(p.name for p in PARAMETERS)
+PLACE = {name: i for i, name in enumerate(NAMES)}
+_CAUSES = [PLACE[row.name] for row in CAUSES]
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What metrology says of a parameter: spectrometer (wavelength), AFM (height), SEM (bias), ellipsometer (index).
+
+    sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely.
+    """
+
+    name: str
+    value: float
+    sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.name not in PLACE:
+            raise ConfigError(f"unknown parameter {self.name!r}{nearest(self.name, NAMES)}")
+        if not math.isfinite(self.value) or not self.sigma >= 0:
+            raise ConfigError(f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0")
+
+
+def vector(values: Mapping[str, float] | None = None) -> Array:
+    """(parameters,) starts, with some set by name.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    out = np.array([p.start for p in PARAMETERS])
+    for name, value in (values or {}).items():
+        if name not in PLACE:
+            raise ConfigError(f"unknown parameter {name!r}{nearest(name, NAMES)}")
+        out[PLACE[name]] = value
+    return out
+
+
+def state(x: Array) -> State:
+    """The made lens that all parameters mean; what belongs to the bench is left out."""
+    return State(x[_CAUSES])

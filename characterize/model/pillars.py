@@ -1,0 +1,164 @@
+"""What a change of the pillars does to their transmission, as few functions of the designed diameter.
+
+t(D + b; height, index, sidewall, wavelength) for all small changes lies close to a space of a few functions u_k(D);
+summing the lens once for each u_k makes every change of process act on coarse nodes (see :mod:`reduced`).
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.model.parameters import PLACE, state
+from metalens.ground.arrays import Array
+from metalens.lens import Lens
+from metalens.made import Answers, Sensitivity, of_kind, transmission
+from metalens.pillars import Proxy
+
+_ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
+_ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
+_ROWS = [row for _, row in of_kind(Answers)]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Change of the pillars that is the same all over the lens: the answering causes in base units, and the wavelength.
+
+    Zeros are the design.
+    """
+
+    answers: tuple[float, ...] = (0.0,) * len(_ROWS)
+    wavelength_um: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Largest change of each kind that a low-rank basis must hold; beyond it the fit is refused."""
+
+    bias_um: float = 0.03
+    answers: tuple[float, ...] = tuple(_ROOM * max(-row.low, row.high) * row.unit for row in _ROWS)
+    wavelength_um: float = 0.006
+
+
+class Pillars:
+    """Transmission of pillars under change, exact and in its low-rank basis.
+
+    basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,) biases where coefficients are
+    formed. error: largest |t - low-rank| met on random changes inside the range, that the basis was not made from.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        response: Sensitivity,
+        *,
+        span: Range | None = None,
+        tolerance: float = 3e-5,
+        angle_rad: float = 0.0,
+    ) -> None:
+        span = span or Range()
+        self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
+        built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+        self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
+        b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
+        self.nodes_um = np.cos(np.pi * (np.arange(b) + 0.5) / b) * span.bias_um
+        self._slopes = response.at(self.diameter_um + self.nodes_um[:, None])
+        self._designed: dict[float, Array] = {}
+        columns = np.concatenate([self._at_nodes(p) for p in self._training()])
+        u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
+        tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
+        self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
+        self.error = self._measure()
+
+    def exact(self, bias_um: Array | float, change: Change) -> Array:
+        """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
+        d = self.diameter_um + bias_um
+        wave = self.lens.wavelength_um + change.wavelength_um
+        return transmission(self.lens.proxy, self.response, d, wave, np.array(change.answers), angle_rad=self.angle_rad)
+
+    def coefficients(self, change: Change) -> Array:
+        """(b, r) coefficients of t in the basis at the bias nodes."""
+        return np.asarray(self._at_nodes(change) @ self.basis.T)
+
+    def slopes(self, change: Change) -> Array:
+        """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering causes, in base units."""
+        return np.asarray((self._slopes * self._at_nodes(change)) @ self.basis.T)
+
+    def _at_nodes(self, change: Change) -> Array:
+        """:meth:`exact` at the bias nodes; what the last few wavelengths made of the design is kept."""
+        wave = self.lens.wavelength_um + change.wavelength_um
+        if wave not in self._designed:
+            bias = self.nodes_um[:, None]
+            if len(self._designed) >= 8:
+                self._designed.pop(next(iter(self._designed)))
+            self._designed[wave] = self.exact(bias, Change(wavelength_um=change.wavelength_um))
+        return np.asarray(self._designed[wave] * np.exp(np.tensordot(change.answers, self._slopes, 1)))
+
+    def table(self) -> Array:
+        """(r, entries): the conjugate basis on a fine grid of diameters; the last entry is no pillar."""
+        place = np.linspace(0, len(self.diameter_um) - 1, _ENTRIES)
+        rows = [_cubic(row.conj(), place) for row in self.basis]
+        return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1)
+
+    def place(self, diameter_um: Array) -> Array:
+        """Entry of :meth:`table` nearest to designed diameters (any shape)."""
+        low, high = self.diameter_um[0], self.diameter_um[-1]
+        entry = np.rint((diameter_um - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
+        return np.where(diameter_um > 0, entry, _ENTRIES)
+
+    def weights(self, bias_um: Array) -> tuple[Array, Array]:
+        """(b, *shape) Lagrange weights of the bias nodes at ``bias_um``, and their derivatives."""
+        n = self.nodes_um
+        value = np.ones((len(n), *np.shape(bias_um)))
+        slope = np.zeros_like(value)
+        for i in range(len(n)):
+            for j in range(len(n)):
+                if i != j:
+                    factor = (bias_um - n[j]) / (n[i] - n[j])
+                    slope[i] = slope[i] * factor + value[i] / (n[i] - n[j])
+                    value[i] = value[i] * factor
+        return value, slope
+
+    def _training(self) -> list[Change]:
+        s, waves = self.span, self._waves()
+        single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
+        both = [Change(tuple(sign * one[:-1]), sign * one[-1]) for one in single for sign in (1, -1)]
+        return [Change(), *both, *(_draw(np.random.default_rng(i), s, waves) for i in range(6))]
+
+    def _waves(self) -> bool:
+        return bool(np.ptp(self.lens.proxy.wavelengths_um) > 0)
+
+    def _measure(self) -> float:
+        random = np.random.default_rng(99)
+        worst = 0.0
+        for _ in range(40):
+            change, bias = _draw(random, self.span, self._waves()), random.uniform(-0.7, 0.7) * self.span.bias_um
+            c = self.weights(np.array(bias))[0] @ self.coefficients(change)
+            worst = max(worst, float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()))
+        return worst
+
+
+def change(x: Array) -> Change:
+    """The pillars' change that the parameters mean."""
+    return Change(tuple(state(x).answers().tolist()), float(x[PLACE["wavelength_nm"]]) * 1e-3)
+
+
+def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
+    """Angle of incidence for a field angle (x, y): 0 where the proxy holds at normal incidence only."""
+    tilt = math.atan(math.hypot(*(math.tan(a) for a in angle_rad)))
+    return tilt if proxy.max_angle_rad > 0 else 0.0
+
+
+def _draw(random: np.random.Generator, span: Range, waves: bool) -> Change:
+    *some, wave = random.uniform(-0.7, 0.7, len(span.answers) + 1)
+    return Change(tuple(np.array(some) * span.answers), float(wave) * span.wavelength_um * waves)
+
+
+def _cubic(values: Array, place: Array) -> Array:
+    """Catmull-Rom interpolation on an even grid; error of order h³, 1e-6 here."""
+    i = np.clip(place.astype(int), 1, len(values) - 3)
+    t = place - i
+    a, b, c, d = values[i - 1], values[i], values[i + 1], values[i + 2]
+    inner = c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a))
+    return np.asarray(b + 0.5 * t * inner)

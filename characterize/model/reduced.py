@@ -1,0 +1,211 @@
+"""The lens gathered on coarse nodes, and the way from there to a sensor window.
+
+E(X, Y) = sum over nodes of G_pq f_pq K, where the nodes are direction cosines (p, q) seen from the window's centre,
+G is the lens without its known focusing phase, f is whatever acts smoothly over the aperture, and
+K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) is a factor of (p, X), one of (q, Y), one of (X, Y) and a smooth rest of
+low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pillars, so the result is that of the full
+sum for every smooth f.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.model.kernel import Kernel, digits, factors, precision, turns
+from characterize.model.pillars import Pillars
+from metalens.ground import legendre, threads
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.ground.paths import sensor_path, source_path
+from metalens.lens import Lens
+
+_BESIDE = 0.1  # weight of directions that miss the lens when the low-rank terms are chosen
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Where source, lens and sensor stand for one field angle.
+
+    tangents: (x, y) of the chief ray; the window sits where it meets the sensor.
+    reference_um: source depth whose phase is taken off before gathering.
+    """
+
+    distance_um: float
+    wavelength_um: float
+    reference_um: float
+    tangents: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Operators:
+    """From nodes to window for one wavelength and distance: along_y (Y, q), along_x (p, X), low-rank terms.
+
+    remainder: (rank,) relative size of what is left out before each term.
+    """
+
+    along_y: Array
+    along_x: Array
+    lens_terms: Array
+    window_terms: Array
+    remainder: Array
+
+    def field(self, light: Array, *, tolerance: float = 0.0) -> Array:
+        """(..., q, p) -> (..., Y, X) in the precision of the operators; fewer terms with a ``tolerance``."""
+        kind = self.along_y.dtype
+        out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), kind)
+        terms = max(1, int((self.remainder > tolerance).sum()))
+        light = light.astype(kind, copy=False)
+        flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
+
+        def some(first: int, last: int) -> None:
+            for lens, window in zip(self.lens_terms[:terms], self.window_terms[:terms], strict=True):
+                for i in range(first, last):
+                    result[i] += (self.along_y @ ((flat[i] * lens) @ self.along_x)) * window
+
+        with threads.one_blas_thread():
+            threads.split(len(flat), some)
+        return out
+
+
+class Reduced:
+    """A lens on nodes for one field angle.
+
+    nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same over the lens radius.
+    gathered: (r, q, p) one field for each function of :class:`Pillars`.
+
+    Tables and sums are in single precision where ``tolerance`` lets them be, else in double: see :func:`precision`.
+    """
+
+    def __init__(
+        self, lens: Lens, pillars: Pillars, bench: Bench, *, window_um: float, depths_um: Array, tolerance: float
+    ) -> None:
+        self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
+        self._kind = precision(tolerance)
+        self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
+        self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
+        self.k = 2 * math.pi / bench.wavelength_um
+        self._operators: dict[tuple[float, float, tuple[int, int]], Operators] = {}
+        self._directions(depths_um)
+        self.gathered = self._gather(lens, pillars)
+        self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
+
+    def _directions(self, depths_um: Array) -> None:
+        d, (cx, cy) = self.bench.distance_um, self.center_um
+        hy, hx = self.half_um
+        edge = np.linspace(-1, 1, 41)
+        x, y = (g.ravel() for g in np.meshgrid(edge * hx - cx, edge * hy - cy))
+        r = np.sqrt(x**2 + y**2 + d**2)
+        self._p = float((x / r).min()), float((x / r).max())
+        self._q = float((y / r).min()), float((y / r).max())
+        swing = self.k * self.window_um / 2 * max(np.ptp(self._p), np.ptp(self._q)) / 2
+        inverse = np.abs(1 / np.asarray(depths_um) - 1 / self.bench.reference_um).max()
+        blur = self.k * inverse * self.radius_um**2 / 2
+        more = 1.5 * digits(self.tolerance)
+        self.nodes = int(math.ceil(swing + blur + 14 + 2.5 * (swing + 1) ** (1 / 3) + more))
+        if self.nodes > 600:
+            raise FitError(f"window of {self.window_um:.0f} um needs {self.nodes} nodes a side; fit a smaller window")
+        p, q = legendre.mapped(self.nodes, *self._p), legendre.mapped(self.nodes, *self._q)
+        self.p, self.q = np.meshgrid(p, q)
+        if (self.p**2 + self.q**2).max() >= 0.98:
+            raise FitError("the aperture angle is too wide for the reduced model; need below 45 degrees across corners")
+        r_w = d / np.sqrt(1 - self.p**2 - self.q**2)
+        self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
+
+    @property
+    def center_um(self) -> tuple[float, float]:
+        """(x, y) of the window on the sensor at the nominal distance."""
+        tx, ty = self.bench.tangents
+        return self.bench.distance_um * tx, self.bench.distance_um * ty
+
+    def _gather(self, lens: Lens, pillars: Pillars) -> Array:
+        d = lens.diameters
+        x, y = d.x_um, d.y_um
+        hy, hx = self.half_um
+        n, r = self.nodes + 6, len(pillars.basis)
+        real_kind = np.empty(0, self._kind).real.dtype
+        across, along = (legendre.interpolation(n, t).astype(real_kind) for t in (x / hx, y / hy))
+        table = pillars.table().astype(self._kind)
+        block = max(1, 200_000 // len(x))
+        parts = [slice(start, start + block) for start in range(0, len(y), block)]
+        sums = np.zeros((len(parts), r, n, n), self._kind)
+
+        def some(first: int, last: int) -> None:
+            for i in range(first, last):
+                rows = parts[i]
+                path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
+                light = table[:, pillars.place(d.diameter_um[rows])] * turns(self.k * path, self._kind)
+                halves = np.concatenate([light.real, light.imag]).reshape(-1, len(x)) @ across
+                real, imaginary = along[rows].T @ halves.reshape(2, r, -1, n)
+                sums[i] = real + 1j * imaginary
+
+        with threads.one_blas_thread():
+            threads.split(len(parts), some)
+        return self._to_directions(sums.sum(0, dtype=complex), n)
+
+    def _to_directions(self, fields: Array, n: int) -> Array:
+        """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
+        hy, hx = self.half_um
+        x, y = legendre.mapped(n, -hx, hx), legendre.mapped(n, -hy, hy)
+        (cx, cy), d, m = self.center_um, self.bench.distance_um, self.nodes
+        p = (x[None] - cx) / np.sqrt((x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2)
+        turned = np.stack([fields[:, j] @ _at(m, self._p, p[j]) for j in range(n)], 1)
+        q = (y - cy)[None] * np.sqrt(1 - self.p[0][:, None] ** 2) / np.sqrt((y - cy)[None] ** 2 + d**2)
+        out = np.stack([turned[:, :, a] @ _at(m, self._q, q[a]) for a in range(m)], 2)
+        return np.asarray(out)
+
+    def path(self, x: Array, y: Array, distance_um: float, bench: Bench) -> Array:
+        """Path from the reference source by (x, y) on the lens to the window's centre, um, less that by the axis."""
+        tx, ty = bench.tangents
+        centre = distance_um * tx, distance_um * ty
+        return np.asarray(source_path(x, y, (tx, ty), 1 / bench.reference_um) + sensor_path(x, y, centre, distance_um))
+
+    def operators(self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
+        """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples.
+
+        The last few are kept: most steps of a search move neither.
+        """
+        key = wavelength_um, distance_um, (len(axes_um[0]), len(axes_um[1]))
+        if key not in self._operators:
+            if len(self._operators) >= 6:
+                self._operators.pop(next(iter(self._operators)))
+            self._operators[key] = self._operators_of(wavelength_um, distance_um, axes_um)
+        return self._operators[key]
+
+    def _operators_of(self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
+        kernel = Kernel(
+            2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
+        )
+        y, x = axes_um
+        wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
+        w, m = kernel.counts(wy, wx, self.tolerance)
+        Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
+        P, Q = legendre.mapped(m, *self._p), legendre.mapped(m, *self._q)[:, None]
+        weight = np.where(np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE)
+        table = np.empty((w, w, m, m), self._kind)
+        for layer, height in zip(table, Y, strict=True):
+            layer[:] = weight * kernel.rest(P, Q, X[:, None, None], height, self._kind)
+        columns, rows, remainder = factors(table.reshape(w * w, m * m), self.tolerance)
+        iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
+        window = np.einsum("Yj,jir,Xi->rYX", iy, columns.reshape(w, w, -1), ix, optimize=True)
+        to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
+        lens = np.einsum("bq,rqp,ap->rba", to_p, rows.reshape(-1, m, m) / weight, to_p, optimize=True)
+        ways = kernel.along_y(self.q[:, 0], y[:, None]), kernel.along_x(self.p[0][:, None], x)
+        terms = lens * self.pitch_um**2, window * kernel.window(x, y[:, None])
+        a, b, c, d = (part.astype(self._kind) for part in (*ways, *terms))
+        return Operators(a, b, c, d, remainder)
+
+    def small_change(self, axes_um: tuple[Array, Array]) -> float:
+        """Relative change of wavelength or distance that turns no path inside the window by more than 4 mrad."""
+        reach = max(float(np.abs(axis).max()) for axis in axes_um)
+        return 4e-3 / (self.k * reach * float(np.abs([self._p, self._q]).max()))
+
+    def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
+        """(x, y) on the lens of direction cosines seen from the window's centre."""
+        r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
+        return self.center_um[0] + r * p, self.center_um[1] + r * q
+
+
+def _at(count: int, span: tuple[float, float], values: Array) -> Array:
+    low, high = span
+    return np.asarray(legendre.interpolation(count, (2 * values - low - high) / (high - low)))

@@ -1,0 +1,84 @@
+"""Smooth phases over the aperture without a formula: thin-plate modes of what the parameters cannot do.
+
+A bicubic spline less piston, tilt, defocus and the low Zernikes; its modes (Wahba 1990) are equal in rms and ordered by
+bending energy: the more a mode bends, the less likely it is.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+from scipy.interpolate import BSpline, RectBivariateSpline
+
+from metalens.ground.arrays import Array
+from metalens.made import Bends, maps
+
+MODES, KNOTS, EXPECTED_RAD = 24, 9, 0.3
+_GRID = 61
+
+
+def phase_rad(modes: Array, u: Array, v: Array) -> Array:
+    """(len(v), len(u)) phase of ``modes`` (m,) on a grid of lens places over the radius; 1e-5 of its size."""
+    t = np.linspace(-1, 1, 129)
+    coarse = np.tensordot(modes, basis(*np.meshgrid(t, t), len(modes)), 1)
+    return np.asarray(RectBivariateSpline(t, t, coarse)(np.clip(v, -1, 1), np.clip(u, -1, 1)))
+
+
+def basis(u: Array, v: Array, count: int = MODES) -> Array:
+    """(count, *shape) modes at lens places over the radius, of unit rms on the disc."""
+    weights, taken, _ = _modes()
+    splines, known = _splines(u, v), _known(u, v)
+    return np.asarray(np.tensordot(weights[:count], splines, 1) - np.tensordot(taken[:count], known, 1))
+
+
+def prior_rad() -> Array:
+    """(modes,) expected size of every mode: EXPECTED_RAD for the smoothest, then as its bending energy to the -1/2."""
+    energy = _modes()[2]
+    return np.asarray(EXPECTED_RAD * np.sqrt(energy[0] / energy))
+
+
+def _splines(u: Array, v: Array) -> Array:
+    """(KNOTS², *shape) bicubic B-splines on -1 to 1 along both axes, held at the rim outside."""
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, KNOTS - 2), [1.0] * 3])
+
+    def along(t: Array) -> Array:
+        inside = np.clip(t.ravel(), -1, 1)
+        return np.asarray(BSpline.design_matrix(inside, knots, 3).toarray().T.reshape(KNOTS, *t.shape))
+
+    return np.asarray(np.einsum("i...,j...->ij...", along(v), along(u)).reshape(KNOTS**2, *u.shape))
+
+
+def _known(u: Array, v: Array) -> Array:
+    """(4 + wave-front causes, *shape) what parameters already do: piston, tilt, defocus, aberrations."""
+    return np.concatenate([np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(Bends, u, v)])
+
+
+@functools.lru_cache
+def _modes() -> tuple[Array, Array, Array]:
+    """Least bending energy at unit rms, in the span of splines less the known shapes.
+
+    ((MODES, splines), (MODES, known), (MODES,) energy): a mode is the first @ splines - the second @ known.
+    """
+    t = np.linspace(-1, 1, _GRID)
+    u, v = np.meshgrid(t, t)
+    inside = np.hypot(u, v) <= 1
+    splines, known = _splines(u, v).reshape(KNOTS**2, -1), _known(u, v).reshape(11, -1)
+    disc = inside.ravel()
+    taken = np.linalg.lstsq(known[:, disc].T, splines[:, disc].T, rcond=None)[0].T
+    rest = (splines - taken @ known).reshape(-1, _GRID, _GRID)
+    mass = rest[:, inside] @ rest[:, inside].T / inside.sum()
+    size, vectors = np.linalg.eigh(mass)
+    some = vectors[:, size > 1e-5 * size[-1]] / np.sqrt(size[size > 1e-5 * size[-1]])
+    bend = _bending(rest, inside, t[1] - t[0])
+    energy, turn = np.linalg.eigh(some.T @ bend @ some)
+    weights = (some @ turn[:, :MODES]).T
+    return weights, weights @ taken, energy[:MODES]
+
+
+def _bending(shapes: Array, inside: Array, step: float) -> Array:
+    """(k, k) mean of f_uu g_uu + 2 f_uv g_uv + f_vv g_vv over the disc, by differences."""
+    gradient: Callable[..., list[Array]] = np.gradient
+    by_v, by_u = gradient(shapes, step, axis=(1, 2))
+    parts = [*gradient(by_u, step, axis=(1, 2)), gradient(by_v, step, axis=(1, 2))[0]]
+    sums = [part[:, inside] @ part[:, inside].T for part in parts]
+    return np.asarray((2 * sums[0] + sums[1] + sums[2]) / inside.sum())

@@ -1,0 +1,264 @@
+"""A generic pupil: through-focus images of a small bead by any objective, from NA, wavelength and pixel alone.
+
+Vectorial Debye integral for an isotropic incoherent emitter (Richards and Wolf 1959; six components, aplanatic
+apodisation 1 / sqrt(cos theta)), or its scalar form for low apertures; phase and log-amplitude are Zernike sums.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from characterize.model import detector
+from characterize.pupil import zernike
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError, FitError
+
+_BLOCK = 1 << 22  # samples of the fields that are formed at once
+_SHARP = 0.01  # pixels of blur that are none: 5e-4 of the finest detail
+
+
+@dataclass(frozen=True, slots=True)
+class PupilSpec:
+    """What is known of the microscope or lens; TOML of ``metalens fit --pupil``.
+
+    numerical_aperture: on the object side, below ``index``.
+    wavelength_um: in vacuum, of the light; pixel_um: in object space (sensor pixel over magnification).
+    index: of the medium between bead and lens.
+    step_um: stage step, used where the capture has no positions.
+    bead_um: diameter of an evenly glowing bead (0: a point).
+    window: pixels of the square that is fitted, centred on the bead; center: its (row, column), else found.
+    phase_order, amplitude_order: highest radial Zernike order of phase and of log-amplitude.
+    drift_order: of the polynomial sideways drift through the stack.
+    model: vector or scalar; auto takes vector above NA / index 0.6.
+    model_error: share of the light that no model of this kind explains; keeps bright pixels from ruling the fit.
+    """
+
+    numerical_aperture: float
+    wavelength_um: float = math.nan
+    pixel_um: float = math.nan
+    index: float = 1.0
+    step_um: float = math.nan
+    bead_um: float = 0.0
+    window: int = 40
+    center: tuple[int, int] | None = None
+    phase_order: int = 8
+    amplitude_order: int = 5
+    drift_order: int = 3
+    model: Literal["auto", "vector", "scalar"] = "auto"
+    model_error: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0 < self.numerical_aperture < self.index:
+            raise FitError(f"numerical_aperture = {self.numerical_aperture}: need above 0 and below index {self.index}")
+        for key in ("wavelength_um", "pixel_um", "step_um"):
+            if not math.isnan(getattr(self, key)) and not 0 < abs(getattr(self, key)) < math.inf:
+                raise FitError(f"{key} = {getattr(self, key)}: need a finite length other than 0")
+        if self.phase_order < 4 or min(self.amplitude_order, self.drift_order) < 0 or self.window < 8:
+            raise FitError(
+                "need phase_order >= 4, amplitude_order >= 0, drift_order >= 0 and a window of 8 pixels or more"
+            )
+
+    @property
+    def sine(self) -> float:
+        """Sine of the half aperture angle."""
+        return self.numerical_aperture / self.index
+
+    @property
+    def vectorial(self) -> bool:
+        """Whether the six-component model is used."""
+        return self.model == "vector" or (self.model == "auto" and self.sine > 0.6)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which parameter is where: phase, log-amplitude, drift x and y, blur, gain and background of each frame."""
+
+    phase: int
+    amplitude: int
+    drift: int
+    frames: int
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.phase + self.amplitude + 2 * self.drift + 1 + 2 * self.frames
+
+    def split(self, x: Array) -> tuple[Array, Array, Array, Array, float, Array, Array]:
+        """The groups, in the order above."""
+        ends = np.cumsum([self.phase, self.amplitude, self.drift, self.drift, 1, self.frames, self.frames])
+        phase, amplitude, dx, dy, blur, gain, background = np.split(x, ends[:-1])
+        return phase, amplitude, dx, dy, float(blur[0]), gain, background
+
+
+class PupilModel:
+    """Images of one bead at given stage positions as a function of the parameters of :class:`Layout`.
+
+    Accuracy: the pupil is sampled finely enough that images of ``window`` pixels do not wrap around at the farthest
+    defocus; the rim of the disc is weighted by the covered share of its cells.
+    """
+
+    def __init__(self, spec: PupilSpec, position_um: Array, *, phase_order: int, amplitude_order: int) -> None:
+        _need(spec, position_um)
+        self.spec, self.position_um = spec, position_um
+        self.span_um = max(float(np.abs(position_um).max()), 1e-9)
+        highest = 2 * spec.numerical_aperture / spec.wavelength_um
+        over = detector.fine_enough(spec.pixel_um, highest)
+        self.grid = detector.Grid(spec.window, spec.window, spec.pixel_um, over, margin=3)
+        self._sample_pupil(phase_order, amplitude_order)
+        fy, fx = self.grid.frequencies()
+        fixed = detector.pixel(fy, fx, spec.pixel_um) if over > 1 else np.ones_like(fy * fx)
+        self._fixed, self._f = fixed * detector.ball(fy, fx, spec.bead_um), (fy, fx)
+        self._sharp = over == 1 and not spec.bead_um
+
+    def _sample_pupil(self, phase_order: int, amplitude_order: int) -> None:
+        spec, k = self.spec, 2 * math.pi * self.spec.index / self.spec.wavelength_um
+        sine, width = spec.sine, (spec.window + 6) * spec.pixel_um
+        blur = 2 * self.span_um * sine / math.sqrt(1 - sine**2)
+        nodes = 2 * math.ceil(sine * spec.index / spec.wavelength_um * (width + blur) * 0.55 + 6)
+        q = (np.arange(nodes) - (nodes - 1) / 2) * (2 * sine / nodes)
+        sx, sy = np.meshgrid(q, q)
+        weight = np.clip((sine - np.hypot(sx, sy)) / (q[1] - q[0]) + 0.5, 0, 1)
+        self.inside = weight > 0
+        self.sx, self.sy = sx[self.inside], sy[self.inside]
+        squeeze = np.minimum(1, sine / np.maximum(np.hypot(self.sx, self.sy), 1e-12))
+        self.cosine = np.sqrt(1 - (self.sx * squeeze) ** 2 - (self.sy * squeeze) ** 2)
+        self.k, self.nodes = k, nodes
+        self.phase_indices = zernike.indices(2, phase_order)
+        self.amplitude_indices = zernike.indices(1, amplitude_order)
+        u, v = self.sx * squeeze / sine, self.sy * squeeze / sine
+        self.phase_basis = zernike.basis(self.phase_indices, u, v)
+        self.amplitude_basis = zernike.basis(self.amplitude_indices, u, v)
+        turns = np.concatenate([1j * self.phase_basis, self.amplitude_basis, -1j * k * np.stack([self.sx, self.sy])])
+        self._columns = self._square(turns.astype(np.complex64))
+        self.components = weight[self.inside] * _components(self.sx * squeeze, self.sy * squeeze, spec.vectorial)
+        y, x = self.grid.axes_um()
+        self._ey, self._ex = np.exp(1j * k * y[:, None] * q), np.exp(1j * k * q[:, None] * x)
+        period = 2 * math.pi / (k * (q[1] - q[0]))
+        self._norm = (self.grid.pixel_um / period) ** 2
+
+    def layout(self) -> Layout:
+        """Where each parameter is."""
+        n = len(self.position_um)
+        return Layout(len(self.phase_indices), len(self.amplitude_indices), self.spec.drift_order + 1, n)
+
+    def names(self) -> list[str]:
+        """Name of every parameter, with its unit."""
+        n, drift = len(self.position_um), range(self.spec.drift_order + 1)
+        return [
+            *(f"phase {zernike.name(i)} / rad" for i in self.phase_indices),
+            *(f"log-amplitude {zernike.name(i)}" for i in self.amplitude_indices),
+            *(f"drift {axis} order {j} / um" for axis in "xy" for j in drift),
+            "blur / um",
+            *(f"log-gain {i}" for i in range(n)),
+            *(f"background {i} / e" for i in range(n)),
+        ]
+
+    def images(self, x: Array, jacobian: bool) -> tuple[Array, Array | None]:
+        """Expected images (n, window, window) in electrons, and their derivatives by every parameter."""
+        layout = self.layout()
+        phase, amplitude, dx, dy, blur, gain, background = layout.split(x)
+        envelope = self.components * np.exp(amplitude @ self.amplitude_basis)
+        total = (envelope**2).sum()
+        scale = (np.exp(gain) * self._norm / total)[:, None, None]
+        pupil = self._square(self._pupils(phase, dx, dy)[:, None] * envelope)
+        sharp = self._sharp and blur <= _SHARP * self.spec.pixel_um
+        field = self._transform(pupil, sharp)
+        intensity = (field.real**2 + field.imag**2).sum(1)
+        transfer = None if sharp else self._fixed * detector.gauss(*self._f, blur)[0]
+        light = self._seen(intensity, transfer) * scale
+        image = light + background[:, None, None]
+        if not jacobian:
+            return image, None
+        out = np.zeros((layout.size, *image.shape))
+        self._pupil_columns(out, layout, (pupil.astype(np.complex64), field.astype(np.complex64)), transfer)
+        out[: layout.size - 2 * layout.frames - 1] *= scale
+        for j, z in enumerate(self.amplitude_basis, layout.phase):
+            out[j] -= light * (2 * (envelope**2 * z).sum() / total)
+        by_blur = None if sharp else self._fixed * detector.gauss(*self._f, blur)[1]
+        self._linear_columns(out, layout, light, 0 * light if sharp else self._seen(intensity, by_blur) * scale)
+        return image, out
+
+    def _seen(self, intensity: Array, transfer: Array | None) -> Array:
+        """Intensity (..., y, x) through bead, blur and pixels; as it is, one sample a pixel, without a transfer."""
+        return intensity if transfer is None else self.grid.sample(intensity, transfer)
+
+    def _pupil_columns(self, out: Array, layout: Layout, at: tuple[Array, Array], transfer: Array | None) -> None:
+        """Derivatives by phase, log-amplitude and drift, before the scale: 2 Re E* dE, many at a time."""
+        pupil, field = at
+        first, drift = layout.phase + layout.amplitude, self._legendre()
+        block = max(1, _BLOCK // field.size)
+        for start in range(0, first + 2, block):
+            some = slice(start, min(start + block, first + 2))
+            change = self._transform(pupil * self._columns[some, None, None], transfer is None)
+            both = field.view(np.float32) * change.view(np.float32)
+            slope = 2 * (both[..., ::2] + both[..., 1::2]).sum(2)
+            for j, seen in zip(range(some.start, some.stop), self._seen(slope, transfer), strict=True):
+                if j < first:
+                    out[j] = seen
+                else:  # tilt along x or y, times each polynomial along the stack
+                    place = first + (j - first) * layout.drift
+                    out[place : place + layout.drift] = drift[:, :, None, None] * seen
+
+    def _linear_columns(self, out: Array, layout: Layout, light: Array, blur_slope: Array) -> None:
+        first = layout.size - 2 * layout.frames
+        out[first - 1] = blur_slope
+        for i in range(layout.frames):
+            out[first + i, i] = light[i]
+            out[first + layout.frames + i, i] = 1
+
+    def _pupils(self, phase: Array, dx: Array, dy: Array) -> Array:
+        """(n, inside) phase factors of every frame: aberration, defocus, sideways drift."""
+        drift = self._legendre()
+        angle = (phase @ self.phase_basis)[None] + self.k * self.position_um[:, None] * self.cosine
+        angle = angle - self.k * ((dx @ drift)[:, None] * self.sx + (dy @ drift)[:, None] * self.sy)
+        return np.asarray(np.exp(1j * angle))
+
+    def _legendre(self) -> Array:
+        """(drift order + 1, n) Legendre polynomials along the stack."""
+        return np.asarray(np.polynomial.legendre.legvander(self.position_um / self.span_um, self.spec.drift_order).T)
+
+    def _transform(self, pupil: Array, sharp: bool) -> Array:
+        """(..., nodes, nodes) -> (..., y, x) field on the fine grid; without its margin where nothing blurs."""
+        inner = slice(self.grid.margin, -self.grid.margin) if sharp else slice(None)
+        ey, ex = (way.astype(pupil.dtype) for way in (self._ey[inner], self._ex[:, inner]))
+        rows = pupil.reshape(-1, self.nodes) @ ex
+        return np.asarray(ey @ rows.reshape(*pupil.shape[:-1], -1))
+
+    def _square(self, values: Array) -> Array:
+        """(..., inside) -> (..., nodes, nodes), 0 outside the aperture."""
+        square = np.zeros((*values.shape[:-1], self.nodes, self.nodes), values.dtype)
+        square[..., self.inside] = values
+        return square
+
+
+def _components(sx: Array, sy: Array, vectorial: bool) -> Array:
+    """(5 or 1, inside) amplitudes in the image of dipoles along x, y and z, with the aplanatic 1/sqrt(cos).
+
+    Two of the six are equal, and are one of sqrt(2) times the size.
+    """
+    sine2 = sx**2 + sy**2
+    cosine = np.sqrt(1 - sine2)
+    if not vectorial:
+        return np.asarray(1 / np.sqrt(cosine))[None]
+    angle = np.arctan2(sy, sx)
+    c, s, lower = np.cos(angle), np.sin(angle), cosine - 1
+    rows = [
+        1 + lower * c * c,
+        math.sqrt(2) * lower * s * c,
+        -np.sqrt(sine2) * c,
+        1 + lower * s * s,
+        -np.sqrt(sine2) * s,
+    ]
+    return np.asarray(np.stack(rows) / np.sqrt(cosine))
+
+
+def _need(spec: PupilSpec, position_um: Array) -> None:
+    for key, text in (("wavelength_um", "the light's wavelength"), ("pixel_um", "the pixel in object space")):
+        if math.isnan(getattr(spec, key)):
+            raise CaptureError(
+                f"{key} is missing: give {text} in the pupil file or in capture.toml; it cannot be fitted"
+            )
+    if not np.isfinite(position_um).all():
+        raise CaptureError("stage positions are missing: give step_um in the pupil file, or a stage.csv")

@@ -1,0 +1,31 @@
+"""The network for the lens as made; the next mask."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from codesign.adapt import correction as correction
+    from codesign.adapt import report as report
+    from codesign.adapt import sure as sure
+    from codesign.adapt import train as train
+    from codesign.adapt.reading import bootstrap as bootstrap
+    from codesign.adapt.train import Lenses as Lenses
+    from codesign.adapt.train import RetrainConfig as RetrainConfig
+    from codesign.adapt.train import Source as Source
+    from codesign.adapt.train import network as network
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Lenses": "train",
+        "RetrainConfig": "train",
+        "Source": "train",
+        "bootstrap": "reading",
+        "correction": "",
+        "network": "train",
+        "report": "",
+        "sure": "",
+        "train": "",
+    },
+)

@@ -1,0 +1,173 @@
+"""What the next lithography run should draw: a bias table from the as-built lens, a corrected map, and their gain.
+
+The table undoes what depends on the diameter alone: the mean bias, and through the diameters the phase that height,
+index and sidewall took. What varies over the lens (gradient, bow, saddle) is no table: a corrected diameter map undoes
+it. Both follow from the fit; the gain is simulated on the true lens, or on others of the posterior.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterize.model import PLACE, state
+from codesign.optics import MadeLens, Stack
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError
+from metalens.lens import DiameterMap, Lens
+from metalens.made import STEEPEST, Bias, Sensitivity, State, of_process, transmission
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Correction:
+    """Proposal for the next mask.
+
+    drawn_nm, bias_nm: (knots,) the new bias table: made less drawn diameter, as ``layout`` takes it.
+    old_nm: (knots,) bias of the present table at the same drawn diameters.
+    wanted_um: (knots,) made diameter that gives the designed phase in the process as it is, for ``designed_um``.
+    lens: the design with the unevenness of the bias taken off every pillar; to be drawn with the new table.
+    """
+
+    drawn_nm: Array
+    bias_nm: Array
+    old_nm: Array
+    designed_um: Array
+    wanted_um: Array
+    lens: Lens
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Proposal:
+    """One state of the next lens: its PSFs, Strehl ratio against the designed wave front, and light."""
+
+    name: str
+    stack: Stack
+    strehl: float
+    light: float
+
+
+def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: int = 13) -> Correction:
+    """The correction that fitted parameters ask for.
+
+    Args:
+        x: all parameters of the fit. old: bias that the present mask was drawn with.
+
+    Raises:
+        ConfigError: the table would be steeper than the layout can invert.
+    """
+    printed = design.diameters.diameter_um[design.diameters.diameter_um > 0]
+    designed = np.linspace(float(printed.min()), float(printed.max()), knots)
+    wanted = _wanted_um(design, designed, x, response)
+    drawn = old.drawn_nm(wanted * 1e3 - state(x)["bias_nm"])
+    bias = designed * 1e3 - drawn
+    slope = np.diff(bias) / np.diff(drawn)
+    if np.abs(slope).max() > STEEPEST:
+        raise ConfigError(
+            f"the table would change by {np.abs(slope).max():.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
+            "lens is too far from its design for a table; correct height or index in the process instead"
+        )
+    return Correction(drawn, bias, old.at(drawn), designed, wanted, _evened(design, x))
+
+
+def next_lenses(made: MadeLens, plan: Correction, x_fit: Array, x_true: Array) -> list[Proposal]:
+    """The lens as made, with the new table, with the corrected map too, and at the corrected distance besides.
+
+    Args:
+        x_fit: what the correction was made from. x_true: what the process really does; both all parameters.
+    """
+    table = _drawn_with(made.design, plan, x_fit)
+    full = _drawn_with(plan.lens, plan, x_fit)
+    placed = x_true.copy()
+    placed[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
+    cases = (
+        ("as made", made, x_true),
+        ("new bias table", made.redrawn(table), x_true),
+        ("table and corrected map", made.redrawn(full), x_true),
+        ("and the spacer set right", made.redrawn(full), placed),
+    )
+    goal = made.wave()
+    out = []
+    for name, lens, x in cases:
+        wave = lens.wave(x)
+        out.append(
+            Proposal(name, lens.stack(x), overlap(wave, goal), float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum()))
+        )
+    return out
+
+
+def overlap(one: Array, other: Array) -> float:
+    """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a> <b, b>), best piston."""
+    cross = abs(np.vdot(one, other)) ** 2
+    return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
+
+
+def write(folder: Path, plan: Correction) -> None:
+    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5."""
+    from metalens import lens as lenses
+
+    rows = [f"{d:.3f},{b:.3f}" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)]
+    store.write_text(folder / "bias.csv", "\n".join(["drawn_nm,bias_nm", *rows]) + "\n")
+    pairs = ", ".join(f"[{d:.3f}, {b:.3f}]" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True))
+    store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
+    lenses.save(folder / "lens_corrected.h5", plan.lens)
+
+
+def present_bias(path: Path | None) -> Bias:
+    """The bias that a mask was drawn with, from its PROCESS.toml; none without a file.
+
+    Raises:
+        ConfigError, ProcessError: as :func:`metalens.made.of_process`.
+    """
+    return Bias() if path is None else of_process(path).bias
+
+
+def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -> Array:
+    """Made diameters whose phase in the process as it is equals the designed one, up to a piston."""
+    low, high = design.proxy.domain_um
+    fine = np.linspace(low, min(high, 0.999 * design.diameters.pitch_um), 4001)
+    wave = design.wavelength_um
+    now, meant = (
+        np.unwrap(np.angle(transmission(design.proxy, response, fine, wave, made.answers())))
+        for made in (state(x), State.of())
+    )
+    inside = (fine >= designed[0]) & (fine <= designed[-1])
+    piston = float((now - meant)[inside].mean())
+    goal = np.interp(designed, fine, meant) + piston
+    return np.asarray(np.interp(goal, np.maximum.accumulate(now), fine))
+
+
+def _evened(design: Lens, x: Array) -> Lens:
+    d = design.diameters
+    constant = state(x)["bias_nm"] * 1e-3
+    change = np.empty(d.diameter_um.shape, np.float32)
+    for first in range(0, len(change), 256):
+        rows = slice(first, first + 256)
+        u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um[rows] / d.radius_um)
+        change[rows] = state(x).bias_um(u, v) - constant
+    return _with_diameters(design, d.diameter_um - change, d.diameter_um > 0)
+
+
+def _drawn_with(design: Lens, plan: Correction, x_fit: Array) -> Lens:
+    """The lens whose diameters, made by a process of that bias, are those that the new table aims at."""
+    d = design.diameters.diameter_um
+    aim = np.interp(d, plan.designed_um, plan.wanted_um - plan.designed_um) - state(x_fit)["bias_nm"] * 1e-3
+    return _with_diameters(design, d + aim, d > 0, keep=False)
+
+
+def _with_diameters(design: Lens, diameter_um: Array, there: Array, *, keep: bool = True) -> Lens:
+    """The lens with other diameters, kept within the proxy's domain unless a bias will bring them back into it."""
+    low, high = design.proxy.domain_um if keep else (1e-3, np.inf)
+    top = min(high, 0.999 * design.diameters.pitch_um)
+    inside = np.where(there, np.clip(diameter_um, low, top), 0).astype(np.float32)
+    return dataclasses.replace(
+        design, diameters=DiameterMap(inside, design.diameters.pitch_um), profile=f"{design.profile}, corrected"
+    )
+
+
+def table_rows(plan: Correction) -> list[tuple[Any, ...]]:
+    """Rows of the table for people: drawn diameter, present bias, new bias, designed and aimed diameter, nm."""
+    columns = plan.drawn_nm, plan.old_nm, plan.bias_nm, plan.designed_um * 1e3, plan.wanted_um * 1e3
+    return [tuple(float(v) for v in row) for row in zip(*columns, strict=True)]

@@ -1,0 +1,64 @@
+"""Errors of what a network said, frame by frame, so that they come with intervals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from codesign.train import Answers, Seen
+from metalens.ground.arrays import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Accuracy:
+    """Errors of one network on one lens: (n,) absolute errors of the slippage, mean over axes and along each, in mm.
+
+    The error that the studies speak of is ``slip_mm``, the mean over the three axes.
+    """
+
+    error_mm: Tensor
+    iou: Tensor
+
+    @property
+    def slip_mm(self) -> float:
+        """Mean over frames and axes."""
+        return float(self.error_mm.mean())
+
+    @property
+    def axial_mm(self) -> float:
+        """Mean error of the distance."""
+        return float(self.error_mm[:, 2].mean())
+
+    @property
+    def lateral_mm(self) -> float:
+        """Mean error across."""
+        return float(self.error_mm[:, :2].mean())
+
+    def interval_mm(self, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
+        """95 % interval of ``slip_mm`` by a bootstrap over frames."""
+        low, high = bootstrap(self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed)
+        return low, high
+
+    def values(self) -> dict[str, float]:
+        """The numbers by name, for tables and JSON."""
+        low, high = self.interval_mm()
+        return {
+            "slip_mm": self.slip_mm,
+            "slip_low_mm": low,
+            "slip_high_mm": high,
+            "axial_mm": self.axial_mm,
+            "lateral_mm": self.lateral_mm,
+            "iou": float(self.iou.mean()),
+        }
+
+
+def accuracy(answers: Answers, seen: Seen) -> Accuracy:
+    """Errors of answers against the truth of their frames."""
+    return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou)
+
+
+def bootstrap(values: Array, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of the mean of (n,) values."""
+    rows = np.random.default_rng(seed).integers(0, len(values), (draws, len(values)))
+    low, high = np.quantile(np.asarray(values)[rows].mean(1), [0.025, 0.975])
+    return float(low), float(high)

@@ -1,0 +1,171 @@
+"""The page of a retraining: what the made lens cost, what training on bought back, what the next mask should draw."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign.adapt.correction import Correction, Proposal, table_rows
+from codesign.adapt.train import Lenses, Outcome
+from metalens.ground import report
+from metalens.ground.report import Figure, KeyFigure, Section, Table
+
+CASES = {
+    "designed": "nominal lens, network as it came",
+    "nominal": "nominal lens, trained on as long",
+    "before": "made lens, before retraining",
+    "after": "made lens, after retraining",
+    "known": "made lens, truth known in training",
+}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Story:
+    """Everything that the page shows.
+
+    apart: PSF errors against the nominal lens of the fitted lens and of the lens that judges. curves: {job: (step,
+    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions: in words.
+    """
+
+    outcome: Outcome
+    lenses: Lenses
+    apart: tuple[float, float]
+    curves: dict[str, tuple[list[int], list[float]]]
+    plan: Correction
+    proposals: Sequence[tuple[Proposal, float, float]]
+    cautions: Sequence[str] = field(default_factory=tuple)
+
+
+def write(path: Path, story: Story) -> None:
+    """Write report.html."""
+    o = story.outcome
+    keys = [
+        KeyFigure("slippage error, nominal lens", f"{o.nominal.slip_mm:.3f} mm"),
+        KeyFigure("made lens, before", f"{o.before.slip_mm:.3f} mm"),
+        KeyFigure("made lens, after", f"{o.after.slip_mm:.3f} mm"),
+        KeyFigure("share of the gap won back", _share(o), None if o.recovered is None else o.recovered >= 0.9),
+    ]
+    judge = "the true lens of the virtual bench" if story.lenses.known else "lenses of the posterior not seen before"
+    lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
+    sections = [_accuracy(story), _light(story), _mask(story)]
+    if story.cautions:
+        sections.append(Section("Read with care", "\n\n".join(story.cautions)))
+    report.write(path, "Retrained on the lens as built", sections, lead=lead, key_figures=keys)
+
+
+def _share(o: Outcome) -> str:
+    return "no gap beyond chance" if o.recovered is None else f"{o.recovered:.0%}"
+
+
+def _accuracy(story: Story) -> Section:
+    head = ("case", "slippage error / mm", "95 % interval", "axial / mm", "lateral / mm", "pupil IoU")
+    rows: list[tuple[Any, ...]] = []
+    for name, v in story.outcome.rows().items():
+        interval = f"{v['slip_low_mm']:.3f} to {v['slip_high_mm']:.3f}"
+        rows.append((CASES[name], v["slip_mm"], interval, v["axial_mm"], v["lateral_mm"], v["iou"]))
+    text = (
+        "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
+        "trained on for as many steps as the others, so that no case is credited with more training."
+    )
+    return Section(
+        "Accuracy",
+        text,
+        [
+            Figure(bars(story.outcome), "Slippage error, with its 95 % interval."),
+            Table(head, rows, digits=3),
+            Figure(_curves(story), "Loss while training on."),
+        ],
+    )
+
+
+def bars(outcome: Outcome) -> bytes:
+    """Slippage error of every case as PNG."""
+    rows = outcome.rows()
+    figure, axes = report.canvas(size=(6.4, 2.6))
+    place = np.arange(len(rows))[::-1]
+    values = [v["slip_mm"] for v in rows.values()]
+    reach = [
+        [v["slip_mm"] - v["slip_low_mm"] for v in rows.values()],
+        [v["slip_high_mm"] - v["slip_mm"] for v in rows.values()],
+    ]
+    colours = {"before": "#d1495b", "after": "#2a9d8f"}
+    axes.barh(place, values, xerr=reach, color=[colours.get(n, "#9db4d8") for n in rows], height=0.62, ecolor="#444")
+    axes.set_yticks(place, [CASES[n] for n in rows])
+    axes.set(xlabel="slippage error / mm")
+    axes.grid(axis="y", visible=False)
+    return report.png(figure)
+
+
+def _curves(story: Story) -> bytes:
+    figure, axes = report.canvas(size=(6.4, 2.4))
+    for name, (step, loss) in story.curves.items():
+        width = max(1, len(loss) // 20)
+        smooth = np.convolve(loss, np.ones(width) / width, mode="valid")
+        axes.plot(
+            step[width - 1 :],
+            smooth,
+            label={"nominal": "nominal lens", "retrained": "as built", "known": "truth known"}[name],
+        )
+    axes.set(xlabel="step", ylabel="task loss")
+    axes.legend()
+    return report.png(figure)
+
+
+def _light(story: Story) -> Section:
+    fitted, judged = story.apart
+    text = (
+        f"PSFs of the fitted lens differ from the nominal ones by {fitted:.1%} (relative L2 over all depths), those of "
+        f"the lens that judges by {judged:.1%}. Training drew {len(story.lenses.drawn)} lenses from the posterior."
+    )
+    caption = "Square root of the PSFs on the samples of training, by depth: nominal, fitted, and the lens that judges."
+    return Section("Light", text, [Figure(_psfs(story), caption, wide=True)])
+
+
+def _psfs(story: Story) -> bytes:
+    lenses = story.lenses
+    rows = (
+        ("nominal", lenses.nominal),
+        ("as built", lenses.best),
+        ("true" if lenses.known else "a draw", lenses.judges[0]),
+    )
+    chosen = np.unique(np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int))
+    figure, axes = report.canvas(len(rows), len(chosen), size=(1.15 * len(chosen), 3.6), squeeze=False)
+    for column, depth in enumerate(chosen):
+        top = max(float(s.intensity[depth].max()) for _, s in rows)
+        for row, (label, made) in enumerate(rows):
+            axes[row, column].imshow(made.intensity[depth].clamp_min(0).sqrt().numpy(), vmin=0, vmax=top**0.5)
+            axes[row, column].set(xticks=[], yticks=[])
+            axes[row, column].grid(visible=False)
+            axes[row, 0].set_ylabel(label)
+        axes[0, column].set_title(f"{float(lenses.nominal.depths_um[depth]) * 1e-3:.1f} mm")
+    return report.png(figure)
+
+
+def _mask(story: Story) -> Section:
+    head = ("next lens", "PSF error", "Strehl ratio", "light", "slippage error / mm, network not retrained")
+    rows = [(p.name, error, p.strehl, p.light, slip) for p, error, slip in story.proposals]
+    gain = Table(
+        head, rows, "Simulated with the lens that judges as the truth; Strehl and light against the design.", digits=3
+    )
+    columns = ("drawn / nm", "present bias / nm", "new bias / nm", "designed / nm", "aimed at / nm")
+    table = Table(columns, table_rows(story.plan), "bias.toml holds the new table for PROCESS.toml.")
+    text = (
+        "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
+        "process as it is (height, index, sidewall) makes the designed phase. lens_corrected.h5 also takes off what "
+        "varies over the lens; draw it with the new table. The spacer is no matter of the mask: the last row sets it "
+        "right as well."
+    )
+    return Section(
+        "The next mask", text, [gain, Figure(_table_plot(story.plan), "Bias: made less drawn diameter."), table]
+    )
+
+
+def _table_plot(plan: Correction) -> bytes:
+    figure, axes = report.canvas(size=(5.2, 2.6))
+    axes.plot(plan.drawn_nm, plan.old_nm, "--", color="#888", label="present table")
+    axes.plot(plan.drawn_nm, plan.bias_nm, "o-", label="new table")
+    axes.set(xlabel="drawn diameter / nm", ylabel="bias / nm")
+    axes.legend()
+    return report.png(figure)

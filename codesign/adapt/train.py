@@ -1,0 +1,402 @@
+"""The network trained on for the lens that was made: the inner loop on its PSFs, with the optics fixed.
+
+Training draws a lens from the posterior of the fit at every step, so the network trusts no parameter more than the
+captures do. What retraining bought is measured against three others: the nominal lens, the made lens before, and, on
+a virtual bench, a network that was trained with the truth known.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from characterize.bench import Truth
+from characterize.inference import AsBuilt
+from codesign.adapt import reading
+from codesign.adapt.reading import Accuracy
+from codesign.batches import TEST
+from codesign.network import Architecture, Supernet, check, recalibrate
+from codesign.optics import MadeLens, Stack, built
+from codesign.train import (
+    Batch,
+    InnerConfig,
+    Record,
+    Run,
+    RunConfig,
+    Scenes,
+    Schedule,
+    Trainer,
+    assess,
+    checkpoint,
+    model,
+)
+from codesign.train import run as runs
+from metalens.ground import manifest
+from metalens.ground.errors import ConfigError, FitError, TrainingError
+from metalens.lens import Lens
+
+APART = 7919  # between the seeds of retrainings: no step of one is a step of another
+JOBS = ("nominal", "retrained", "known")  # networks that are trained on: for the design, the fit, and the truth
+
+
+@dataclass(frozen=True, slots=True)
+class RetrainConfig:
+    """How to train on.
+
+    steps: of the inner loop; its batch and loss weights are those of the run. rate: largest learning rate.
+    draws: lenses from the posterior that training sees; judge: other ones that judge it where the truth is not known.
+    test_batches: frames that judge, in batches of the run. seed: of draws, frames and noise.
+    budget_mmacs: which network of the run; 0 for the one of the largest budget.
+    """
+
+    steps: int = 200
+    rate: float = 1.5e-3
+    draws: int = 8
+    judge: int = 4
+    test_batches: int = 16
+    seed: int = 0
+    budget_mmacs: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.draws, self.judge, self.test_batches) < 1 or not self.rate > 0:
+            raise ConfigError(f"{self}: need steps, draws, judge and test_batches of 1 or more, and a rate above 0")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Source:
+    """A finished run that is trained on: its network, the architecture that was chosen, its row of result.json."""
+
+    run: Run
+    architecture: Architecture
+    row: dict[str, Any]
+
+    @property
+    def settings(self) -> RunConfig:
+        """The run's settings."""
+        return self.run.settings
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lenses:
+    """PSFs of the lens in question.
+
+    nominal: as designed. best: of the fitted values. drawn: from the posterior, for training. judges: those that
+    judge: the truth where it is known, else further draws. known: whether it is.
+    """
+
+    nominal: Stack
+    best: Stack
+    drawn: tuple[Stack, ...]
+    judges: tuple[Stack, ...]
+    known: bool
+
+
+def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
+    """Standard error of the difference of two mean slippage errors over the frames, which both cases share."""
+    apart = (worse.error_mm - better.error_mm).mean(1)
+    return float(apart.std()) / math.sqrt(len(apart))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Outcome:
+    """Accuracy in the order of the story.
+
+    designed: the run's network on the nominal lens, as it was. nominal: trained on for the nominal lens just as long,
+    so that the others are not credited with more training. before: that network on the made lens. after: retrained on
+    the fit. known: trained on with the truth known; None on a real bench.
+    """
+
+    designed: Accuracy
+    nominal: Accuracy
+    before: Accuracy
+    after: Accuracy
+    known: Accuracy | None
+
+    @property
+    def gap_mm(self) -> float:
+        """What the made lens costs an unwarned network."""
+        return self.before.slip_mm - self.nominal.slip_mm
+
+    @property
+    def gap_sigma_mm(self) -> float:
+        """Standard error of the gap."""
+        return gap_sigma_mm(self.before, self.nominal)
+
+    @property
+    def recovered(self) -> float | None:
+        """Share of the gap that retraining wins back; None where the gap is within two of its standard errors."""
+        if self.gap_mm <= 2 * self.gap_sigma_mm:
+            return None
+        return (self.before.slip_mm - self.after.slip_mm) / self.gap_mm
+
+    def rows(self) -> dict[str, dict[str, float]]:
+        """Numbers by name of the case."""
+        cases = {n: getattr(self, n) for n in ("designed", "nominal", "before", "after", "known")}
+        return {name: case.values() for name, case in cases.items() if case is not None}
+
+
+def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
+    """A finished run and its network of this budget.
+
+    Raises:
+        TrainingError: no run folder, half written, unfinished, of another version, or without such a budget.
+    """
+    names = ("run.toml", "checkpoint.safetensors", "lens.h5", "result.json")
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        what = "no run folder" if len(missing) == len(names) else "a half-written run"
+        raise TrainingError(
+            f"{folder} is {what}: {', '.join(missing)} missing; finish it with "
+            f"`metalens codesign RUN.toml -o {folder} --resume`"
+        )
+    manifest.check(folder)
+    settings = runs.load(folder / "run.toml")
+    made = runs.resume(folder / "checkpoint.safetensors", settings)
+    rows = rows_of(folder)
+    found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
+    if not found:
+        have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
+        raise TrainingError(f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}")
+    return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
+
+
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    """Rows of result.json, least budget first.
+
+    Raises:
+        TrainingError: the file is missing, cut short or of another version.
+    """
+    manifest.check(folder)
+    path = folder / "result.json"
+    if not path.is_file():
+        raise TrainingError(f"{path} is missing: no finished run; resume the run")
+    try:
+        rows: list[dict[str, Any]] = sorted(
+            json.loads(path.read_text("utf-8"))["rows"], key=lambda r: r["budget_mmacs"]
+        )
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise TrainingError(f"{path}: cut short or of another version ({error!r}); resume the run") from None
+    if not rows:
+        raise TrainingError(f"{path}: holds no network; resume the run")
+    return rows
+
+
+def architecture_of(entry: dict[str, Any], run: Run, folder: Path) -> Architecture:
+    """The architecture in a row of result.json.
+
+    Raises:
+        TrainingError: of another version, or outside the run's space.
+    """
+    values: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k not in ("error", "macs")
+    }
+    try:
+        return check(run.settings.space, Architecture(**values))
+    except TypeError as error:
+        raise TrainingError(f"{folder}/result.json: its network is of another version ({error})") from None
+
+
+def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
+    """Refuse an as-built record of another lens, or of a fit that failed its own checks.
+
+    Raises:
+        FitError: either of the two, with what to do.
+    """
+    mine, other = design.diameters, result.design.diameters
+    if mine.diameter_um.shape != other.diameter_um.shape or mine.pitch_um != other.pitch_um:
+        raise FitError(
+            f"the as-built record is of another lens: {other.diameter_um.shape} pillars of pitch {other.pitch_um} um, "
+            f"the run's lens has {mine.diameter_um.shape} of {mine.pitch_um} um; fit captures of the run's own lens.h5"
+        )
+    apart = float(np.abs(mine.diameter_um - other.diameter_um).max())
+    if apart > 1e-6 or design.sensor_distance_um != result.design.sensor_distance_um:
+        raise FitError(
+            f"the as-built record is of another lens: designed diameters differ by up to {apart * 1e3:.1f} nm, sensor "
+            f"distances are {design.sensor_distance_um} and {result.design.sensor_distance_um} um; "
+            "fit captures of the run's own lens.h5"
+        )
+    if not result.trusted and not insist:
+        raise FitError(
+            "the fit was refused by its own checks: " + "; ".join(result.problems) + ". Mend the captures and fit "
+            "again; --insist trains on it in spite of that"
+        )
+
+
+def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None) -> Lenses:
+    """PSFs of the nominal, fitted, drawn and (where known) true lens."""
+    draws = [made.stack(x) for x in built.posterior(result, config.draws + config.judge, seed=config.seed)]
+    judges = tuple(draws[config.draws :]) if truth is None else (made.stack(truth.vector()),)
+    best = made.stack(result.parameters())
+    return Lenses(made.stack(), best, tuple(draws[: config.draws]), judges, truth is not None)
+
+
+def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:
+    """The inner loop of the run, from its trained weights, on given PSFs; only the weights move."""
+    settings, origin = source.settings, source.run.trainer
+    fresh = model(
+        settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
+        network=settings.network,
+    )  # fmt: skip
+    fresh.net.load_state_dict(origin.model.net.state_dict())
+    with torch.no_grad():
+        fresh.coefficients_rad.copy_(origin.model.coefficients_rad)
+        fresh.log_pitch.copy_(origin.model.log_pitch)
+    return Trainer(
+        fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, fresh,
+        architecture=source.architecture, stacks=stacks,
+    )  # fmt: skip
+
+
+def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
+    """The inner loop's settings for training on."""
+    still = Schedule(0.0)
+    return replace(
+        inner, steps=config.steps, seed=inner.seed + APART * (config.seed + 1),
+        weights=replace(inner.weights, rate=config.rate, start=0.0, end=1.0), optics=still, pitch=still,
+    )  # fmt: skip
+
+
+def job(source: Source, config: RetrainConfig, found: Lenses, name: str) -> Trainer:
+    """The training of one of :data:`JOBS`."""
+    return trainer(source, config, {"nominal": (found.nominal,), "retrained": found.drawn, "known": found.judges}[name])
+
+
+def network(going: Trainer) -> Supernet:
+    """The network of a trainer.
+
+    Raises:
+        TrainingError: a baseline of fixed shape.
+    """
+    net = going.model.net
+    if not isinstance(net, Supernet):
+        raise TrainingError(f"the run trained a {type(net).__name__}; only elastic networks are retrained")
+    return net
+
+
+def jobs(found: Lenses) -> tuple[str, ...]:
+    """Networks that can be trained: with the truth only where it is known."""
+    return JOBS if found.known else JOBS[:2]
+
+
+def train(going: Trainer, path: Path, settings: object, *, every: int = 50) -> Iterator[Record]:
+    """Run one job to its end, from where it stands, with checkpoints in ``path``; a record a step."""
+    for record in going.run():
+        yield record
+        if record.step % every == 0 or record.step == going.inner.steps:
+            checkpoint.save(path, {"trainer": going.state()}, settings=settings)
+
+
+def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
+    """Measure the batch statistics on training frames through the lenses that the network was trained for.
+
+    Never on frames that judge: a network that nobody warned of the made lens knows none of its images.
+    """
+    frames = []
+    for number in range(batches):
+        made = going.stacks[number % len(going.stacks)]
+        step = _Step(going.scenes, number)
+        frames.append(assess.frames(going, step, 1, stack=made).frames)
+    recalibrate(network(going), source.architecture, frames)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One batch of scenes."""
+
+    scenes: Scenes
+    number: int
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frames."""
+        return self.scenes.margin
+
+    def batch(self, step: int, size: int) -> Batch:
+        """The batch, whatever ``step``."""
+        return self.scenes.batch(self.number, size)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Held:
+    """Frames that judge, rendered once for every case."""
+
+    batches: tuple[Batch, ...]
+    margin: int
+    stream: int
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Batch number ``step``, of the size that it was rendered in."""
+        return self.batches[step]
+
+
+def held(source: Source, config: RetrainConfig) -> Held:
+    """The test frames of a run, that no training sees."""
+    scenes = source.run.scenes(TEST)
+    size = source.settings.inner.batch
+    return Held(tuple(scenes.batch(n, size) for n in range(config.test_batches)), scenes.margin, scenes.stream)
+
+
+def judge(
+    going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack], *, frames: Held | None = None
+) -> Accuracy:
+    """Errors on test frames through these lenses, all of them together.
+
+    frames: of :func:`held`, where several cases are judged.
+    """
+    settle(going, source)
+    frames = frames or held(source, config)
+    parts = []
+    for made in stacks[: config.judge]:
+        seen = assess.frames(going, frames, config.test_batches, stack=made)
+        answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
+        parts.append(reading.accuracy(answers, seen))
+    return Accuracy(torch.cat([p.error_mm for p in parts]), torch.cat([p.iou for p in parts]))
+
+
+def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]) -> Outcome:
+    """Accuracy of all cases, on the same test frames."""
+    nominal, frames = (found.nominal,), held(source, config)
+    untouched = trainer(source, config, nominal)
+
+    def of(going: Trainer, stacks: Sequence[Stack]) -> Accuracy:
+        return judge(going, source, config, stacks, frames=frames)
+
+    return Outcome(
+        designed=of(untouched, nominal),
+        nominal=of(trained["nominal"], nominal),
+        before=of(trained["nominal"], found.judges),
+        after=of(trained["retrained"], found.judges),
+        known=of(trained["known"], found.judges) if found.known else None,
+    )
+
+
+def retrain(
+    folder: Path, result: AsBuilt, *, config: RetrainConfig | None = None, truth: Truth | None = None
+) -> Outcome:
+    """A finished run's network trained on for the lens that was made, in one call; ``metalens retrain`` keeps files.
+
+    Args:
+        folder: of ``metalens codesign``. result: of ``metalens fit`` for that run's lens.h5.
+        truth: of the virtual bench, where there is one.
+
+    Raises:
+        TrainingError: the run is missing, half written or of another version.
+        FitError: the record is of another lens, or its fit was refused.
+    """
+    from metalens import lens as lens_files
+
+    config = config or RetrainConfig()
+    source = load(folder, budget_mmacs=config.budget_mmacs)
+    design = lens_files.load(folder / "lens.h5")
+    check_lens(design, result)
+    found = lenses(MadeLens(design, source.settings.optics, response=result.response), result, config, truth)
+    trained = {name: job(source, config, found, name) for name in jobs(found)}
+    for going in trained.values():
+        for _ in going.run():
+            pass
+    return outcome(source, config, found, trained)

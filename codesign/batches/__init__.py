@@ -1,0 +1,41 @@
+"""Frames as training takes them, over processes."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from codesign.batches import parallel as parallel
+    from codesign.batches.batch import Batch as Batch
+    from codesign.batches.flat import Flat as Flat
+    from codesign.batches.flat import irradiance as irradiance
+    from codesign.batches.flat import samples as samples
+    from codesign.batches.pool import PoolScenes as PoolScenes
+    from codesign.batches.pool import fill as fill
+    from codesign.batches.scenes import EXPERIMENT as EXPERIMENT
+    from codesign.batches.scenes import TEST as TEST
+    from codesign.batches.scenes import VALIDATION as VALIDATION
+    from codesign.batches.scenes import EyeScenes as EyeScenes
+    from codesign.batches.scenes import SceneConfig as SceneConfig
+    from codesign.batches.scenes import as_batch as as_batch
+    from codesign.batches.scenes import decoupled as decoupled
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Batch": "batch",
+        "EXPERIMENT": "scenes",
+        "EyeScenes": "scenes",
+        "Flat": "flat",
+        "PoolScenes": "pool",
+        "SceneConfig": "scenes",
+        "TEST": "scenes",
+        "VALIDATION": "scenes",
+        "as_batch": "scenes",
+        "decoupled": "scenes",
+        "fill": "pool",
+        "irradiance": "flat",
+        "parallel": "",
+        "samples": "flat",
+    },
+)

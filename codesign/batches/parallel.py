@@ -1,0 +1,136 @@
+"""Training and search under ``torchrun``: every process takes its part of each batch, and all move alike.
+
+Gradients are averaged and batch statistics taken over the whole batch, so two processes do what one does, to rounding.
+Candidates of a search are judged by one process each.
+Outside ``torchrun`` there is one process and nothing here costs anything.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch import distributed as dist
+
+from codesign.batches.batch import Batch
+from codesign.batches.flat import Flat
+from metalens.ground.errors import TrainingError
+from metalens.image import Frames
+
+
+def join() -> None:
+    """Join the other processes of ``torchrun``, if it started this one."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
+        dist.init_process_group("gloo")
+
+
+def leave() -> None:
+    """Part from the others: what follows is done by process 0 alone."""
+    if dist.is_initialized():
+        dist.barrier()
+        dist.destroy_process_group()
+
+
+def rank() -> int:
+    """Number of this process."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def ranks() -> int:
+    """Processes that train together."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def wait() -> None:
+    """Until all are here."""
+    if ranks() > 1:
+        dist.barrier()
+
+
+def part_of(batch: Batch) -> Batch:
+    """The frames of a batch that this process takes.
+
+    Raises:
+        TrainingError: the processes do not share the batch evenly.
+    """
+    if ranks() == 1:
+        return batch
+    size, odd = divmod(len(batch.slip_mm), ranks())
+    if odd:
+        raise TrainingError(f"a batch of {len(batch.slip_mm)} frames on {ranks()} processes: need a multiple of them")
+    mine = slice(rank() * size, (rank() + 1) * size)
+    kind = type(batch.frames)
+    frames: Frames | Flat = kind(*(getattr(batch.frames, name)[mine] for name in kind.__slots__))
+    return replace(batch, frames=frames, mask=batch.mask[mine], slip_mm=batch.slip_mm[mine])
+
+
+def average(parameters: Iterable[nn.Parameter]) -> None:
+    """Replace every gradient by its mean over the processes."""
+    if ranks() == 1:
+        return
+    grads = [p.grad for p in parameters if p.grad is not None]
+    for kind in sorted({(g.dtype, g.device) for g in grads}, key=str):  # in the same order everywhere
+        mine = [g for g in grads if (g.dtype, g.device) == kind]
+        joined = _reduced(torch.cat([g.flatten() for g in mine])) / ranks()
+        start = 0
+        for grad in mine:
+            grad.copy_(joined[start : start + grad.numel()].view_as(grad))
+            start += grad.numel()
+
+
+def mean_of(values: list[float]) -> list[float]:
+    """Mean of numbers over the processes."""
+    if ranks() == 1:
+        return values
+    return [float(v) for v in _reduced(torch.tensor(values, dtype=torch.float64)) / ranks()]
+
+
+def each(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
+    """``work`` of every item, done by one process each; all get all answers, in order."""
+    found = torch.zeros(len(items), dtype=torch.float64)
+    for i in range(rank(), len(items), ranks()):
+        found[i] = work(items[i])
+    return [float(v) for v in (_reduced(found) if ranks() > 1 else found)]
+
+
+def batch_norm(x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5) -> Tensor:
+    """Batch normalisation with the statistics of all processes' frames; differentiable."""
+    count = x.numel() // x.shape[1] * ranks()
+    mean = _summed(x.sum((0, 2, 3))) / count
+    centred = x - mean[:, None, None]
+    variance = _summed(centred.square().sum((0, 2, 3))) / count
+    scale = weight * torch.rsqrt(variance + epsilon)
+    return centred * scale[:, None, None] + bias[:, None, None]
+
+
+class _Sum(torch.autograd.Function):
+    """Sum over processes; every process's loss depends on every process's part, so gradients are summed too."""
+
+    @staticmethod
+    def forward(context: Any, value: Tensor) -> Tensor:
+        return _reduced(value.clone())
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> Tensor:
+        return _reduced(gradients[0].clone())
+
+
+def _summed(value: Tensor) -> Tensor:
+    total: Tensor = _Sum.apply(value)  # type: ignore[no-untyped-call]
+    return total
+
+
+def _reduced(value: Tensor) -> Tensor:
+    try:
+        dist.all_reduce(value)
+    except RuntimeError as error:
+        raise _lost(error) from error
+    return value
+
+
+def _lost(error: RuntimeError) -> TrainingError:
+    return TrainingError(
+        f"another process of this run was lost ({error}); start it again with --resume to go on from the checkpoint"
+    )

@@ -1,0 +1,113 @@
+"""A pool of rendered eyes that training draws from again and again, each time at another scale."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from codesign.batches.batch import Batch
+from codesign.batches.flat import Flat, flattened
+from codesign.batches.scenes import EyeScenes, decoupled
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import TrainingError
+
+MASK = 64  # pixels along a side of the kept masks, where the frame allows it
+CHUNK = 64  # frames rendered at a time
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pool:
+    """Frames at unit scale, with their labels; what :class:`PoolScenes` draws from.
+
+    light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil coverage without the margin.
+    place_um: (n, 3) nominal place and slippage together, at unit scale. here_um: (3,) nominal place.
+    depths_um: (2,) range of the depth.
+    """
+
+    light: Array
+    depth_um: Array
+    mask: Array
+    place_um: Array
+    here_um: Array
+    depths_um: Array
+
+    def __len__(self) -> int:
+        return len(self.light)
+
+
+def fill(scenes: EyeScenes, count: int) -> Pool:
+    """Render ``count`` frames of a stream of scenes."""
+    parts = []
+    for number, start in enumerate(range(0, count, CHUNK)):
+        parts.append(_part(scenes, number, min(CHUNK, count - start)))
+    light, depth, mask, place = (np.concatenate([p[i] for p in parts]) for i in range(4))
+    here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
+    return Pool(light, depth, mask, place, here, np.array(scenes.depths_um))
+
+
+def save(path: Path, pool: Pool) -> None:
+    """Keep a pool (HDF5, kind ``pool``)."""
+    store.save(path, "pool", {name: getattr(pool, name) for name in Pool.__slots__})
+
+
+def load(path: Path) -> Pool:
+    """A pool that was kept.
+
+    Raises:
+        StoreError: not a pool.
+    """
+    return Pool(**store.load(path, "pool").arrays)
+
+
+def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, Array, Array, Array]:
+    made = scenes.rendered(number, count)
+    states = scenes.states(number, count)
+    flat = flattened(made.frames, states.scale)
+    inside = slice(scenes.margin, made.pupil.shape[-1] - scenes.margin)
+    mask = made.pupil[:, None, inside, inside]
+    if mask.shape[-1] % MASK == 0:
+        mask = F.avg_pool2d(mask, mask.shape[-1] // MASK)
+    coverage = (mask[:, 0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
+    return flat.light, flat.depth_um, coverage, here + states.slip_um.numpy()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoolScenes:
+    """Batches from a pool; see :class:`codesign.train.inner.Scenes`.
+
+    Every pass over the pool has an order of its own, and every frame a new scale each time it is drawn.
+
+    seed: of orders and scales. margin: samples around the frames. spread: of the scale, see :func:`decoupled`.
+    """
+
+    pool: Pool
+    margin: int
+    spread: float
+    seed: int
+
+    def batch(self, step: int, size: int) -> Batch:
+        """``size`` frames of a step.
+
+        Raises:
+            TrainingError: the pool holds less than a batch.
+        """
+        a_pass = len(self.pool) // size
+        if a_pass == 0:
+            raise TrainingError(f"a pool of {len(self.pool)} frames is smaller than a batch of {size}: raise the pool")
+        order = np.random.default_rng([self.seed, step // a_pass, 5]).permutation(len(self.pool))
+        first = step % a_pass * size
+        return self.rows(np.sort(order[first : first + size]), np.random.default_rng([self.seed, step, 6]))
+
+    def rows(self, rows: Array, generator: np.random.Generator) -> Batch:
+        """The frames of these numbers, at scales drawn from ``generator``."""
+        pool = self.pool
+        here, place = torch.from_numpy(pool.here_um), torch.from_numpy(pool.place_um[rows])
+        low, high = self.pool.depths_um
+        scale = decoupled(place[:, 2], (float(low), float(high)), self.spread, generator)
+        slip = (scale[:, None] * place - here) * 1e-3
+        flat = Flat(pool.light[rows], pool.depth_um[rows], scale.numpy().astype(np.float32))
+        return Batch(flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float())

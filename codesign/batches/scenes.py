@@ -1,0 +1,126 @@
+"""Eyes as training and test frames: drawn from a seed and a number, with a margin, depth not readable from size."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.batches.batch import Batch
+from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, render
+from codesign.eye import population as eye
+from metalens.ground.errors import ConfigError
+from metalens.image import Frames
+
+# streams of the random generator: frames of one are never seen by another
+TRAINING, VALIDATION, TEST, EXPERIMENT = 0, 1, 2, 9
+
+
+@dataclass(frozen=True, slots=True)
+class SceneConfig:
+    """What the camera sees.
+
+    pixels: of the image grid along a side, ``sample_um`` of the optics apart. margin: samples rendered beyond it.
+    scale: spread of the scale ambiguity: depths and labels are multiplied by a factor of 1 +- scale at an unchanged
+        pinhole image, so that size does not tell depth; see :func:`decoupled`.
+    slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
+    depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image tells it from slippage.
+    pool: frames that training draws from again and again, at another scale each time; 0 renders every frame anew.
+    """
+
+    pixels: int = 128
+    margin: int = 16
+    scale: float = 0.2
+    slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
+    gaze_deg: tuple[float, float] = (18.0, 13.0)
+    depth_sd_mm: float = 0.0
+    pool: int = 0
+
+    def __post_init__(self) -> None:
+        if self.pixels < 32 or not 0 <= self.margin < self.pixels or not 0 <= self.scale < 0.5:
+            raise ConfigError(
+                f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
+                "margin below them, and a scale below 0.5"
+            )
+        if self.pool < 0 or not self.depth_sd_mm >= 0:
+            raise ConfigError(f"pool = {self.pool}, depth_sd_mm = {self.depth_sd_mm}: need both 0 or more")
+
+    @property
+    def motion(self) -> Motion:
+        """The ranges that states are drawn from, at unit scale."""
+        depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)
+        return replace(
+            Motion(),
+            population={**POPULATION, "depth_um": depth},
+            gaze_x_rad=math.radians(self.gaze_deg[0]),
+            gaze_y_rad=math.radians(self.gaze_deg[1]),
+            slip_um=(self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EyeScenes:
+    """Frames by number; see :class:`codesign.train.inner.Scenes`.
+
+    seed, stream: choose the subjects and states.
+    """
+
+    settings: SceneConfig
+    sample_um: float
+    sensor_distance_um: float
+    seed: int
+    stream: int = TRAINING
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frame that are rendered to be blurred in."""
+        return self.settings.margin
+
+    @property
+    def rig(self) -> Rig:
+        """Camera and lamps."""
+        return replace(Rig(), sensor_distance_um=self.sensor_distance_um)
+
+    @property
+    def depths_um(self) -> tuple[float, float]:
+        """Least and largest depth of the pupil."""
+        reach = self.settings.slip_mm[2] * 1e3
+        return self.rig.distance_um - reach, self.rig.distance_um + reach
+
+    @property
+    def camera(self) -> Camera:
+        """Image grid with its margin."""
+        return Camera(self.settings.pixels + 2 * self.margin, self.sample_um)
+
+    def states(self, step: int, size: int) -> States:
+        """Subjects and states of a step."""
+        plain = eye.draw(size, (self.seed, self.stream, step), motion=self.settings.motion)
+        depth = self.rig.distance_um + plain.slip_um[:, 2]
+        generator = np.random.default_rng((self.seed, self.stream, step, 1))
+        return replace(plain, scale=decoupled(depth, self.depths_um, self.settings.scale, generator))
+
+    def rendered(self, step: int, size: int) -> Rendered:
+        """Frames of a step with all labels."""
+        return render(self.states(step, size), rig=self.rig, camera=self.camera)
+
+    def batch(self, step: int, size: int) -> Batch:
+        """Frames of a step, as training takes them."""
+        return as_batch(self.rendered(step, size), self.margin)
+
+
+def decoupled(depth_um: Tensor, range_um: tuple[float, float], spread: float, generator: np.random.Generator) -> Tensor:
+    """(n,) factors that bring depths to others, drawn evenly from ``range_um`` whatever the depth was.
+
+    So the scaled depth has nothing to do with the size of what is seen: the geometric cue is removed, as far as a
+    factor of 1 +- ``spread`` reaches. A factor drawn on its own would leave most of the cue.
+    """
+    wanted = torch.from_numpy(generator.uniform(*range_um, len(depth_um)))
+    return (wanted / depth_um).clamp(1 - spread, 1 + spread)
+
+
+def as_batch(made: Rendered, margin: int) -> Batch:
+    """Rendered frames as a training batch: the mask without its margin, the slippage in mm."""
+    inside = slice(margin, made.pupil.shape[-1] - margin)
+    frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
+    return Batch(frames, made.pupil[:, inside, inside], (made.labels.slip_um * 1e-3).to(torch.float32))

@@ -1,0 +1,207 @@
+"""What an error of the optics costs in gaze: the linearised estimator of gaze, slip and size that sees whole images.
+
+An image I of an eye in state theta, formed by optics that differ a little from those the estimator knows, is read as
+the state theta + (D'WD + P)^-1 D'W dI: D the derivative of the known image, W the inverse noise variance, P the prior.
+Unknown are also the size (all depths and labels scaled at an unchanged pinhole image, paper Sec. 3.6), the brightness,
+and every trait of the subject within its population, so that depth is read from blur and not from a known anatomy. What
+the model of a subject cannot describe counts as noise in proportion to the light (``mismatch``).
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from codesign.eye import POPULATION, Camera, Motion, Rig, States, render
+from codesign.eye import population as eye
+from metalens.image import Frames, PsfBasis, Sensor, scene, sensor
+
+MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z", "scale")
+STEPS = (math.radians(0.02), math.radians(0.02), 5.0, 5.0, 5.0, 1e-3)  # rad, um, 1: half the central difference
+PRIOR = (0.18, 0.13, 1200.0, 900.0, 2000.0, 0.12)  # standard deviations before the image is seen
+TRAITS = tuple(n for n, trait in POPULATION.items() if trait.sd > 0 and n != "depth_um")  # a depth is a slip along z
+TRAIT_STEP = 0.005  # of a trait's standard deviation
+FINE = 3  # rays along a side of a pixel: edges of the eye move smoothly, as they do on a sensor
+NAMES = (*MOTIONS, *TRAITS, "brightness")
+BRIGHTNESS = 0.3  # standard deviation before the image is seen
+SCENES = 77  # stream of the random generator
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSetting:
+    """What the estimator looks at.
+
+    scenes: eyes, from ``seed``. pixels: along a side, of ``pitch_um``; margin: rendered beyond them.
+    sensor: noise and exposure; its own pitch is replaced by ``pitch_um``.
+    mismatch: share of the light of a pixel by which no subject of the population looks like the one that is seen.
+    sensor_distance_um: of the lens.
+    """
+
+    scenes: int = 6
+    pixels: int = 64
+    margin: int = 8
+    pitch_um: float = 18.0
+    seed: int = 0
+    sensor: Sensor = field(default_factory=Sensor)
+    mismatch: float = 0.03
+    sensor_distance_um: float = 2000.0
+
+    @property
+    def rig(self) -> Rig:
+        """Camera and lamps."""
+        return Rig(sensor_distance_um=self.sensor_distance_um)
+
+    @property
+    def size(self) -> int:
+        """Pixels along a side with the margin."""
+        return self.pixels + 2 * self.margin
+
+    @property
+    def states(self) -> States:
+        """The eyes: subjects, gazes and slips drawn from the seed."""
+        return eye.draw(self.scenes, (self.seed, SCENES), motion=Motion(scale=0.2))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Views:
+    """Renderings of every eye: as it is, and moved to both sides along every unknown but the brightness."""
+
+    anchor: Frames
+    moved: tuple[tuple[Frames, Frames], ...]
+
+    @property
+    def depths_um(self) -> tuple[float, float]:
+        """Nearest and farthest surface that is seen."""
+        seen = self.anchor.depth_um[self.anchor.coverage > 0]
+        return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
+
+
+def views(setting: TaskSetting, states: States | None = None, *, exposed: States | None = None) -> Views:
+    """Render everything that the linear estimator needs; two frames an unknown and eye.
+
+    Args:
+        states: instead of those of the setting. exposed: that the exposure was set at, by default these.
+    """
+    still = setting.states if states is None else states
+    lit = still if exposed is None else exposed
+
+    def frames(unknown: int, step: float) -> Frames:
+        return _frames(shifted(still, unknown, step), lit, setting)
+
+    pairs = [(frames(k, step), frames(k, -step)) for k, step in enumerate(_steps())]
+    return Views(_frames(still, lit, setting), tuple(pairs))
+
+
+def _frames(states: States, exposed: States, setting: TaskSetting) -> Frames:
+    """Renderings averaged over each pixel."""
+    camera = Camera(FINE * setting.size, setting.pitch_um / FINE)
+    fine = render(states, rig=setting.rig, camera=camera, exposed=exposed).frames
+    radiance, coverage, deep, plain = (
+        avg_pool2d(v, FINE) for v in (fine.radiance, fine.coverage, fine.coverage * fine.depth_um, fine.depth_um)
+    )
+    return Frames(radiance, coverage, torch.where(coverage > 0, deep / coverage.clamp_min(1e-9), plain))
+
+
+def _steps() -> tuple[float, ...]:
+    return (*STEPS, *(TRAIT_STEP * POPULATION[name].sd for name in TRAITS))
+
+
+def _priors() -> tuple[float, ...]:
+    return (*PRIOR, *(POPULATION[name].sd for name in TRAITS), BRIGHTNESS)
+
+
+def _precision() -> Tensor:
+    """(unknowns, unknowns) information before the image is seen."""
+    return torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
+
+
+def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
+    """States moved along one of :data:`NAMES` but the last."""
+    if unknown < 2:
+        gaze = states.gaze_rad.clone()
+        gaze[:, unknown] += amount
+        return replace(states, gaze_rad=gaze)
+    if unknown < 5:
+        slip = states.slip_um.clone()
+        slip[:, unknown - 2] += amount
+        return replace(states, slip_um=slip)
+    if unknown == 5:
+        return replace(states, scale=states.scale + amount)
+    traits = states.traits.clone()
+    traits[:, list(POPULATION).index(NAMES[unknown])] += amount
+    return replace(states, traits=traits)
+
+
+def electrons(frames: Frames, optics: PsfBasis, setting: TaskSetting) -> Tensor:
+    """(scenes, pixels) expected electrons through these optics, float64."""
+    prepared = scene.uniform_imager(optics, (setting.size, setting.size), margin=setting.margin)
+    light = scene.image(frames, prepared, margin=setting.margin)
+    chip = replace(setting.sensor, pitch_um=setting.pitch_um)
+    return sensor.mean_electrons(light, setting.pitch_um, sensor=chip).flatten(1).double()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Linear:
+    """The estimator about each eye.
+
+    image: (scenes, pixels) electrons that it expects. pull: (scenes, unknowns, pixels) change of its answer by a
+    change of the image, unknowns in the order of NAMES. covariance: (scenes, unknowns, unknowns) of its answer under
+    the noise of one frame.
+    """
+
+    image: Tensor
+    pull: Tensor
+    covariance: Tensor
+
+    def shift(self, image: Tensor) -> Tensor:
+        """(scenes, unknowns) error of the answer to images (scenes, pixels) of the same eyes by other optics."""
+        return torch.einsum("skp,sp->sk", self.pull, image - self.image)
+
+    @property
+    def noise_rad(self) -> float:
+        """Gaze error (rms over eyes, both angles) that the noise of one frame leaves."""
+        return float(self.covariance[:, :2, :2].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
+
+
+def linear(seen: Views, optics: PsfBasis, setting: TaskSetting) -> Linear:
+    """The estimator that knows these optics."""
+    image = electrons(seen.anchor, optics, setting)
+    slopes = [
+        (electrons(more, optics, setting) - electrons(less, optics, setting)) / (2 * step)
+        for (more, less), step in zip(seen.moved, _steps(), strict=True)
+    ]
+    derivative = torch.stack([*slopes, image], 1)
+    chip = replace(setting.sensor, pitch_um=setting.pitch_um)
+    noise = sensor.variance(image, sensor=chip) + (setting.mismatch * image) ** 2
+    weighted = derivative / noise[:, None]
+    prior = _precision()
+    normal = weighted @ derivative.mT + prior
+    unit = normal.diagonal(dim1=1, dim2=2).rsqrt()  # the unknowns differ by powers of ten in size
+    inverse = torch.linalg.inv(normal * unit[:, :, None] * unit[:, None, :]) * unit[:, :, None] * unit[:, None, :]
+    return Linear(image, inverse @ weighted, inverse)
+
+
+def gaze_rms(shift: Tensor) -> float:
+    """Root mean square over eyes (and draws) of the gaze error, rad, from shifts (..., unknowns)."""
+    return float(shift[..., :2].pow(2).sum(-1).mean().sqrt())
+
+
+def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, seen: Views, steps: int) -> Tensor:
+    """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels), starting from the true states.
+
+    Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen`` are those of the true states.
+    """
+    prior = _precision()
+    found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
+    for step in range(steps):
+        if step:
+            moved = states
+            for k in range(len(NAMES) - 1):
+                moved = shifted(moved, k, found[:, k])
+            seen = views(setting, moved, exposed=states)
+        reader = linear(seen, optics, setting)
+        pulled = reader.shift(image / (1 + found[:, -1:])) - (reader.covariance @ (found @ prior)[..., None])[..., 0]
+        found = found + pulled
+    return found

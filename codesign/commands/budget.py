@@ -1,0 +1,145 @@
+"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each with how it was found."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from characterize.inference import asbuilt
+from codesign.budget import Entry, Given
+from codesign.budget import links as budget
+from codesign.budget import page as budget_page
+from codesign.optics import Numerics
+from metalens import lens, library
+from metalens.commands import Common, Output
+from metalens.ground import config, manifest, store
+from metalens.ground.errors import ConfigError
+from metalens.ground.reading import reader
+from metalens.made import of_process
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens budget``.
+
+    Attributes:
+        lens: lens.h5.
+        output: budget.h5 to write; a report lies beside it as .html.
+        library: library.h5 that the lens was made from: parts solver and proxy.
+        process: PROCESS.toml: adds mask grid and process spread.
+        asbuilt: asbuilt.h5 of the same lens: adds the calibration uncertainty.
+        run: RUN_DIR of a co-design run: adds its network.
+        led_fwhm_nm: width of the diode; adds wavelength sampling.
+        depths: number of PSFs over depth. wavelengths: over the diode's line.
+        tolerance: of the PSF engine. kernels: of the kernels that images are formed with.
+    """
+
+    lens: tyro.conf.Positional[Path]
+    output: Output = Path("budget.h5")
+    library: Path | None = None
+    process: Path | None = None
+    asbuilt: Path | None = None
+    run: Path | None = None
+    led_fwhm_nm: float = 0.0
+    depths: int = 24
+    wavelengths: int = 3
+    tolerance: float = 1e-4
+    kernels: float = 3e-3
+
+
+def run(options: Options) -> int:
+    """Compute, write, report; exit 0."""
+    target = options.output
+    if target.suffix != ".h5":
+        raise ConfigError(f"{target}: need a name that ends in .h5")
+    made, given = lens.load(options.lens), _given(options)
+    with options.claim(target, beside=(".html", ".png")) as draft:
+        rows = list(options.console.track(budget.entries(budget.bench(made, given)), total=9, label="links"))
+        save(draft.path, rows, _provenance(options, given))
+        budget_page.write(draft.path.with_suffix(".html"), rows)
+        store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
+    values = {"rows": [dataclasses.asdict(row) for row in rows], "gaze_error_deg": math.degrees(rows[-1].gaze_rad)}
+    options.console.result(_plain(values), text(rows))
+    return 0
+
+
+def save(path: Path, rows: list[Entry], provenance: store.Provenance) -> None:
+    """Write a budget file (kind ``budget``)."""
+    numbers = {name: np.array([getattr(r, name) for r in rows]) for name in ("phase_rad", "psf", "gaze_rad")}
+    words = {name: np.array([getattr(r, name) for r in rows]) for name in ("link", "method")}
+    store.save(path, "budget", numbers | words, provenance=provenance)
+
+
+@reader
+def load(path: Path) -> list[Entry]:
+    """Read a budget file.
+
+    Raises:
+        StoreError: not a budget file.
+    """
+    arrays = store.load(path, "budget").arrays
+    words = {n: [w.decode() if isinstance(w, bytes) else str(w) for w in arrays[n]] for n in ("link", "method")}
+    columns = (words["link"], *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")), words["method"])
+    return [Entry(*row) for row in zip(*columns, strict=True)]
+
+
+def text(rows: list[Entry]) -> str:
+    """The table for a terminal."""
+    lines = [f"{'link':<30} {'phase/rad':>10} {'PSF':>9} {'gaze/deg':>10}  how"]
+    for r in rows:
+        numbers = [("-" if math.isnan(v) else f"{v:.2g}") for v in (r.phase_rad, r.psf, math.degrees(r.gaze_rad))]
+        lines.append(f"{r.link:<30} {numbers[0]:>10} {numbers[1]:>9} {numbers[2]:>10}  {r.method}")
+    return "\n".join(lines)
+
+
+def slip_of(folder: Path) -> tuple[float, float, float]:
+    """Slippage errors of the best row of a run, mm.
+
+    Raises:
+        ConfigError: no finished run.
+    """
+    manifest.check(folder)
+    path = folder / "result.json"
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        best = min(rows, key=lambda row: row["axial_slip_mm"])
+        return float(best["lateral_slip_mm"]), float(best["lateral_slip_mm"]), float(best["axial_slip_mm"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: no result of a finished run ({error}); finish it with metalens codesign --resume"
+        ) from None
+
+
+def _given(options: Options) -> Given:
+    wide = options.led_fwhm_nm > 0
+    numerics = Numerics(options.depths, options.wavelengths if wide else 1, options.tolerance, options.kernels)
+    return Given(
+        numerics=numerics,
+        fwhm_nm=options.led_fwhm_nm,
+        mask=of_process(options.process) if options.process else None,
+        library=library.load(options.library) if options.library else None,
+        asbuilt=asbuilt.load(options.asbuilt) if options.asbuilt else None,
+        slip_mm=slip_of(options.run) if options.run else None,
+    )
+
+
+def _provenance(options: Options, given: Given) -> store.Provenance:
+    files = [options.lens, options.library, options.process, options.asbuilt]
+    return store.Provenance(
+        config=config.dumps(given.numerics) + f"fwhm_nm = {given.fwhm_nm}\n",
+        inputs={f.name: store.sha256(f) for f in files if f is not None},
+    )
+
+
+def _plain(values: Any) -> Any:
+    """JSON knows no nan: null."""
+    if isinstance(values, dict):
+        return {k: _plain(v) for k, v in values.items()}
+    if isinstance(values, list):
+        return [_plain(v) for v in values]
+    return None if isinstance(values, float) and math.isnan(values) else values

@@ -1,0 +1,222 @@
+"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from safetensors.torch import save_file
+
+from codesign.batches import parallel
+from codesign.network import Baseline, Subnet
+from codesign.optics import stack as trained
+from codesign.train import (
+    Journal,
+    Model,
+    Place,
+    Record,
+    Run,
+    RunConfig,
+    best,
+    device_of,
+    finished,
+    pareto,
+    pictures,
+    place,
+)
+from codesign.train import run as runs
+from metalens import design, lens, library
+from metalens.commands import Common, Output
+from metalens.ground import config, report, store, transaction
+from metalens.ground.console import Console
+
+CHECKPOINT, LOG, SETTINGS, RESULT = "checkpoint.safetensors", "log.jsonl", "run.toml", "result.json"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens codesign``.
+
+    Attributes:
+        config: RUN.toml.
+        output: folder of the run.
+        resume: go on from the folder's checkpoint, bit for bit.
+        freeze: parts that stay as they start, beside those of the config: the ablations.
+        device: of the network; auto takes a GPU where there is one. Scenes and optics stay on the processor.
+        events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
+    """
+
+    config: tyro.conf.Positional[Path]
+    output: Output = Path("run")
+    resume: bool = False
+    freeze: tuple[runs.Part, ...] = ()
+    device: Place = "auto"
+    events: bool = False
+
+
+def run(options: Options) -> int:
+    """Train, search, finish; exit 0."""
+    settings = _frozen(runs.load(options.config), options.freeze)
+    device = device_of(options.device)
+    parallel.join()
+    if parallel.rank():
+        return _assist(transaction.unfinished(options.output), settings, device)
+    with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:
+        rows = _work(options, settings, device, draft.path)
+    options.console.result({"rows": rows, "folder": str(options.output)}, _table(rows))
+    return 0
+
+
+def _work(options: Options, settings: RunConfig, device: torch.device, folder: Path) -> list[dict[str, Any]]:
+    """Train, search and write into the folder; a row a network."""
+    console = options.console
+    going = _resume(folder, settings) if options.resume else _start(folder, settings)
+    place(going.trainer, device)
+    parallel.wait()
+    journal = Journal(folder) if options.events else None
+    for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
+        _log(folder, {"kind": "step", **asdict(record)})
+        if journal:
+            _events(journal, going, record)
+        if record.step % settings.checkpoint_every == 0:
+            console.say(
+                f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
+                f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
+            )
+    for budget, born in runs.search(going, folder / CHECKPOINT):
+        _log(folder, {"kind": "birth", "budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6})
+        console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
+    parallel.leave()
+    ends = finished(going)
+    _keep(folder, going, ends)
+    return [row for row, _ in ends]
+
+
+def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
+    """Another process of ``torchrun``: trains and searches along from the same checkpoint, writes nothing."""
+    parallel.wait()
+    going = runs.resume(folder / CHECKPOINT, settings)
+    place(going.trainer, device)
+    for _ in runs.train(going, folder / CHECKPOINT):
+        pass
+    for _ in runs.search(going, folder / CHECKPOINT):
+        pass
+    parallel.leave()
+    return 0
+
+
+def _frozen(settings: RunConfig, parts: tuple[runs.Part, ...]) -> RunConfig:
+    both = tuple(sorted({*settings.run.frozen, *parts}))
+    return replace(settings, run=replace(settings.run, frozen=both))
+
+
+def _events(journal: Journal, going: Run, record: Record) -> None:
+    values = {k: float(v) for k, v in asdict(record).items() if k != "step"}
+    journal.scalars(record.step, values)
+    if record.step % going.settings.checkpoint_every == 0:
+        for name, picture in pictures.all_of(going).items():
+            journal.picture(record.step, name, picture)
+
+
+def _start(folder: Path, settings: RunConfig) -> Run:
+    store.write_text(folder / SETTINGS, config.dumps(settings))
+    made = runs.start(settings)
+    runs.save(folder / CHECKPOINT, made)
+    return made
+
+
+def _resume(folder: Path, settings: RunConfig) -> Run:
+    """The run of the folder's checkpoint; log lines beyond it are dropped."""
+    made = runs.resume(folder / CHECKPOINT, settings)
+    births = sum(len(s.history) for s in made.searches)
+    kept: list[str] = []
+    for line in (folder / LOG).read_text(encoding="utf-8").splitlines() if (folder / LOG).is_file() else []:
+        entry = _entry(line)
+        if entry.get("kind") == "step" and entry["step"] <= made.trainer.step:
+            kept.append(line)
+        elif entry.get("kind") == "birth" and births > 0:
+            kept.append(line)
+            births -= 1
+    store.write_text(folder / LOG, "".join(line + "\n" for line in kept))
+    return made
+
+
+def _entry(line: str) -> dict[str, Any]:
+    try:
+        entry: dict[str, Any] = json.loads(line)
+    except json.JSONDecodeError:  # the line that was being written when the run was killed
+        return {}
+    return entry
+
+
+def _progress(console: Console, records: Iterator[Record], going: Run) -> Iterator[Record]:
+    left = going.settings.inner.steps - going.trainer.step
+    return console.track(records, total=left, label="training")
+
+
+def _log(folder: Path, entry: dict[str, Any]) -> None:
+    with open(folder / LOG, "a", encoding="utf-8") as file:
+        file.write(json.dumps(entry) + "\n")
+
+
+def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:
+    """lens.h5, the networks, result.json and the plot of the Pareto set."""
+    settings = going.settings
+    _lens(folder / "lens.h5", going)
+    for (row, made), state in zip(ends, [*going.searches, None], strict=False):
+        net = made.net
+        kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
+        name = settings.network if row["budget_mmacs"] is None else f"subnet_{row['budget_mmacs']:g}"
+        with store.replacing(folder / f"{name}.safetensors") as part:
+            tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
+            save_file(tensors, str(part), metadata={"kind": "subnet"})
+    pitch = float(going.trainer.model.pitch_um.detach())
+    rows = [row for row, _ in ends]
+    found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
+    found |= {"network": settings.network, "frozen": list(settings.run.frozen)}
+    store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
+    if going.searches:
+        store.write_bytes(folder / "pareto.png", _plot(going))
+
+
+def _lens(path: Path, going: Run) -> None:
+    settings = going.settings.optics
+    made = library.sweep(library.DEFAULT_CELL, wavelengths_um=(settings.focus.wavelength_um,))
+    phase = trained.phase_of(settings, runs.coefficients(going).numpy())
+    result, _ = design.make(
+        phase,
+        settings.focus,
+        aperture_um=settings.aperture_mm * 1e3,
+        cell=made.cell,
+        proxy=library.proxy_of(made),
+        profile="codesign",
+        provenance=store.Provenance(config=config.dumps(going.settings), seed=going.settings.inner.seed),
+    )
+    lens.save(path, result)
+
+
+def _plot(going: Run) -> bytes:
+    figure, axes = report.canvas(size=(6.0, 4.0))
+    for budget, state in zip(going.settings.run.budgets_mmacs, going.searches, strict=True):
+        macs = [c.macs / 1e6 for c in state.history]
+        axes.plot(macs, [c.error for c in state.history], "o", label=f"budget {budget:g} MMACs")
+    front = pareto([c for s in going.searches for c in s.history])
+    axes.step([c.macs / 1e6 for c in front], [c.error for c in front], where="post", color="k", label="Pareto set")
+    axes.set(xlabel="MMACs", ylabel="slippage error on validation / mm", title="Accuracy against compute")
+    axes.legend()
+    return report.png(figure)
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    head = "budget  MMACs  pixels seen / um  axial / mm  lateral / mm   IoU  mm per mm of PSF depth"
+    lines = []
+    for r in rows:
+        budget = "     -" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:6g}"
+        iou = "    -" if r["iou"] is None else f"{r['iou']:.3f}"
+        errors = f"{r['axial_slip_mm']:10.3f}  {r['lateral_slip_mm']:12.3f}"
+        costs = f"{r['mmacs']:5.2f}  {r['effective_pitch_um']:16.1f}"
+        lines.append(f"{budget}  {costs}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}")
+    return "\n".join([head, *lines])

@@ -1,0 +1,27 @@
+"""What a lens, a run or the paper's claims are worth: ``metalens evaluate optics | ...``, a module each.
+
+``metalens evaluate lens.h5...`` is ``optics``, and ``metalens evaluate RUN_DIR...`` is ``paper``.
+"""
+
+from pathlib import Path
+
+# sub-verb: (module that holds ``Options`` and ``run``, one line of help)
+PARTS: dict[str, tuple[str, str]] = {
+    "optics": (
+        "codesign.commands.evaluate_optics",
+        "LENS... -> axial information, PSF slices and scene sensitivity of lenses (Tables 1 and 3, Figs. 5 and 7)",
+    ),
+    "experiment": (
+        "codesign.commands.experiment",
+        "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 9 to 11)",
+    ),
+    "paper": ("codesign.commands.paper", "RUN_DIR... -> every table and figure of the paper beside ours"),
+}
+
+
+def part_of(word: str) -> str | None:
+    """The sub-verb that a first word is meant for: optics for a file, paper for a folder, None for anything else."""
+    path = Path(word)
+    if path.is_dir():
+        return "paper"
+    return "optics" if path.suffix == ".h5" or path.is_file() else None

@@ -1,0 +1,132 @@
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
+
+import dataclasses
+import html
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from codesign.evaluate import Scenes, Setting
+from codesign.evaluate import optics as evaluate_optics
+from codesign.evaluate import plots as evaluate_plots
+from codesign.evaluate import tables as evaluate_tables
+from codesign.eye import states_at
+from metalens import design
+from metalens import lens as lenses
+from metalens.commands import Common, Output
+from metalens.design import Focus
+from metalens.design.free_form import Fisher, design_pupil
+from metalens.design.free_form import simple_lenses as baselines
+from metalens.ground import config, store
+from metalens.ground.errors import ConfigError
+from metalens.ground.report import Figure, Markup, Section, write
+from metalens.lens import Lens
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The content of OPTICS.toml; every key may be left out.
+
+    axial: how the axial information is measured. scenes: what the scene table is made of.
+    """
+
+    axial: Setting = field(default_factory=Setting)
+    scenes: Scenes = field(default_factory=Scenes)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate optics``.
+
+    Attributes:
+        lenses: lens files; the first is what the others are compared with.
+        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
+        config: OPTICS.toml with the tables [axial] and [scenes]; without it the defaults.
+        scenes: number of scenes, in place of the one in the settings.
+        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
+            and at the aperture of the first lens; tuned on axis for the finest binning.
+    """
+
+    lenses: tyro.conf.Positional[tuple[Path, ...]]
+    output: Output = Path("optics")
+    config: Path | None = None
+    scenes: int | None = None
+    baselines: bool = False
+
+
+def run(options: Options) -> int:
+    """Measure, print, draw, write."""
+    if not options.lenses:
+        raise ConfigError("no lens to evaluate; give at least one lens file")
+    settings = Settings() if options.config is None else config.load(options.config, Settings)
+    if options.scenes is not None:
+        settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
+    made = [lenses.load(path) for path in options.lenses]
+    names = distinct([path.stem for path in options.lenses])
+    folder = options.output
+    with options.claim_folder(folder) as draft:
+        values, text = _measure(options, settings, made, names, draft.path)
+    options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html")
+    return 0
+
+
+def _measure(
+    options: Options, settings: Settings, made: list[Lens], names: list[str], folder: Path
+) -> tuple[dict[str, Any], str]:
+    """Measure, draw, write; the numbers and the tables."""
+    if options.baselines:
+        for name, lens in tuned_like(made[0], settings.axial):
+            names.append(name)
+            made.append(lens)
+    states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
+    pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
+    axial = {name: evaluate_optics.axial(lens, settings.axial) for name, lens in pairs}
+    scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
+    text = evaluate_tables.tables(axial, scenes, settings.axial)
+    values = evaluate_tables.values(axial, scenes, settings.axial)
+    store.write_text(folder / "tables.txt", text + "\n")
+    store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
+    pictures = {
+        "axial": evaluate_plots.information(axial, settings.axial),
+        "slices": evaluate_plots.slices(axial, settings.axial),
+        "scenes": evaluate_plots.scenes(scenes),
+    }
+    for name, image in pictures.items():
+        store.write_bytes(folder / f"{name}.png", image)
+    items = [Figure(image, evaluate_plots.CAPTIONS[name], wide=True) for name, image in pictures.items()]
+    write(
+        folder / "report.html",
+        "What the lenses tell",
+        [Section("Pictures", items=items), Section("Tables", items=[Markup(f"<pre>{html.escape(text)}</pre>")])],
+    )
+    return values, text
+
+
+def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
+    """The tuned hyperbolic lens and double helix, of the pillars and aperture of a lens, with their names."""
+    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
+    wanted = Fisher(
+        depths_mm=setting.depths_mm,
+        pixel_um=setting.pixel_um * min(setting.binnings),
+        radius_um=setting.radius_um,
+        normalisation="sum" if setting.normalisation == "sum" else "l2",
+    )
+    out = []
+    for found in baselines.tuned_pair(design_pupil(focus, radius), wanted):
+        phase, mine = found.phase(focus, radius_um=radius)
+        kind = "double-helix" if found.zones else "hyperbolic"
+        simple, _ = design.make(
+            phase, mine, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind
+        )  # fmt: skip
+        out.append((found.name, simple))
+    return out
+
+
+def distinct(names: list[str]) -> list[str]:
+    """Names of lenses, numbered where two files have the same stem."""
+    return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]

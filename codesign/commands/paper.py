@@ -1,0 +1,154 @@
+"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import tyro
+
+from codesign.adapt import train as retraining
+from codesign.commands import evaluate_optics as command_evaluate_optics
+from codesign.commands import experiment as command_experiment
+from codesign.evaluate import ROLES, ExperimentConfig, Line, Measured, paper, paper_runs
+from metalens.commands import Common, Output
+from metalens.ground import report, store
+from metalens.ground.errors import ConfigError
+
+JSON, PAGE, GAZE = "paper.json", "report.html", "gaze.json"
+DIM_DB = 15.0
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate paper``.
+
+    Attributes:
+        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
+            far as there are; without any, the claims are listed with the commands that measure them.
+        others: further finished runs: other networks (Table 2), runs with one part frozen (Fig. 8b); each run's
+            result.json tells which it is.
+        output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
+        subjects: of the experiment.
+        scenes: of Table 1.
+        measure: measure what is not in the folder yet; without it only what is there is used.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    others: tuple[Path, ...] = ()
+    output: Output = Path("paper")
+    subjects: int = 20
+    scenes: int = 24
+    measure: bool = True
+
+
+def run(options: Options) -> int:
+    """Measure what is missing, compare, write; exit 0."""
+    if len(options.runs) > len(ROLES):
+        raise ConfigError(f"{len(options.runs)} runs; give at most {len(ROLES)}: {', '.join(ROLES)}")
+    folder = options.output
+    runs = dict(zip(ROLES, options.runs, strict=False))
+    if (folder / JSON).is_file() and not options.force:
+        raise ConfigError(f"{folder / JSON} exists; give --force to write it again from the measurements beside it")
+    for path in options.runs:
+        retraining.rows_of(path)  # refused now, not after an hour of measuring
+    with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
+        if options.runs and options.measure:
+            _measure(options, draft.path)
+        told = paper.lines(collect(draft.path, runs, options.others), draft.path)
+        _write(draft.path, told)
+        values = [{**asdict(t.claim), "ours": asdict(t.ours) if t.ours else None, "picture": t.picture} for t in told]
+        store.write_text(draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n")
+    options.console.result({"lines": values, "folder": str(folder)}, f"{table(told)}\nopen {folder / PAGE}")
+    return 0
+
+
+def collect(folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()) -> dict[str, Measured]:
+    """Everything that was measured into ``folder``, and the rows of the runs and of those with a part frozen.
+
+    Raises:
+        StoreError, TrainingError: a measurement or a run is damaged or of another version.
+    """
+    found: dict[str, Measured] = {}
+    experiment, dim, optics = (
+        folder / name / f"{file}.json"
+        for name, file in (("experiment", "experiment"), ("dim", "experiment"), ("optics", "optics"))
+    )
+    if experiment.is_file():
+        found |= paper.of_experiment(experiment)
+    if experiment.is_file() and dim.is_file():
+        found |= paper.of_dim(experiment, dim)
+    if optics.is_file():
+        found |= paper.of_optics(optics)
+    if (folder / GAZE).is_file():
+        found |= paper_runs.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
+    rows = {role: retraining.rows_of(path) for role, path in runs.items()}
+    found |= paper.of_runs(rows)
+    return found | paper_runs.of_ablations(rows.get("proposed", []), dict(paper_runs.frozen_rows(others)))
+
+
+def _measure(options: Options, folder: Path) -> None:
+    names = ROLES[: len(options.runs)]
+    config = ExperimentConfig(subjects=options.subjects)
+    for name, settings in (("experiment", config), ("dim", replace(config, snr_db=DIM_DB))):
+        if not (folder / name / "experiment.json").is_file():
+            options.console.say(f"measuring: {name}")
+            asked = command_experiment.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
+            command_experiment.run(asked)
+    _measure_gaze(options, folder / GAZE)
+    if not (folder / "optics" / "optics.json").is_file():
+        options.console.say("measuring: optics")
+        order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
+        lenses = tuple(_named(folder, name, path) for name, path in order)
+        optics = command_evaluate_optics.Options(
+            lenses=lenses, output=folder / "optics", scenes=options.scenes, quiet=True, force=True
+        )
+        command_evaluate_optics.run(optics)
+
+
+def _measure_gaze(options: Options, path: Path) -> None:
+    """Gaze of the proposed run and of the other networks; runs that are in the file are not measured again."""
+    told = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+    for folder in (options.runs[0], *options.others):
+        kind = paper_runs.kind_of(folder)
+        if str(folder) in told or (folder != options.runs[0] and kind.network == "supernet"):
+            continue
+        options.console.say(f"measuring: gaze of {folder}")
+        told[str(folder)] = {"network": kind.network, "rows": paper_runs.gaze(folder)}
+        store.write_text(path, json.dumps(told, indent=1) + "\n")
+
+
+def _named(folder: Path, name: str, run_dir: Path) -> Path:
+    """The run's lens under its role's name, by which the tables know it."""
+    kept = folder / "lenses"
+    kept.mkdir(exist_ok=True)
+    store.write_bytes(kept / f"{name}.h5", (run_dir / "lens.h5").read_bytes())
+    return kept / f"{name}.h5"
+
+
+def table(told: list[Line]) -> str:
+    """The lines as text."""
+    rows = [("place", "what", "paper", "ours", "ratio", "conditions"), *(t.words() for t in told)]
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+    return "\n".join(
+        "  ".join([*(c.ljust(w) for c, w in zip(row, widths, strict=False)), row[5]]).rstrip() for row in rows
+    )
+
+
+def _write(folder: Path, told: list[Line]) -> None:
+    places = list(dict.fromkeys(t.claim.place for t in told))
+    head = ("what", "paper", "ours", "ratio", "conditions")
+    sections = []
+    for place in places:
+        mine = [t for t in told if t.claim.place == place]
+        items: list[report.Figure | report.Table] = (
+            [report.Table(head, [t.words()[1:] for t in mine if not t.picture])]
+            if any(not t.picture for t in mine)
+            else []
+        )
+        items += [report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True) for t in mine if t.picture]
+        sections.append(report.Section(place, items=items))
+    done = sum(t.ours is not None or bool(t.picture) for t in told)
+    keys = [report.KeyFigure("claims of the paper", str(len(told))), report.KeyFigure("measured here", str(done))]
+    lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
+    report.write(folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys)

@@ -1,0 +1,235 @@
+"""RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and the next mask's correction."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from safetensors.torch import save_file
+
+from characterize.bench import Truth
+from characterize.inference import asbuilt
+from codesign.adapt import Lenses, RetrainConfig, Source, correction
+from codesign.adapt import report as retrain_report
+from codesign.adapt import train as retraining
+from codesign.adapt.sure import Sureness, judge
+from codesign.network import Subnet
+from codesign.optics import MadeLens, posterior, psf_error
+from codesign.train import Record, RunConfig, Trainer, checkpoint
+from metalens import __version__, lens
+from metalens.commands import Common, Output
+from metalens.ground import config, store
+from metalens.ground.errors import TrainingError
+from metalens.ground.transaction import Draft
+from metalens.made import Bias
+
+LOG, RECIPE, RESULT = "log.jsonl", "retrain.toml", "result.json"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens retrain``.
+
+    Attributes:
+        run_dir: folder of a finished ``metalens codesign``.
+        asbuilt: what ``metalens fit`` made of captures of the run's lens.h5.
+        output: folder for the retrained network, result.json, bias.toml, lens_corrected.h5 and report.html.
+        truth: TOML of the virtual bench; then the true lens judges, and a network is trained with it known.
+        process: PROCESS.toml that the mask was drawn with; its bias table is the one to be corrected.
+        settings: how to train on.
+        resume: go on from the folder's checkpoints, bit for bit.
+        insist: use a fit that failed its own checks.
+    """
+
+    run_dir: tyro.conf.Positional[Path]
+    asbuilt: Annotated[Path, tyro.conf.arg(aliases=["--optics"])]
+    output: Output
+    truth: Path | None = None
+    process: Path | None = None
+    settings: tyro.conf.OmitArgPrefixes[RetrainConfig] = field(default_factory=RetrainConfig)
+    resume: bool = False
+    insist: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a resume must find unchanged.
+
+    asbuilt, weights, truth: SHA-256 of the files; '' without one.
+    """
+
+    settings: RetrainConfig
+    asbuilt: str
+    weights: str
+    truth: str
+    run: RunConfig
+
+
+Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
+
+
+def run(options: Options) -> int:
+    """Train on, judge, correct, report; exit 0."""
+    source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
+    result = asbuilt.load(options.asbuilt)
+    design = lens.load(options.run_dir / "lens.h5")
+    retraining.check_lens(design, result, insist=options.insist)
+    truth = config.load(options.truth, Truth) if options.truth else None
+    old = correction.present_bias(options.process)
+    recipe = _recipe(options, source)
+    with options.claim_work(options.output, keep=("*.safetensors",), resume=options.resume) as draft:
+        _agree(draft, recipe, resume=options.resume)
+        story = _story(options, draft.path, recipe, (source, result, design, truth, old))
+    options.console.result(_values(story, options.output), _text(story, options.output))
+    return 0
+
+
+def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retrain_report.Story:
+    """Train on, judge, correct and write into the folder."""
+    source, result, design, truth, old = given
+    made = MadeLens(design, source.settings.optics, response=result.response)
+    found = retraining.lenses(made, result, options.settings, truth)
+    trained = {name: _train(options, folder, (recipe, source, found), name) for name in retraining.jobs(found)}
+    outcome = retraining.outcome(source, options.settings, found, trained)
+    plan = correction.propose(design, result.parameters(), response=made.response, old=old)
+    true = (
+        truth.vector() if truth else list(posterior(result, options.settings.draws + 1, seed=options.settings.seed))[-1]
+    )
+    proposals, frames = [], retraining.held(source, options.settings)
+    for state in correction.next_lenses(made, plan, result.parameters(), true):
+        error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,), frames=frames)
+        proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
+    sure = judge(result, lambda x: correction.propose(design, x, response=made.response, old=old).bias_nm)
+    apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
+    story = retrain_report.Story(
+        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found, sure)
+    )
+    if sure.usable:
+        correction.write(folder, plan)
+    _keep(folder, options.output, (source, trained["retrained"]), story)
+    return story
+
+
+def _recipe(options: Options, source: Source) -> Recipe:
+    return Recipe(
+        options.settings,
+        store.sha256(options.asbuilt),
+        store.sha256(options.run_dir / "checkpoint.safetensors"),
+        store.sha256(options.truth) if options.truth else "",
+        source.settings,
+    )
+
+
+def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
+    """Note the recipe, or refuse to resume another."""
+    text, folder = config.dumps(recipe), draft.path
+    if resume:
+        if not (folder / RECIPE).is_file():
+            raise TrainingError(f"{draft.target}: no retraining to resume ({RECIPE} missing); start without --resume")
+        changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), text)
+        if changed:
+            raise TrainingError(f"{folder} belongs to other settings; start anew or undo the change:\n{changed}")
+        return
+    store.write_text(folder / RECIPE, text)
+
+
+def _train(options: Options, folder: Path, given: tuple[Recipe, Source, Lenses], name: str) -> Trainer:
+    """One job to its end, logged and kept; a resume drops log lines beyond its checkpoint."""
+    (recipe, source, found), console = given, options.console
+    going = retraining.job(source, options.settings, found, name)
+    path = folder / f"{name}.safetensors"
+    if path.is_file():
+        going.restore(checkpoint.load(path, settings=recipe)["trainer"])
+    _trim(folder, name, going.step)
+    records = retraining.train(going, path, recipe)
+    for record in console.track(records, total=going.inner.steps - going.step, label=f"training: {name}"):
+        _log(folder, name, record)
+    return going
+
+
+def _log(folder: Path, name: str, record: Record) -> None:
+    with open(folder / LOG, "a", encoding="utf-8") as file:
+        file.write(json.dumps({"job": name, **asdict(record)}) + "\n")
+
+
+def _trim(folder: Path, name: str, step: int) -> None:
+    kept = [e for e in _entries(folder) if e["job"] != name or e["step"] <= step]
+    store.write_text(folder / LOG, "".join(json.dumps(e) + "\n" for e in kept))
+
+
+def _entries(folder: Path) -> list[dict[str, Any]]:
+    lines = (folder / LOG).read_text("utf-8").splitlines() if (folder / LOG).is_file() else []
+    entries = []
+    for line in lines:
+        try:
+            entries.append(json.loads(line))
+        except json.JSONDecodeError:  # the line that was being written when the run was killed
+            continue
+    return entries
+
+
+def _curves(folder: Path, found: Lenses) -> dict[str, tuple[list[int], list[float]]]:
+    entries = _entries(folder)
+    return {
+        name: ([e["step"] for e in entries if e["job"] == name], [e["task"] for e in entries if e["job"] == name])
+        for name in retraining.jobs(found)
+    }
+
+
+def _cautions(result: asbuilt.AsBuilt, found: Lenses, sure: Sureness) -> list[str]:
+    words = [sure.words] * (not sure.usable) + list(result.problems) + list(result.degeneracies)
+    release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
+    if release != __version__:
+        words.append(f"the as-built record was made by release {release}, this is {__version__}")
+    if not found.known:
+        words.append("the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance")
+    return words
+
+
+def _keep(folder: Path, target: Path, trained: tuple[Source, Trainer], story: retrain_report.Story) -> None:
+    source, going = trained
+    retraining.settle(going, source)
+    cut = Subnet(retraining.network(going), source.architecture)
+    with store.replacing(folder / "subnet_retrained.safetensors") as part:
+        save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})
+    retrain_report.write(folder / "report.html", story)
+    store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
+    store.write_text(folder / RESULT, json.dumps(_values(story, target), indent=1) + "\n")
+
+
+def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
+    o = story.outcome
+    states = [
+        {"name": p.name, "psf_error": error, "strehl": p.strehl, "light": p.light, "slip_mm": slip}
+        for p, error, slip in story.proposals
+    ]
+    return {
+        "folder": str(folder),
+        "rows": [{"case": retrain_report.CASES[name], **row} for name, row in o.rows().items()],
+        "slip_mm": o.rows()["after"]["slip_mm"],
+        "cases": o.rows(),
+        "gap_mm": o.gap_mm,
+        "gap_sigma_mm": o.gap_sigma_mm,
+        "recovered": o.recovered,
+        "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
+        "truth_known": story.lenses.known,
+        "next_lens": states,
+    }
+
+
+def _text(story: retrain_report.Story, folder: Path) -> str:
+    o = story.outcome
+    lines = [f"{'case':<38}slippage error / mm        axial   IoU"]
+    for name, v in o.rows().items():
+        span = f"[{v['slip_low_mm']:.3f}, {v['slip_high_mm']:.3f}]"
+        lines.append(
+            f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} {v['axial_mm']:.3f}   {v['iou']:.3f}"
+        )
+    won = "nothing to win back beyond chance" if o.recovered is None else f"{o.recovered:.0%} won back"
+    lines.append(f"gap {o.gap_mm:.3f} +- {o.gap_sigma_mm:.3f} mm, {won}")
+    for p, error, slip in story.proposals:
+        lines.append(
+            f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"
+        )
+    return "\n".join([*lines, f"open {folder / 'report.html'}"])

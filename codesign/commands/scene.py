@@ -1,0 +1,168 @@
+"""SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks, render
+from codesign.referee import pathtraced
+from metalens.commands import Common, Output
+from metalens.ground import config, store
+from metalens.ground.errors import ConfigError
+from metalens.ground.store import Provenance
+from metalens.image import scene
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The content of SCENE.toml; every key may be left out.
+
+    frames, seed: how many states, drawn from which seed.
+    pixels, pitch_um: of the image grid.
+    elevation_deg, distance_mm: of the camera below the eye's forward direction, and its distance from the pupil.
+    gaze_deg: largest gaze to the side, and up or down. slip_mm: largest slippage along the camera's x, y, z.
+    scale: spread of the scale ambiguity (depth and labels times 1 +- scale at an unchanged image).
+    layer_mm: thickness of the depth layers that are written; at most 0.5.
+    """
+
+    frames: int = 24
+    seed: int = 0
+    pixels: int = 320
+    pitch_um: float = 4.5
+    elevation_deg: float = 45.0
+    distance_mm: float = 21.0
+    gaze_deg: tuple[float, float] = (18.0, 13.0)
+    slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
+    scale: float = 0.0
+    layer_mm: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= 100_000:
+            raise ConfigError(f"frames = {self.frames}: need 1 to 100000")
+        if not 0 < self.layer_mm <= 0.5:
+            raise ConfigError(f"layer_mm = {self.layer_mm}: need a thickness above 0 and at most 0.5 mm")
+        if not (8 <= self.pixels <= 8192 and 0 < self.pitch_um < 1e4 and 0 < self.distance_mm < 1e4):
+            raise ConfigError(
+                f"pixels = {self.pixels}, pitch_um = {self.pitch_um}, distance_mm = {self.distance_mm}: need 8 to 8192 "
+                "pixels, and a pitch and a distance above 0"
+            )
+        if abs(self.elevation_deg) >= 90 or not all(0 <= v < 90 for v in self.gaze_deg) or min(self.slip_mm) < 0:
+            raise ConfigError(
+                f"elevation_deg = {self.elevation_deg}, gaze_deg = {self.gaze_deg}, slip_mm = {self.slip_mm}: need "
+                "angles below 90, ranges of 0 or more"
+            )
+        if not 0 <= self.scale < 0.5:
+            raise ConfigError(f"scale = {self.scale}: need 0 to 0.5")
+
+    @property
+    def rig(self) -> Rig:
+        """Camera and lamps in um and rad."""
+        return replace(Rig(), elevation_rad=math.radians(self.elevation_deg), distance_um=self.distance_mm * 1e3)
+
+    @property
+    def motion(self) -> Motion:
+        """Ranges in um and rad."""
+        x, y = (math.radians(angle) for angle in self.gaze_deg)
+        slip = (self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3)
+        return replace(Motion(), gaze_x_rad=x, gaze_y_rad=y, slip_um=slip, scale=self.scale)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens scene``.
+
+    Attributes:
+        config: SCENE.toml; without it the defaults.
+        output: folder for scene.h5, layers.h5, sheet.png and labels.csv.
+        referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
+            referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
+    """
+
+    config: tyro.conf.Positional[Path | None] = None
+    output: Output = Path("scene")
+    referee: bool = False
+    settings: tyro.conf.Suppress[Scene] = field(default_factory=Scene)
+
+
+def run(options: Options) -> int:
+    """Render, write and show."""
+    settings = options.settings if options.config is None else config.load(options.config, Scene)
+    if options.referee:
+        pathtraced.start()
+    folder = options.output
+    with options.claim_folder(folder) as draft:
+        count = _make(settings, draft.path, referee=options.referee)
+    values = {"frames": settings.frames, "layers": count, "folder": str(folder)}
+    options.console.result(values, f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png")
+    return 0
+
+
+def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
+    """Render and write; the number of layers of the first frame."""
+    camera = Camera(settings.pixels, settings.pitch_um)
+    states = dataset.states_at(torch.arange(settings.frames), settings.seed, motion=settings.motion)
+    made = render(states, rig=settings.rig, camera=camera)
+    about = Provenance(config=config.dumps(settings), seed=settings.seed)
+    dataset.write_shard(folder / "scene.h5", made, seed=settings.seed, provenance=about)
+    count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)
+    store.write_text(folder / "labels.csv", _table(made))
+    contact_sheet(made, folder / "sheet.png")
+    if referee:
+        view = Camera(96, settings.pixels * settings.pitch_um / 96)
+        judged = pathtraced.compare(states, rig=settings.rig, camera=view)
+        pathtraced.picture(judged, folder / "referee.png")
+        store.write_text(folder / "referee.txt", "\n".join(judged.lines()) + "\n")
+    return count
+
+
+def _write_layers(path: Path, made: Rendered, step_um: float, about: Provenance) -> int:
+    """The occupied layers of the first frame, as image formation takes them."""
+    frame = scene.Frames(made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1])
+    seen = frame.depth_um[frame.coverage > 0]
+    low, high = float(seen.min()), float(seen.max())
+    depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
+    layers = scene.cut(frame, depths)
+    arrays = {
+        "radiance": layers.radiance[0].numpy(),
+        "coverage": layers.coverage[0].numpy(),
+        "depth_um": layers.depth_um.numpy(),
+        "near": layers.near.numpy(),
+    }
+    store.save(path, "layers", arrays, provenance=about)
+    return len(layers.depth_um)
+
+
+def _table(made: Rendered) -> str:
+    """Labels as comma-separated values, a frame a line."""
+    labels = made.labels
+    marks = [f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"]
+    head = ["slip x um", "slip y um", "slip z um", "optic x", "optic y", "optic z", "visual x", "visual y", "visual z"]
+    head += ["pupil x um", "pupil y um", "pupil z um", "pupil x px", "pupil y px", "visible", *marks]
+    columns = [labels.slip_um, labels.optic_axis, labels.visual_axis, labels.pupil_um, labels.pupil_px]
+    columns += [labels.visible[:, None], labels.landmarks_px.flatten(1)]
+    rows = torch.cat(columns, 1).tolist()
+    return "\n".join([",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]) + "\n"
+
+
+def contact_sheet(made: Rendered, path: Path, *, columns: int = 6, most: int = 24) -> None:
+    """A picture of frames, with depth and pupil masks of the first row below."""
+    import cv2
+
+    light = made.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)
+    frames = list((light * 255).numpy().astype(np.uint8))
+    depth = (made.frames.depth_um * made.frames.coverage).sum(1)[:columns]
+    low, high = float(depth.min()), float(depth.max())
+    near = 255 * (high - depth) / max(high - low, 1e-9)
+    frames += list(near.numpy().astype(np.uint8)) if len(frames) % columns == 0 else []
+    frames += list((made.pupil[:columns] * 255).numpy().astype(np.uint8)) if len(frames) % columns == 0 else []
+    blank = np.zeros_like(frames[0])
+    frames += [blank] * (-len(frames) % columns)
+    rows = [np.concatenate(frames[k : k + columns], 1) for k in range(0, len(frames), columns)]
+    done, coded = cv2.imencode(".png", np.concatenate(rows, 0))
+    if not done:
+        raise OSError(f"{path}: the picture could not be encoded")
+    store.write_bytes(path, coded.tobytes())

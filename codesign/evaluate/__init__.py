@@ -1,0 +1,45 @@
+"""The paper's tables and figures."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from codesign.evaluate import experiment_plots as experiment_plots
+    from codesign.evaluate import optics as optics
+    from codesign.evaluate import paper as paper
+    from codesign.evaluate import paper_runs as paper_runs
+    from codesign.evaluate import plots as plots
+    from codesign.evaluate import tables as tables
+    from codesign.evaluate.gaze_experiment import AXIAL as AXIAL
+    from codesign.evaluate.gaze_experiment import LATERAL as LATERAL
+    from codesign.evaluate.gaze_experiment import ExperimentConfig as ExperimentConfig
+    from codesign.evaluate.gaze_experiment import Result as Result
+    from codesign.evaluate.gaze_experiment import experiment as experiment
+    from codesign.evaluate.optics import Scenes as Scenes
+    from codesign.evaluate.optics import Setting as Setting
+    from codesign.evaluate.paper import ROLES as ROLES
+    from codesign.evaluate.paper import Line as Line
+    from codesign.evaluate.paper import Measured as Measured
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "AXIAL": "gaze_experiment",
+        "ExperimentConfig": "gaze_experiment",
+        "LATERAL": "gaze_experiment",
+        "Line": "paper",
+        "Measured": "paper",
+        "ROLES": "paper",
+        "Result": "gaze_experiment",
+        "Scenes": "optics",
+        "Setting": "optics",
+        "experiment": "gaze_experiment",
+        "experiment_plots": "",
+        "optics": "",
+        "paper": "",
+        "paper_runs": "",
+        "plots": "",
+        "tables": "",
+    },
+)

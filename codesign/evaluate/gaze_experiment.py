@@ -1,0 +1,281 @@
+"""The experiment of the paper's Sec. 5 with synthetic subjects: a grid of stimuli under known slippage of the camera.
+
+The paper's bench holds the head, shows 7 x 7 stimuli over 25 x 35 degrees, and moves the camera to seven places that
+share an origin: two to the side and four along the axis, in steps of 2.5 mm. Here the subjects are drawn from the
+population of :mod:`codesign.eye.population`, none of whom training saw; every run sees the same frames through its
+own lens.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from codesign.adapt import Source, network
+from codesign.batches import EXPERIMENT, EyeScenes, as_batch
+from codesign.eye import POPULATION, Rendered, Rig, States, render
+from codesign.eye import population as eye
+from codesign.gaze import angle_deg, personal
+from codesign.network import recalibrate
+from codesign.optics import stack as lens
+from codesign.train import Answers, Seen, assess, read_out
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError
+from metalens.image import UniformImager, image, low_snr
+
+AXIAL, LATERAL = "axial", "lateral"
+LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
+Points = Literal["random", "spread"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentConfig:
+    """What is shown to whom, and how gaze is calibrated.
+
+    subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that they span.
+    axial_mm, lateral_mm: slippage states beside the origin, along z and x.
+    share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
+        at random or spread over the field, as a calibration screen would show them.
+    hidden: neurons of the regressor. fixation_deg: standard deviation of where a subject really looks.
+    pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
+    snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
+    """
+
+    subjects: int = 20
+    grid: tuple[int, int] = (7, 7)
+    field_deg: tuple[float, float] = (35.0, 25.0)
+    axial_mm: tuple[float, ...] = (-5.0, -2.5, 2.5, 5.0)
+    lateral_mm: tuple[float, ...] = (-2.5, -5.0)
+    share: float = 0.2
+    points: Points = "random"
+    hidden: int = 10
+    fixation_deg: float = 0.3
+    pupil_sd: float = 0.05
+    seed: int = 0
+    snr_db: float | None = None
+
+    def __post_init__(self) -> None:
+        points = self.grid[0] * self.grid[1]
+        if self.subjects < 1 or min(self.grid) < 2 or not 3 <= round(self.share * points) < points:
+            raise ConfigError(
+                f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
+                "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
+            )
+
+    @property
+    def stimuli_deg(self) -> Array:
+        """(points, 2) direction of every stimulus, x and y (down)."""
+        x, y = (np.linspace(-f / 2, f / 2, n) for f, n in zip(self.field_deg, self.grid, strict=True))
+        return np.stack([g.ravel() for g in np.meshgrid(x, y)], 1)
+
+    @property
+    def slips_mm(self) -> Array:
+        """(states, 3): the origin, the lateral and the axial ones."""
+        lateral = [(x, 0.0, 0.0) for x in self.lateral_mm]
+        return np.array([(0.0, 0.0, 0.0), *lateral, *((0.0, 0.0, z) for z in self.axial_mm)])
+
+    @property
+    def frames(self) -> int:
+        """Of all subjects."""
+        return self.subjects * len(self.stimuli_deg) * len(self.slips_mm)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trial:
+    """Of every frame (n,): subject, stimulus, slippage state; and what was true.
+
+    stimulus_deg: (n, 2). slip_mm: (n, 3).
+    """
+
+    subject: Array
+    stimulus: Array
+    state: Array
+    stimulus_deg: Array
+    slip_mm: Array
+
+    def group(self, kind: str) -> Array:
+        """(n,) frames of the axial or lateral states, the origin among both."""
+        along = 2 if kind == AXIAL else 0
+        other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
+        return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Result:
+    """One run in the experiment.
+
+    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where the
+    regressor is told the true slippage: what the reading of the pupil alone leaves.
+    """
+
+    name: str
+    mmacs: float
+    trial: Trial
+    slip_mm: Array
+    centre: Array
+    iou: Array
+    gaze_deg: Array
+    predicted_deg: Array
+    told_deg: Array
+
+    def gaze(self, kind: str) -> float:
+        """Mean gaze error over the judged frames of a group, deg."""
+        return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
+
+    @property
+    def slip_error_mm(self) -> Array:
+        """(n, 3) absolute errors of the slippage."""
+        return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
+
+    def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
+        """(subjects,) means of (n,) values, of which nan are left out."""
+        keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
+        return np.array([values[keep & (self.trial.subject == s)].mean() for s in np.unique(self.trial.subject)])
+
+
+def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tuple[States, Trial]:
+    """All frames of one subject: slippage states outermost, stimuli within."""
+    stimuli, slips = config.stimuli_deg, config.slips_mm
+    n = len(stimuli) * len(slips)
+    rng = np.random.default_rng([config.seed, subject, LOOKS])
+    person = eye.draw(1, (config.seed, PEOPLE, subject), motion=replace(scenes.settings.motion, scale=0.0))
+    base = person[torch.zeros(n, dtype=torch.int64)]
+    state, stimulus = (g.ravel() for g in np.meshgrid(np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"))
+    kappa = torch.stack([base.trait("kappa_x_rad"), base.trait("kappa_y_rad")], 1)
+    looks = np.radians(stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2)))
+    traits = base.traits.clone()
+    radius = list(POPULATION).index("pupil_radius_um")
+    traits[:, radius] *= torch.from_numpy(np.clip(1 + config.pupil_sd * rng.standard_normal(n), 0.7, 1.3))
+    states = replace(
+        base,
+        traits=traits,
+        gaze_rad=torch.from_numpy(looks) + kappa,  # the visual axis lies nasal of and above the optic axis
+        torsion_rad=torch.zeros(n, dtype=torch.float64),
+        slip_um=torch.from_numpy(slips[state] * 1e3),
+        aperture=torch.from_numpy(np.clip(1 + 0.05 * rng.standard_normal(n), 0.8, 1.15)),
+    )
+    return states, Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
+
+
+def through(source: Source, made: Rendered, prepared: UniformImager, *, seed: int, snr_db: float | None = None) -> Seen:
+    """Rendered frames through a run's lens and sensor, with noise of a seed; dimmed with ``snr_db``."""
+    trainer = source.run.trainer
+    margin = source.settings.scenes.margin
+    batch = as_batch(made, margin)
+    frames = batch.frames
+    light = image(frames, prepared, margin=margin)  # type: ignore[arg-type]
+    noise = torch.Generator().manual_seed(seed)
+    sensor, pitch = trainer.sensor, trainer.model.pitch_um
+    if snr_db is not None:
+        at = replace(sensor, pitch_um=float(pitch))
+        sensor = replace(low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um)
+    pixels = read_out(light, trainer.optics.sample_um, pitch, sensor, generator=noise)
+    return Seen(pixels, batch.mask, batch.slip_mm, trainer.inner.batch)
+
+
+@torch.no_grad()
+def experiment(
+    sources: Sequence[Source], config: ExperimentConfig, *, names: Sequence[str] | None = None
+) -> Iterator[tuple[int, list[Result]]]:
+    """Run the experiment, subject by subject.
+
+    Yields:
+        (subjects done, one :class:`Result` a run); results are there with the last subject only.
+
+    Raises:
+        ConfigError: runs whose frames differ in size, samples or lens distance: they cannot share subjects' frames.
+    """
+    _check(sources)
+    scenes = sources[0].run.scenes(EXPERIMENT)
+    prepared, trials = [], []
+    answers: list[list[Answers]] = [[] for _ in sources]
+    for source in sources:
+        prepared.append(ready(source))
+    for subject in range(config.subjects):
+        states, trial = states_of(config, subject, scenes)
+        made = render(states, rig=scenes.rig, camera=scenes.camera)
+        trials.append(trial)
+        for kept, source, imager in zip(answers, sources, prepared, strict=True):
+            seen = through(source, made, imager, seed=NOISE + subject, snr_db=config.snr_db)
+            kept.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
+        if subject + 1 < config.subjects:
+            yield subject + 1, []
+    joined = Trial(*(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__))
+    labels = names or [f"run {i + 1}" for i in range(len(sources))]
+    yield (
+        config.subjects,
+        [
+            _result(label, source, kept, joined, config)
+            for label, source, kept in zip(labels, sources, answers, strict=True)
+        ],
+    )
+
+
+def _check(sources: Sequence[Source]) -> None:
+    if not sources:
+        raise ConfigError("no run to evaluate; give one run folder or more")
+    views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
+              s.settings.optics.sensor_distance_mm) for s in sources]  # fmt: skip
+    if len(set(views)) > 1:
+        raise ConfigError(
+            f"the runs see frames of different (pixels, margin, sample_um, sensor_distance_mm): {views}; "
+            "compare runs of one geometry"
+        )
+
+
+def ready(source: Source) -> UniformImager:
+    """The imager of a run's lens, its network set to the batch statistics of training frames."""
+    trainer = source.run.trainer
+    made = lens.stack(trainer.optics, trainer.model.coefficients_rad)
+    measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
+    recalibrate(network(trainer), source.architecture, assess.parts(measured))
+    size = source.settings.scenes.pixels + 2 * source.settings.scenes.margin
+    return lens.prepared(trainer.optics, made, size, margin=source.settings.scenes.margin)
+
+
+def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig) -> Result:
+    slip, centre, iou = (
+        torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("slip_mm", "centre", "iou")
+    )
+    pupil_mm, rig = centre * source.run.window_um * 1e-3, source.run.scenes(EXPERIMENT).rig
+    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig)
+    told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=rig)
+    error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
+    return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted, told_error)
+
+
+def calibrated(
+    pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
+) -> tuple[Array, Array]:
+    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
+    predicted, judged = np.empty((len(pupil_mm), 2)), np.ones(len(pupil_mm), bool)
+    for subject in np.unique(trial.subject):
+        rows = np.flatnonzero(trial.subject == subject)
+        points = np.unique(trial.stimulus[rows])
+        rng = np.random.default_rng([config.seed, int(subject), POINTS])
+        count = round(config.share * len(points))
+        if config.points == "spread":
+            chosen = spread(config.stimuli_deg[points], count, first=int(rng.integers(len(points))))
+        else:
+            chosen = rng.choice(len(points), count, replace=False)
+        seen = np.isin(trial.stimulus[rows], points[chosen])
+        known = rows[seen]
+        person = personal.fit(
+            pupil_mm[known], slip_mm[known], trial.stimulus_deg[known], rig=rig, hidden=config.hidden, seed=config.seed
+        )
+        predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
+        judged[known] = False
+    return predicted, judged
+
+
+def spread(places: Array, count: int, *, first: int) -> Array:
+    """(count,) numbers of places (n, 2) that cover them: each next one is the farthest from all before it."""
+    chosen = [first]
+    while len(chosen) < count:
+        gaps = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)
+        chosen.append(int(gaps.argmax()))
+    return np.array(chosen)

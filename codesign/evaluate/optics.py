@@ -1,0 +1,240 @@
+"""Lenses compared as the paper compares them: axial information on and off axis (Table 3, Fig. 7), and the sensitivity
+of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals over scenes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.eye import Camera, Rendered, Rig, States, Triplets, triplets
+from metalens.ground.errors import ConfigError, SceneError
+from metalens.image import Normalisation, axial_information, integrate, scene
+from metalens.lens import Lens
+from metalens.psf import View, from_lens
+
+STEP_UM = 200.0  # of the difference in Eq. 11
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How lenses are measured.
+
+    depths_mm, count: of I(z). angles_deg: field angles. pixel_um, binnings: pixels. normalisation: of Eq. 11.
+    window_um, sample_um: of the PSFs; light outside the window counts as lost. tolerance: of the PSF engine.
+    """
+
+    depths_mm: tuple[float, float] = (16.0, 26.0)
+    count: int = 11
+    angles_deg: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0)
+    pixel_um: float = 3.0
+    binnings: tuple[int, ...] = (1, 2, 3)
+    normalisation: Normalisation = "l2"
+    window_um: float = 192.0
+    sample_um: float = 0.75
+    radius_um: float = 18.0
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        low, high = self.depths_mm
+        if not (0 < low <= high and self.count >= 1 and self.angles_deg and self.binnings and min(self.binnings) >= 1):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
+                f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
+            )
+        if not (self.window_um >= 4 * self.sample_um > 0 and self.pixel_um > 0 and self.radius_um > 0):
+            raise ConfigError(
+                f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
+                f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """What the sensitivity of whole scenes is measured on.
+
+    count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the paper's kind of step).
+    pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the light within it.
+    """
+
+    count: int = 24
+    seed: int = 11
+    gaze_step_deg: float = 1.0
+    slip_step_mm: float = 0.5
+    pitch_um: float = 6.0
+    pixels: int = 240
+    window_um: float = 288.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= 100_000:
+            raise ConfigError(f"count = {self.count} scenes: need 1 to 100000")
+        if not (0 < abs(self.gaze_step_deg) <= 20 and 0 < abs(self.slip_step_mm) <= 5):
+            raise ConfigError(
+                f"gaze_step_deg = {self.gaze_step_deg}, slip_step_mm = {self.slip_step_mm}: need steps other than 0, "
+                "up to 20 degrees and 5 mm"
+            )
+        if not (self.window_um >= 4 * self.pitch_um > 0 and 8 <= self.pixels <= 4096):
+            raise ConfigError(
+                f"window_um = {self.window_um}, pitch_um = {self.pitch_um}, pixels = {self.pixels}: need a pitch above "
+                "0, a window of four pixels or more, and 8 to 4096 pixels"
+            )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Axial:
+    """Honest axial information of one lens.
+
+    information: (angles, binnings, depths) per mm², over sub-pixel positions. encircled: (angles, depths) share of the
+    light through the lens that a circle of the radius holds, placed where it holds most. psf_error: of the engine.
+    slices: (depths, x) the light on axis summed over y, on samples: what a line across the PSF's image shows.
+    """
+
+    information: Tensor
+    encircled: Tensor
+    psf_error: float
+    slices: Tensor
+
+
+def axial(lens: Lens, setting: Setting | None = None) -> Axial:
+    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the PSF engine."""
+    s = setting or Setting()
+    depths = np.linspace(1e3 * s.depths_mm[0], 1e3 * s.depths_mm[1], s.count)
+    both = np.sort(np.concatenate([depths, depths + STEP_UM]))
+    samples = round(s.window_um / s.sample_um)
+    angles = tuple((math.radians(a), 0.0) for a in s.angles_deg)
+    stack = from_lens(lens, View(tuple(both), angles, s.window_um, samples), tolerance=s.tolerance)
+    where = [int(np.argmin(np.abs(both - d))) for d in (*depths, *(depths + STEP_UM))]
+    intensity = torch.as_tensor(stack.intensity)[..., where, :, :].reshape(len(angles), 2, s.count, samples, samples)
+    values = []
+    for b in s.binnings:
+        values.append(
+            axial_information(
+                intensity[:, 0],
+                intensity[:, 1],
+                step_um=STEP_UM,
+                sample_um=s.sample_um,
+                pixel_um=s.pixel_um * b,
+                normalisation=s.normalisation,
+            )
+        )
+    light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(len(angles), s.count)
+    share = light / passed_um2(lens) / torch.cos(torch.tensor([a for a, _ in angles]))[:, None]
+    inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
+    slices = intensity[0, 0].sum(1)
+    return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error), slices)
+
+
+def most_encircled(intensity: Tensor, sample_um: float, *, radius_um: float) -> Tensor:
+    """Largest share of the light (..., y, x) that a circle of this radius holds, wherever in the window it lies.
+
+    Off axis the core of a PSF is neither at the chief ray nor at the centroid, which haze pulls away.
+    """
+    n = intensity.shape[-1]
+    grid = (torch.arange(n, dtype=torch.float64) + n // 2) % n - n // 2  # 0 first, as the transform counts
+    inside = (radius_um / sample_um + 0.5 - torch.hypot(grid[:, None], grid)).clamp(0, 1).to(intensity)
+    summed: Tensor = torch.fft.irfft2(torch.fft.rfft2(intensity) * torch.fft.rfft2(inside), s=(n, n))
+    most: Tensor = summed.amax((-2, -1))
+    return most
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneEnergy:
+    """Table 1 of one lens: (scenes,) squared differences of energy-matched images, summed over pixels.
+
+    gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
+    light: least share of the light through the lens that the PSFs' window holds, over the depths of the scenes.
+    maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared difference of gaze and slip (Fig. 5).
+    """
+
+    gaze: Tensor
+    slip: Tensor
+    separability: Tensor
+    light: float
+    maps: Tensor
+
+    @property
+    def angle_rad(self) -> Tensor:
+        """(scenes,) span angle of Eq. 5 between the changes with gaze and with slip."""
+        along = (self.gaze + self.slip - self.separability) / (2 * torch.sqrt(self.gaze * self.slip).clamp_min(1e-300))
+        return torch.arccos(along.clamp(-1, 1))
+
+
+def scene_energies(
+    lenses: Sequence[Lens], states: States, settings: Scenes | None = None, *, views: Triplets | None = None
+) -> list[SceneEnergy]:
+    """Table 1: how much the images of the same scenes change with gaze and with axial slip.
+
+    Images of all lenses are scaled to the same mean (the paper normalises the PSFs' sums). The steps are the paper's
+    kind of perturbation, not infinitesimal ones.
+
+    Args:
+        views: rendered triplets of the states, where they are at hand.
+
+    Raises:
+        SceneError: no lens is given, or they differ in their sensor distance.
+    """
+    if not lenses:
+        raise SceneError("no lens to evaluate; give at least one")
+    settings = settings or Scenes()
+    distance = lenses[0].sensor_distance_um
+    for number, lens in enumerate(lenses):
+        if abs(lens.sensor_distance_um / distance - 1) > 1e-3:
+            raise SceneError(
+                f"lens {number + 1} is made for a sensor at {lens.sensor_distance_um} um, the first for {distance} um: "
+                "their images differ in size; compare lenses of one sensor distance"
+            )
+    views = views or scene_views(states, settings, sensor_distance_um=distance)
+    out = []
+    for lens in lenses:
+        rendered = (views.anchor, views.gaze, views.slip)
+        basis, light = lens_basis(lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um)
+        out.append(energies_of(scene.uniform_imager(basis, (settings.pixels, settings.pixels)), views, light=light))
+    return out
+
+
+def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0) -> Triplets:
+    """Anchor, gaze and slip views of the states."""
+    return triplets(
+        states,
+        gaze_step_rad=math.radians(settings.gaze_step_deg),
+        slip_step_um=1e3 * settings.slip_step_mm,
+        rig=replace(Rig(), sensor_distance_um=sensor_distance_um),
+        camera=Camera(settings.pixels, settings.pitch_um),
+    )
+
+
+def energies_of(optics: scene.UniformImager, views: Triplets, *, light: float = 1.0) -> SceneEnergy:
+    """Table 1 of any PSFs, see :func:`scene_energies`."""
+    images = [scene.image(v.frames, optics) for v in (views.anchor, views.gaze, views.slip)]
+    anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
+    maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
+    sums = [m.sum((1, 2)) for m in maps]
+    return SceneEnergy(sums[0], sums[1], sums[2], light, torch.stack([anchor[0], maps[0][0], maps[2][0]]))
+
+
+def lens_basis(
+    lens: Lens, views: Sequence[Rendered], *, pitch_um: float, window_um: float = 288.0, tolerance: float = 1e-3
+) -> tuple[scene.PsfBasis, float]:
+    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few kernels of sum 1.
+
+    Also the least share of the light through the lens that the window holds: what lies outside is left out of the
+    images, where a real sensor would show it as haze.
+    """
+    seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
+    low, high = max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
+    count = max(2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1)  # 0.5 mm at the pupil, more beyond
+    depths = 1 / torch.linspace(1 / high, 1 / low, count, dtype=torch.float64).flip(0)
+    fine, window = max(1, math.ceil(pitch_um / 0.85)), 2 * math.ceil(window_um / (2 * pitch_um))
+    view = View(tuple(depths.tolist()), ((0.0, 0.0),), window * pitch_um, window * fine)
+    stack = from_lens(lens, view, tolerance=1e-3)
+    intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
+    pixels = integrate(intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1))  # odd: centred
+    light = float(torch.as_tensor(stack.energy_um2).min()) / passed_um2(lens)
+    return scene.basis(pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance), min(light, 1.0)
+
+
+def passed_um2(lens: Lens) -> float:
+    """Light through the lens at unit irradiance: sum of |T|² times the cell's area."""
+    return float((lens.transmission() ** 2).sum()) * lens.diameters.pitch_um**2

@@ -1,0 +1,125 @@
+"""What finished runs say to Table 2 and Fig. 8b of the paper: gaze of other networks, cost of what is frozen."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from codesign.adapt import train as retraining
+from codesign.batches import TEST
+from codesign.evaluate.paper import Measured
+from codesign.gaze import GazeErrors
+from codesign.gaze import bench as gaze_test
+from codesign.network import Architecture, Baseline, recalibrate, smallest
+from codesign.train import Run, assess
+from codesign.train import run as runs
+from metalens.ground.errors import TrainingError
+
+TABLE_2 = {"nvgaze": "nvgaze", "popovic": "popovic_et_al", "de2gaze": "de2gaze"}  # our network: the claim's key
+PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
+WORDS = "visual axis after a personal calibration on a fifth of the frames"
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a finished run was: its network, and which parts did not move."""
+
+    network: str
+    frozen: tuple[str, ...]
+
+
+def kind_of(folder: Path) -> Kind:
+    """Read from result.json.
+
+    Raises:
+        TrainingError: no finished run, or of another version.
+    """
+    retraining.rows_of(folder)  # refuses what is missing, cut short or empty
+    told = json.loads((folder / "result.json").read_text("utf-8"))
+    return Kind(str(told.get("network", "supernet")), tuple(told.get("frozen", ())))
+
+
+@torch.no_grad()
+def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5) -> list[dict[str, Any]]:
+    """Gaze errors of every network of a finished run on people whom training never saw; least compute first.
+
+    Raises:
+        TrainingError: no finished run, half written, or of another version.
+    """
+    settings = runs.load(folder / "run.toml")
+    going = runs.resume(folder / "checkpoint.safetensors", settings)
+    test = gaze_test.people(going.scenes(TEST), people, each, seed=seed)
+    seen = assess.frames(going.trainer, test, math.ceil(people * each / settings.inner.batch))
+    known = assess.parts(assess.frames(going.trainer, going.trainer.scenes, min(8, settings.test_batches)))
+    out = []
+    for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
+        architecture = _architecture(row, going, folder)
+        recalibrate(going.trainer.model.net, architecture, known)
+        answers = assess.predict(going.trainer.model.net, architecture, seen, settings.inner)
+        found: GazeErrors = gaze_test.gaze_errors(test, answers.centre, answers.slip_mm)
+        out.append({"mmacs": row["mmacs"], "people": people, "frames_each": each, "seed": seed, **asdict(found)})
+    return out
+
+
+def _architecture(row: Mapping[str, Any], going: Run, folder: Path) -> Architecture:
+    net = going.trainer.model.net
+    if isinstance(net, Baseline):
+        return smallest(net.space)
+    return retraining.architecture_of(row["architecture"], going, folder)
+
+
+def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
+    """Table 2 from gaze.json: {folder: {network, rows of :func:`gaze`}}; the first supernet is the proposed one."""
+    found: dict[str, Measured] = {}
+    for entry in told.values():
+        rows = entry["rows"]
+        if entry["network"] in TABLE_2:
+            found[f"table2/{TABLE_2[entry['network']]}"] = _measured(rows[0])
+        elif "table2/proposed_efficient" not in found:
+            found["table2/proposed_efficient"] = _measured(rows[0])
+            found["table2/proposed_accurate"] = _measured(min(rows, key=lambda r: float(r["personal_deg"])))
+    return found
+
+
+def _measured(row: Mapping[str, Any]) -> Measured:
+    words = f"{row['mmacs']:.1f} MMACs, {row['people']} synthetic people, seed {row['seed']}, {WORDS}"
+    return Measured(float(row["personal_deg"]), conditions=words)
+
+
+def of_ablations(
+    ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> dict[str, Measured]:
+    """Fig. 8b: compute of a run with one part frozen over ours, at the best axial slippage that the frozen one reaches.
+
+    ours: rows of the joint run. others: {frozen part: rows}. A part whose best error ours never reaches is left out.
+    """
+    found = {}
+    for part, rows in others.items():
+        best = min(rows, key=lambda r: float(r["axial_slip_mm"]))
+        enough = [float(r["mmacs"]) for r in ours if r["axial_slip_mm"] <= best["axial_slip_mm"]]
+        if enough:
+            words = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(enough):.1f} MMACs"
+            found[f"fig8b/{part}"] = Measured(float(best["mmacs"]) / min(enough), conditions=words)
+    return found
+
+
+def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """(part, rows) of every run of the elastic network in which exactly one part was frozen.
+
+    Raises:
+        TrainingError: two runs with the same part frozen.
+    """
+    seen: dict[str, Path] = {}
+    for folder in folders:
+        kind = kind_of(folder)
+        if kind.network != "supernet" or len(kind.frozen) != 1:
+            continue
+        part = kind.frozen[0]
+        if part in seen:
+            raise TrainingError(f"{seen[part]} and {folder} both have {part} frozen; give one of them")
+        seen[part] = folder
+        yield part, retraining.rows_of(folder)

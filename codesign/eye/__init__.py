@@ -1,0 +1,55 @@
+"""A parametric eye -> rendered frames with labels."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from codesign.eye import dataset as dataset
+    from codesign.eye import landmarks as landmarks
+    from codesign.eye import model as model
+    from codesign.eye import population as population
+    from codesign.eye import renderer as renderer
+    from codesign.eye import textures as textures
+    from codesign.eye.dataset import Triplets as Triplets
+    from codesign.eye.dataset import ambiguity_pairs as ambiguity_pairs
+    from codesign.eye.dataset import states_at as states_at
+    from codesign.eye.dataset import triplets as triplets
+    from codesign.eye.population import POPULATION as POPULATION
+    from codesign.eye.population import Motion as Motion
+    from codesign.eye.population import Rig as Rig
+    from codesign.eye.population import States as States
+    from codesign.eye.population import face_axes as face_axes
+    from codesign.eye.population import mean_eye_um as mean_eye_um
+    from codesign.eye.population import parameters as parameters
+    from codesign.eye.renderer import Camera as Camera
+    from codesign.eye.renderer import Labels as Labels
+    from codesign.eye.renderer import Rendered as Rendered
+    from codesign.eye.renderer import render as render
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Camera": "renderer",
+        "Labels": "renderer",
+        "Motion": "population",
+        "POPULATION": "population",
+        "Rendered": "renderer",
+        "Rig": "population",
+        "States": "population",
+        "Triplets": "dataset",
+        "ambiguity_pairs": "dataset",
+        "dataset": "",
+        "landmarks": "",
+        "model": "",
+        "face_axes": "population",
+        "mean_eye_um": "population",
+        "parameters": "population",
+        "population": "",
+        "render": "renderer",
+        "renderer": "",
+        "states_at": "dataset",
+        "textures": "",
+        "triplets": "dataset",
+    },
+)

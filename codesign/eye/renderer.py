@@ -1,0 +1,238 @@
+"""Frames of eyes: radiance and coverage of two sheets, depth, pupil masks, labels, and exact derivatives."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.eye import model, textures
+from codesign.eye.landmarks import NAMES, iris_to_camera, landmark_points
+from codesign.eye.population import Rig, States, directions, parameters
+from metalens.ground.arrays import Array
+from metalens.ground.errors import SceneError
+from metalens.image import Frames
+
+MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z")  # rad, rad, um, um, um
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """The pinhole grid that frames are rendered on: the image side of the lens, turned upright.
+
+    pixels: along both sides. pitch_um: of the grid.
+    """
+
+    pixels: int = 160
+    pitch_um: float = 9.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.pixels <= 8192 and 0 < self.pitch_um < 1e4):
+            raise SceneError(f"camera of {self.pixels} pixels of {self.pitch_um} um: need 1-8192 pixels, pitch above 0")
+
+    def tangents(self, rig: Rig) -> Array:
+        """(pixels,) tangents of the rays through the pixel centres along one side."""
+        return (np.arange(self.pixels) - (self.pixels - 1) / 2) * (self.pitch_um / rig.sensor_distance_um)
+
+    def position_px(self, tangent: Tensor, rig: Rig) -> Tensor:
+        """Pixel coordinates (x, y) of tangents; the first pixel's centre is 0."""
+        return tangent * (rig.sensor_distance_um / self.pitch_um) + (self.pixels - 1) / 2
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Labels:
+    """What is true of each frame, in the camera's frame; lengths with the scale of the state applied.
+
+    slip_um: (n, 3) displacement of the head from the rig's nominal place.
+    optic_axis, visual_axis: (n, 3) unit vectors, pointing out of the eye.
+    centre_um, pupil_um: (n, 3) centre of rotation and of the pupil.
+    pupil_px: (n, 2) where the refracted centre of the pupil lands (x, y).
+    centroid_px: (n, 2) centroid of the visible pupil; ``pupil_px`` where none is seen.
+    visible: (n,) seen share of the pupil's area, 0 where it is hidden or out of the frame.
+    landmarks_px: (n, len(landmarks.NAMES), 2).
+    """
+
+    slip_um: Tensor
+    optic_axis: Tensor
+    visual_axis: Tensor
+    centre_um: Tensor
+    pupil_um: Tensor
+    pupil_px: Tensor
+    centroid_px: Tensor
+    visible: Tensor
+    landmarks_px: Tensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rendered:
+    """frames: near and far sheet. pupil: (n, y, x) visible share of pupil in every pixel. labels: of every frame."""
+
+    frames: Frames
+    pupil: Tensor
+    labels: Labels
+
+    def pinhole(self) -> Tensor:
+        """(n, y, x) what a perfect lens would show."""
+        return self.frames.radiance.sum(1)
+
+
+def render(
+    states: States,
+    *,
+    rig: Rig | None = None,
+    camera: Camera | None = None,
+    texture_seed: int = 0,
+    exposed: States | None = None,
+) -> Rendered:
+    """Render states with labels, masks and depth (float32); compiled, on all threads of numba.
+
+    Args:
+        exposed: states that the automatic exposure was set at, where it shall not follow; by default these.
+
+    Raises:
+        SceneError: non-finite states (from :class:`States`) or an impossible camera.
+    """
+    rig, camera = rig or Rig(), camera or Camera()
+    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed)
+    frames, mask = _compiled(p, states.scale, rig, camera, texture_seed)
+    return Rendered(frames, mask, _labels(states, p, mask, rig=rig, camera=camera))
+
+
+def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int) -> tuple[Frames, Tensor]:
+    from codesign.eye import kernel as render_kernel
+
+    n, size = len(p), camera.pixels
+    t = camera.tangents(rig).astype(np.float32)
+    sheets = [np.empty((n, 2, size, size), np.float32) for _ in range(3)]
+    pupil = np.empty((n, 1, size, size), np.float32)
+    values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
+    render_kernel.frames(values, factor, textures.pairs(seed), t, t, *sheets, pupil)
+    return Frames(*map(torch.from_numpy, sheets)), torch.from_numpy(pupil[:, 0])
+
+
+def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera) -> Labels:
+    p, scale = p.detach(), states.scale[:, None]
+    centre = p[:, model.CENTRE : model.CENTRE + 3]
+    pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
+    optic, visual = directions(states, rig)
+    here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
+    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
+    middle = middle_and_rim[:, 0]
+    x, y = middle_and_rim[:, 1:].unbind(-1)
+    area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
+    rows, columns = mask.sum(2).double(), mask.sum(1).double()
+    weight = rows.sum(1)
+    grid = torch.arange(camera.pixels, dtype=torch.float64)
+    sums = [(line * grid).sum(1) / weight.clamp_min(1e-9) for line in (columns, rows)]
+    centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
+    return Labels(
+        slip_um=scale * (here + states.slip_um) - here,
+        optic_axis=optic.detach(),
+        visual_axis=visual.detach(),
+        centre_um=scale * centre,
+        pupil_um=scale * pupil,
+        pupil_px=middle,
+        centroid_px=centroid,
+        visible=(weight / area.clamp_min(1e-6)).clamp(0, 1),
+        landmarks_px=camera.position_px(landmark_points(p), rig),
+    )
+
+
+def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
+    """(n, 1 + rim, 2) centre and rim of the pupil in the plane of the iris."""
+    turn = torch.arange(rim, dtype=torch.float64) * (2 * torch.pi / rim)
+    circle = torch.cat([torch.zeros(1, 2, dtype=torch.float64), torch.stack([torch.cos(turn), torch.sin(turn)], 1)])
+    return p[:, model.PUPIL_R, None, None] * circle
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sensitivities:
+    """Frames and their exact derivatives along two motions.
+
+    frames: as rendered. first, second: derivative of every field of ``frames`` (per rad, per um).
+    """
+
+    frames: Frames
+    first: Frames
+    second: Frames
+
+
+def sensitivities(
+    states: States,
+    motions: tuple[str, str] = ("gaze_x", "slip_z"),
+    *,
+    rig: Rig | None = None,
+    camera: Camera | None = None,
+    texture_seed: int = 0,
+) -> Sensitivities:
+    """Derivatives of the rendered sheets by forward-mode dual numbers, compiled (float32).
+
+    The brightness is held: the automatic exposure does not follow the motion.
+
+    Raises:
+        SceneError: a motion is none of MOTIONS.
+    """
+    from codesign.eye import kernel as render_kernel
+
+    rig, camera = rig or Rig(), camera or Camera()
+    packed = torch.stack(parameter_tangents(states, motions, rig=rig, camera=camera), 1)
+    n, size = len(states), camera.pixels
+    t = camera.tangents(rig).astype(np.float32)
+    out = np.empty((n, 3, 5, size, size), np.float32)
+    render_kernel.tangents(
+        packed.numpy().astype(np.float32), textures.pairs(texture_seed), t, t, out.reshape(n, 15, size, size)
+    )
+    scale = states.scale.to(torch.float32)[:, None, None, None]
+    value, first, second = (torch.from_numpy(out[:, k]) for k in range(3))
+    hidden = torch.stack([1 - value[:, 2], value[:, 2]], 1)
+    turns = [torch.stack([-d[:, 2], d[:, 2]], 1) for d in (first, second)]
+    return Sensitivities(
+        Frames(value[:, :2], hidden, value[:, 3:] * scale),
+        Frames(first[:, :2], turns[0], first[:, 3:] * scale),
+        Frames(second[:, :2], turns[1], second[:, 3:] * scale),
+    )
+
+
+def parameter_tangents(
+    states: States, motions: tuple[str, str], *, rig: Rig, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Parameters (n, COUNT) and their derivatives along two motions."""
+    for name in motions:
+        if name not in MOTIONS:
+            raise SceneError(f"motion {name!r}: need one of {', '.join(MOTIONS)}")
+
+    def packed(change: Tensor) -> Tensor:
+        moved = replace(states, gaze_rad=states.gaze_rad + change[:, :2], slip_um=states.slip_um + change[:, 2:])
+        return parameters(moved, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um)
+
+    still = torch.zeros(len(states), len(MOTIONS), dtype=torch.float64)
+    values, slopes = still, []
+    for name in motions:
+        along = still.clone()
+        along[:, MOTIONS.index(name)] = 1
+        values, slope = torch.func.jvp(packed, (still,), (along,))  # type: ignore[misc]
+        slopes.append(slope)
+    return values, slopes[0], slopes[1]
+
+
+def twin(p: Tensor, rig: Rig, camera: Camera, *, texture_seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The compiled frames again, in torch and the dtype of ``p``: exact, differentiable, and slow.
+
+    Args:
+        p: (n, COUNT) parameters.
+
+    Returns:
+        light, coverage, depth (n, 2, y, x) and pupil (n, y, x).
+    """
+    bank = torch.tensor(textures.bank(texture_seed), dtype=p.dtype)
+    t = torch.from_numpy(camera.tangents(rig)).to(p)
+    q = p.mT[:, :, None, None]
+    dx, dy, dz = model.ray(t, t[:, None])
+    s, seen, gx, gy, upper, lower, nx, ny, nz = model.lids(q, dx, dy, dz)
+    near = model.skin(q, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz)
+    far, z, hole = model.eye(q, bank, gx, gy, upper, lower, dx, dy, dz)
+    light = torch.stack([near * (1 - seen), far * seen], 1)
+    return light, torch.stack([1 - seen, seen], 1), torch.stack([s * dz, z * dz], 1), hole * seen
+
+
+__all__ = ["NAMES", "Camera", "Labels", "Rendered", "Sensitivities", "render", "sensitivities", "twin"]

@@ -1,0 +1,98 @@
+"""From pupil centre and slippage to gaze: the spherical-eye solver, and a learned turn from optical to visual axis.
+
+Camera frame: origin at the lens, z towards the eye, x right and y down as on the (upright) sensor image.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from metalens.ground.errors import SceneError
+
+
+@dataclass(frozen=True, slots=True)
+class EyeGeometry:
+    """Where the eye of a population mean sits before the camera, and how it is built.
+
+    centre_mm: rotation centre of the eye at zero slippage.
+    radius_mm: rotation centre to the pupil (13.1 mm from the corneal apex less 3.05 mm of anterior chamber,
+        Le Grand's eye; apex to rotation centre after Guestrin and Eizenman 2006).
+    sensor_distance_mm: lens to sensor: turns a place on the sensor into a ray.
+    """
+
+    centre_mm: tuple[float, float, float]
+    radius_mm: float = 10.05
+    sensor_distance_mm: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (self.radius_mm > 0 and self.sensor_distance_mm > 0):
+            raise SceneError(
+                f"radius_mm = {self.radius_mm}, sensor_distance_mm = {self.sensor_distance_mm}: need both above 0"
+            )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OpticalAxis:
+    """Result of the solver.
+
+    direction: (batch, 3) unit vector from the rotation centre through the pupil, towards the camera side.
+    hit: (batch,) whether the ray meets the sphere; where it does not, ``direction`` points to the place on the
+        sphere that is nearest to the ray.
+    """
+
+    direction: Tensor
+    hit: Tensor
+
+
+def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> OpticalAxis:
+    """Intersect the ray through the pupil's image with the sphere on which the pupil moves.
+
+    The slippage moves the camera, so the eye sits at centre - slip. With the unit ray u and centre C the near
+    intersection is at t = u·C - sqrt((u·C)² - |C|² + R²); values and gradients stay finite when the ray misses.
+
+    Args:
+        pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the lens axis.
+        slip_mm: (batch, 3) displacement of the camera.
+    """
+    x, y = pupil_mm[..., 0], pupil_mm[..., 1]
+    ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
+    ray = ray / ray.norm(dim=-1, keepdim=True)
+    centre = torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
+    along = (ray * centre).sum(-1)
+    beside = centre - along[..., None] * ray  # from the nearest point of the ray to the centre
+    inside = geometry.radius_mm**2 - (beside**2).sum(-1)
+    hit = inside > 0
+    depth = torch.sqrt(torch.where(hit, inside, torch.ones_like(inside))) * hit
+    offset = -beside - depth[..., None] * ray
+    return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-9), hit)
+
+
+def pupil_of(direction: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Tensor:
+    """(batch, 2) place on the sensor, mm, of the pupil of an eye that looks along ``direction``: the inverse.
+
+    Raises:
+        SceneError: the pupil lies behind the lens.
+    """
+    centre = torch.tensor(geometry.centre_mm, dtype=direction.dtype, device=direction.device) - slip_mm
+    point = centre + geometry.radius_mm * direction
+    if bool((point[..., 2] <= 0).any()):
+        raise SceneError("a pupil lies behind the lens: the slippage is larger than the distance to the eye")
+    return point[..., :2] / point[..., 2:] * geometry.sensor_distance_mm
+
+
+def angle_rad(one: Tensor, other: Tensor) -> Tensor:
+    """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|)."""
+    a, b = one / one.norm(dim=-1, keepdim=True), other / other.norm(dim=-1, keepdim=True)
+    gap = ((a - b) ** 2).sum(-1)
+    near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
+    return 2 * torch.atan2(near, (a + b).norm(dim=-1))
+
+
+def turn(axis: Tensor, yaw_rad: Tensor, pitch_rad: Tensor) -> Tensor:
+    """Directions turned about the vertical (yaw) and then about the horizontal axis (pitch)."""
+    x, y, z = axis.unbind(-1)
+    c, s = torch.cos(yaw_rad), torch.sin(yaw_rad)
+    x, z = c * x + s * z, c * z - s * x
+    c, s = torch.cos(pitch_rad), torch.sin(pitch_rad)
+    return torch.stack([x, c * y - s * z, c * z + s * y], -1)

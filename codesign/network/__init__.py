@@ -1,0 +1,47 @@
+"""Elastic network, cost, losses."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from codesign.network import cost as cost
+    from codesign.network import losses as losses
+    from codesign.network.architecture import Architecture as Architecture
+    from codesign.network.architecture import Space as Space
+    from codesign.network.architecture import active as active
+    from codesign.network.architecture import check as check
+    from codesign.network.architecture import largest as largest
+    from codesign.network.architecture import mutate as mutate
+    from codesign.network.architecture import sample as sample
+    from codesign.network.architecture import smallest as smallest
+    from codesign.network.baselines import Baseline as Baseline
+    from codesign.network.baselines import Name as Name
+    from codesign.network.baselines import make as make
+    from codesign.network.subnet import Subnet as Subnet
+    from codesign.network.supernet import Prediction as Prediction
+    from codesign.network.supernet import Supernet as Supernet
+    from codesign.network.supernet import recalibrate as recalibrate
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Architecture": "architecture",
+        "Baseline": "baselines",
+        "Name": "baselines",
+        "Prediction": "supernet",
+        "Space": "architecture",
+        "Subnet": "subnet",
+        "Supernet": "supernet",
+        "active": "architecture",
+        "check": "architecture",
+        "cost": "",
+        "largest": "architecture",
+        "losses": "",
+        "make": "baselines",
+        "mutate": "architecture",
+        "recalibrate": "supernet",
+        "sample": "architecture",
+        "smallest": "architecture",
+    },
+)

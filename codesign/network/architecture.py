@@ -1,0 +1,224 @@
+"""The search space: elastic MobileNetV3 backbones as plain records (paper Sec. 3.3, after Howard et al. 2019).
+
+An :class:`Architecture` names depth, kernel, expansion, width and resolution; :func:`blocks` turns it into the
+inverted residuals that the network builds and the cost model counts.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from metalens.ground.errors import ConfigError
+
+Activation = Literal["relu", "hardswish"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A run of blocks of equal width; the first one strides.
+
+    channels: at width 1.
+    squeeze: whether the blocks carry squeeze-and-excitation.
+    """
+
+    channels: int
+    stride: int
+    squeeze: bool
+    activation: Activation
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One inverted residual: expand 1x1, depthwise k x k, squeeze-excite, project 1x1.
+
+    squeeze: channels inside squeeze-and-excitation, 0 for none.
+    """
+
+    kernel: int
+    inputs: int
+    hidden: int
+    outputs: int
+    stride: int
+    squeeze: int
+    activation: Activation
+
+    @property
+    def residual(self) -> bool:
+        """Whether the input is added to the output."""
+        return self.stride == 1 and self.inputs == self.outputs
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """Everything that can vary, and what stays.
+
+    resolution: (least, largest) scale of the input; the search moves in steps of 0.1, training in any.
+    """
+
+    stem_channels: int = 16
+    stages: tuple[Stage, ...] = field(
+        default_factory=lambda: (
+            Stage(24, 2, False, "relu"),
+            Stage(40, 2, True, "relu"),
+            Stage(80, 2, False, "hardswish"),
+            Stage(112, 1, True, "hardswish"),
+            Stage(160, 1, True, "hardswish"),
+        )
+    )
+    kernels: tuple[int, ...] = (3, 5, 7)
+    expansions: tuple[int, ...] = (3, 4, 6)
+    depths: tuple[int, ...] = (2, 3, 4)
+    widths: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
+    resolution: tuple[float, float] = (0.3, 1.0)
+
+    @property
+    def slots(self) -> int:
+        """Blocks of the deepest architecture."""
+        return len(self.stages) * max(self.depths)
+
+
+@dataclass(frozen=True, slots=True)
+class Architecture:
+    """One member of the space.
+
+    depths: blocks of each stage.
+    kernels, expansions: of every slot (stages x deepest); slots beyond a stage's depth are idle.
+    width: channel multiplier. resolution: input scale.
+    """
+
+    depths: tuple[int, ...]
+    kernels: tuple[int, ...]
+    expansions: tuple[int, ...]
+    width: float = 1.0
+    resolution: float = 1.0
+
+
+def divisible(channels: float, divisor: int = 8) -> int:
+    """Channels rounded to a multiple of ``divisor``, never losing more than a tenth (MobileNet convention)."""
+    rounded = max(divisor, int(channels + divisor / 2) // divisor * divisor)
+    return rounded + divisor if rounded < 0.9 * channels else rounded
+
+
+def check(space: Space, architecture: Architecture) -> Architecture:
+    """``architecture`` if it belongs to ``space``.
+
+    Raises:
+        ConfigError: naming the entry that does not.
+    """
+    wanted = {"depths": len(space.stages), "kernels": space.slots, "expansions": space.slots}
+    for name, count in wanted.items():
+        values = getattr(architecture, name)
+        if len(values) != count:
+            raise ConfigError(f"architecture has {len(values)} {name}, need {count}")
+        for i, value in enumerate(values):
+            if value not in getattr(space, name):
+                raise ConfigError(f"architecture: {name}[{i}] is {value}, need one of {getattr(space, name)}")
+    if architecture.width not in space.widths:
+        raise ConfigError(f"architecture: width is {architecture.width}, need one of {space.widths}")
+    low, high = space.resolution
+    if not low <= architecture.resolution <= high:
+        raise ConfigError(f"architecture: resolution is {architecture.resolution}, need {low} to {high}")
+    return architecture
+
+
+def stem_channels(space: Space, architecture: Architecture) -> int:
+    """Channels after the first convolution."""
+    return divisible(space.stem_channels * architecture.width)
+
+
+def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
+    """The active blocks, stage by stage."""
+    inputs = stem_channels(space, architecture)
+    deepest = max(space.depths)
+    result = []
+    for i, (stage, depth) in enumerate(zip(space.stages, architecture.depths, strict=True)):
+        row = []
+        for j in range(depth):
+            slot = i * deepest + j
+            hidden = divisible(inputs * architecture.expansions[slot])
+            outputs = divisible(stage.channels * architecture.width)
+            squeeze = divisible(hidden / 4) if stage.squeeze else 0
+            stride = stage.stride if j == 0 else 1
+            row.append(Block(architecture.kernels[slot], inputs, hidden, outputs, stride, squeeze, stage.activation))
+            inputs = outputs
+        result.append(row)
+    return result
+
+
+def largest(space: Space) -> Architecture:
+    """The member that holds all others as slices."""
+    return _uniform(space, max)
+
+
+def smallest(space: Space) -> Architecture:
+    """The cheapest member."""
+    return _uniform(space, min)
+
+
+def sample(space: Space, generator: np.random.Generator) -> Architecture:
+    """A member drawn evenly over every choice."""
+    return Architecture(
+        depths=tuple(int(v) for v in generator.choice(space.depths, len(space.stages))),
+        kernels=tuple(int(v) for v in generator.choice(space.kernels, space.slots)),
+        expansions=tuple(int(v) for v in generator.choice(space.expansions, space.slots)),
+        width=float(generator.choice(space.widths)),
+        resolution=float(generator.choice(resolutions(space))),
+    )
+
+
+def mutate(
+    space: Space, architecture: Architecture, generator: np.random.Generator, *, rate: float = 0.15
+) -> Architecture:
+    """A neighbour: every entry is drawn anew with probability ``rate``, and at least one entry differs."""
+    while True:
+        other = sample(space, generator)
+        child = replace(
+            architecture,
+            depths=_mix(architecture.depths, other.depths, generator, rate),
+            kernels=_mix(architecture.kernels, other.kernels, generator, rate),
+            expansions=_mix(architecture.expansions, other.expansions, generator, rate),
+            width=other.width if generator.random() < rate else architecture.width,
+            resolution=other.resolution if generator.random() < rate else architecture.resolution,
+        )
+        if active(space, child) != active(space, architecture):
+            return child
+
+
+def resolutions(space: Space) -> tuple[float, ...]:
+    """The input scales that the search tries, 0.1 apart."""
+    low, high = space.resolution
+    return tuple(round(low + 0.1 * i, 3) for i in range(round((high - low) / 0.1) + 1))
+
+
+def active(space: Space, architecture: Architecture) -> Architecture:
+    """The same network with every idle slot set to the least choice: equal networks compare equal."""
+    used = [j < depth for depth in architecture.depths for j in range(max(space.depths))]
+    return replace(
+        architecture,
+        kernels=tuple(k if u else min(space.kernels) for k, u in zip(architecture.kernels, used, strict=True)),
+        expansions=tuple(e if u else min(space.expansions) for e, u in zip(architecture.expansions, used, strict=True)),
+    )
+
+
+def walk(rows: list[list[Block]]) -> Iterator[Block]:
+    """All blocks in order."""
+    for row in rows:
+        yield from row
+
+
+def _uniform(space: Space, pick: Callable[[Any], Any]) -> Architecture:
+    return Architecture(
+        depths=(pick(space.depths),) * len(space.stages),
+        kernels=(pick(space.kernels),) * space.slots,
+        expansions=(pick(space.expansions),) * space.slots,
+        width=pick(space.widths),
+        resolution=pick(space.resolution),
+    )
+
+
+def _mix(
+    mine: tuple[int, ...], others: tuple[int, ...], generator: np.random.Generator, rate: float
+) -> tuple[int, ...]:
+    return tuple(b if generator.random() < rate else a for a, b in zip(mine, others, strict=True))

@@ -1,0 +1,210 @@
+"""Multiply-accumulates of a network as a function of architecture and pixel pitch (paper Eq. 9).
+
+Every convolution costs (its multiply-accumulates per output pixel) x (output pixels), and the output of total
+stride s on an input of n pixels has ceil(n / s)² pixels. So a network is a short list of (stride, cost per
+output pixel) and a constant; at integer n the sum is exact, between integers it follows a C1 cubic.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.network.architecture import Architecture, Block, Space, blocks, divisible, stem_channels
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError
+
+# widths of the heads; the networks and the count share them
+LEAST_SIZE = 16  # pixels along the edge of an input
+MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN = 24, 16, 8, 64
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Multiply-accumulates as a polynomial of the sizes of the feature maps.
+
+    per_pixel: {total stride: multiply-accumulates per output pixel at that stride}.
+    constant: of layers whose size does not follow the image.
+    """
+
+    per_pixel: dict[int, int]
+    constant: int
+
+    def at(self, size: int | Array) -> Array:
+        """Exact count for square inputs of ``size`` pixels (integers)."""
+        size = np.asarray(size)
+        parts = [macs * (-(-size // stride)) ** 2 for stride, macs in self.per_pixel.items()]
+        return np.asarray(sum(parts) + self.constant)
+
+
+def backbone(stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: int = 3) -> Cost:
+    """Cost of a stem of stride 2 and the blocks behind it."""
+    per_pixel, constant, stride = {2: inputs * stem * stem_kernel**2}, 0, 2
+    for block in rows:
+        if block.hidden != block.inputs:
+            per_pixel[stride] = per_pixel.get(stride, 0) + block.inputs * block.hidden
+        stride *= block.stride
+        wide = block.hidden * (block.kernel**2 + block.outputs)
+        per_pixel[stride] = per_pixel.get(stride, 0) + wide
+        constant += 2 * block.hidden * block.squeeze
+    return Cost(per_pixel, constant)
+
+
+def network(space: Space, architecture: Architecture) -> Cost:
+    """Cost of backbone, perception head and calibration head."""
+    rows = blocks(space, architecture)
+    body = backbone(stem_channels(space, architecture), [b for row in rows for b in row])
+    per_pixel = dict(body.per_pixel)
+    laterals = lateral_strides(space)
+    for stage, stride in laterals:
+        per_pixel[stride] = per_pixel.get(stride, 0) + rows[stage][-1].outputs * MASK_CHANNELS
+    finest = laterals[0][1]
+    per_pixel[finest] += MASK_CHANNELS * (9 + 1)  # depthwise 3x3, then the mask itself
+    deepest = total_stride(space)
+    per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
+    return Cost(per_pixel, body.constant + SLIP_CHANNELS * SLIP_GRID**2 * SLIP_HIDDEN + SLIP_HIDDEN * 3)
+
+
+def lateral_strides(space: Space) -> list[tuple[int, int]]:
+    """(stage, total stride) of the features that the mask is decoded from: the last stage of every stride."""
+    stride, last = 2, {}
+    for i, stage in enumerate(space.stages):
+        stride *= stage.stride
+        last[stride] = i
+    return [(stage, stride) for stride, stage in last.items()]
+
+
+def total_stride(space: Space) -> int:
+    """Stride of the last feature map."""
+    return lateral_strides(space)[-1][1]
+
+
+def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
+    """Pixels along the edge of the network's input: window / pitch, scaled.
+
+    Raises:
+        ConfigError: less than 16 pixels remain.
+    """
+    if not (pitch_um > 0 and window_um > 0 and 0 < resolution <= 1):
+        raise ConfigError(f"window {window_um} um, pitch {pitch_um} um, resolution {resolution}: need all above 0")
+    size = window_um / pitch_um * resolution
+    if size < LEAST_SIZE:
+        raise ConfigError(
+            f"pitch {pitch_um} um leaves {size:.1f} pixels of a {window_um} um window, need {LEAST_SIZE} or more"
+        )
+    return size
+
+
+def coarsest_um(window_um: float, resolution: float) -> float:
+    """Largest pitch that :func:`input_size` takes."""
+    return window_um * resolution / LEAST_SIZE
+
+
+def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:
+    """Multiply-accumulates at a continuous input size, differentiable; exact where ``size`` is an integer.
+
+    Args:
+        size: pixels along the edge of the input, 16 or more, scalar.
+    """
+    return interpolated(network(space, architecture).at, size)
+
+
+def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
+    """Counts at integer sizes continued to a continuous size, differentiable.
+
+    A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more pixels never cost less, and where
+    two counts are equal the gradient between them is zero.
+
+    Args:
+        at: exact counts at integer sizes. size: scalar.
+    """
+    size = torch.as_tensor(size, dtype=torch.float64)
+    low = int(torch.floor(size.detach()))
+    counts = at(np.arange(low - 1, low + 3)).astype(float)
+    before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
+    slope, next_slope = _slope(here - before, after - here), _slope(after - here, beyond - after)
+    u = size - low
+    return (
+        here * (1 + 2 * u) * (1 - u) ** 2
+        + after * u**2 * (3 - 2 * u)
+        + slope * u * (1 - u) ** 2
+        + next_slope * u**2 * (u - 1)
+    )
+
+
+def _slope(left: Tensor, right: Tensor) -> Tensor:
+    """Harmonic mean of two rises; zero where one of them is."""
+    return torch.where((left > 0) & (right > 0), 2 * left * right / (left + right).clamp_min(1), torch.zeros_like(left))
+
+
+def macs(
+    architecture: Architecture, pitch_um: Tensor | float, *, window_um: float, space: Space | None = None
+) -> Tensor:
+    """Multiply-accumulates C_total of one inference as a function of the pixel pitch (paper Eq. 9), differentiable.
+
+    Args:
+        pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on the sensor.
+
+    Raises:
+        ConfigError: a pitch that leaves less than 16 pixels.
+    """
+    input_size(window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution)
+    return macs_of_size(space or Space(), architecture, window_um / pitch_um * architecture.resolution)
+
+
+def mobilenet_v3(variant: str, *, size: int = 224, classes: int = 1000) -> int:
+    """Multiply-accumulates of MobileNetV3 small or large as published (Howard et al. 2019, Tables 1 and 2)."""
+    rows, last, hidden = _MOBILENETS[variant]
+    inputs, chain = 16, []
+    for kernel, wide, outputs, squeeze, stride in rows:
+        chain.append(Block(kernel, inputs, wide, outputs, stride, divisible(wide / 4) if squeeze else 0, "relu"))
+        inputs = outputs
+    body = backbone(16, chain, inputs=3)
+    end = max(body.per_pixel)
+    per_pixel = dict(body.per_pixel) | {end: body.per_pixel[end] + inputs * last}
+    return int(Cost(per_pixel, body.constant + last * hidden + hidden * classes).at(size))
+
+
+# kernel, expanded channels, output channels, squeeze-and-excitation, stride
+_MOBILENETS: dict[str, tuple[list[tuple[int, int, int, bool, int]], int, int]] = {
+    "large": (
+        [
+            (3, 16, 16, False, 1),
+            (3, 64, 24, False, 2),
+            (3, 72, 24, False, 1),
+            (5, 72, 40, True, 2),
+            (5, 120, 40, True, 1),
+            (5, 120, 40, True, 1),
+            (3, 240, 80, False, 2),
+            (3, 200, 80, False, 1),
+            (3, 184, 80, False, 1),
+            (3, 184, 80, False, 1),
+            (3, 480, 112, True, 1),
+            (3, 672, 112, True, 1),
+            (5, 672, 160, True, 2),
+            (5, 960, 160, True, 1),
+            (5, 960, 160, True, 1),
+        ],
+        960,
+        1280,
+    ),
+    "small": (
+        [
+            (3, 16, 16, True, 2),
+            (3, 72, 24, False, 2),
+            (3, 88, 24, False, 1),
+            (5, 96, 40, True, 2),
+            (5, 240, 40, True, 1),
+            (5, 240, 40, True, 1),
+            (5, 120, 48, True, 1),
+            (5, 144, 48, True, 1),
+            (5, 288, 96, True, 2),
+            (5, 576, 96, True, 1),
+            (5, 576, 96, True, 1),
+        ],
+        576,
+        1024,
+    ),
+}

@@ -1,0 +1,76 @@
+"""Losses of the inner loop: mask, slippage, budget (paper Eqs. 8 and 10). The optics loss is metalens.fisher's."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from codesign.network.supernet import Prediction
+
+
+def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
+    """Mean Dice loss 1 - (2 sum pm + s) / (sum p + sum m + s): 0 for a perfect mask, finite for an empty one.
+
+    Args:
+        logits: (batch, y, x). mask: (batch, y, x) coverage in [0, 1], of the same size.
+    """
+    probability = torch.sigmoid(logits)
+    both = (probability * mask).sum((1, 2))
+    either = probability.sum((1, 2)) + mask.sum((1, 2))
+    return (1 - (2 * both + smooth) / (either + smooth)).mean()
+
+
+def segmentation(logits: Tensor, mask: Tensor) -> Tensor:
+    """Dice loss plus cross entropy, which carries the gradient while the mask is still far off."""
+    target = resized(mask, logits)
+    return dice(logits, target) + F.binary_cross_entropy_with_logits(logits, target)
+
+
+def slip(predicted: Tensor, truth: Tensor, scale: Tensor, *, knee: float = 0.3) -> Tensor:
+    """Squared error of the slippage in units of ``scale``, linear beyond ``knee`` so that outliers do not rule.
+
+    Args:
+        predicted: (batch, 3) in units of ``scale``. truth: (batch, 3) in mm. scale: (3,) spread in mm.
+    """
+    return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
+
+
+def task(found: Prediction, mask: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, slip_weight: float = 2.0) -> Tensor:
+    """L_task = L_seg + lambda_slip L_calib; a network without a mask is held to the pupil's centre in its place."""
+    seen = segmentation(found.mask_logits, mask) if found.mask_logits.numel() else place(found.centre, mask)
+    return seen + slip_weight * slip(found.slip, slip_mm, scale_mm)
+
+
+def place(centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3) -> Tensor:
+    """Distance of the pupil's centre from the centroid of its mask, in units of 2 % of the frame; 0 for empty masks.
+
+    Args:
+        centre: (batch, 2) x, y as a fraction of the frame from its middle. mask: (batch, y, x) coverage.
+    """
+    total = mask.sum((1, 2))
+    y, x = ((torch.arange(n, dtype=mask.dtype) + 0.5) / n - 0.5 for n in mask.shape[-2:])
+    truth = torch.stack([(mask.sum(1) * x).sum(1), (mask.sum(2) * y).sum(1)], -1) / total.clamp_min(1e-6)[:, None]
+    each = F.smooth_l1_loss(centre / unit, truth / unit, beta=knee, reduction="none").mean(1)
+    seen = total > 0.5
+    return (each * seen).sum() / seen.sum().clamp_min(1)
+
+
+def over_budget(macs: Tensor, budget: float) -> Tensor:
+    """[C_total - C_budget]_+ relative to the budget (paper Eq. 10)."""
+    return F.relu(macs / budget - 1)
+
+
+def resized(mask: Tensor, like: Tensor) -> Tensor:
+    """Mask coverage averaged onto the grid of the logits."""
+    if mask.shape[-2:] == like.shape[-2:]:
+        return mask
+    return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
+
+
+def overlap(logits: Tensor, mask: Tensor) -> Tensor:
+    """(batch,) intersection over union of the thresholded masks; 1 where both are empty, nan without a mask."""
+    if not logits.numel():
+        return torch.full((len(mask),), float("nan"))
+    found, truth = logits > 0, resized(mask, logits) > 0.5
+    union = (found | truth).sum((1, 2))
+    both = (found & truth).sum((1, 2))
+    return torch.where(union > 0, both / union.clamp_min(1), torch.ones_like(both, dtype=torch.float32))

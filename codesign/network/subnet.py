@@ -1,0 +1,84 @@
+"""One architecture cut out of a supernet, to be exported: it holds only the weights that it uses."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from codesign.network.architecture import Architecture, Block, blocks, stem_channels
+from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, lateral_strides
+from codesign.network.supernet import ElasticBlock, Supernet, modules_of
+from metalens.ground.store import replacing
+
+
+class Subnet(nn.Module):
+    """One architecture cut out of a supernet, for export: ``forward(frames) -> (mask_logits, centre, slip)``.
+
+    It holds only the weights that it uses; outputs equal those of the recalibrated supernet.
+    """
+
+    def __init__(self, net: Supernet, architecture: Architecture) -> None:
+        super().__init__()
+        self.architecture = architecture
+        self.net = Supernet(net.space)
+        self.net.load_state_dict(net.state_dict())
+        _trim(self.net, architecture)
+        self.eval()
+
+    def forward(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = self.net(frames, self.architecture)
+        return found.mask_logits, found.centre, found.slip
+
+    def export_onnx(self, path: str | Path, *, size: int) -> None:
+        """Write an ONNX file (opset 17) for square frames of ``size`` pixels: frames -> mask_logits, centre, slip.
+
+        Raises:
+            OSError: the target cannot be written.
+        """
+        names = ["mask_logits", "centre", "slip"]
+        example = torch.zeros(1, 1, size, size)
+        with replacing(path) as part:
+            torch.onnx.export(
+                self, (example,), str(part), dynamo=False, input_names=["frames"], output_names=names, opset_version=17
+            )
+
+
+def _trim(net: Supernet, architecture: Architecture) -> None:
+    """Drop the weights that ``architecture`` does not use."""
+    rows = blocks(net.space, architecture)
+    stem = stem_channels(net.space, architecture)
+    _trim_conv(net.stem, 1, stem, 3)
+    for stage, row in zip(net.stages, rows, strict=True):
+        modules = list(modules_of(stage))
+        for module, block in zip(modules, row, strict=False):
+            _trim_block(module, block)
+        del stage[len(row) :]  # type: ignore[operator]
+    kept = [rows[stage][-1].outputs for stage, _ in lateral_strides(net.space)]
+    for lateral, channels in zip(net.perception.laterals, kept, strict=True):
+        _trim_conv(lateral, channels, MASK_CHANNELS, 1)
+    _trim_conv(net.calibration.reduce, rows[-1][-1].outputs, SLIP_CHANNELS, 1)
+
+
+def _trim_block(module: ElasticBlock, block: Block) -> None:
+    _trim_conv(module.expand, block.inputs, block.hidden, 1)
+    _trim_conv(module.depthwise, 1, block.hidden, block.kernel)
+    _trim_conv(module.project, block.hidden, block.outputs, 1)
+    if module.squeeze is not None:
+        down, up = module.squeeze.down, module.squeeze.up
+        _keep(down, weight=down.weight[: block.squeeze, : block.hidden], bias=down.bias[: block.squeeze])
+        _keep(up, weight=up.weight[: block.hidden, : block.squeeze], bias=up.bias[: block.hidden])
+
+
+def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
+    trim = (conv.weight.shape[-1] - kernel) // 2
+    inside = slice(trim, trim + kernel)
+    _keep(conv, weight=conv.weight[:outputs, :inputs, inside, inside])
+    norm = conv.norm
+    _keep(norm, weight=norm.weight[:outputs], bias=norm.bias[:outputs])
+    norm.mean, norm.variance = norm.mean[:outputs].clone(), norm.variance[:outputs].clone()
+
+
+def _keep(module: nn.Module, **tensors: Tensor) -> None:
+    for name, tensor in tensors.items():
+        setattr(module, name, nn.Parameter(tensor.detach().clone()))

@@ -1,0 +1,260 @@
+"""Elastic MobileNetV3 with two heads: every architecture of the space is a slice of one set of weights.
+
+A kernel is the centre of a larger one, channels are the first of more, blocks are the first of a stage (after
+Cai et al. 2019). Batch statistics belong to one architecture at a time: :func:`recalibrate` measures them.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from codesign.batches import parallel
+from codesign.network.architecture import Architecture, Block, Space, blocks, largest, stem_channels
+from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
+from metalens.ground.arrays import Array
+from metalens.ground.errors import TrainingError
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Prediction:
+    """What the network says of a frame.
+
+    mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a network that gives no mask.
+    centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle, -0.5 at the left and top edge.
+    slip: (batch, 3) camera displacement in units of the scale that the loss divides by (paper Eq. 7).
+    """
+
+    mask_logits: Tensor
+    centre: Tensor
+    slip: Tensor
+
+
+class SlicedNorm(nn.Module):
+    """Batch normalisation whose first channels serve narrower networks."""
+
+    mean: Tensor
+    variance: Tensor
+    batches: Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.register_buffer("mean", torch.zeros(channels))
+        self.register_buffer("variance", torch.ones(channels))
+        self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
+        self.measuring = False
+
+    def forward(self, x: Tensor) -> Tensor:
+        count = x.shape[1]
+        weight, bias = self.weight[:count], self.bias[:count]
+        if self.measuring:
+            self._measure(x)
+        if self.training and not self.measuring and parallel.ranks() > 1:
+            return parallel.batch_norm(x, weight, bias)
+        if self.training or self.measuring:
+            return F.batch_norm(x, None, None, weight, bias, training=True)
+        return F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias)
+
+    @torch.no_grad()
+    def _measure(self, x: Tensor) -> None:
+        """Running mean over batches of equal weight, so the order of the batches does not matter."""
+        count = x.shape[1]
+        self.batches += 1
+        variance, mean = torch.var_mean(x, dim=(0, 2, 3), unbiased=x.numel() > count)
+        self.mean[:count] += (mean - self.mean[:count]) / self.batches
+        self.variance[:count] += (variance - self.variance[:count]) / self.batches
+
+
+class SlicedConv(nn.Module):
+    """Convolution with norm, of which the leading channels and the centre of the kernel are used."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 1, *, depthwise: bool = False) -> None:
+        super().__init__()
+        fan_out = kernel**2 * (1 if depthwise else outputs)
+        shape = (outputs, 1 if depthwise else inputs, kernel, kernel)
+        self.weight = nn.Parameter(torch.randn(shape) * (2 / fan_out) ** 0.5)
+        self.norm = SlicedNorm(outputs)
+        self.depthwise = depthwise
+
+    def forward(self, x: Tensor, outputs: int, *, kernel: int = 1, stride: int = 1) -> Tensor:
+        trim = (self.weight.shape[-1] - kernel) // 2
+        inside = slice(trim, trim + kernel)
+        weight = self.weight[:outputs, : 1 if self.depthwise else x.shape[1], inside, inside]
+        groups = outputs if self.depthwise else 1
+        y: Tensor = self.norm(F.conv2d(x, weight, stride=stride, padding=kernel // 2, groups=groups))
+        return y
+
+
+class SqueezeExcite(nn.Module):
+    """Channel gates from the mean of the image; leading channels serve narrower blocks."""
+
+    def __init__(self, channels: int, squeeze: int) -> None:
+        super().__init__()
+        self.down = nn.Linear(channels, squeeze)
+        self.up = nn.Linear(squeeze, channels)
+
+    def forward(self, x: Tensor, squeeze: int) -> Tensor:
+        count = x.shape[1]
+        pooled = x.mean((2, 3))
+        inside = F.relu(F.linear(pooled, self.down.weight[:squeeze, :count], self.down.bias[:squeeze]))
+        gate = F.hardsigmoid(F.linear(inside, self.up.weight[:count, :squeeze], self.up.bias[:count]))
+        gated: Tensor = x * gate[:, :, None, None]
+        return gated
+
+
+class ElasticBlock(nn.Module):
+    """Inverted residual at its largest; ``forward`` takes the block to act as."""
+
+    def __init__(self, most: Block) -> None:
+        super().__init__()
+        self.expand = SlicedConv(most.inputs, most.hidden)
+        self.depthwise = SlicedConv(most.hidden, most.hidden, most.kernel, depthwise=True)
+        self.squeeze = SqueezeExcite(most.hidden, most.squeeze) if most.squeeze else None
+        self.project = SlicedConv(most.hidden, most.outputs)
+
+    def forward(self, x: Tensor, block: Block) -> Tensor:
+        act = F.relu if block.activation == "relu" else F.hardswish
+        y = act(self.expand(x, block.hidden)) if block.hidden != block.inputs else x
+        y = act(self.depthwise(y, block.hidden, kernel=block.kernel, stride=block.stride))
+        if self.squeeze is not None:
+            y = self.squeeze(y, block.squeeze)
+        projected: Tensor = self.project(y, block.outputs)
+        return x + projected if block.residual else projected
+
+
+class PerceptionHead(nn.Module):
+    """Pupil mask from the last features of every stride, added up from coarse to fine."""
+
+    def __init__(self, channels: list[int]) -> None:
+        super().__init__()
+        self.laterals = nn.ModuleList(SlicedConv(c, MASK_CHANNELS) for c in channels)
+        self.smooth = SlicedConv(MASK_CHANNELS, MASK_CHANNELS, 3, depthwise=True)
+        self.mask = nn.Conv2d(MASK_CHANNELS, 1, 1)
+
+    def forward(self, features: list[Tensor]) -> Tensor:
+        total = F.hardswish(self.laterals[-1](features[-1], MASK_CHANNELS))
+        for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
+            total = F.interpolate(total, size=feature.shape[-2:], mode="nearest")
+            total = total + F.hardswish(lateral(feature, MASK_CHANNELS))
+        logits: Tensor = self.mask(F.hardswish(self.smooth(total, MASK_CHANNELS, kernel=3)))
+        return logits[:, 0]
+
+
+class CalibrationHead(nn.Module):
+    """Slip from the flattened last feature map, so that place in the image is kept (paper Eq. 7)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.reduce = SlicedConv(channels, SLIP_CHANNELS)
+        self.hidden = nn.Linear(SLIP_CHANNELS * SLIP_GRID**2, SLIP_HIDDEN)
+        self.slip = nn.Linear(SLIP_HIDDEN, 3)
+
+    def forward(self, features: Tensor) -> Tensor:
+        reduced = F.hardswish(self.reduce(features, SLIP_CHANNELS))
+        grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
+        slip: Tensor = self.slip(F.hardswish(self.hidden(grid.flatten(1))))
+        return slip
+
+
+class Supernet(nn.Module):
+    """All architectures of ``space`` in one set of weights.
+
+    ``forward(frames, architecture)``: frames (batch, 1, y, x), standardised; returns a :class:`Prediction`.
+    """
+
+    def __init__(self, space: Space | None = None) -> None:
+        super().__init__()
+        self.space = space or Space()
+        most = largest(self.space)
+        rows = blocks(self.space, most)
+        self.stem = SlicedConv(1, stem_channels(self.space, most), 3)
+        self.stages = nn.ModuleList(nn.ModuleList(ElasticBlock(b) for b in row) for row in rows)
+        self.perception = PerceptionHead([rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)])
+        self.calibration = CalibrationHead(rows[-1][-1].outputs)
+
+    def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
+        x = F.hardswish(
+            self.stem(scaled(frames, architecture.resolution), self._stem(architecture), kernel=3, stride=2)
+        )
+        kept = {stage for stage, _ in lateral_strides(self.space)}
+        features = []
+        for i, (stage, row) in enumerate(zip(self.stages, blocks(self.space, architecture), strict=True)):
+            for module, block in zip(modules_of(stage), row, strict=False):
+                x = module(x, block)
+            if i in kept:
+                features.append(x)
+        logits = self.perception(features)
+        return Prediction(logits, soft_argmax(logits), self.calibration(x))
+
+    def counts(self, architecture: Architecture, sizes: Array) -> Array:
+        """Multiply-accumulates of a member for square frames of these sizes after scaling (integers), exact."""
+        return network(self.space, architecture).at(sizes)
+
+    def _stem(self, architecture: Architecture) -> int:
+        return stem_channels(self.space, architecture)
+
+
+def scaled(frames: Tensor, resolution: float) -> Tensor:
+    """Frames resized to ``resolution`` of their size (to the nearest pixel)."""
+    height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
+    return resampled(frames, (height, width))
+
+
+def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """(batch, channels, *size): averaged by whole factors, then interpolated where the size is no divisor."""
+    factor = [max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)]
+    pooled = F.avg_pool2d(x, factor) if max(factor) > 1 else x
+    if tuple(int(s) for s in pooled.shape[-2:]) == size:
+        return pooled
+    return F.interpolate(pooled, size=size, mode="bilinear", align_corners=False)
+
+
+def soft_argmax(logits: Tensor) -> Tensor:
+    """(batch, 2) centre of mass x, y of the mask probability, as a fraction of the image from its middle.
+
+    Probabilities below 0.05 are left out, so that the sea of background does not pull the centre; an empty mask
+    gives (0, 0) with a finite gradient.
+    """
+    probability = torch.sigmoid(logits)
+    weight = F.relu(probability - 0.05)
+    total = weight.sum((1, 2)) + 1e-6
+    height, width = logits.shape[-2:]
+    x = (torch.arange(width, device=logits.device) + 0.5) / width - 0.5
+    y = (torch.arange(height, device=logits.device) + 0.5) / height - 0.5
+    return torch.stack([(weight.sum(1) * x).sum(1) / total, (weight.sum(2) * y).sum(1) / total], -1)
+
+
+@torch.no_grad()
+def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]) -> None:
+    """Measure the batch statistics of one architecture from a reset, on fixed batches; leaves eval mode.
+
+    Raises:
+        TrainingError: no batch was given.
+    """
+    norms = [m for m in net.modules() if isinstance(m, SlicedNorm)]
+    for norm in norms:
+        norm.mean.zero_()
+        norm.variance.fill_(1)
+        norm.batches.zero_()
+        norm.measuring = True
+    count = 0
+    try:
+        for frames in batches:
+            net(frames, architecture)
+            count += 1
+    finally:
+        for norm in norms:
+            norm.measuring = False
+    if count == 0:
+        raise TrainingError("recalibration needs at least one batch of frames, found none")
+    net.eval()
+
+
+def modules_of(stage: nn.Module) -> Iterator[Any]:
+    """The blocks of a stage, in order."""
+    return iter(stage.children())

@@ -1,0 +1,138 @@
+"""Lenses as they will be made, drawn while training: what the assembly and every cause of the table do to the light.
+
+Training knows the phase of its lens but not its pillars. Their answers are taken as those of the default cell, whose
+phases fill a turn evenly wherever one looks: what all of them answer alike is a phase of the wave front, what they
+answer differently takes light out of the image.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError
+from metalens.made import DRAWN, Answers, Draw, State, guide, of_kind
+from metalens.pillars import DEFAULT_CELL, Proxy
+
+ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
+_FIRST = ("bias_nm", "height_nm")  # of the process: the order that correlations are written in
+ENTRIES = (*ASSEMBLY, *_FIRST, *(name for name in DRAWN if name not in _FIRST))
+WAVELENGTH_UM = 0.85
+# phase of the default cell over its domain, as `metalens library` finds it (1e-3 rad); a test holds it to the solver
+TURN = Proxy(
+    np.array(
+        [[2.23327426, 3.46714529, 0.160908115, -0.19169534, -0.0139012285, 0.0567230276, 0.00584519421, -0.0124124034,
+          -0.00450211399, 0.00380727079, 0.00164159463, -0.000646972864]]
+    ),
+    np.array([[0.95]]), (0.06, 0.20321608040201006), (WAVELENGTH_UM, WAVELENGTH_UM), 1e-3, 0.05, power=3,
+)  # fmt: skip
+_Entries: Any = dataclasses.make_dataclass("_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True)
+
+
+@dataclass(frozen=True)
+class LensErrors(_Entries):  # type: ignore[misc]
+    """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
+
+    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
+    astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process spreads, in the names of
+    :class:`metalens.made.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k, k) between the first k of them,
+    rows one after the other; empty for none.
+    """
+
+    correlation: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if min(self.deviations) < 0:
+            raise ConfigError(f"spread {self.deviations}: need standard deviations of 0 or more")
+        if self.correlation:
+            self._check()
+
+    @property
+    def deviations(self) -> tuple[float, ...]:
+        """Standard deviations in order."""
+        return tuple(float(getattr(self, name)) for name in ENTRIES)
+
+    @property
+    def covariance(self) -> Array:
+        """(entries, entries) of the errors."""
+        correlation = np.eye(len(ENTRIES))
+        if self.correlation:
+            size = math.isqrt(len(self.correlation))
+            correlation[:size, :size] = np.reshape(self.correlation, (size, size))
+        return np.asarray(correlation * np.outer(self.deviations, self.deviations))
+
+    def draw(self, generator: torch.Generator) -> "LensError | None":
+        """The errors of one lens; None where nothing varies."""
+        if not any(self.deviations):
+            return None
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(values.clip(0))
+        normal = torch.randn(len(ENTRIES), generator=generator, dtype=torch.float64).numpy()
+        turn = 2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
+        return LensError(dict(zip(ENTRIES, (root @ normal).tolist(), strict=True)), turn)
+
+    def _check(self) -> None:
+        size = math.isqrt(len(self.correlation))
+        if size**2 != len(self.correlation) or size > len(ENTRIES):
+            raise ConfigError(
+                f"correlation has {len(self.correlation)} entries, need k x k for the first k of {', '.join(ENTRIES)}"
+            )
+        matrix = np.reshape(self.correlation, (size, size))
+        if not np.allclose(np.diag(matrix), 1) or not np.allclose(matrix, matrix.T):
+            raise ConfigError("correlation must be symmetric with ones on its diagonal")
+        if np.linalg.eigvalsh(matrix)[0] < -1e-9:
+            raise ConfigError("correlation is not positive semi-definite: no errors can be correlated like that")
+
+
+@dataclass(frozen=True, slots=True)
+class LensError:
+    """One lens: amounts by entry of :data:`ENTRIES` (left out: 0), and the direction of its gradients."""
+
+    amounts: Mapping[str, float]
+    turn_rad: float = 0.0
+
+    def state(self) -> State:
+        """What the process did to it."""
+        return Draw({n: a for n, a in self.amounts.items() if n in DRAWN}, self.turn_rad).state()
+
+    def assembly(self) -> tuple[float, ...]:
+        """Amounts of :data:`ASSEMBLY`."""
+        return tuple(self.amounts.get(name, 0.0) for name in ASSEMBLY)
+
+
+def wave_front_rad(state: State, u: Tensor, v: Tensor) -> Tensor:
+    """Phase at lens places over the radius that all pillars share: their mean answer, and the causes that bend."""
+    shared = _answers()[0][0] * (state.bias_um(u.numpy(), v.numpy()) - state.bias_um(np.zeros(1), np.zeros(1)))
+    return torch.from_numpy(shared + state.phase_rad(u.numpy(), v.numpy()))
+
+
+def variance_rad2(state: State, *, rings: int = 12) -> float:
+    """Variance of the pillars' phases about what they share, mean over the aperture (Gauss nodes: exact)."""
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    radius, turn = np.sqrt((node[:, None] + 1) / 2), np.arange(2 * rings) * (math.pi / rings)
+    bias, answers = state.bias_um(radius * np.cos(turn), radius * np.sin(turn)), state.answers()
+    mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
+    c = _answers()[1]
+    return float(c[0, 0] * square + 2 * mean * (c[0, 1:] @ answers) + answers @ c[1:, 1:] @ answers)
+
+
+@functools.cache
+def _answers() -> tuple[Array, Array]:
+    """Mean and covariance over a turn of d phase / d(diameter, answering causes), base units, of the default cell.
+
+    Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 % of the covariance with height.
+    """
+    start = TURN.phase_rad(np.array([TURN.domain_um[0]]), WAVELENGTH_UM)[0]
+    even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
+    diameter = np.asarray(TURN.diameter_um(even, WAVELENGTH_UM))
+    seen = guide(DEFAULT_CELL, TURN, WAVELENGTH_UM, diameter)
+    quick = [row.acts.quick(seen).imag for _, row in of_kind(Answers) if isinstance(row.acts, Answers)]
+    rates = np.stack([TURN.dphase_ddiameter(diameter, WAVELENGTH_UM), *quick])
+    return rates.mean(1), np.cov(rates)

@@ -1,0 +1,291 @@
+"""The optics that training moves: a focus and a few dozen orthonormal polynomials of phase, and their PSFs.
+
+A smooth phase is enough to shape a PSF, keeps its gradients of one size, and leaves no pillar noise to overfit;
+:func:`phase_of` gives the same phase at every pillar of the full lens.
+"""
+
+import functools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.fft
+import torch
+from torch import Tensor
+
+from codesign.optics.lens_errors import LensError, LensErrors, variance_rad2, wave_front_rad
+from metalens.design import Focus, PhaseOf, profiles
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, TrainingError
+from metalens.ground.paths import source_path
+from metalens.image import (
+    Field,
+    PsfBasis,
+    Pupil,
+    Seen,
+    UniformImager,
+    basis,
+    coordinates,
+    radius,
+    uniform_imager,
+    view,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsConfig:
+    """The lens in front of the sensor, and how finely training sees it.
+
+    aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
+    focus_mm: source distance that the hyperbolic part images onto the sensor.
+    polynomials: orthonormal radial-angular terms of order 2 and above that training moves; 0 for a fixed lens.
+    zones: rings of a double helix added to the hyperbolic phase; 0 for none.
+    depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at equal steps of 1/z.
+    sample_um: of the PSFs; the image is formed on this grid before the pixels integrate it.
+    window_samples: of the PSFs.
+    tolerance: of the low-rank PSF basis.
+    spread: of the lenses that are made.
+    angle_deg: field angle, towards +x, of the whole image: sources and window lie around that chief ray.
+    """
+
+    aperture_mm: float = 1.0
+    sensor_distance_mm: float = 2.0
+    wavelength_nm: float = 850.0
+    focus_mm: float = 20.0
+    polynomials: int = 35
+    zones: int = 0
+    depths_mm: tuple[float, float] = (12.0, 50.0)
+    depth_count: int = 24
+    sample_um: float = 9.0
+    window_samples: int = 33
+    tolerance: float = 3e-3
+    spread: LensErrors = field(default_factory=LensErrors)
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        low, high = self.depths_mm
+        if not (0 < low < high and self.depth_count >= 2):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, depth_count = {self.depth_count}: need 0 < least < largest"
+            )
+        if min(self.aperture_mm, self.sensor_distance_mm, self.wavelength_nm, self.focus_mm, self.sample_um) <= 0:
+            raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")
+        if not abs(self.angle_deg) <= 40:
+            raise ConfigError(f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees")
+        if self.window_samples < 3 or self.window_samples % 2 == 0:
+            raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
+
+    @property
+    def fine(self) -> int:
+        """Samples of the intensity to one of ``sample_um``: at most lambda / (4 NA) apart, an odd number."""
+        pupil = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
+        need = math.ceil(self.sample_um / (pupil.field_step_um / 2))
+        return need + 1 - need % 2
+
+    @property
+    def pupil(self) -> Pupil:
+        """The aperture with as many nodes as the window of the PSFs needs."""
+        rough = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
+        width = self.window_samples * self.sample_um * 1.05
+        nodes = max(64, math.ceil(width * 2 * rough.edge / rough.wavelength_um / 2) * 2)
+        return Pupil(rough.radius_um, rough.sensor_distance_um, rough.wavelength_um, nodes)
+
+    @property
+    def depths_um(self) -> Tensor:
+        """(depths,) ascending, at equal steps of 1/z, float64."""
+        low, high = self.depths_mm
+        return 1e3 / torch.linspace(1 / low, 1 / high, self.depth_count, dtype=torch.float64)
+
+    @property
+    def focus(self) -> Focus:
+        """What the hyperbolic part images onto the sensor."""
+        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.focus_mm * 1e3)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stack:
+    """PSFs over depth on the grid of the image.
+
+    intensity: (depths, h, w) share of the light. depths_um: (depths,).
+    """
+
+    intensity: Tensor
+    depths_um: Tensor = field(repr=False)
+
+    def basis(self, tolerance: float) -> PsfBasis:
+        """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1)."""
+        total = self.intensity.sum((-2, -1), keepdim=True)
+        return basis(self.intensity / total, self.depths_um, tolerance=tolerance)
+
+
+def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: LensError | None = None) -> Stack:
+    """PSFs of the lens whose polynomial coefficients are these, on samples of the image; differentiable.
+
+    Each is the light on square samples, low-passed to what the grid of the samples can show: so it does not depend
+    on where a source falls on the grid, and no optimiser can exploit that. The low frequencies of the intensity are
+    the autocorrelation of the pupil, exact from one padded transform of the pupil's nodes a depth.
+
+    Args:
+        coefficients_rad: (polynomials,) in rad of root-mean-square phase over the aperture.
+        error: one draw of ``settings.spread``.
+
+    Raises:
+        TrainingError: a coefficient is not finite.
+    """
+    if not bool(torch.isfinite(coefficients_rad).all()):
+        raise TrainingError("the optics left the finite numbers: lower the learning rate of the optics")
+    phase = added_phase(settings, coefficients_rad)
+    if error is not None:
+        phase = phase + _error_phase(settings, error)
+    carriers, shape = _carriers(settings)
+    turn = torch.polar(torch.ones_like(phase, dtype=torch.float32), torch.remainder(phase, 2 * math.pi).float())
+    field = torch.fft.fft2(carriers * turn, s=shape)
+    transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
+    rows, columns = _sample_rows(settings)
+    low = len(columns)
+    kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
+    light = (rows @ (kept @ columns)).real
+    return Stack(light if error is None else _hazy(settings, light, error), settings.depths_um)
+
+
+def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
+    """(nodes, nodes) phase on top of the hyperbolic focus: vortices of the double helix, and the polynomials."""
+    phase = _vortices(settings)
+    if settings.polynomials:
+        phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), _modes(settings))
+    return phase
+
+
+def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
+    """The trained phase as a function of pillar positions, for :func:`metalens.design.make`."""
+    mix = _polynomials(settings.pupil, settings.polynomials)[1] if settings.polynomials else torch.zeros(0, 0)
+    weights = (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).numpy() if len(mix) else np.zeros(0)
+    rim = settings.aperture_mm * 500
+
+    def phase(x_um: Array, y_um: Array) -> Array:
+        x, y = x_um, y_um[:, None]
+        if settings.zones:
+            shape = profiles.DoubleHelix(settings.zones)
+            total = profiles.double_helix(x, y, settings.focus, shape, radius_um=rim)
+        else:
+            total = profiles.hyperbolic(x, y, settings.focus)
+        for weight, term in zip(weights, _terms(x / rim, y / rim, len(weights)), strict=True):
+            total = total + weight * term
+        return total
+
+    return phase
+
+
+def prepared(settings: OpticsConfig, made: Stack, frame: int, *, margin: int) -> UniformImager:
+    """Transfer functions for square frames of ``frame`` samples rendered with ``margin`` to spare."""
+    return uniform_imager(made.basis(settings.tolerance), (frame, frame), margin=margin)
+
+
+def _terms(x: Array, y: Array, count: int) -> list[Array]:
+    """rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n: the first ``count``."""
+    rho, theta = np.hypot(x, y), np.arctan2(y, x)
+    terms: list[Array] = []
+    order = 2
+    while len(terms) < count:
+        for m in range(-order, order + 1, 2):
+            terms.append(rho**order * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta)))
+        order += 1
+    return terms[:count]
+
+
+@functools.lru_cache(maxsize=8)
+def _polynomials(pupil: Pupil, count: int) -> tuple[Tensor, Tensor]:
+    """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of :func:`_terms`."""
+    x, y = (c.numpy() / pupil.radius_um for c in coordinates(pupil))
+    raw = torch.from_numpy(np.stack(_terms(x, y, count)))
+    inside = radius(pupil) <= pupil.radius_um
+    samples = raw[:, inside]
+    _, upper = torch.linalg.qr(samples.T)
+    mix = torch.linalg.inv(upper).T * math.sqrt(samples.shape[1])
+    return torch.einsum("nm,myx->nyx", mix, raw) * inside, mix
+
+
+@functools.lru_cache(maxsize=8)
+def _modes(settings: OpticsConfig) -> Tensor:
+    """(polynomials, nodes, nodes) terms where the rays of the nodes leave the lens."""
+    terms, mix = _polynomials(settings.pupil, settings.polynomials)
+    if not settings.angle_deg:
+        return terms
+    seen, rim = _seen(settings), settings.pupil.radius_um
+    raw = torch.from_numpy(np.stack(_terms((seen.x_um / rim).numpy(), (seen.y_um / rim).numpy(), len(mix))))
+    return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
+
+
+@functools.lru_cache(maxsize=8)
+def _vortices(settings: OpticsConfig) -> Tensor:
+    x, y = _seen(settings).x_um, _seen(settings).y_um
+    if not settings.zones:
+        return torch.zeros_like(x)
+    fraction = torch.hypot(x, y) / settings.pupil.radius_um
+    ring = torch.ceil(settings.zones * fraction**2).clamp(1, settings.zones)
+    return (2 * ring - 1) * torch.atan2(y, x)
+
+
+def _field(settings: OpticsConfig) -> Field:
+    return Field(math.radians(settings.angle_deg))
+
+
+@functools.lru_cache(maxsize=8)
+def _seen(settings: OpticsConfig) -> Seen:
+    """The pupil from where the chief ray meets the sensor; its nodes are those of the lens on axis."""
+    return view(settings.pupil, _field(settings), settings.focus_mm * 1e3)
+
+
+@functools.lru_cache(maxsize=8)
+def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
+    """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic lens; size of its transforms.
+
+    The size leaves the autocorrelation free of wrap-around at all frequencies that are kept. complex64.
+    """
+    seen, k = _seen(settings), 2 * math.pi / settings.pupil.wavelength_um
+    tangents = _field(settings).tangents
+    paths = [source_path(seen.x_um, seen.y_um, tangents, 1 / float(z)) for z in settings.depths_um]
+    angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
+    size = scipy.fft.next_fast_len(settings.pupil.nodes + _frequencies(settings) + 1)
+    return torch.polar(seen.weight, angle).to(torch.complex64), (size, size)
+
+
+def _frequencies(settings: OpticsConfig) -> int:
+    """Harmonics of the pupil's period that the grid of the samples can show."""
+    return math.floor(settings.pupil.period_um / (2 * settings.sample_um))
+
+
+@functools.lru_cache(maxsize=8)
+def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
+    """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to the light on each sample."""
+    pupil, size = settings.pupil, settings.window_samples
+    harmonic = torch.arange(_frequencies(settings) + 1, dtype=torch.float64) / pupil.period_um
+    place = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * settings.sample_um
+    half = torch.exp(2j * math.pi * place[:, None] * harmonic) * torch.sinc(harmonic * settings.sample_um)
+    rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
+    columns = half * torch.where(harmonic == 0, 1.0, 2.0)  # the other half of the frequencies is its conjugate
+    nodes_light = float((_seen(settings).weight ** 2).sum()) * _carriers(settings)[1][0] ** 2
+    scale = (settings.sample_um / pupil.period_um) ** 2 / nodes_light
+    return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
+
+
+def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
+    pupil = settings.pupil
+    x, y = (c.double() / pupil.radius_um for c in (_seen(settings).x_um, _seen(settings).y_um))
+    rho2 = x**2 + y**2
+    focus_um, tilt, astigmatism = error.assembly()
+    k = 2 * math.pi / pupil.wavelength_um
+    defocus = -k * focus_um * (pupil.radius_um / pupil.sensor_distance_um) ** 2 / 2 * rho2
+    assembled = defocus + 2 * math.pi * (tilt * rho2 * x + astigmatism * (x**2 - y**2))
+    return assembled + wave_front_rad(error.state(), x, y)
+
+
+def _hazy(settings: OpticsConfig, light: Tensor, error: LensError) -> Tensor:
+    """Light of pillars that the process made wrong: their phases differ by more than a smooth wave front.
+
+    With the phases of a lens spread evenly over a turn, an error of variance V leaves exp(-V) of the light in the
+    image (Marechal) and sends the rest straight on, over the shadow of the aperture.
+    """
+    kept = math.exp(-variance_rad2(error.state()))
+    shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)
+    return kept * light + (1 - kept) * shadow

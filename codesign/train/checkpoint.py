@@ -1,0 +1,132 @@
+"""Training state on disk: every tensor bit for bit (safetensors), the rest as JSON, written whole or not at all."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from metalens.ground import config
+from metalens.ground.errors import TrainingError
+from metalens.ground.store import replacing
+
+VERSION = 2
+ABOUT = "about"
+_TENSOR = "\0tensor"
+
+
+def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
+    """Write a training state.
+
+    Args:
+        state: nested dicts and lists of tensors, numbers, strings, booleans and None; keys are strings or integers.
+        settings: the run's config record; kept as TOML so that a resume can compare it.
+
+    Raises:
+        OSError: the target cannot be written, the disk is full (the old checkpoint stays).
+        TrainingError: the state holds something else.
+    """
+    tensors: dict[str, Tensor] = {}
+    tree = _split(state, "", tensors)
+    about = {"kind": "checkpoint", "version": VERSION, "state": tree, "settings": config.dumps(settings)}
+    metadata = {ABOUT: json.dumps(about)}  # one entry: the file format does not keep the order of several
+    with replacing(path) as part:
+        try:
+            save_file(tensors, str(part), metadata=metadata)
+        except SafetensorError as error:
+            raise OSError(f"{path}: cannot write the checkpoint ({error})") from error
+
+
+def load(path: str | Path, *, settings: object) -> dict[str, Any]:
+    """Read a training state back.
+
+    Raises:
+        TrainingError: missing, truncated or foreign file, another version, or a run of other settings (the
+            difference is named).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise TrainingError(f"{path}: no checkpoint to resume from; start without --resume")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            about = _about(file.metadata() or {})
+            _check(path, about, settings)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        merged: dict[str, Any] = _merge(about["state"], tensors)
+    except TrainingError:
+        raise
+    except (SafetensorError, OSError, LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise TrainingError(f"{path}: truncated or not a checkpoint ({error})") from error
+    return merged
+
+
+def difference(old: str, new: str) -> str:
+    """What changed between two settings in TOML, one ``key: old -> new`` a line; '' for none."""
+    before, after = (_flat(text) for text in (old, new))
+    keys = sorted(before.keys() | after.keys())
+    changed = [k for k in keys if before.get(k) != after.get(k)]
+    return "\n".join(f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed)
+
+
+def _about(metadata: dict[str, str]) -> dict[str, Any]:
+    try:
+        about: dict[str, Any] = json.loads(metadata.get(ABOUT, "{}"))
+    except json.JSONDecodeError:
+        return {}
+    return about
+
+
+def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
+    if metadata.get("kind") != "checkpoint" or metadata.get("version") != VERSION:
+        found = metadata.get("kind", "no kind"), metadata.get("version", "no version")
+        raise TrainingError(f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}")
+    changed = difference(metadata["settings"], config.dumps(settings))
+    if changed:
+        raise TrainingError(f"{path} belongs to other settings; start a new run or undo the change:\n{changed}")
+
+
+def _flat(text: str) -> dict[str, str]:
+    table, result = "", {}
+    for line in text.splitlines():
+        if line.startswith("["):
+            table = line.strip("[]") + "."
+        elif " = " in line:
+            key, value = line.split(" = ", 1)
+            result[table + key] = value
+    return result
+
+
+def _split(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(node, Tensor):
+        tensors[name] = node.detach().contiguous().clone()
+        return {_TENSOR: name}
+    if isinstance(node, dict):
+        return {"items": [[k, _split(v, f"{name}/{k}", tensors)] for k, v in node.items()]}
+    if isinstance(node, list | tuple):
+        return [_split(v, f"{name}/{i}", tensors) for i, v in enumerate(node)]
+    if node is None or isinstance(node, bool | int | float | str):
+        return node
+    raise TrainingError(f"checkpoint entry {name or '/'} is a {type(node).__name__}; need tensors, numbers, text")
+
+
+def _merge(tree: Any, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(tree, list):
+        return [_merge(v, tensors) for v in tree]
+    if isinstance(tree, dict):
+        if _TENSOR in tree:
+            return tensors[tree[_TENSOR]]
+        return {k: _merge(v, tensors) for k, v in tree["items"]}
+    return tree
+
+
+def random_state() -> dict[str, Any]:
+    """State of torch's global generator."""
+    return {"torch": torch.get_rng_state()}
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Restore what :func:`random_state` gave."""
+    torch.set_rng_state(state["torch"])

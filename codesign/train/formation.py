@@ -1,0 +1,93 @@
+"""From light on the image grid to what the network sees and what it costs, and the depth that a PSF stack tells."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from codesign.batches import parallel
+from codesign.network import Architecture, Baseline, Supernet, cost
+from codesign.optics import OpticsConfig, Stack
+from metalens.image import Sensor, encircled_energy, texture_information
+from metalens.image import sensor as camera
+
+
+def read_out(
+    irradiance: Tensor,
+    sample_um: float,
+    pitch_um: Tensor,
+    sensor: Sensor,
+    *,
+    generator: torch.Generator | None,
+    exact: bool = True,
+    resized: bool = False,
+) -> Tensor:
+    """(batch, 1, rows, columns) standardised frames as the network sees them: pixels, noise, quantisation.
+
+    The gradient in the pitch is that of a network whose own grid stays on the scene, so of a fixed cost: the box of the
+    pixels widens, and an area of the sensor is read (pitch0 / pitch)^2 times; its light and photon noise stay. (The
+    frame as such zooms while its pixels grow, until one drops off at the rim: a slope that says nothing of the next
+    count of pixels.)
+
+    Args:
+        exact: Poisson counts; otherwise their normal approximation, four times faster (the skewness 1 / sqrt(mean)
+            is lost), still Poisson where the mean is below 20 electrons.
+        resized: the frames will be averaged to a coarser grid, whose cells, not the pixels, are then the box: the
+            gradient in the pitch is that of the reads alone.
+    """
+    here, moves = float(pitch_um.detach()), pitch_um.requires_grad
+    pixel = replace(sensor, pitch_um=here)  # the full well is that of this pitch
+    box, grid_um = (pitch_um, here) if moves and not resized else (pitch_um.detach(), None)
+    mean = camera.mean_electrons(irradiance, sample_um, sensor=pixel, pitch_um=box, grid_um=grid_um)
+    reads = (here / pitch_um) ** 2
+    if not exact and float(mean.detach().mean()) > 20:
+        electrons = _normal(mean, pixel, generator, reads)
+    else:
+        electrons = camera.expose(mean, sensor=pixel, generator=generator, reads=reads)
+    frames = camera.digitise(electrons, sensor=pixel)
+    centred = frames - frames.mean((-2, -1), keepdim=True)
+    return (centred / centred.std((-2, -1), keepdim=True).clamp_min(1e-6))[:, None].to(torch.float32)
+
+
+def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None, reads: Tensor) -> Tensor:
+    """Electrons of mean and variance as :func:`metalens.image.expose`, up to the full well, from one normal draw."""
+    well = sensor.full_well_e * float(camera.kappa(sensor.pitch_um, sensor.base_pitch_um))
+    collected = mean.clamp(max=well)
+    share, size = parallel.ranks(), len(mean)  # the noise of the whole batch, whoever takes which part of it
+    noise = torch.randn((share * size, *mean.shape[1:]), generator=generator, dtype=mean.dtype, device=mean.device)
+    noise = noise[parallel.rank() * size : (parallel.rank() + 1) * size]
+    return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6)
+
+
+def network_macs(net: Supernet | Baseline, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
+    """Multiply-accumulates of one member at this pitch, differentiable."""
+    size = window_um / pitch_um * architecture.resolution
+    return cost.interpolated(lambda sizes: net.counts(architecture, sizes), size)
+
+
+def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:
+    """-log of the information on depth in blurred texture, and a hinge on the encircled energy (paper Eq. 6).
+
+    A texture's blur is what the network reads; the information of the PSF alone ranks lenses wrongly.
+    """
+    psfs = made.intensity
+    size = psfs.shape[-1]
+    spectrum = _texture(size).to(psfs)
+    step = (made.depths_um[1:] - made.depths_um[:-1])[:, None, None].to(psfs)
+    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
+    told = torch.stack(
+        [
+            texture_information(pair, step_um=float(gap), spectrum=spectrum, noise=1e-3)[0]
+            for pair, gap in zip(pairs, step.flatten(), strict=True)
+        ]
+    )
+    share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
+    return -torch.log(told + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+
+
+def _texture(size: int) -> Tensor:
+    """Power of a 1/f texture on the grid of rfft2, of mean 1."""
+    fy, fx = torch.fft.fftfreq(size), torch.fft.rfftfreq(size)
+    power = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
+    scaled: Tensor = power / power.mean()
+    return scaled

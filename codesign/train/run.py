@@ -1,0 +1,241 @@
+"""A co-design run from its config: joint training, search over architectures under budgets, and what is kept of it."""
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+
+from codesign.batches import VALIDATION, EyeScenes, PoolScenes, SceneConfig, fill, parallel
+from codesign.network import Architecture, Name, Space, cost
+from codesign.optics import OpticsConfig
+from codesign.train import assess, checkpoint, evolution
+from codesign.train.evolution import Candidate, Plan, Search
+from codesign.train.formation import network_macs
+from codesign.train.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
+from metalens.ground import config
+from metalens.ground.errors import ConfigError
+from metalens.image import Sensor
+
+Preset = Literal["smoke", "laptop", "paper"]
+Part = Literal["optics", "pitch", "architecture"]
+
+
+@dataclass(frozen=True, slots=True)
+class Budgets:
+    """Where the run starts, and what it is searched under.
+
+    pitch_um: pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
+    budgets_mmacs: one search each; the results together are the Pareto set. Training keeps to them in turn.
+    frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest
+        uniform one, at the resolution that each budget allows, trained alone.
+    finetune_steps: of further training of the weights of each budget's network, on its own.
+    """
+
+    pitch_um: float = 9.0
+    budgets_mmacs: tuple[float, ...] = (12.0,)
+    frozen: tuple[Part, ...] = ()
+    finetune_steps: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.pitch_um > 0 or not self.budgets_mmacs or min(self.budgets_mmacs) <= 0:
+            raise ConfigError(f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0")
+        if self.finetune_steps < 0:
+            raise ConfigError(f"finetune_steps = {self.finetune_steps}: need 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """The content of RUN.toml; a preset gives every value that the file leaves out.
+
+    checkpoint_every: steps. validation_batches: judge architectures. test_batches: judge the result.
+    network: the elastic network, or a baseline in its place (no search; one row without a budget).
+    ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that test out.
+    """
+
+    preset: Preset = "laptop"
+    checkpoint_every: int = 50
+    validation_batches: int = 8
+    test_batches: int = 32
+    network: Name = "supernet"
+    ambiguity_pairs: int = 0
+    scenes: SceneConfig = field(default_factory=SceneConfig)
+    optics: OpticsConfig = field(default_factory=OpticsConfig)
+    sensor: Sensor = field(default_factory=Sensor)
+    space: Space = field(default_factory=Space)
+    inner: InnerConfig = field(default_factory=InnerConfig)
+    search: Plan = field(default_factory=Plan)
+    run: Budgets = field(default_factory=Budgets)
+
+    def __post_init__(self) -> None:
+        if min(self.checkpoint_every, self.validation_batches, self.test_batches) < 1:
+            raise ConfigError("checkpoint_every, validation_batches and test_batches must be 1 or more")
+        if 0 < self.scenes.pool < self.inner.batch or self.ambiguity_pairs < 0:
+            raise ConfigError(
+                f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}, ambiguity_pairs = "
+                f"{self.ambiguity_pairs}: need a pool of a batch or more (or 0), and pairs of 0 or more"
+            )
+        for resolution in (self.space.resolution[0], 1.0):
+            cost.input_size(self.scenes.pixels * self.optics.sample_um, self.run.pitch_um, resolution)
+
+
+def load(path: str | Path) -> RunConfig:
+    """Read RUN.toml over its preset.
+
+    Raises:
+        ConfigError: see :func:`metalens.ground.config.load`; an unknown preset.
+    """
+    table = config.read(path, RunConfig)
+    preset = preset_table(table.get("preset", "laptop"))
+    return config.from_table(config.merged(preset, table), RunConfig, where=str(path))
+
+
+def preset_table(name: str) -> dict[str, Any]:
+    """The settings of a preset; of laptop for a name that is none, which :func:`load` then refuses."""
+    known = name if name in get_args(Preset) else "laptop"
+    return tomllib.loads(resources.files("codesign").joinpath("data", f"{known}.toml").read_text(encoding="utf-8"))
+
+
+@dataclass(eq=False)
+class Run:
+    """A run and where it stands: ``trainer`` first, then a search for every budget."""
+
+    settings: RunConfig
+    trainer: Trainer
+    searches: list[Search]
+
+    @property
+    def window_um(self) -> float:
+        """Edge of the image."""
+        return self.settings.scenes.pixels * self.settings.optics.sample_um
+
+    def macs(self, architecture: Architecture) -> float:
+        """Multiply-accumulates of an architecture at the pitch that was found."""
+        pitch = self.trainer.model.pitch_um.detach()
+        cost.input_size(self.window_um, float(pitch), architecture.resolution)
+        return float(network_macs(self.trainer.model.net, architecture, self.window_um, pitch))
+
+    def scenes(self, stream: int) -> EyeScenes:
+        """Frames of another stream than training's."""
+        s = self.settings
+        return EyeScenes(s.scenes, s.optics.sample_um, s.optics.sensor_distance_mm * 1e3, s.inner.seed, stream)
+
+
+def start(settings: RunConfig) -> Run:
+    """A fresh run; renders the pool of frames where there is one.
+
+    Raises:
+        TrainingError: a budget is below the smallest network.
+    """
+    seed, frozen = settings.inner.seed, settings.run.frozen
+    inner = settings.inner
+    inner = replace(inner, optics=Schedule(0.0)) if "optics" in frozen else inner
+    inner = replace(inner, pitch=Schedule(0.0)) if "pitch" in frozen else inner
+    made = model(
+        settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space, network=settings.network
+    )
+    fresh = EyeScenes(settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, seed)
+    scenes: Scenes = fresh
+    if settings.scenes.pool:
+        scenes = PoolScenes(fill(fresh, settings.scenes.pool), fresh.margin, settings.scenes.scale, seed)
+    if parallel.ranks() > 1 and settings.network != "supernet":
+        raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
+    budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
+    trainer = Trainer(
+        inner,
+        settings.optics,
+        settings.sensor,
+        scenes,
+        made,
+        budgets_mmacs=budgets,
+        largest_only="architecture" in frozen,
+    )
+    run = Run(settings, trainer, [])
+    if settings.network == "supernet":
+        _affordable(run, moves=inner.pitch.rate > 0)
+    return run
+
+
+def _affordable(run: Run, *, moves: bool) -> None:
+    """Refuse a budget that no network keeps, at the run's pitch or, if that moves, at any."""
+    settings, net = run.settings, run.trainer.model.net
+    coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])
+    pitch = torch.tensor(coarsest if moves else settings.run.pitch_um, dtype=torch.float64)
+
+    def count(architecture: Architecture) -> float:
+        return float(network_macs(net, architecture, run.window_um, pitch))
+
+    evolution.affordable(settings.space, count, min(settings.run.budgets_mmacs) * 1e6)
+
+
+def save(path: Path, run: Run) -> None:
+    """Checkpoint: training state and the searches so far; written by one process alone."""
+    if parallel.rank():
+        return
+    state = {"trainer": run.trainer.state(), "searches": [evolution.dumps(s) for s in run.searches]}
+    checkpoint.save(path, state, settings=run.settings)
+
+
+def resume(path: Path, settings: RunConfig) -> Run:
+    """Go on from a checkpoint.
+
+    Raises:
+        TrainingError: no checkpoint, a damaged one, or one of other settings (the difference is named).
+    """
+    state = checkpoint.load(path, settings=settings)
+    run = start(settings)
+    run.trainer.restore(state["trainer"])
+    run.searches = [evolution.loads(text, settings.space) for text in state["searches"]]
+    return run
+
+
+def train(run: Run, path: Path) -> Iterator[Record]:
+    """Advance the training to its end, with checkpoints; a record a step."""
+    for record in run.trainer.run():
+        yield record  # first the caller's log, then the checkpoint: a log never lacks a step that is kept
+        if record.step % run.settings.checkpoint_every == 0 or record.step == run.settings.inner.steps:
+            save(path, run)
+
+
+def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
+    """Advance the searches to their end, budget by budget, with a checkpoint after every round of births.
+
+    Yields:
+        (budget in MMACs, the candidate that was born).
+    """
+    settings = run.settings
+    if settings.network != "supernet":
+        return
+    frames = assess.frames(run.trainer, run.scenes(VALIDATION), settings.validation_batches)
+    plan = settings.search
+    if "architecture" in settings.run.frozen:
+        plan = Plan(population=1, tournament=1, rounds=1)
+
+    def error(architecture: Architecture) -> float:
+        return assess.assess(run.trainer.model.net, architecture, frames, settings.inner).slip_mm
+
+    for i, budget in enumerate(settings.run.budgets_mmacs):
+        before = run.searches[i] if i < len(run.searches) else None
+        states = evolution.evolve(
+            settings.space,
+            plan,
+            error,
+            run.macs,
+            budget=budget * 1e6,
+            seed=settings.inner.seed + i,
+            start=before,
+        )
+        told = len(before.history) if before else 0
+        for state in states:
+            yield from ((budget, born) for born in state.history[told:])
+            told = len(state.history)
+            run.searches[i:] = [state]
+            save(path, run)
+
+
+def coefficients(run: Run) -> torch.Tensor:
+    """Polynomial coefficients of the trained lens, rad."""
+    return run.trainer.model.coefficients_rad.detach().clone()

@@ -1,0 +1,179 @@
+"""Pages that the site makes from the code: every command with its options, every settings file with its keys.
+
+An mkdocs hook (``hooks`` in mkdocs.yml). The texts come from the docstrings of the records, so that they cannot go
+stale; a key without a text is an error of the build.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from metalens.cli import VERBS
+
+# settings file: (module, record, command that reads it)
+SETTINGS = {
+    "CELL.toml": ("metalens.commands.library", "CellFile", "library"),
+    "STUDY.toml": ("metalens.pillars.study", "Study", "study"),
+    "DESIGN.toml": ("metalens.commands.design", "Design", "design"),
+    "PSF.toml": ("metalens.commands.psf", "Settings", "psf"),
+    "PROCESS.toml": ("layout.process.process", "Process", "layout"),
+    "TRUTH.toml": ("characterize.bench.bench", "Truth", "capture --truth"),
+    "PROTOCOL.toml": ("characterize.bench.protocol", "Protocol", "capture --protocol"),
+    "METROLOGY.toml": ("characterize.commands.fit", "Metrology", "fit --metrology"),
+    "PUPIL.toml": ("characterize.pupil.record", "PupilSpec", "fit --pupil"),
+    "SCENE.toml": ("codesign.commands.scene", "Scene", "scene"),
+    "RUN.toml": ("codesign.train.run", "RunConfig", "codesign"),
+    "PLAN.toml": ("codesign.budget.plan", "PlanConfig", "plan"),
+    "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
+}
+KEY = re.compile(r"(?<!\S)((?:\w+, )*\w+): ")
+
+
+def texts(record: type[Any]) -> dict[str, str]:
+    """{field: what its docstring says of it}; lines ``name: text`` or ``name, other: text``, several to a line too."""
+    names = {f.name for f in dataclasses.fields(record)}
+    doc = inspect.getdoc(record) or ""
+    found: dict[str, str] = {}
+    places = [m for m in KEY.finditer(doc) if set(m.group(1).split(", ")) <= names]
+    for place, following in zip(places, [*places, None][1:], strict=True):
+        end = following.start() if following else len(doc)
+        text = doc[place.end() : end].split("\n\n")[0]
+        text = " ".join(text.split()).rstrip(" ;.")
+        for name in place.group(1).split(", "):
+            found.setdefault(name, text)
+    return found
+
+
+def _word(kind: Any) -> str:
+    origin = typing.get_origin(kind)
+    if origin is typing.Annotated:
+        return _word(typing.get_args(kind)[0])
+    if origin is typing.Literal:
+        return " \\| ".join(f"`{value}`" for value in typing.get_args(kind))
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_word(one) for one in typing.get_args(kind) if one is not type(None))
+    if origin is tuple:
+        inside = [a for a in typing.get_args(kind) if a is not Ellipsis]
+        return f"list of {_word(inside[0])}" if Ellipsis in typing.get_args(kind) else f"{len(inside)} values"
+    if origin is dict:
+        return "table"
+    names = {float: "number", int: "integer", str: "text", bool: "true or false", Path: "file"}
+    return names.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def _default(field: "dataclasses.Field[Any]") -> str:
+    if field.default is not dataclasses.MISSING:
+        value = field.default
+    elif field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    else:
+        return "**needed**"
+    if value is None:
+        return "–"
+    if dataclasses.is_dataclass(value):
+        return "see its table"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        value = list(value)
+    return f"`{value}`" if str(value) else '`""`'
+
+
+def _table_of(kind: Any) -> type[Any] | None:
+    """The record behind a key that is a table."""
+    for one in (kind, *typing.get_args(kind)):
+        if dataclasses.is_dataclass(one) and isinstance(one, type):
+            return one
+    return None
+
+
+def keys(record: type[Any], path: str = "") -> list[str]:
+    """Markdown of a record's keys, then of the tables below it."""
+    hints, told = typing.get_type_hints(record, include_extras=True), texts(record)
+    lead = (inspect.getdoc(record) or "").split("\n\n")[0].replace("\n", " ")
+    lines = [f"### `[{path}]`" if path else "### Top level", "", lead, ""]
+    lines += ["| key | kind | default | |", "|---|---|---|---|"]
+    below: list[str] = []
+    for field in dataclasses.fields(record):
+        kind = hints[field.name]
+        inner = _table_of(kind)
+        word = f"table `[{f'{path}.' if path else ''}{field.name}]`" if inner else _word(kind)
+        lines.append(f"| `{field.name}` | {word} | {_default(field)} | {told.get(field.name, '')} |")
+        if inner is not None:
+            below += ["", *keys(inner, f"{path}.{field.name}" if path else field.name)]
+    return [*lines, *below]
+
+
+def settings_page(name: str) -> str:
+    """Every key of one settings file."""
+    module, record, verb = SETTINGS[name]
+    made = keys(getattr(importlib.import_module(module), record))
+    return "\n".join([f"# {name}", "", f"Read by `metalens {verb}`. An unknown key is refused.", "", *made, ""])
+
+
+def _options(verb: str, module: str) -> list[str]:
+    loaded = importlib.import_module(module)
+    parts = getattr(loaded, "PARTS", None)
+    if parts:
+        return [line for part, (where, _) in parts.items() for line in _options(f"{verb} {part}", where)]
+    record = loaded.Options
+    told, hints = texts(record), typing.get_type_hints(record, include_extras=True)
+    for base in reversed(record.__mro__[1:-1]):
+        if dataclasses.is_dataclass(base):
+            told = texts(base) | told
+    lines = [
+        f"## metalens {verb}",
+        "",
+        (loaded.__doc__ or "").strip(),
+        "",
+        "| option | kind | default | |",
+        "|---|---|---|---|",
+    ]
+    for field in dataclasses.fields(record):
+        flag = f"`--{field.name.replace('_', '-')}`"
+        row = f"| {flag} | {_word(hints[field.name])} | {_default(field)} | {told.get(field.name, '')} |"
+        lines.append(row)
+    return [*lines, ""]
+
+
+def commands_page() -> str:
+    """Every verb with its options."""
+    lines = [
+        "# Commands",
+        "",
+        "Every command ends 0 on success, 1 when a result fails its own check, 2 on bad input.",
+        "",
+    ]
+    for verb, (module, _) in VERBS.items():
+        lines += _options(verb, module)
+    return "\n".join(lines)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links from docs/ to the pages of the root, as the site has them."""
+    return re.sub(r"\]\(\.\./([A-Z]+)\.md\)", lambda m: f"]({m[1].lower()}.md)", markdown)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the made pages to the site."""
+    root = Path(config.config_file_path).parent
+    pages = {f"reference/{name.removesuffix('.toml').lower()}.md": settings_page(name) for name in SETTINGS}
+    pages["reference/commands.md"] = commands_page()
+    for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG"):
+        text = (root / f"{name}.md").read_text(encoding="utf-8")
+        text = re.sub(r"\]\(docs/(\w[^)]*)\)", r"](\1)", text)
+        where = "index.md" if name == "README" else f"{name.lower()}.md"
+        pages[where] = re.sub(
+            r"\]\((ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md\)", lambda m: f"]({m[1].lower()}.md)", text
+        )
+    for where, text in pages.items():
+        files.append(File.generated(config, where, content=text))
+    return files

@@ -1,0 +1,1 @@
+"""Metalens layout and its page."""

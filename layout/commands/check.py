@@ -1,0 +1,79 @@
+"""Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid; violations as markers for KLayout."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from layout.files import MaskContent, mapped
+from layout.gdsii import read as gdsii_read
+from layout.oasis import bytes as oasis_bytes
+from layout.oasis import read as oasis_read
+from layout.process import process as processes
+from layout.rules import DrcReport, foreign, markers
+from metalens.commands import Common, MaybeOutput
+from metalens.ground.errors import MaskFileError
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens check``.
+
+    Attributes:
+        mask: GDSII or OASIS file, told apart by its first bytes.
+        process: PROCESS.toml with the rules; left out: the defaults.
+        output: marker database to write (.lyrdb for KLayout); left out: none.
+        ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
+    """
+
+    mask: tyro.conf.Positional[Path]
+    process: Path | None = None
+    output: MaybeOutput = None
+    ignore: tuple[int, ...] = ()
+
+
+def run(options: Options) -> int:
+    """Check the mask; exit 1 where a rule is broken."""
+    process = processes.Process() if options.process is None else processes.load(options.process)
+    if not options.mask.is_file():
+        raise MaskFileError(f"{options.mask}: no such file; need a GDSII or OASIS mask")
+    content = read(options.mask)
+    skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
+    found = foreign.check(content, process.rules, skip=skip)
+    if options.output is not None:
+        with options.claim(options.output) as draft:
+            markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
+    options.console.result(_values(found), _text(options.mask, found))
+    return 0 if found.ok else 1
+
+
+def read(path: Path) -> MaskContent:
+    """A mask of either format."""
+    is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
+    return oasis_read.read(path) if is_oasis else gdsii_read.read(path)
+
+
+def _values(found: DrcReport) -> dict[str, Any]:
+    return {
+        "ok": found.ok,
+        "shapes": found.pillars,
+        "minimum_gap_nm": found.minimum_gap_nm,
+        "minimum_feature_nm": found.minimum_feature_nm,
+        "violations": found.counts,
+    }
+
+
+def _text(path: Path, found: DrcReport) -> str:
+    broken = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
+    verdict = f"FAILS: design rules broken: {broken}" if broken else "keeps the design rules"
+    lines = [
+        f"{path}: {verdict}",
+        f"  {found.pillars:,} shapes; smallest gap below the rule's reach "
+        f"{found.minimum_gap_nm:.1f} nm, thinnest {found.minimum_feature_nm:.1f} nm",
+    ]
+    lines += [
+        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.value:.4g} nm, need {v.limit:.4g}; {v.text}"
+        for v in found.violations[:10]
+    ]
+    return "\n".join(lines)

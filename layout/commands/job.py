@@ -1,0 +1,104 @@
+"""What ``metalens layout`` was asked for, and what it has made so far."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from layout.certify import Certificate
+from layout.files import Window, verify
+from layout.mask import FieldPlan, MaskPlan, build
+from layout.process import LayerNumber
+from layout.process import process as processes
+from layout.rules import DrcReport
+from metalens.commands import Common, Output
+from metalens.lens import Lens
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens layout``.
+
+    Attributes:
+        lens: the lens file.
+        process: PROCESS.toml; left out: 100 kV electron-beam defaults.
+        output: folder for the mask and its report.
+        oasis: write OASIS (with --gds the default where neither is asked for).
+        gds: write GDSII.
+        dxf: write DXF of a window.
+        step: write STEP of die, aperture, mount and module, with a tile of pillars.
+        stl: write STL, 3MF and glTF of the tapered pillars of a window.
+        form: of OASIS: fewest bytes, least time, or one repetition for each diameter.
+        circles: true circles in OASIS in place of polygons.
+        window: of DXF and STL.
+        name: of the top cell.
+        dose: proximity correction, where the process asks for it.
+        study: add stitching, tolerance (Monte Carlo) and the tolerant choice to the report.
+    """
+
+    lens: tyro.conf.Positional[Path]
+    process: Path | None = None
+    output: Output = Path("mask")
+    oasis: bool = False
+    gds: bool = False
+    dxf: bool = False
+    step: bool = False
+    stl: bool = False
+    form: Literal["small", "fast", "reader"] = "small"
+    circles: bool = False
+    window: Window = field(default_factory=Window)
+    name: str = "METALENS"
+    dose: bool = True
+    study: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class Job:
+    """What a run of the command has made so far.
+
+    seconds: of each stage. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
+    certified: {file name: what the file and the dose table make, by the simulator}.
+    undosed: {file name: layers with shapes that the dose table lacks}.
+    """
+
+    options: Options
+    source: Lens
+    process: processes.Process
+    made: build.MadePlan
+    fields: FieldPlan
+    plan: MaskPlan
+    drc: DrcReport
+    seconds: dict[str, float]
+    written: dict[str, int] = field(default_factory=dict)
+    compared: dict[str, verify.Comparison] = field(default_factory=dict)
+    undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
+    certified: dict[str, Certificate] = field(default_factory=dict)
+
+    @property
+    def failures(self) -> list[str]:
+        """What is wrong with the mask, in words, worst first; empty where it may go to the writer."""
+        found = [
+            f"{name}: no dose for layer {', '.join(f'{a}/{b}' for a, b in layers[:8])}"
+            for name, layers in self.undosed.items()
+            if layers
+        ]
+        found += [f"{name} does not read back as planned" for name, outcome in self.compared.items() if not outcome.ok]
+        if self.process.exposure.corrected and self.options.dose:
+            found += [
+                f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm"
+                for name, c in self.certified.items()
+                if not c.ok
+            ]
+        broken = ", ".join(f"{count} {rule}" for rule, count in self.drc.counts.items() if count)
+        return found + ([f"design rules broken: {broken}"] if broken else [])
+
+    @property
+    def ok(self) -> bool:
+        """Whether the rules hold, every dose is there and every file reads back as planned."""
+        return not self.failures
+
+    @property
+    def verdict(self) -> str:
+        """First line of everything that tells about the mask."""
+        return "FAILS: " + "; ".join(self.failures) if self.failures else "The mask passes its own checks."

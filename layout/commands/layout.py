@@ -1,0 +1,176 @@
+"""lens.h5 to a mask: quantised, dosed, checked, written, read back and compared, with report and pictures."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from layout.certify import certify
+from layout.commands.job import Job, Options
+from layout.files import doses, verify
+from layout.files import write as write_dxf
+from layout.gdsii import read as gdsii_read
+from layout.gdsii import write as gdsii_write
+from layout.mask import MaskPlan, build, fields, with_fields
+from layout.oasis import read as oasis_read
+from layout.oasis import write as oasis_write
+from layout.process import process as processes
+from layout.rules import check as drc
+from layout.rules import markers
+from metalens import lens as lenses
+from metalens.ground import config, store
+from metalens.ground.arrays import Array
+from metalens.ground.units import nm
+from metalens.lens import Lens
+
+MOST_CERTIFIED = 20_000_000  # pillars whose exposure is simulated: some 200 bytes each
+
+
+def run(options: Options) -> int:
+    """Make the mask; exit 1 where a rule is broken or a file does not read back as planned."""
+    with options.claim_folder(options.output) as draft:
+        job = _prepare(options)
+        doses.write(job.plan, job.process, draft.path / "doses.csv")
+        _write_masks(job, draft.path)
+        with _timed(job.seconds, "report"):
+            _accompany(job, draft.path)
+        values = _values(job)
+        store.write_text(draft.path / "layout.json", json.dumps(values, indent=1) + "\n")
+    options.console.result(values, _text(job, options.output))
+    return 0 if job.ok else 1
+
+
+def _prepare(options: Options) -> Job:
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "read"):
+        source = lenses.load(options.lens)
+        rules = processes.Process() if options.process is None else processes.load(options.process)
+    with _timed(seconds, "classes and dose"):
+        made = build.prepare(source, rules, name=options.name, with_doses=options.dose)
+    with _timed(seconds, "write fields"):
+        split = fields.split(source.diameters, rules)
+        plan = with_fields(made.plan, split, rules)
+    with _timed(seconds, "check"):
+        found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
+    return Job(options, source, rules, made, split, plan, found, seconds)
+
+
+def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
+    """(classes,) diameters at the foot of what the etch makes of each class; isolated pillars count where wider."""
+    drawn = np.array([made.diameter_nm for made in plan.classes])
+    made = rules.made_diameter_nm(drawn) + max(0.0, rules.bias.isolated_nm)
+    top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
+    return np.maximum(top, foot)
+
+
+def _write_masks(job: Job, target: Path) -> None:
+    options, plan = job.options, job.plan
+    neither = not (options.oasis or options.gds)
+    if options.oasis or neither:
+        path = target / "mask.oas"
+        with _timed(job.seconds, "write OASIS"):
+            oasis_write.write(plan, path, form=options.form, circles=options.circles)
+        _read_back(job, path, oasis_read.read)
+    if options.gds or neither:
+        path = target / "mask.gds"
+        with _timed(job.seconds, "write GDSII"):
+            gdsii_write.write(plan, path)
+        _read_back(job, path, gdsii_read.read)
+    if options.dxf:
+        with _timed(job.seconds, "write DXF"):
+            write_dxf(plan, target / "mask.dxf", window=options.window)
+        job.written["mask.dxf"] = (target / "mask.dxf").stat().st_size
+    if options.stl or options.step:
+        _write_solids(job, target)
+
+
+def _write_solids(job: Job, target: Path) -> None:
+    from layout.solid import files as solid_files
+
+    options, made = job.options, []
+    if options.stl:
+        with _timed(job.seconds, "write STL"):
+            made += solid_files.write_stl(job.source, job.process, target, options.window)
+    if options.step:
+        with _timed(job.seconds, "write STEP"):
+            made += solid_files.write_step(job.source, job.process, target, options.window)
+    job.written |= {path.name: path.stat().st_size for path in made}
+
+
+def _read_back(job: Job, path: Path, read: Callable[[Path], Any]) -> None:
+    with _timed(job.seconds, f"read back {path.suffix[1:]}"):
+        content = read(path)
+        job.compared[path.name] = verify.compare(job.plan, content)
+        table = doses.read(path.with_name("doses.csv"))
+        job.undosed[path.name] = doses.missing(content, table, job.process)
+    if _certifiable(job):
+        with _timed(job.seconds, f"certify {path.suffix[1:]}"):
+            job.certified[path.name] = certify(content, table, job.process)
+    job.written[path.name] = path.stat().st_size
+
+
+def _certifiable(job: Job) -> bool:
+    """Whether the simulator knows the point exposure (Gaussians), the tone and has room for the pillars."""
+    exposure = job.process.exposure
+    known = exposure.known and exposure.csv is None and job.process.tone == "positive"
+    return known and job.drc.pillars <= MOST_CERTIFIED
+
+
+def _accompany(job: Job, target: Path) -> None:
+    """Layer properties, markers, report and pictures."""
+    from layout.commands import page
+
+    markers.write_lyp(job.plan, target / "mask.lyp")
+    markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
+    store.write_text(target / "process.toml", config.dumps(job.process))
+    page.write(job, target)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start
+
+
+def _values(job: Job) -> dict[str, Any]:
+    found = job.drc
+    return {
+        "ok": job.ok,
+        "failures": job.failures,
+        "pillars": found.pillars,
+        "classes": len(job.plan.classes),
+        "diameters": len(job.made.cells.diameters_nm),
+        "minimum_gap_nm": found.minimum_gap_nm,
+        "minimum_foot_gap_nm": found.minimum_foot_gap_nm,
+        "minimum_feature_nm": found.minimum_feature_nm,
+        "maximum_density": found.maximum_density,
+        "violations": found.counts,
+        "files": job.written,
+        "exposure": {
+            name: {"worst_relative": c.worst_exposure, "worst_diameter_nm": c.worst_nm, "pillars": len(c.x_um)}
+            for name, c in job.certified.items()
+        },
+        "differences": {name: list(outcome.differences) for name, outcome in job.compared.items()},
+        "seconds": job.seconds,
+    }
+
+
+def _text(job: Job, target: Path) -> str:
+    lines = [job.verdict, job.drc.summary]
+    for name, size in job.written.items():
+        outcome = job.compared.get(name)
+        verdict = "" if outcome is None else (", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN")
+        lines.append(f"  {target / name}: {size / 1e6:.3g} MB{verdict}")
+        if outcome is not None:
+            lines += [f"    {difference}" for difference in outcome.differences[:10]]
+    lines += [
+        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}) nm: {v.value:.4g}, need {v.limit:.4g}; {v.text}"
+        for v in job.drc.violations[:10]
+    ]
+    lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")
+    return "\n".join(lines)

@@ -1,0 +1,206 @@
+"""report.html of a mask: what will be made, whether it can be, what was written and how it was checked."""
+
+from pathlib import Path
+
+import numpy as np
+
+from layout.commands import pictures
+from layout.commands.job import Job
+from layout.files import Window
+from layout.shapes import polygon
+from metalens.ground import report
+from metalens.ground.report import Figure, KeyFigure, Section, Table
+from metalens.ground.units import nm
+
+
+def write(job: Job, target: Path) -> None:
+    """Write report.html and the pictures beside it."""
+    shots = {
+        "die.png": pictures.whole_die(job.plan, job.drc),
+        "pillars.png": pictures.pillars(job.plan, (Window(0, 0, 8), pictures.edge_window(job.plan, 8))),
+        "diameters.png": pictures.diameters(job.plan),
+        "margins.png": pictures.margins(job.drc),
+    }
+    for name, png in shots.items():
+        (target / name).write_bytes(png)
+    sections = [
+        _overview(job, shots),
+        _rules(job, shots),
+        _classes(job, shots),
+        _doses(job),
+        _certified(job),
+        _fields(job),
+        _files(job),
+    ]
+    if job.options.study:
+        from layout.study import page as study_page
+
+        sections[-1:-1] = study_page.sections(job.source, job.process, job.fields)
+    report.write(
+        target / "report.html",
+        f"Mask {job.plan.name}",
+        [section for section in sections if section is not None],
+        lead=_lead(job),
+        key_figures=_key_figures(job),
+    )
+
+
+def _lead(job: Job) -> str:
+    source = job.source
+    return (
+        f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
+        f"{2 * job.made.radius_um / 1e3:.4g} mm "
+        f"across, as {job.drc.pillars:,} pillars in {len(job.plan.classes)} cells; process “{job.process.name}”."
+    )
+
+
+def _key_figures(job: Job) -> list[KeyFigure]:
+    found = job.drc
+    broken = sum(found.counts.values())
+    same = all(outcome.ok for outcome in job.compared.values())
+    return [
+        KeyFigure("pillars", f"{found.pillars:,}"),
+        KeyFigure("smallest gap", f"{found.minimum_gap_nm:.1f} nm", found.counts["gap"] + found.counts["overlap"] == 0),
+        KeyFigure("thinnest pillar", f"{found.minimum_feature_nm:.1f} nm", found.counts["feature"] == 0),
+        KeyFigure("violations", f"{broken:,}", broken == 0),
+        KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
+    ]
+
+
+def _overview(job: Job, shots: dict[str, bytes]) -> Section:
+    text = (
+        "Two lithography steps: the pillar layer (with marks, label, dose-test array and witness cells) and the "
+        "aperture layer, which draws the openings of the opaque film. The F stands in the upper left "
+        "corner. The mask is seen from the pillar side, against the light, in the coordinates of the lens: +y is up "
+        "here, so the first row of the diameter map is the lowest."
+    )
+    items = [
+        Figure(
+            shots["die.png"],
+            "The whole die. Colour: share of the area that pillars cover, averaged.",
+            wide=True,
+        ),
+        Figure(shots["pillars.png"], "Polygons as they are written, in the middle and at the rim.", wide=True),
+    ]
+    return Section("Die", text, items)
+
+
+def _rules(job: Job, shots: dict[str, bytes]) -> Section:
+    found = job.drc
+    rows = [[rule, found.limits[rule], count] for rule, count in found.counts.items()]
+    items: list[Figure | Table] = [
+        Figure(shots["margins.png"], "What was found (bar) beside what is allowed (line).", wide=True),
+        Table(("rule", "limit", "violations"), rows, "Checked on the drawn polygons, all pillars."),
+    ]
+    if found.violations:
+        places = [
+            [v.rule, f"({v.centre[0]:.0f}, {v.centre[1]:.0f})", v.value, v.limit, v.text] for v in found.violations[:50]
+        ]
+        head = ("rule", "(x, y) / nm", "found", "needed", "where")
+        items.append(Table(head, places, "The first violations; mask.lyrdb marks up to 500 of each rule."))
+    return Section("Design rules", found.summary + ".", items)
+
+
+def _classes(job: Job, shots: dict[str, bytes]) -> Section:
+    shapes = {made.diameter_units: made for made in job.plan.classes}
+    grid = job.plan.grid
+    made = [polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)]
+    picked = np.unique(np.linspace(0, len(made) - 1, 12).round().astype(int))
+    unit = grid * job.plan.unit_nm
+    rows = [
+        [m.diameter * unit, len(m.points), m.shots, f"{100 * m.area_error:+.3f}", m.edge_error * unit]
+        for m in (made[i] for i in picked)
+    ]
+    worst = max(abs(m.area_error) for m in made)
+    text = (
+        f"Diameters are drawn in steps of {job.process.rules.diameter_step_nm} nm after the bias was taken off; "
+        f"that rounds each by at most {job.made.cells.rounding_nm:g} nm. Polygons have the area of their circle to "
+        f"{100 * worst:.3f} %."
+    )
+    head = ("diameter / nm", "vertices", "shots", "area error / %", "edge error / nm")
+    picture = Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True)
+    items: list[Figure | Table] = [picture, Table(head, rows), _frontier(made, unit)]
+    return Section("Pillars", text, items)
+
+
+def _frontier(made: list[polygon.PillarShape], unit_nm: float) -> Table:
+    """What other numbers of vertices would give and cost, for five of the diameters."""
+    picked = np.unique(np.linspace(0, len(made) - 1, 5).round().astype(int))
+    sizes = [made[i].diameter * unit_nm for i in picked]
+    rows = [
+        [p.shape, p.vertices, *(f"{v:.2f}" for v in (1e4 * p.area_error, p.edge_error_nm, p.corners, p.shots))]
+        for p in polygon.frontier(sizes, grid_nm=unit_nm, vertices=(12, 16, 24, 32, 48, 64))
+    ]
+    head = ("shape", "at most", "area error / 1e-4", "edge error / nm", "vertices", "shots")
+    return Table(head, rows, "Worst errors and mean cost of a pillar by number of vertices, on this grid.")
+
+
+def _doses(job: Job) -> Section | None:
+    doses = job.made.dose
+    if doses is None:
+        return None
+    count = len(doses.ladder.factors)
+    rows = [
+        ["one dose", 100 * doses.before.worst, 100 * doses.before.rms, doses.before.diameter_nm],
+        [f"{count} doses", 100 * doses.after.worst, 100 * doses.after.rms, doses.after.diameter_nm],
+    ]
+    head = ("", "worst / %", "rms / %", "diameter / nm")
+    used = [made.dose for made in job.plan.classes]
+    table = [
+        [*layer, f"{dose:.4f}", job.plan.layer_names.get(layer, "")] for layer, dose in sorted(job.plan.doses.items())
+    ]
+    text = (
+        f"Proximity correction of lens, dose test, witness cells, marks and label together: relative dose "
+        f"{min(used):.3f} to {max(used):.3f}, a datatype each (doses.csv). Every edge of every shape is exposed within "
+        f"{100 * doses.worst:.2g} % of what it should be; known to {100 * doses.error:.2g} %."
+    )
+    sheet = Table(("layer", "datatype", "relative dose", "name"), table, "The dose table, as in doses.csv.")
+    return Section(
+        "Dose",
+        text,
+        [Table(head, rows, "Error of the exposure at the pillar edges of the lens, and what it does."), sheet],
+    )
+
+
+def _certified(job: Job) -> Section | None:
+    """What an independent simulator makes of the written files and their dose table."""
+    if not job.certified:
+        return None
+    rows = [
+        [name, f"{len(c.x_um):,}", f"{100 * c.worst_exposure:.2f}", f"{c.worst_nm:.2f}", "yes" if c.ok else "NO"]
+        for name, c in job.certified.items()
+    ]
+    head = ("file", "pillars", "worst exposure / %", "worst diameter / nm", "within 1 % and 1 nm")
+    picture = pictures.certified(next(iter(job.certified.values())))
+    text = (
+        "The files and doses.csv, read back and exposed again by a simulator that shares nothing with the correction: "
+        "threshold at half of what a wide area receives. Pillars of lens and witness cells; the dose test is left out."
+    )
+    items: list[Figure | Table] = [Table(head, rows), Figure(picture, "Predicted less drawn diameter.", wide=True)]
+    return Section("Exposure as written", text, items)
+
+
+def _fields(job: Job) -> Section:
+    split = job.fields
+    text = (
+        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm "
+        f"at most; no border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis "
+        f"would have cut {split.cut_before:,} pillars."
+    )
+    return Section("Write fields", text)
+
+
+def _files(job: Job) -> Section:
+    rows = []
+    for name, size in job.written.items():
+        outcome = job.compared.get(name)
+        verdict = (
+            "not read back" if outcome is None else ("as planned" if outcome.ok else "; ".join(outcome.differences))
+        )
+        rows.append([name, f"{size / 1e6:.3f}", verdict])
+    times = [[stage, seconds] for stage, seconds in job.seconds.items()]
+    items = [
+        Table(("file", "MB", "read back and compared"), rows),
+        Table(("stage", "seconds"), times, "On the machine that made the mask.", digits=3),
+    ]
+    return Section("Files", "Each mask file was read back: every pillar at its site, every polygon vertex.", items)

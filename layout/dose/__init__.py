@@ -1,0 +1,25 @@
+"""Proximity correction."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from layout.dose import correct as correct
+    from layout.dose.bodies import Body as Body
+    from layout.dose.bodies import Rects as Rects
+    from layout.dose.correct import DoseResult as DoseResult
+    from layout.dose.correct import Solution as Solution
+    from layout.dose.uniformity import Uniformity as Uniformity
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Body": "bodies",
+        "DoseResult": "correct",
+        "Rects": "bodies",
+        "Solution": "correct",
+        "Uniformity": "uniformity",
+        "correct": "",
+    },
+)

@@ -1,0 +1,287 @@
+"""Proximity correction: a dose for each shape, so that all edges receive the exposure that clears the resist.
+
+The exposure at the edge of pillar i is d_i s(D_i) + B_i: its own disc, and the background B = K * (A d) of all other
+shapes of the die. Setting it to g_i / 2 (1/2: the edge of a wide area of dose 1; g: the goal, 1 but for a dose test)
+gives d = (g / 2 - B) / s, and for the background the linear equation B = K * [(g / 2 - B) A / s], solved on a coarse
+grid of nodes over the die. What varies from pillar to pillar is then the product of a number per diameter and a
+smooth function of place. Gaussians too narrow for coarse nodes are solved on the sites of each lattice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.dose import assign, bodies, exposure, rects
+from layout.dose.assign import Ladder
+from layout.dose.bodies import Body, Ranges, Rects, Table
+from layout.dose.exposure import CLEARS, PointExposure
+from layout.dose.nodes import Convolution, Grid, convolution, gather, spread
+from layout.dose.sampled import sampled_error
+from layout.dose.uniformity import Uniformity
+from layout.process import Exposure, Process
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+from metalens.lens import DiameterMap
+
+_UNIT_UM = 1e-4  # resolution of the diameters in the table
+_MOST_SITES = 40_000_000  # of a lattice with a middle range
+_PIECES = 10  # of a rectangle, along the narrowest far Gaussian
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DoseResult:
+    """Doses of a mask.
+
+    factors: (classes,) relative dose of each class, rising; dose_uC_cm2: (classes,) the doses.
+    classes: (y, x) uint8 class of each pillar, 255 where there is none.
+    needed: classes that meet the tolerance; met: whether ``after`` keeps it (the writer may hold fewer).
+    before, after: uniformity with the best single dose, and with these classes.
+    error: largest difference of the relative exposure from the exact sum, at sample pillars.
+    point: the point-exposure function that was used.
+    """
+
+    factors: Array
+    dose_uC_cm2: Array
+    classes: Array
+    needed: int
+    met: bool
+    before: Uniformity
+    after: Uniformity
+    error: float
+    point: PointExposure
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solution:
+    """Doses of everything on a die; ``before`` and ``after`` as in DoseResult, over the pillars of the first body.
+
+    ladder: the doses. pairs: (entries, doses) pillars of each, over all bodies. rects: pieces, and ``rect_class`` (n,)
+    the dose class of each. worst: largest relative exposure error over all pillars and pieces.
+    """
+
+    ladder: Ladder
+    needed: int
+    pairs: Array
+    rects: Rects
+    rect_class: Array
+    before: Uniformity
+    after: Uniformity
+    worst: float
+    error: float
+    point: PointExposure
+    _fields: assign.Fields
+
+    def classes(self, number: int, first: int, block: Array) -> Array:
+        """(rows, columns) uint8 dose class of the pillars of a block of body ``number``, 255 where there is none."""
+        return assign.classes(self._fields, number, first, block, self.ladder)
+
+
+def solve(
+    parts: Sequence[Body],
+    diameter_um: Array,
+    goal: Array,
+    settings: Exposure,
+    *,
+    cut: Rects | None = None,
+    samples: int = 8,
+) -> Solution:
+    """Dose classes for pillars and rectangles that are exposed together.
+
+    Args:
+        parts: lattices; the first is the lens, over which uniformity is told.
+        diameter_um, goal: (entries,) of the table, entry 0 for none.
+        cut: rectangles, none with a side beyond a tenth of the narrowest far Gaussian (:func:`piece_um`).
+
+    Raises:
+        ProcessError: as :func:`correct`.
+    """
+    point = exposure.point_exposure(settings)
+    number = bodies.count(parts, len(diameter_um))
+    ranges = bodies.split(point, diameter_um, number, min(body.pitch_um for body in parts))
+    drawn = bodies.table(diameter_um, goal, number, point=point, ranges=ranges)
+    fields = _fields(parts, drawn, ranges, cut or Rects.none())
+    ladder, needed = assign.ladder(fields, settings)
+    pairs, rect_class, after = assign.assign(fields, ladder)
+    error = sampled_error(fields, ladder, after, point=point, samples=samples)
+    return Solution(
+        ladder, needed, pairs, fields.rects, rect_class, after.before, after.after, after.worst, error, point, fields
+    )
+
+
+def correct(written: DiameterMap, process: Process, *, samples: int = 8) -> DoseResult:
+    """Dose classes for drawn pillars (``written``: the drawn diameters, bias taken off).
+
+    Accuracy:
+        the background is interpolated to some 1e-4 of itself; neighbours count as Gaussians of matched second
+        moment. ``error`` of the result is measured at ``samples`` pillars against exact discs.
+
+    Raises:
+        ProcessError: tone ``negative``; no pillar; no or an unreadable point exposure; pillars finer than its core;
+            a lens too large for a middle range of the point exposure.
+    """
+    index = np.empty(written.diameter_um.shape, np.uint16 if written.pitch_um < 6 else np.uint32)
+    for band in np.array_split(np.arange(len(index)), max(1, len(index) // 64)):
+        rows = slice(band[0], band[-1] + 1)
+        index[rows] = np.rint(written.diameter_um[rows] * (1 / _UNIT_UM))
+    diameter_um = np.arange(int(index.max()) + 1) * _UNIT_UM
+    return correct_table(index, diameter_um, written.pitch_um, process, samples=samples)
+
+
+def correct_table(
+    index: Array, diameter_um: Array, pitch_um: float, process: Process, *, samples: int = 8
+) -> DoseResult:
+    """As :func:`correct`, for pillars given as (y, x) ``index`` into a table of diameters, entry 0 for none."""
+    refuse_negative(process)
+    body = Body.of(index, pitch_um)
+    found = solve([body], diameter_um, np.ones(len(diameter_um)), process.exposure, samples=samples)
+    classes = np.empty(index.shape, np.uint8)
+    for first, block in body.blocks():
+        classes[first : first + len(block)] = found.classes(0, first, block)
+    factors = found.ladder.factors
+    return DoseResult(
+        factors=factors,
+        dose_uC_cm2=factors * process.exposure.base_uC_cm2,
+        classes=classes,
+        needed=found.needed,
+        met=found.after.worst <= process.exposure.tolerance,
+        before=found.before,
+        after=found.after,
+        error=found.error,
+        point=found.point,
+    )
+
+
+def refuse_negative(process: Process) -> None:
+    """Raises: ProcessError: a dose for each pillar is asked for where the gaps are drawn."""
+    if process.tone == "negative":
+        raise ProcessError(
+            "a dose per pillar needs drawn pillars, but tone is 'negative' (the gaps are drawn); "
+            "draw the pillars, or set exposure.correct = false"
+        )
+
+
+def piece_um(settings: Exposure) -> float:
+    """Largest side of a rectangle that may have one dose."""
+    widths = exposure.point_exposure(settings).widths_um
+    return float(widths[widths > 1.0].min(initial=np.inf)) / _PIECES
+
+
+def _box(parts: Sequence[Body], cut: Rects) -> tuple[float, float, float, float]:
+    boxes = np.array([*(body.box_um for body in parts), *cut.box_um])
+    return *boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()
+
+
+def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> assign.Fields:
+    """Backgrounds that belong to the wanted doses, and to dose 1 everywhere."""
+    width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
+    grid = Grid.over(_box(parts, cut), width)
+    beside = PointExposure(
+        np.r_[ranges.near.widths_um, ranges.middle.widths_um], np.r_[ranges.near.weights, ranges.middle.weights]
+    )
+    own, points, piece = rects.own(cut, beside)
+    spots, area, of = rects.samples(cut, width / _PIECES)
+    plain, wanted, goal = _masses(parts, drawn, grid)
+    if len(spots):
+        per_own = area / own[of]
+        plain += grid.deposit(spots[:, 0], spots[:, 1], area)
+        wanted += grid.deposit(spots[:, 0], spots[:, 1], per_own)
+        goal += grid.deposit(spots[:, 0], spots[:, 1], per_own * cut.goal[of])
+    reach = convolution(grid.shape, grid.x.spacing_um, point=ranges.far, hollow=False)
+    middles = [_middle(body, ranges) for body in parts] if len(ranges.middle.widths_um) else []
+    alone = [_times(body, drawn.area_um2, middle) for body, middle in zip(parts, middles, strict=False)]
+    field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles)
+    return assign.Fields(
+        parts,
+        drawn,
+        ranges,
+        grid,
+        reach,
+        middles,
+        field,
+        reach(plain),
+        near,
+        alone,
+        cut,
+        own,
+        points,
+        piece,
+        (spots, area, of),
+    )
+
+
+def _masses(parts: Sequence[Body], drawn: Table, grid: Grid) -> tuple[Array, Array, Array]:
+    """Node sums of area, area / own, and goal area / own."""
+    per_own = np.divide(drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used)
+    value = np.stack([np.where(drawn.used, drawn.area_um2, 0.0), per_own, per_own * drawn.goal])
+    out = np.zeros((3, *grid.shape))
+    for body in parts:
+        xn, xw = grid.x.at(body.columns_um)
+        for first, block in body.blocks():
+            yn, yw = grid.y.at(body.rows_um(first, len(block)))
+            gather(block, value, yn, yw, xn, xw, out)
+    return out[0], out[1], out[2]
+
+
+def _middle(body: Body, ranges: Ranges) -> Convolution:
+    """Convolution on the sites of a lattice with the Gaussians that reach neighbours only."""
+    if body.rows * body.columns > _MOST_SITES:
+        raise ProcessError(
+            f"a lens of {body.rows} x {body.columns} sites with a point exposure that holds Gaussians of "
+            f"{np.array2string(ranges.middle.widths_um, precision=3)} um: such middle ranges are corrected on at most "
+            f"{_MOST_SITES:,} sites; give a point exposure of core and backscatter alone"
+        )
+    return convolution((body.rows, body.columns), body.pitch_um, point=ranges.middle, hollow=True)
+
+
+def _times(body: Body, value: Array, middle: Convolution) -> Array:
+    """(rows, columns) what pillars that carry ``value`` (entries,) give to each other."""
+    mass = np.concatenate([value.take(block) for _, block in body.blocks()])
+    return middle(mass).astype(np.float32)
+
+
+def _backgrounds(
+    parts: Sequence[Body],
+    drawn: Table,
+    grid: Grid,
+    reach: Convolution,
+    masses: tuple[Array, Array],
+    middles: Sequence[Convolution],
+) -> tuple[Array, list[Array]]:
+    """Far field on the nodes and middle field on the sites that belong to the wanted doses, in turn until they rest."""
+    wanted, goal = masses
+    field = _relaxed(reach, wanted, CLEARS * goal)
+    near: list[Array] = []
+    per_own = np.divide(drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used)
+    for _ in range(12 if middles else 0):
+        near, taken = [], np.zeros(grid.shape)
+        for body, middle in zip(parts, middles, strict=True):
+            index = np.concatenate([block for _, block in body.blocks()])
+            xn, xw = grid.x.at(body.columns_um)
+            yn, yw = grid.y.at(body.rows_um(0, body.rows))
+            far = np.empty(index.shape, np.float32)
+            spread(field, yn, yw, xn, xw, far)
+            mass = per_own.take(index)
+            own = _relaxed(middle, mass, (CLEARS * drawn.goal.take(index) - far) * mass, bound_below=0.9)
+            near.append(own.astype(np.float32))
+            rows, columns = np.nonzero(index)
+            x, y = body.columns_um[columns], body.rows_um(0, body.rows)[rows]
+            taken += grid.deposit(x, y, (own * mass)[rows, columns])
+        before, field = field, _relaxed(reach, wanted, CLEARS * goal - taken)
+        if np.abs(field - before).max() < 1e-7:
+            break
+    return field, near
+
+
+def _relaxed(reach: Convolution, mass: Array, drive: Array, *, bound_below: float = 0.0) -> Array:
+    """B = K * [drive - B mass], to 1e-8; eigenvalues of K * mass lie between -bound_below and the largest row sum."""
+    bound = float(reach(mass).max())
+    step = 2 / (2 + bound - bound_below)
+    rate = max(1 - step * (1 - bound_below), step * (1 + bound) - 1, 1e-3)
+    field = np.zeros_like(mass)
+    for _ in range(int(np.ceil(np.log(1e-8) / np.log(rate)))):
+        change = reach(drive - field * mass) - field
+        field += step * change
+        if np.abs(change).max() < 1e-9:
+            break
+    return field

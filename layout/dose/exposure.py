@@ -1,0 +1,153 @@
+"""Point exposure of an electron beam as a sum of Gaussians, and the exact exposure that discs make of it.
+
+A beam at one point deposits the energy density f(r) = sum_k w_k exp(-r^2 / a_k^2) / (pi a_k^2) with sum w_k = 1:
+the double Gaussian of forward and back-scattered electrons (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)) has
+w = (1, eta) / (1 + eta), a = (alpha, beta). Measured functions have longer tails; they are fitted with a ladder
+of Gaussians.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.process import Exposure
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+from metalens.made import read_csv
+
+CLEARS = 0.5  # exposure at the edge of a wide area of dose 1
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PointExposure:
+    """f(r) = sum weights exp(-r^2 / widths^2) / (pi widths^2).
+
+    widths_um, weights: (terms,), the weights sum to 1.
+    fit_error: largest difference between the energy within a radius of the fit and of the table; 0 if exact.
+    """
+
+    widths_um: Array
+    weights: Array
+    fit_error: float = 0.0
+
+    def density(self, radius_um: Array) -> Array:
+        """(*shape) energy density per um^2 at ``radius_um``."""
+        r2 = np.asarray(radius_um, float)[..., None] ** 2
+        scale = self.weights / (np.pi * self.widths_um**2)
+        return np.asarray((scale * np.exp(-r2 / self.widths_um**2)).sum(-1))
+
+    def within(self, radius_um: Array) -> Array:
+        """(*shape) share of the energy within ``radius_um``."""
+        r2 = np.asarray(radius_um, float)[..., None] ** 2
+        return np.asarray((self.weights * -np.expm1(-r2 / self.widths_um**2)).sum(-1))
+
+
+def point_exposure(exposure: Exposure) -> PointExposure:
+    """What the process file describes: the double or triple Gaussian, or the fit of its measured table.
+
+    Raises:
+        ProcessError: it describes none, or the table cannot be used.
+    """
+    if exposure.csv is not None:
+        radius, density = np.array(read_csv(exposure.csv)).T
+        return fit(radius, density, where=str(exposure.csv))
+    if exposure.alpha_um is None or exposure.beta_um is None or exposure.eta is None:
+        raise ProcessError(f"no point exposure is given: [exposure] needs {exposure.missing}")
+    third = ([], []) if exposure.gamma_um is None else ([exposure.gamma_um], [exposure.nu])
+    weights = np.array([1.0, exposure.eta, *third[1]])
+    return PointExposure(np.array([exposure.alpha_um, exposure.beta_um, *third[0]]), weights / weights.sum())
+
+
+def fit(radius_um: Array, density: Array, *, where: str = "point exposure") -> PointExposure:
+    """Gaussians of non-negative weight through a measured radial function, by relative error at each sample.
+
+    Args:
+        radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above 0.
+
+    Raises:
+        ProcessError: fewer than 4 samples, radii that do not rise, values that are not above 0.
+    """
+    from scipy.optimize import nnls
+
+    radius, value = np.asarray(radius_um, float), np.asarray(density, float)
+    sound = np.isfinite(value).all() and np.isfinite(radius).all() and (value > 0).all() and (np.diff(radius) > 0).all()
+    if radius.size < 4 or not sound or radius[0] <= 0:
+        raise ProcessError(f"{where}: need at least 4 rising radii above 0 um, each with an energy density above 0")
+    steps = max(8, int(np.ceil(4 * np.log2(radius[-1] / radius[0]))))
+    widths = np.geomspace(radius[0], radius[-1], steps + 1)
+    energy = radius**2 * value
+    heed = (0.02 + energy / energy.max()) / value  # relative errors count, most where the energy is
+    design = np.exp(-((radius[:, None] / widths) ** 2)) / (np.pi * widths**2) * heed[:, None]
+    scale = design.max(axis=0)
+    weights = nnls(design / scale, value * heed)[0] / scale
+    total = weights.sum()
+    keep = weights > 1e-9 * total
+    found = PointExposure(widths[keep], weights[keep] / total)
+    return PointExposure(found.widths_um, found.weights, _fit_error(found, radius, value / total))
+
+
+def _fit_error(found: PointExposure, radius: Array, density: Array) -> float:
+    """Largest difference of the energy between the first radius and each other one, table by power laws."""
+    slope = np.diff(np.log(density)) / np.diff(np.log(radius)) + 2
+    start, end = density[:-1] * radius[:-1] ** 2, density[1:] * radius[1:] ** 2
+    flat = abs(slope) < 1e-9
+    ring = np.where(flat, start * np.diff(np.log(radius)), (end - start) / np.where(flat, 1, slope))
+    table = 2 * np.pi * np.r_[0, np.cumsum(ring)]
+    return float(abs(found.within(radius) - found.within(radius[:1]) - table).max())
+
+
+def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
+    """Exposure at the rim of a disc of unit dose by one Gaussian: (1 - exp(-x) I0(x)) / 2, x = 2 R^2 / a^2.
+
+    From the Marcum Q function at equal arguments, Q1(c, c) = (1 + exp(-c^2) I0(c^2)) / 2. Exact.
+    """
+    from scipy.special import i0e
+
+    x = 2 * (np.asarray(diameter_um, float) / 2 / width_um) ** 2
+    return np.asarray((1 - i0e(x)) / 2)
+
+
+def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
+    """How fast that exposure falls with the radius there, per um: (2 R / a^2) exp(-x) I1(x). Exact."""
+    from scipy.special import i1e
+
+    radius = np.asarray(diameter_um, float) / 2
+    return np.asarray(2 * radius / width_um**2 * i1e(2 * (radius / width_um) ** 2))
+
+
+def disc(distance_um: Array | float, diameter_um: Array | float, width_um: float) -> Array:
+    """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one Gaussian. Exact.
+
+    The probability that a Gaussian displacement ends within the disc: non-central chi-square of 2 degrees.
+    """
+    from scipy.special import chndtr
+
+    scale = 2 / width_um**2
+    return np.asarray(chndtr(scale * np.square(diameter_um) / 4, 2.0, scale * np.square(distance_um)))
+
+
+def at_edges(
+    centres_um: Array, diameter_um: Array, dose: Array, point: PointExposure, *, which: Array, rim_points: int = 24
+) -> Array:
+    """Exposure at the edge of pillars, averaged round the rim, by the direct sum over all pillars: the referee.
+
+    Args:
+        centres_um: (n, 2) x, y; diameter_um, dose: (n,).
+        which: (m,) indices of the pillars that are looked at.
+
+    Returns:
+        (m,) exposure; 1/2 at the edge of a wide area of dose 1.
+
+    Accuracy: trapezoidal mean of a periodic function: exact to rounding for smooth neighbours; costs m n rim_points.
+    """
+    angle = 2 * np.pi * (np.arange(rim_points) + 0.5) / rim_points
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+    result = np.zeros(len(which))
+    for row, index in enumerate(np.asarray(which)):
+        others = np.arange(len(dose)) != index
+        points = centres_um[index] + diameter_um[index] / 2 * ring
+        distance = np.linalg.norm(points[:, None] - centres_um[others], axis=-1)
+        for width, weight in zip(point.widths_um, point.weights, strict=True):
+            near = (disc(distance, diameter_um[others], width) * dose[others]).sum(-1).mean()
+            result[row] += weight * (near + dose[index] * rim_of_own_disc(diameter_um[index], width))
+    return result

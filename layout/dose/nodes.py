@@ -1,0 +1,179 @@
+"""Sums over all shapes of a smooth kernel, through a coarse grid: cubic interpolation and its transpose.
+
+A kernel that is smooth over some pitches needs no sum over sites: spread each pillar to the four nearest nodes of
+each axis with the weights of cubic interpolation, convolve on the nodes, and interpolate back. Both interpolations
+are of order 4, also at the edge of the lens, since what is interpolated is the kernel and not the pattern. The nodes
+lie anywhere: lattices of any place and pitch, and shapes off any lattice, share one grid.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.dose.exposure import PointExposure
+from layout.process import compiled
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+MOST_NODES = 40_000_000
+_PER_WIDTH = 6  # nodes along the 1/e radius of the narrowest Gaussian
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """Nodes at ``origin_um + k spacing_um``, k from 0 to ``count - 1``."""
+
+    origin_um: float
+    spacing_um: float
+    count: int
+
+    @classmethod
+    def over(cls, low_um: float, high_um: float, spacing_um: float) -> "Axis":
+        """Nodes that hold four around every position from ``low_um`` to ``high_um``."""
+        return cls(low_um - 1.5 * spacing_um, spacing_um, int((high_um - low_um) / spacing_um) + 5)
+
+    def at(self, position_um: Array) -> tuple[Array, Array]:
+        """First of the four nodes around each position (n,), and their cubic Lagrange weights (n, 4)."""
+        steps = (np.asarray(position_um, float) - self.origin_um) / self.spacing_um
+        first = np.clip(np.floor(steps).astype(np.int64) - 1, 0, self.count - 4)
+        t = steps - first - 1
+        inner = (-t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2)
+        outer = (-(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6)
+        return first, np.stack([*inner, *outer], -1)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Nodes of a die."""
+
+    y: Axis
+    x: Axis
+
+    @classmethod
+    def over(cls, box_um: tuple[float, float, float, float], width_um: float) -> "Grid":
+        """Nodes over (left, bottom, right, top), fine enough for Gaussians of ``width_um`` (1/e radius).
+
+        Raises:
+            ProcessError: more than 4e7 nodes.
+        """
+        left, bottom, right, top = box_um
+        step = width_um / _PER_WIDTH
+        made = cls(Axis.over(bottom, top, step), Axis.over(left, right, step))
+        if made.y.count * made.x.count > MOST_NODES:
+            raise ProcessError(
+                f"a Gaussian of {width_um:.3g} um over a die of {right - left:.0f} x {top - bottom:.0f} um needs "
+                f"{made.y.count * made.x.count:,} nodes, at most {MOST_NODES:,}; leave out the range of the point "
+                "exposure between a tenth of a micrometre and some micrometres, or correct a smaller die"
+            )
+        return made
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) nodes."""
+        return self.y.count, self.x.count
+
+    def deposit(self, x_um: Array, y_um: Array, mass: Array) -> Array:
+        """(y, x) node sums of masses (n,) at any places."""
+        out = np.zeros(self.shape)
+        _deposit(*self.x.at(x_um), *self.y.at(y_um), np.asarray(mass, float), out)
+        return out
+
+    def sample(self, field: Array, x_um: Array, y_um: Array) -> Array:
+        """(n,) values of a node field at any places."""
+        out = np.zeros(len(np.atleast_1d(x_um)))
+        _sample(*self.x.at(np.atleast_1d(x_um)), *self.y.at(np.atleast_1d(y_um)), field, out)
+        return out
+
+
+@compiled
+def _deposit(xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array) -> None:
+    for n in range(mass.shape[0]):
+        for i in range(4):
+            for j in range(4):
+                out[yn[n] + i, xn[n] + j] += mass[n] * yw[n, i] * xw[n, j]
+
+
+@compiled
+def _sample(xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array) -> None:
+    for n in range(out.shape[0]):
+        total = 0.0
+        for i in range(4):
+            for j in range(4):
+                total += field[yn[n] + i, xn[n] + j] * yw[n, i] * xw[n, j]
+        out[n] = total
+
+
+@compiled
+def gather(block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array) -> None:
+    """Add what the pillars of a block of rows carry to the nodes.
+
+    block: (rows, columns) entries; value: (fields, entries), 0 for none; yn, yw: (rows,), (rows, 4) nodes and weights
+    of the rows, xn, xw of the columns; out: (fields, y, x).
+    """
+    fields, wide = out.shape[0], out.shape[2]
+    line = np.zeros((fields, wide))
+    for row in range(block.shape[0]):
+        line[:] = 0
+        for column in range(block.shape[1]):
+            entry = block[row, column]
+            if entry:
+                for f in range(fields):
+                    for j in range(4):
+                        line[f, xn[column] + j] += value[f, entry] * xw[column, j]
+        for f in range(fields):
+            for i in range(4):
+                for node in range(wide):
+                    out[f, yn[row] + i, node] += yw[row, i] * line[f, node]
+
+
+@compiled
+def spread(field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array) -> None:
+    """The node field (y, x) at the sites of a block of rows: (rows, columns) float32."""
+    line = np.zeros(field.shape[1])
+    for row in range(out.shape[0]):
+        line[:] = 0
+        for i in range(4):
+            for node in range(field.shape[1]):
+                line[node] += yw[row, i] * field[yn[row] + i, node]
+        for column in range(out.shape[1]):
+            total = 0.0
+            for j in range(4):
+                total += xw[column, j] * line[xn[column] + j]
+            out[row, column] = total
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Convolution:
+    """Convolution with a radial kernel on a grid of nodes, zero outside, by FFT.
+
+    spectrum: of the kernel. shape: (y, x) of the nodes. size: (y, x) of the transform.
+    """
+
+    spectrum: Array
+    shape: tuple[int, int]
+    size: tuple[int, int]
+
+    def __call__(self, mass: Array) -> Array:
+        """(y, x) sum over all nodes of kernel times ``mass``."""
+        from scipy import fft
+
+        field = fft.irfft2(fft.rfft2(mass, self.size) * self.spectrum, self.size)
+        return np.asarray(field[: self.shape[0], : self.shape[1]])
+
+
+def convolution(shape: tuple[int, int], spacing_um: float, *, point: PointExposure, hollow: bool) -> Convolution:
+    """Convolution with a sum of Gaussians on nodes ``spacing_um`` apart, cut 5 widths out (exp(-25)).
+
+    hollow: leave out what a node gives to itself.
+    """
+    from scipy import fft
+
+    far = int(np.ceil(5 * float(point.widths_um.max(initial=0.0)) / spacing_um))
+    ny, nx = (fft.next_fast_len(n + min(n, far), real=True) for n in shape)
+    y, x = (np.minimum(np.arange(n), n - np.arange(n)) * spacing_um for n in (ny, nx))
+    kernel = np.zeros((ny, nx))
+    for width, weight in zip(point.widths_um, point.weights, strict=True):
+        kernel += weight / (np.pi * width**2) * np.outer(np.exp(-((y / width) ** 2)), np.exp(-((x / width) ** 2)))
+    if hollow:
+        kernel[0, 0] = 0
+    return Convolution(fft.rfft2(kernel), shape, (ny, nx))

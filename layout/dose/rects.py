@@ -1,0 +1,77 @@
+"""Exposure by rectangles: marks, labels, verniers and boxes, cut into pieces small enough for one dose each."""
+
+import numpy as np
+
+from layout.dose.bodies import Rects
+from layout.dose.exposure import PointExposure
+from metalens.ground.arrays import Array
+
+_OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
+
+
+def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
+    """What a shape gives to its own edges by the Gaussians that are not summed on nodes, exact.
+
+    Returns:
+        (pieces,) mean exposure of the outer edges of each piece by its whole group at unit dose (an inner piece: of
+        its middle, less half), and the points (n, 2) of the outer edges with (n,) the piece of each.
+    """
+    exposure = np.zeros(len(rects.box_um))
+    points: list[Array] = []
+    piece: list[int] = []
+    for group in np.unique(rects.group):
+        members = np.flatnonzero(rects.group == group)
+        boxes = rects.box_um[members]
+        for n, box in zip(members.tolist(), boxes, strict=True):
+            edge = _outer(box, boxes)
+            inside = not len(edge)
+            at = np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]) if inside else edge
+            exposure[n] = of_boxes(at, boxes, near).mean() / (2 if inside else 1)
+            points.extend(at)
+            piece.extend([n] * len(at))
+    return exposure, np.array(points).reshape(-1, 2), np.array(piece, np.int64)
+
+
+def _outer(box: Array, boxes: Array) -> Array:
+    """Middles of the sides of a piece that no other piece of the shape covers."""
+    left, bottom, right, top = box
+    x, y = (left + right) / 2, (bottom + top) / 2
+    sides = np.array([[left, y], [right, y], [x, bottom], [x, top]])
+    outside = sides + _OUTSIDE_UM * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+    within = (outside[:, None] >= boxes[:, :2]) & (outside[:, None] <= boxes[:, 2:])
+    return np.asarray(sides[~within.all(-1).any(-1)])
+
+
+def of_boxes(points_um: Array, boxes_um: Array, point: PointExposure) -> Array:
+    """(n,) exposure at points by boxes of unit dose: products of error functions, exact."""
+    from scipy.special import erf
+
+    total = np.zeros(len(points_um))
+    for width, weight in zip(point.widths_um, point.weights, strict=True):
+        part = np.ones((len(points_um), len(boxes_um)))
+        for axis in (0, 1):
+            at = points_um[:, None, axis]
+            part *= (erf((boxes_um[:, axis + 2] - at) / width) - erf((boxes_um[:, axis] - at) / width)) / 2
+        total += weight * part.sum(-1)
+    return total
+
+
+def _cut(box: Array, side_um: float) -> Array:
+    xs, ys = (
+        np.linspace(low, high, max(1, int(np.ceil((high - low) / side_um - 1e-9))) + 1)
+        for low, high in ((box[0], box[2]), (box[1], box[3]))
+    )
+    left, bottom = (v.ravel() for v in np.meshgrid(xs[:-1], ys[:-1]))
+    right, top = (v.ravel() for v in np.meshgrid(xs[1:], ys[1:]))
+    return np.stack([left, bottom, right, top], -1)
+
+
+def samples(rects: Rects, step_um: float) -> tuple[Array, Array, Array]:
+    """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the rectangle of each (n,)."""
+    if not len(rects.box_um):
+        return np.empty((0, 2)), np.empty(0), np.empty(0, np.int64)
+    parts = [_cut(box, step_um) for box in rects.box_um]
+    cut = np.concatenate(parts)
+    middle = (cut[:, :2] + cut[:, 2:]) / 2
+    area = (cut[:, 2] - cut[:, 0]) * (cut[:, 3] - cut[:, 1])
+    return middle, area, np.repeat(np.arange(len(parts)), [len(p) for p in parts])

@@ -1,0 +1,49 @@
+"""What both formats share: content, read loops, comparison, DXF."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from layout.files import doses as doses
+    from layout.files import flat as flat
+    from layout.files import paths as paths
+    from layout.files import verify as verify
+    from layout.files.content import NOTHING as NOTHING
+    from layout.files.content import QUARTERS as QUARTERS
+    from layout.files.content import CellContent as CellContent
+    from layout.files.content import MaskContent as MaskContent
+    from layout.files.content import Placed as Placed
+    from layout.files.content import Turn as Turn
+    from layout.files.content import mapped as mapped
+    from layout.files.dxf import Window as Window
+    from layout.files.dxf import sites_in as sites_in
+    from layout.files.dxf import write as write
+    from layout.files.read_loops import FARTHEST as FARTHEST
+    from layout.files.read_loops import deltas as deltas
+    from layout.files.read_loops import placements as placements
+    from layout.files.read_loops import sref_run as sref_run
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "CellContent": "content",
+        "FARTHEST": "read_loops",
+        "MaskContent": "content",
+        "NOTHING": "content",
+        "Placed": "content",
+        "QUARTERS": "content",
+        "Turn": "content",
+        "Window": "dxf",
+        "deltas": "read_loops",
+        "doses": "",
+        "flat": "",
+        "mapped": "content",
+        "paths": "",
+        "placements": "read_loops",
+        "sites_in": "dxf",
+        "sref_run": "read_loops",
+        "verify": "",
+        "write": "dxf",
+    },
+)

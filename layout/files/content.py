@@ -1,0 +1,173 @@
+"""What a mask file holds, as it was read: cells, their polygons, circles and placements."""
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from layout.process import LayerNumber
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A mirror at the x axis (or none), then a turn counter-clockwise, then a scale."""
+
+    angle_deg: float = 0.0
+    mirrored: bool = False
+    scale: float = 1.0
+
+    def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Points turned; exact for quarter turns without a scale, else rounded to whole units."""
+        if self.mirrored:
+            y = -y
+        if self.scale == 1 and self.angle_deg % 90 == 0:
+            for _ in range(int(self.angle_deg // 90) & 3):
+                x, y = -y, x
+            return x, y
+        c, s = (self.scale * f(math.radians(self.angle_deg)) for f in (math.cos, math.sin))
+        return np.rint(c * x - s * y).astype(np.int64), np.rint(s * x + c * y).astype(np.int64)
+
+    def after(self, inner: "Turn") -> "Turn":
+        """The turn that equals ``inner`` followed by this one."""
+        angle = self.angle_deg + (-inner.angle_deg if self.mirrored else inner.angle_deg)
+        return Turn(angle % 360, self.mirrored != inner.mirrored, self.scale * inner.scale)
+
+
+QUARTERS = tuple(Turn(90.0 * (k & 3), bool(k & 4)) for k in range(8))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Placed:
+    """Placements in one cell.
+
+    children: names. child: (n,) index into them. x, y: (n,) int32 database units.
+    turn: (n,) index into ``turns``. The first eight are quarter turns counter-clockwise (bits 0-1) after a mirror at
+    the x axis (bit 2); any other follows where the file has it.
+    """
+
+    children: tuple[str, ...]
+    child: Array
+    x: Array
+    y: Array
+    turn: Array
+    turns: tuple[Turn, ...] = QUARTERS
+
+
+_DEEPEST = 64
+NOTHING = Placed((), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CellContent:
+    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n, 3) of x, y, radius}."""
+
+    name: str
+    polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
+    circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
+    placed: Placed = NOTHING
+    texts: int = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MaskContent:
+    """All of a mask file.
+
+    kind: ``GDSII`` or ``OASIS``. unit_nm: database unit. cells: by name, in the order of the file.
+    """
+
+    kind: str
+    unit_nm: float
+    cells: dict[str, CellContent]
+    layer_names: dict[LayerNumber, str] = field(default_factory=dict)
+
+    @property
+    def tops(self) -> list[str]:
+        """Cells that no other cell places."""
+        used = {name for cell in self.cells.values() for name in cell.placed.children}
+        return [name for name in self.cells if name not in used]
+
+    def leaves(self, top: str) -> Iterator[Placed]:
+        """All placements below ``top`` of cells that place nothing themselves, at their final places.
+
+        Raises:
+            MaskFileError: a cell that places itself, or one that is placed and not there.
+        """
+        yield from self._walk(top, 0, 0, QUARTERS[0], ())
+
+    def sites(self, top: str) -> dict[str, tuple[Array, Array]]:
+        """{leaf cell: (x, y) of all its placements below ``top``}, the hierarchy taken apart."""
+        found: dict[str, list[tuple[Array, Array]]] = {}
+        for placed in self.leaves(top):
+            order = np.argsort(placed.child, kind="stable")
+            edges = np.searchsorted(placed.child[order], np.arange(len(placed.children) + 1))
+            for k, child in enumerate(placed.children):
+                chosen = order[edges[k] : edges[k + 1]]
+                if len(chosen):
+                    found.setdefault(child, []).append((placed.x[chosen], placed.y[chosen]))
+        return {
+            name: (np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts]))
+            for name, parts in found.items()
+        }
+
+    def counts(self, top: str) -> dict[str, int]:
+        """{leaf cell: number of placements below ``top``}."""
+        found: dict[str, int] = {}
+        for placed in self.leaves(top):
+            for k, count in enumerate(np.bincount(placed.child, minlength=len(placed.children)).tolist()):
+                if count:
+                    found[placed.children[k]] = found.get(placed.children[k], 0) + count
+        return found
+
+    def _walk(self, name: str, x: int, y: int, turn: Turn, above: tuple[str, ...]) -> Iterator[Placed]:
+        if name in above or len(above) > _DEEPEST:
+            raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
+        placed = self._cell(name).placed
+        if not len(placed.child):
+            return
+        deep = np.array([bool(len(self._cell(child).placed.child)) for child in placed.children], bool)
+        px, py = (_within(v, name) for v in _moved(placed, turn, x, y))
+        turns = placed.turns if turn == QUARTERS[0] else tuple(turn.after(inner) for inner in placed.turns)
+        if not deep.any():
+            yield Placed(placed.children, placed.child, px, py, placed.turn, turns)
+            return
+        inner = deep[placed.child]
+        for i in np.flatnonzero(inner):
+            down = turns[int(placed.turn[i])]
+            yield from self._walk(placed.children[placed.child[i]], int(px[i]), int(py[i]), down, (*above, name))
+        if not inner.all():
+            yield Placed(placed.children, placed.child[~inner], px[~inner], py[~inner], placed.turn[~inner], turns)
+
+    def _cell(self, name: str) -> CellContent:
+        if name not in self.cells:
+            raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
+        return self.cells[name]
+
+
+def _moved(placed: Placed, turn: Turn, x: int, y: int) -> tuple[Array, Array]:
+    """Places turned about (0, 0), then moved."""
+    px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
+    return px + x, py + y
+
+
+def _within(places: Array, name: str) -> Array:
+    """``places`` as int32; MaskFileError where nested places leave 32 bits."""
+    farthest = int(np.abs(places).max(initial=0))
+    if farthest > 2**31 - 1:
+        raise MaskFileError(f"cell {name!r} is placed {farthest} units from the origin, beyond 32 bits")
+    return np.asarray(places, np.int32)
+
+
+def mapped(path: str | Path) -> Array:
+    """The bytes of a file as uint8, read when they are looked at.
+
+    Raises:
+        MaskFileError: an empty file. OSError: it cannot be opened.
+    """
+    if not os.stat(path).st_size:
+        raise MaskFileError(f"{path}: byte 0: empty file, need a mask")
+    return np.asarray(np.memmap(path, np.uint8, mode="r"))

@@ -1,0 +1,85 @@
+"""The shapes of a mask with the hierarchy taken apart: each different polygon once, with all its places."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.files.content import QUARTERS, MaskContent, Turn
+from layout.process import LayerNumber
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+_DEEPEST = 64
+_CIRCLE = 64  # corners of a true circle
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Shapes:
+    """Copies of one polygon.
+
+    cell: that holds it. outline: (n, 2), counter-clockwise, turned as placed. x, y: (m,) places.
+    """
+
+    cell: str
+    layer: LayerNumber
+    outline: Array
+    x: Array
+    y: Array
+
+
+def shapes(content: MaskContent, top: str) -> Iterator[Shapes]:
+    """Every polygon below ``top``; true circles as polygons of 64 corners of their area.
+
+    Raises:
+        MaskFileError: a cell that places itself or is missing, a place beyond 32 bits.
+    """
+    for name, x, y, turn in _cells(content, top, (0, 0), QUARTERS[0], ()):
+        cell = content.cells[name]
+        for layer, polygons in cell.polygons.items():
+            for points in polygons:
+                yield Shapes(name, layer, _turned(points, turn), x, y)
+        for layer, circles in cell.circles.items():
+            for cx, cy, radius in circles:
+                yield Shapes(name, layer, _turned(_circle(cx, cy, radius), turn), x, y)
+
+
+def _circle(x: int, y: int, radius: int) -> Array:
+    angle = 2 * np.pi * (np.arange(_CIRCLE) + 0.5) / _CIRCLE
+    reach = radius * np.sqrt(2 * np.pi / _CIRCLE / np.sin(2 * np.pi / _CIRCLE))
+    return np.asarray(np.rint(np.column_stack([x + reach * np.cos(angle), y + reach * np.sin(angle)])), np.int64)
+
+
+def _turned(points: Array, turn: Turn) -> Array:
+    """Corners turned, counter-clockwise again."""
+    made = np.column_stack(turn.apply(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64)))
+    after = np.roll(made, -1, axis=0)
+    return made if (made[:, 0] * after[:, 1] - after[:, 0] * made[:, 1]).sum() >= 0 else made[::-1]
+
+
+def _cells(
+    content: MaskContent, name: str, at: tuple[int, int], turn: Turn, above: tuple[str, ...]
+) -> Iterator[tuple[str, Array, Array, Turn]]:
+    """(cell, x, y, turn) of every cell below ``name`` and of itself, equal ones together where they are leaves."""
+    if name not in content.cells:
+        raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
+    if name in above or len(above) > _DEEPEST:
+        raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
+    yield name, np.array([at[0]]), np.array([at[1]]), turn
+    placed = content.cells[name].placed
+    if not len(placed.child):
+        return
+    px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
+    px, py = px + at[0], py + at[1]
+    if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
+        raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
+    key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
+    order = np.argsort(key, kind="stable")
+    kinds, first = np.unique(key[order], return_index=True)
+    for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
+        child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])
+        if child in content.cells and not len(content.cells[child].placed.child):
+            yield child, px[some], py[some], inner
+        else:
+            for i in some.tolist():
+                yield from _cells(content, child, (int(px[i]), int(py[i])), inner, (*above, name))

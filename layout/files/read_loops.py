@@ -1,0 +1,163 @@
+"""The loops of the readers over millions of placements. They never read beyond the bytes they are given."""
+
+import numpy as np
+
+from layout.process import compiled
+from metalens.ground.arrays import Array
+
+FARTHEST = 2**31 - 1
+_RUN = 1 << 20
+_MOST_NAMES = 65536
+
+
+def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, int]:
+    """Plain GDSII references from byte ``at`` on, all with names of one length.
+
+    Returns:
+        (names, index into names, x, y, byte after the last); nothing where the next record is something else.
+    """
+    nothing = np.empty(0, np.int32)
+    if len(data) - at < 28 or bytes(data[at : at + 5]) != b"\0\x04\x0a\0\0":
+        return [], nothing, nothing, nothing, at
+    size = int(data[at + 5]) + 20
+    most = min(_RUN, (len(data) - at) // max(size, 1))
+    out = np.empty((3, most), np.int32)
+    first = np.empty(min(_MOST_NAMES, most), np.int64)
+    slots = np.full(4 << len(first).bit_length(), -1, np.int32)
+    count, names = _srefs(data, at, size, out, slots, first)
+    found = [data[first[k] : first[k] + size - 24].tobytes() for k in range(names)]
+    child, x, y = out[:, :count]
+    return found, child, x, y, at + count * size
+
+
+@compiled
+def _srefs(data: Array, at: int, size: int, out: Array, slots: Array, first: Array) -> tuple[int, int]:
+    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where each stands first."""
+    child, x, y = out[0], out[1], out[2]
+    names, mask = 0, slots.shape[0] - 1
+    for n in range(out.shape[1]):
+        p = at + n * size
+        q = p + size - 16
+        if not (data[p] == 0 and data[p + 1] == 4 and data[p + 2] == 10 and data[p + 3] == 0 and data[p + 4] == 0):
+            return n, names
+        if not (data[p + 5] == size - 20 and size > 24 and data[p + 6] == 18 and data[p + 7] == 6):
+            return n, names
+        if not (data[q] == 0 and data[q + 1] == 12 and data[q + 2] == 16 and data[q + 3] == 3):
+            return n, names
+        if not (data[q + 12] == 0 and data[q + 13] == 4 and data[q + 14] == 17 and data[q + 15] == 0):
+            return n, names
+        key = 0
+        for i in range(p + 8, q):
+            key = (key * 131 + data[i]) & 0x7FFFFFFF
+        slot = (key ^ key >> 15) & mask
+        while slots[slot] >= 0:
+            other, same = first[slots[slot]], True
+            for i in range(q - p - 8):
+                if data[other + i] != data[p + 8 + i]:
+                    same = False
+                    break
+            if same:
+                break
+            slot = (slot + 1) & mask
+        if slots[slot] < 0:
+            if names == first.shape[0]:
+                return n, names
+            slots[slot], first[names] = names, p + 8
+            names += 1
+        child[n] = slots[slot]
+        x[n] = _big_endian(data, q + 4)
+        y[n] = _big_endian(data, q + 8)
+    return out.shape[1], names
+
+
+@compiled
+def _big_endian(data: Array, at: int) -> int:
+    value = 0
+    for i in range(4):
+        value = value << 8 | (data[at + i] + 0)  # 64 bits wide
+    return value - (1 << 32) if value >= 1 << 31 else value
+
+
+@compiled
+def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
+    """A variable-length integer of at most 6 bytes and the position after it; -1 where it is cut or longer."""
+    value, shift = 0, 0
+    while at < end and shift < 42:
+        byte = data[at] + 0  # 64 bits wide
+        value |= (byte & 127) << shift
+        at += 1
+        if byte < 128:
+            return value, at
+        shift += 7
+    return 0, -1
+
+
+@compiled
+def placements(data: Array, at: int, end: int, state: Array, out: Array) -> tuple[int, int]:
+    """OASIS placements by reference number without repetition, and switches of the coordinate mode.
+
+    out: (4, n) child, x, y, turn of each, filled.
+    state: (4,) placement x, y, whether relative, and the cell placed last (-1: none), kept up to date.
+
+    Returns:
+        (position of the first record that is something else or broken, placements read)
+    """
+    count, child, x, y, turn = 0, out[0], out[1], out[2], out[3]
+    while at < end and count < out.shape[1]:
+        kind = data[at]
+        if kind == 15 or kind == 16:
+            state[2] = kind - 15
+            at += 1
+            continue
+        if kind != 17 or at + 1 >= end or data[at + 1] & 8 or data[at + 1] & 0xC0 == 0x80:
+            break
+        info, p, number = data[at + 1], at + 2, state[3]
+        if info & 0x80:
+            number, p = unsigned_at(data, p, end)
+        dx, dy = 0, 0
+        if p > 0 and info & 0x20:
+            dx, p = unsigned_at(data, p, end)
+        if p > 0 and info & 0x10:
+            dy, p = unsigned_at(data, p, end)
+        if p < 0 or number < 0:
+            break
+        new_x, new_y = -(dx >> 1) if dx & 1 else dx >> 1, -(dy >> 1) if dy & 1 else dy >> 1
+        new_x = new_x + state[0] if state[2] or not info & 0x20 else new_x
+        new_y = new_y + state[1] if state[2] or not info & 0x10 else new_y
+        if abs(new_x) > FARTHEST or abs(new_y) > FARTHEST or number > FARTHEST:
+            break
+        state[0], state[1], state[3] = new_x, new_y, number
+        child[count], x[count], y[count] = number, new_x, new_y
+        turn[count] = (info >> 1 & 3) | (info & 1) << 2
+        count, at = count + 1, p
+    return at, count
+
+
+@compiled
+def deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
+    """Running sums of the g-deltas of a repetition; x[0], y[0] are given.
+
+    Returns:
+        the position after the last, or -1 where the list is cut or leaves 32 bits.
+    """
+    for n in range(1, x.shape[0]):
+        word, at = unsigned_at(data, at, end)
+        if at < 0:
+            return -1
+        if word & 1:
+            dx = -(word >> 2) if word & 2 else word >> 2
+            word, at = unsigned_at(data, at, end)
+            if at < 0:
+                return -1
+            dy = -(word >> 1) if word & 1 else word >> 1
+        else:
+            direction, size = word >> 1 & 7, word >> 4
+            dx = 0 if direction == 1 or direction == 3 else (-size if direction in (2, 5, 6) else size)
+            dy = 0 if direction == 0 or direction == 2 else (-size if direction in (3, 6, 7) else size)
+        if abs(dx) > FARTHEST or abs(dy) > FARTHEST:
+            return -1
+        far_x, far_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid
+        if abs(far_x) > FARTHEST or abs(far_y) > FARTHEST:
+            return -1
+        x[n], y[n] = far_x, far_y
+    return at

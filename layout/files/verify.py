@@ -1,0 +1,117 @@
+"""A written mask is read back and compared with its plan, site by site and vertex by vertex."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.files.content import QUARTERS, CellContent, MaskContent
+from layout.mask import Lattice, MaskPlan, PillarClass
+from metalens.ground.arrays import Array
+
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Outcome of reading a mask back.
+
+    pillars: placements found on the lattices. differences: what does not agree with the plan, in words.
+    """
+
+    pillars: int
+    differences: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether file and plan are the same."""
+        return not self.differences
+
+
+def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
+    """Whether a file holds exactly the plan: cells, layers, polygons or circles, and every pillar at its site."""
+    found: list[str] = []
+    if abs(content.unit_nm / plan.unit_nm - 1) > 1e-12:
+        found.append(f"database unit {content.unit_nm} nm, planned {plan.unit_nm}")
+    if content.tops != [plan.name]:
+        found.append(f"top cells {content.tops[:5]}, planned {plan.name!r} alone")
+    used = [made for made, count in zip(plan.classes, plan.counts()[1:], strict=True) if count]
+    needed = [*(made.name for made in used), *plan.placed_names, plan.name]
+    missing = [name for name in needed if name not in content.cells]
+    if missing:
+        return Comparison(0, (*found, f"{len(missing)} cells are missing: {', '.join(missing[:5])}"))
+    for made in used:
+        found += _compare_class(made, content.cells[made.name])
+    for figure in plan.figures:
+        for layer, polygons in figure.polygons.items():
+            if not _same(polygons, content.cells[figure.name].polygons.get(layer, [])):
+                found.append(f"figure {figure.name}: polygons on layer {layer} differ")
+    found += _compare_top(plan, content.cells[plan.name])
+    pillars = 0
+    for lattice in plan.lattices:
+        count, wrong = _compare_lattice(plan, lattice, content)
+        pillars, found = pillars + count, found + wrong
+    return Comparison(pillars, tuple(found))
+
+
+def _compare_class(made: PillarClass, cell: CellContent) -> list[str]:
+    circles = cell.circles.get(made.layer)
+    if circles is not None:
+        same = circles == [(0, 0, made.diameter_units // 2)] and not cell.polygons
+    else:
+        same = list(cell.polygons) == [made.layer] and _same(made.polygons, cell.polygons[made.layer])
+    return [] if same else [f"class {made.name}: the shape differs"]
+
+
+def _same(planned: tuple[Array, ...], read: list[Array]) -> bool:
+    return sorted(map(_canonical, planned)) == sorted(map(_canonical, read))
+
+
+def _canonical(points: Array) -> list[tuple[int, int]]:
+    """Vertices from the smallest on, counter-clockwise."""
+    p = [(int(x), int(y)) for x, y in points]
+    twice = sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(p, p[1:] + p[:1], strict=True))
+    if twice < 0:
+        p.reverse()
+    first = p.index(min(p))
+    return p[first:] + p[:first]
+
+
+def _compare_top(plan: MaskPlan, top: CellContent) -> list[str]:
+    placed = sorted(top.placed.children[k] for k in top.placed.child)
+    moved = any(np.any(a) for a in (top.placed.x, top.placed.y, top.placed.turn))
+    if placed != sorted(plan.placed_names) or moved:
+        return [f"cell {plan.name} does not place each figure and lattice once at (0, 0)"]
+    return []
+
+
+def _compare_lattice(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> tuple[int, list[str]]:
+    number = {made.name: k for k, made in enumerate(plan.classes, 1)}
+    read = np.zeros((lattice.rows, lattice.columns), np.uint8 if len(plan.classes) <= 255 else np.uint16)
+    count = 0
+    for placed in content.leaves(lattice.name):
+        lookup = np.array([number.get(child, 0) for child in placed.children], read.dtype)
+        for i in range(0, len(placed.child), _CHUNK):
+            part = slice(i, i + _CHUNK)
+            column, off_x = np.divmod(placed.x[part].astype(np.int64) - lattice.x0, lattice.pitch)
+            row, off_y = np.divmod(lattice.y0 - placed.y[part].astype(np.int64), lattice.pitch)
+            outside = (row < 0) | (row >= lattice.rows) | (column < 0) | (column >= lattice.columns)
+            wrong = outside | (off_x != 0) | (off_y != 0) | (placed.turn[part] >= len(QUARTERS))
+            if wrong.any():
+                at = int(wrong.argmax())
+                place = (int(placed.x[i + at]), int(placed.y[i + at]))
+                return count, [f"{lattice.name}: {int(wrong.sum())} pillars off the lattice, the first at {place}"]
+            read[row, column] = lookup[placed.child[part]]
+        count += len(placed.child)
+    return count, _differences(lattice, read, count)
+
+
+def _differences(lattice: Lattice, read: Array, count: int) -> list[str]:
+    planned = 0
+    for first, block in lattice.blocks(1024):
+        planned += int(np.count_nonzero(block))
+        unlike = read[first : first + len(block)] != block
+        if unlike.any():
+            row, column = np.unravel_index(int(unlike.argmax()), unlike.shape)
+            place = f"row {first + int(row)}, column {int(column)}"
+            return [f"{lattice.name}: {int(unlike.sum())} sites differ, the first at {place}"]
+    return [] if count == planned else [f"{lattice.name}: {count} pillars, planned {planned}"]

@@ -1,0 +1,253 @@
+"""GDSII reader: every record is checked; what is wrong is named with its byte offset."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from layout.files import FARTHEST, NOTHING, QUARTERS, CellContent, MaskContent, Placed, Turn, mapped, paths, sref_run
+from layout.gdsii import bytes as gds
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+_HEADS = {0x00, 0x05} | {0x1F, 0x20, 0x22, 0x36, 0x23, 0x39}  # header records that libraries may add
+_SHAPES = {gds.BOUNDARY, gds.BOX, gds.PATH, gds.TEXT, gds.NODE, gds.SREF, gds.AREF}
+LIMIT = 2**29
+
+
+@dataclass(eq=False, slots=True)
+class _Batch:
+    """Placements of the structure that is being read."""
+
+    names: dict[bytes, int] = field(default_factory=dict)
+    child: list[Array] = field(default_factory=list)
+    x: list[Array] = field(default_factory=list)
+    y: list[Array] = field(default_factory=list)
+    turn: list[Array] = field(default_factory=list)
+    turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
+
+    def add(self, child: Array, x: Array, y: Array, turn: Turn) -> None:
+        self.child.append(child.astype(np.int32))
+        self.x.append(x.astype(np.int32))
+        self.y.append(y.astype(np.int32))
+        number = self.turns.setdefault(turn, len(self.turns))
+        self.turn.append(np.full(len(child), number, np.uint8 if number < 256 else np.int32))
+
+    def number(self, name: bytes) -> int:
+        return self.names.setdefault(name, len(self.names))
+
+    def placed(self) -> Placed:
+        if not self.child:
+            return NOTHING
+        child, x, y, turn = (np.concatenate(part) for part in (self.child, self.x, self.y, self.turn))
+        return Placed(tuple(name.decode("ascii") for name in self.names), child, x, y, turn, tuple(self.turns))
+
+
+def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
+    """Read a GDSII file.
+
+    Args:
+        limit: most placements, arrays of references taken apart, that are read.
+
+    Raises:
+        MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte offset.
+        OSError: the file cannot be opened.
+    """
+    return parse(mapped(path), limit=limit, where=str(path))
+
+
+def parse(data: Array, *, limit: int = LIMIT, where: str = "data") -> MaskContent:
+    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them in errors."""
+    return _Reader(where, data, limit).library()
+
+
+class _Reader:
+    """A cursor over the records."""
+
+    def __init__(self, path: str, data: Array, limit: int) -> None:
+        self.path, self.data, self.at, self.limit = path, data, 0, limit
+        self.begin = 0  # of the latest record
+
+    def fail(self, text: str, at: int | None = None) -> MaskFileError:
+        return MaskFileError(f"{self.path}: byte {self.begin if at is None else at}: {text}")
+
+    def next(self, *wanted: int) -> tuple[int, bytes]:
+        """Kind and data of the next record, which must be one of ``wanted`` (any, if none is named)."""
+        self.begin, left = self.at, len(self.data) - self.at
+        if left < 4:
+            raise self.fail(f"the file ends within a record ({left} bytes left); it is cut")
+        high, low, kind, data_type = (int(v) for v in self.data[self.at : self.at + 4])
+        length = high << 8 | low
+        if length < 4 or length % 2 or length > left:
+            raise self.fail(f"record of {length} bytes, {left} left in the file; need an even length from 4 on")
+        if kind in gds.DATA and gds.DATA[kind] != data_type:
+            raise self.fail(f"{gds.NAMES[kind]} with data type {data_type}, need {gds.DATA[kind]}")
+        if wanted and kind not in wanted:
+            needed = " or ".join(gds.NAMES[k] for k in wanted)
+            raise self.fail(f"found {gds.NAMES.get(kind, f'record 0x{kind:02x}')}, need {needed}")
+        self.at += length
+        return kind, self.data[self.begin + 4 : self.at].tobytes()
+
+    def library(self) -> MaskContent:
+        self.next(gds.HEADER)
+        self.next(gds.BGNLIB)
+        while self.next()[0] != gds.LIBNAME:
+            if int(self.data[self.begin + 2]) not in _HEADS:
+                raise self.fail("LIBNAME is missing")
+        kind, data = self.next()
+        while kind in _HEADS and kind != gds.BGNSTR:
+            kind, data = self.next()
+        if kind != gds.UNITS or len(data) != 16:
+            raise self.fail("UNITS of two numbers is missing")
+        user, meters = gds.to_float(data[:8]), gds.to_float(data[8:])
+        if not (1e-15 < meters < 1 and user > 0):
+            raise self.fail(f"database unit of {meters} m")
+        cells: dict[str, CellContent] = {}
+        while self.next(gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+            cell = self.structure()
+            if cell.name in cells:
+                raise self.fail(f"structure {cell.name!r} comes twice")
+            cells[cell.name] = cell
+        if self.data[self.at :].any():
+            raise self.fail("data after ENDLIB", self.at)
+        return MaskContent("GDSII", meters * 1e9, cells)
+
+    def name(self, data: bytes) -> bytes:
+        text = data[:-1] if data.endswith(b"\0") else data
+        if not text or any(c <= 32 or c > 126 for c in text):
+            raise self.fail(f"name {text[:40]!r}, need printable characters")
+        return text
+
+    def structure(self) -> CellContent:
+        name = self.name(self.next(gds.STRNAME)[1]).decode("ascii")
+        batch, texts = _Batch(), 0
+        polygons: dict[tuple[int, int], list[Array]] = {}
+        while True:
+            self.references(batch)
+            kind, _ = self.next(*_SHAPES, gds.ENDSTR)
+            if kind == gds.ENDSTR:
+                return CellContent(name, polygons, {}, batch.placed(), texts)
+            if kind in (gds.SREF, gds.AREF):
+                self.reference(batch, kind)
+            elif kind in (gds.BOUNDARY, gds.BOX, gds.PATH):
+                layer, points = self.line() if kind == gds.PATH else self.boundary(kind)
+                polygons.setdefault(layer, []).append(points)
+            elif kind == gds.NODE:
+                raise self.fail("NODE, which marks a net and draws nothing, is not read; remove it from the file")
+            else:
+                texts += 1
+                while self.next()[0] != gds.ENDEL:
+                    self.refuse_outside_element()
+
+    def refuse_outside_element(self) -> None:
+        kind = int(self.data[self.begin + 2])
+        if kind in _SHAPES or kind in (gds.BGNSTR, gds.ENDSTR, gds.ENDLIB, gds.HEADER):
+            raise self.fail(f"{gds.NAMES[kind]} within an element; ENDEL is missing")
+
+    def references(self, batch: _Batch) -> None:
+        """Plain references in a row, by the compiled loop."""
+        while True:
+            names, child, x, y, end = sref_run(self.data, self.at)
+            if not len(child):
+                return
+            numbers = np.array([batch.number(self.name(n)) for n in names], np.int32)
+            batch.add(numbers[child], x, y, QUARTERS[0])
+            self.at = end
+            self.count(len(child))
+
+    def count(self, more: int) -> None:
+        self.limit -= more
+        if self.limit < 0:
+            raise self.fail("more placements than the limit that was set")
+
+    def fields(self) -> dict[int, bytes]:
+        """{kind: data} up to ENDEL."""
+        found: dict[int, bytes] = {}
+        while True:
+            kind, data = self.next()
+            if kind == gds.ENDEL:
+                return found
+            self.refuse_outside_element()
+            found[kind] = data
+
+    def numbers(self, found: dict[int, bytes], kind: int, count: int | None) -> Array:
+        """Integers of a record that an element needs."""
+        size = 4 if kind == gds.XY else 2
+        data = found.get(kind)
+        if data is None or len(data) % size or (count is not None and len(data) != count * size):
+            raise self.fail(f"element with a wrong or missing {gds.NAMES[kind]}")
+        return np.frombuffer(data, f">i{size}").astype(np.int64)
+
+    def boundary(self, kind: int) -> tuple[tuple[int, int], Array]:
+        start = self.begin
+        found = self.fields()
+        layer = int(self.numbers(found, gds.LAYER, 1)[0])
+        datatype = int(self.numbers(found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1)[0])
+        points = self.numbers(found, gds.XY, None)
+        if len(points) % 2 or len(points) < 8:
+            raise self.fail(f"boundary of {len(points) // 2} points, need at least 4 (first and last alike)", start)
+        points = points.reshape(-1, 2)
+        if (points[0] != points[-1]).any():
+            raise self.fail("boundary that is not closed", start)
+        return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1]
+
+    def reference(self, batch: _Batch, kind: int) -> None:
+        start = self.begin
+        found = self.fields()
+        number = batch.number(self.name(found.get(gds.SNAME, b"")))
+        turn = self.turn(found, start)
+        xy = self.numbers(found, gds.XY, 2 if kind == gds.SREF else 6)
+        if kind == gds.SREF:
+            x, y = xy[:1], xy[1:]
+        else:
+            columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
+            if columns < 1 or rows < 1:
+                raise self.fail(f"array of {columns} x {rows}", start)
+            self.count(columns * rows)
+            across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
+            if (across % columns).any() or (along % rows).any():
+                raise self.fail(
+                    f"array of {columns} x {rows} over {across.tolist()} and {along.tolist()} units: its steps are no "
+                    "whole units; place the copies one by one, or on the grid",
+                    start,
+                )
+            i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
+            x, y = (xy[k] + i * (across[k] // columns) + j * (along[k] // rows) for k in (0, 1))
+            if max(np.abs(x).max(), np.abs(y).max()) > FARTHEST:
+                raise self.fail("array that reaches beyond 32 bits", start)
+        batch.add(np.full(len(x), number), x, y, turn)
+
+    def turn(self, found: dict[int, bytes], start: int) -> Turn:
+        flags = found.get(gds.STRANS, b"\0\0")
+        angle, size = (gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d for k, d in _DEFAULTS)
+        if len(flags) != 2 or not 0 < size < 1e9:
+            raise self.fail(f"reference scaled by {size}, or with broken STRANS; need a scale above 0", start)
+        if flags[1] & 6:
+            raise self.fail("reference of absolute angle or size, which the format allows and writers ignore", start)
+        return Turn(angle % 360, bool(flags[0] & 128), size)
+
+    def line(self) -> tuple[tuple[int, int], Array]:
+        start = self.begin
+        found = self.fields()
+        layer, datatype = (int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE))
+        points = self.numbers(found, gds.XY, None)
+        width, begin, end = (self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN))
+        ends = int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
+        if len(points) % 2 or len(points) < 4 or (points.reshape(-1, 2) == points[:2]).all():
+            raise self.fail(f"path of {len(points) // 2} points, need 2 that differ", start)
+        if width == 0 or ends not in (0, 1, 2, 4):
+            raise self.fail(f"path of width {width} and type {ends}: need a width, and type 0, 1, 2 or 4", start)
+        half = abs(width) / 2
+        longer = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (half, half), 4: (float(begin), float(end))}[ends]
+        made = paths.outline(points.reshape(-1, 2), half, begin=longer[0], end=longer[1], rounded=ends == 1)
+        return (layer & 0xFFFF, datatype & 0xFFFF), made
+
+    def whole(self, found: dict[int, bytes], kind: int) -> int:
+        """A 32-bit number that an element may have; 0 without."""
+        data = found.get(kind, bytes(4))
+        if len(data) != 4:
+            raise self.fail(f"element with a wrong {gds.NAMES[kind]}")
+        return int.from_bytes(data, "big", signed=True)
+
+
+_DEFAULTS = ((gds.ANGLE, 0.0), (gds.MAG, 1.0))

@@ -1,0 +1,240 @@
+"""From a lens and a process to the plan of its mask."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.dose import Solution
+from layout.mask import cells, die, dosed
+from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, pillar_classes
+from layout.process import LayerNumber, Process, names
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+from metalens.ground.units import nm
+from metalens.lens import DiameterMap, Lens
+
+UNIT_NM = 1.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MadePlan:
+    """A plan and what was found while it was made.
+
+    rounding_nm: largest difference between wanted and drawn diameter. dose: None where no correction was asked for.
+    """
+
+    plan: MaskPlan
+    cells: cells.Cells
+    dose: Solution | None
+    radius_um: float
+
+
+def plan(source: Lens | DiameterMap, process: Process, *, name: str = "METALENS", furnished: bool = True) -> MaskPlan:
+    """The mask of a lens.
+
+    Args:
+        source: a lens, or its diameters alone.
+        name: of the top cell.
+        furnished: with aperture, marks, label, dose-test array and witness cells.
+
+    Raises:
+        ProcessError: a pitch off the grid, pillars that the process cannot draw (row and column named), too many
+            classes, a die that is too small, coordinates beyond 32 bits, an illegal name.
+        LensError: invalid diameters.
+    """
+    return prepare(source, process, name=name, furnished=furnished, with_doses=False).plan
+
+
+def prepare(
+    source: Lens | DiameterMap,
+    process: Process,
+    *,
+    name: str = "METALENS",
+    furnished: bool = True,
+    with_doses: bool = True,
+) -> MadePlan:
+    """As :func:`plan`, with everything that a report needs; ``with_doses``: with the correction of the process."""
+    names.check(name)
+    diameters = source.diameters if isinstance(source, Lens) else source
+    pitch = pitch_units(diameters.pitch_um, process)
+    found = cells.quantise(diameters, process)
+    classes = _plain_classes(found.diameters_nm, process)
+    lattice, axis = _lattice(found.classes, pitch, process.rules.grid_nm)
+    bare = MaskPlan(
+        name=name,
+        classes=_toned(classes, pitch, process),
+        lattices=(lattice,),
+        unit_nm=UNIT_NM,
+        grid=process.rules.grid_nm,
+        layer_names={process.layers.pillar: "pillar"},
+        doses={process.layers.pillar: 1.0},
+        axis=axis,
+    )
+    radius_um = diameters.radius_um + diameters.pitch_um / 2
+    if furnished:
+        bare = die.furnish(bare, process, radius_um=radius_um, label=_label(source, radius_um))
+    if process.tone == "negative":
+        bare = bare.replace(figures=(*bare.figures, Figure("CLEAR", {process.layers.pillar: _cleared(bare)})))
+    solution = None
+    if with_doses and process.exposure.corrected:
+        bare, solution = dosed.corrected(bare, process)
+    _check_layers(bare, process)
+    return MadePlan(bare, found, solution, radius_um)
+
+
+def stream(
+    rows: Callable[[int, int], Array],
+    process: Process,
+    *,
+    shape: tuple[int, int],
+    pitch_um: float,
+    range_um: tuple[float, float],
+    name: str = "METALENS",
+) -> MaskPlan:
+    """The mask of a lens too large for memory: diameters come in blocks of rows, whenever they are needed.
+
+    Args:
+        rows: (first row, end row) -> (rows, columns) diameters in um, 0 for no pillar; the same at each call.
+        shape: (rows, columns) of the lens. range_um: thinnest and widest diameter that may come.
+
+    Raises:
+        ProcessError: as :func:`plan`, and a diameter outside the range (when the block is made).
+    """
+    pitch, rules = pitch_units(pitch_um, process), process.rules
+    low, high = (float(process.written_diameter_nm(d / nm)) / rules.diameter_step_nm for d in range_um)
+    reach = math.ceil(3 * process.bias.range_um / pitch_um) if process.bias.isolated_nm else 0
+    thinnest = max(1, math.floor(low) - math.ceil(max(0.0, process.bias.isolated_nm) / rules.diameter_step_nm))
+    widest = math.ceil(high) + math.ceil(max(0.0, -process.bias.isolated_nm) / rules.diameter_step_nm)
+    steps = np.arange(thinnest, widest + 1)
+    classes = _plain_classes(steps * rules.diameter_step_nm, process)
+    kind = np.uint8 if len(classes) <= 255 else np.uint16
+
+    def sites(top: int, bottom: int) -> Array:
+        first, end = shape[0] - bottom, shape[0] - top  # rows of the map, which run upwards on the mask
+        begin, stop = max(0, first - reach), min(shape[0], end + reach)
+        block = np.asarray(rows(begin, stop))
+        if not block.any():
+            return np.zeros((end - first, shape[1]), kind)
+        drawn = cells.drawn_steps(DiameterMap(block, pitch_um), process)[first - begin : end - begin]
+        if (drawn[drawn > 0] < steps[0]).any() or (drawn > steps[-1]).any():
+            raise ProcessError(f"rows {first} to {end - 1}: a diameter outside {range_um} um; widen range_um")
+        return np.where(drawn > 0, drawn - (thinnest - 1), 0).astype(kind)[::-1]
+
+    x0, y0, axis = _origin(shape, pitch, rules.grid_nm)
+    lattice = Lattice("LENS", shape[0], shape[1], pitch, x0, y0, sites)
+    return MaskPlan(name, _toned(classes, pitch, process), (lattice,), grid=rules.grid_nm, axis=axis)
+
+
+def pitch_units(pitch_um: float, process: Process) -> int:
+    """The pitch in database units.
+
+    Raises:
+        ProcessError: it is no multiple of the grid.
+    """
+    steps = pitch_um / nm / process.rules.grid_nm
+    if abs(steps - round(steps)) > 1e-6:
+        raise ProcessError(
+            f"pitch {pitch_um / nm:.6g} nm is no multiple of the grid of {process.rules.grid_nm} nm: the sites would "
+            "lie off the grid; choose another pitch or a finer grid_nm"
+        )
+    return round(steps) * process.rules.grid_nm
+
+
+def _lattice(sites: Array, pitch: int, grid: int) -> tuple[Lattice, tuple[float, float]]:
+    """The map upside down: its rows run towards +y, and +y is up on the mask."""
+    sites = np.ascontiguousarray(sites[::-1])
+    x0, y0, axis = _origin(sites.shape, pitch, grid)
+    return Lattice.of("LENS", sites, pitch=pitch, x0=x0, y0=y0), axis
+
+
+def _origin(shape: tuple[int, ...], pitch: int, grid: int) -> tuple[int, int, tuple[float, float]]:
+    """First site on the grid such that the axis is at (0, 0), or half a grid step off where it cannot be."""
+    half_x, half_y = (shape[1] - 1) * pitch / 2, (shape[0] - 1) * pitch / 2
+    x0, y0 = math.floor(-half_x / grid) * grid, math.ceil(half_y / grid) * grid
+    return x0, y0, (x0 + half_x, y0 - half_y)
+
+
+def _plain_classes(diameters: Array, process: Process) -> tuple[PillarClass, ...]:
+    rules = process.rules
+    return pillar_classes(
+        diameters,
+        layer=process.layers.pillar,
+        grid=rules.grid_nm,
+        unit_nm=UNIT_NM,
+        vertices=rules.vertices,
+        shape=rules.shape,
+    )
+
+
+def _check_layers(plan: MaskPlan, process: Process) -> None:
+    """Refuse datatypes of the doses that are layers of something else."""
+    layers = process.layers
+    fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
+    kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
+    seen: dict[LayerNumber, str] = {}
+    drawn = [(made.layer, {"T": "dose", "W": "witness"}.get(made.name[0], "pillar")) for made in plan.classes]
+    drawn += [(layer, kinds[layer[0]]) for figure in plan.figures for layer in figure.polygons if layer[0] in kinds]
+    for layer, kind in drawn:
+        taken = seen.setdefault(layer, kind)
+        if fixed.get(layer, kind) != kind or taken != kind:
+            other = taken if taken != kind else fixed[layer]
+            raise ProcessError(
+                f"layer {layer[0]}/{layer[1]} is a dose of the {kind} layer and the {other} layer; give "
+                f"{kind} and {other} different layer numbers"
+            )
+
+
+def _toned(classes: tuple[PillarClass, ...], pitch: int, process: Process) -> tuple[PillarClass, ...]:
+    """For a negative tone each class draws its lattice square without the pillar, in two halves."""
+    if process.tone == "positive":
+        return classes
+    if pitch % (2 * process.rules.grid_nm):
+        raise ProcessError(
+            f"tone 'negative' draws squares of the pitch around each site: {pitch} units must be an even number of "
+            f"grid steps of {process.rules.grid_nm} nm"
+        )
+    return tuple(
+        PillarClass(c.name, c.diameter_nm, c.diameter_units, c.layer, c.outline, _halves(c.outline, pitch), c.dose)
+        for c in classes
+    )
+
+
+def _halves(outline: Array, pitch: int) -> tuple[Array, ...]:
+    """Right and left half of the lattice square without the pillar; the cut runs along x = 0."""
+    h = pitch // 2
+    right = outline[outline[:, 0] > 0]
+    right = right[np.argsort(np.arctan2(right[:, 1], right[:, 0]))]
+    top = int(outline[:, 1].max())
+    inner = np.concatenate([[[0, -top]], right, [[0, top]]])
+    half = np.concatenate([[[0, h], [0, top]], inner[::-1][1:-1], [[0, -top], [0, -h], [h, -h], [h, h]]])
+    return half[::-1].copy(), half * (-1, 1)
+
+
+def _cleared(plan: MaskPlan) -> tuple[Array, ...]:
+    """Rectangles over all sites without pillar: equal runs of neighbouring rows together."""
+    made = []
+    for lattice in plan.lattices:
+        half, pitch = lattice.pitch // 2, lattice.pitch
+        open_runs: dict[tuple[int, int], int] = {}
+        for row in range(lattice.rows + 1):
+            empty = lattice.source(row, row + 1)[0] == 0 if row < lattice.rows else np.zeros(lattice.columns, bool)
+            edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
+            runs = set(zip(edges[::2], edges[1::2], strict=True))
+            for first, end in sorted(open_runs.keys() - runs):
+                left, right = lattice.x0 + first * pitch - half, lattice.x0 + end * pitch - half
+                top, bottom = (lattice.y0 - r * pitch + half for r in (open_runs.pop((first, end)), row))
+                made.append(np.array([[left, bottom], [right, bottom], [right, top], [left, top]]))
+            for run in runs - open_runs.keys():
+                open_runs[run] = row
+    return tuple(made)
+
+
+def _label(source: Lens | DiameterMap, radius_um: float) -> str:
+    pitch_nm = (source.diameters if isinstance(source, Lens) else source).pitch_um / nm
+    size = f"{2 * radius_um / 1e3:.3g}MM P{pitch_nm:.4g}"
+    if isinstance(source, Lens):
+        return f"{source.profile} {source.wavelength_um / nm:.0f}NM {size}"
+    return f"LENS {size}"

@@ -1,0 +1,173 @@
+"""A mask with its doses: everything that is exposed together is corrected together, a datatype for each dose."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from layout.dose import Body, Rects, Solution
+from layout.dose import correct as dose
+from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
+from layout.process import LayerNumber, Process
+from layout.shapes import rectilinear
+from metalens.ground.arrays import Array
+from metalens.ground.units import nm
+
+EXPOSED = ("MARKS", "LABEL", "VERNIERS")  # figures that are written in the same exposure as the pillars
+_KINDS = {"T": "dose", "W": "witness"}  # by the first letter of a class
+MOST_HELD = 1 << 27  # sites of a lattice that are kept in memory
+
+
+def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
+    """``plan`` with corrected doses: classes of diameter and dose, marks and labels in pieces of one dose each.
+
+    Raises:
+        ProcessError: as :func:`layout.dose.correct.correct`.
+    """
+    dose.refuse_negative(process)
+    unit = plan.unit_nm * nm
+    parts = [Body(l.rows, l.columns, l.pitch * unit, l.x0 * unit, l.y0 * unit, l.source) for l in plan.lattices]
+    diameters = np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
+    goals = np.array([1.0, *(made.goal for made in plan.classes)])
+    boxes, of, group = _pieces(plan, process)
+    cut = Rects(boxes * unit, group, np.ones(len(boxes)))
+    found = dose.solve(parts, diameters, goals, process.exposure, cut=cut)
+    classes, lookup, names = _classes(plan, found, process)
+    lattices = tuple(_redrawn(l, n, found, lookup) for n, l in enumerate(plan.lattices))
+    figures, more = _figures(plan, found, (boxes, of))
+    doses = {**{made.layer: made.dose for made in classes}, **more}
+    kept = {layer: level for layer, level in plan.doses.items() if layer not in _replaced(plan, process)}
+    titled = {
+        **_untitled(plan, process),
+        **names,
+        **{layer: _name(plan, layer, level) for layer, level in more.items()},
+    }
+    return (
+        plan.replace(classes=classes, lattices=lattices, figures=figures, doses={**kept, **doses}, layer_names=titled),
+        found,
+    )
+
+
+def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
+    """Layers whose shapes get datatypes of their own."""
+    return {made.layer for made in plan.classes} | {
+        layer for figure in plan.figures if figure.name in EXPOSED for layer in figure.polygons
+    }
+
+
+def _untitled(plan: MaskPlan, process: Process) -> dict[LayerNumber, str]:
+    gone = _replaced(plan, process)
+    return {layer: name for layer, name in plan.layer_names.items() if layer not in gone}
+
+
+def _name(plan: MaskPlan, layer: LayerNumber, level: float) -> str:
+    kind = next((name for (number, _), name in plan.layer_names.items() if number == layer[0]), "shape")
+    return title(kind, level)
+
+
+def title(kind: str, level: float) -> str:
+    """Name of a layer that says its relative dose."""
+    return f"{kind}_dose_{level:.4f}"
+
+
+def _pieces(plan: MaskPlan, process: Process) -> tuple[Array, Array, Array]:
+    """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer number, (n,) shape."""
+    side = dose.piece_um(process.exposure) / (plan.unit_nm * nm)
+    boxes, of, group = [np.empty((0, 4), np.int64)], [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
+    shapes = 0
+    for f, figure in enumerate(plan.figures):
+        if figure.name not in EXPOSED:
+            continue
+        for m, polygons in enumerate(figure.polygons.values()):
+            whole = np.concatenate([rectilinear.rectangles(p) for p in polygons])
+            made, box = rectilinear.cut(whole, side, plan.grid)
+            boxes.append(made)
+            of.append(np.tile([f, m], (len(made), 1)))
+            near = _touching(whole)
+            group.append(shapes + near[box])
+            shapes += int(near.max()) + 1
+    return np.concatenate(boxes), np.concatenate(of), np.concatenate(group)
+
+
+def _touching(boxes: Array) -> Array:
+    """(n,) number of the connected shape that each rectangle belongs to."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    low, high = boxes[:, None, :2] <= boxes[None, :, 2:], boxes[:, None, 2:] >= boxes[None, :, :2]
+    i, j = np.nonzero((low & high).all(-1))
+    return np.asarray(connected_components(coo_matrix((np.ones(len(i)), (i, j))))[1], np.int64)
+
+
+def _classes(
+    plan: MaskPlan, found: Solution, process: Process
+) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
+    """Classes of diameter and dose, (old class, dose) -> new class number, and names of their layers."""
+    used = np.argwhere(found.pairs > 0)
+    bases = {kind: getattr(process.layers, kind) for kind in ("pillar", "dose", "witness")}
+    datatypes: dict[str, list[int]] = {kind: [] for kind in bases}
+    for k, j in used.tolist():
+        kind = _kind(plan.classes[k - 1])
+        if j not in datatypes[kind]:
+            datatypes[kind].append(j)
+    number = {kind: {j: n for n, j in enumerate(sorted(js))} for kind, js in datatypes.items()}
+    lookup = np.zeros((len(plan.classes) + 1, 256), np.uint8 if len(used) <= 255 else np.uint16)
+    made, names = [], {}
+    digits = max(6, len(str(len(used))))
+    for n, (k, j) in enumerate(used.tolist(), 1):
+        old = plan.classes[k - 1]
+        kind, level = _kind(old), float(found.ladder.factors[j])
+        layer = (bases[kind][0], bases[kind][1] + number[kind][j])
+        names[layer] = title({"dose": "dose_test"}.get(kind, kind), level)
+        name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
+        made.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
+        lookup[k, j] = n
+    return tuple(made), lookup, names
+
+
+def _kind(made: PillarClass) -> str:
+    return _KINDS.get(made.name[0], "pillar")
+
+
+def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> Lattice:
+    def rows(first: int, end: int) -> Array:
+        block = np.ascontiguousarray(lattice.source(first, end))
+        return np.asarray(lookup[block, found.classes(number, first, block)])
+
+    if lattice.rows * lattice.columns > MOST_HELD:
+        return dataclasses.replace(lattice, source=rows, array=None)
+    whole = np.empty((lattice.rows, lattice.columns), lookup.dtype)
+    step = max(1, (1 << 22) // max(1, lattice.columns))
+    for first in range(0, lattice.rows, step):
+        whole[first : first + step] = rows(first, min(first + step, lattice.rows))
+    return Lattice.of(lattice.name, whole, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
+
+
+def _figures(
+    plan: MaskPlan, found: Solution, cut: tuple[Array, Array]
+) -> tuple[tuple[Figure, ...], Mapping[LayerNumber, float]]:
+    """The exposed figures in pieces, each on the datatype of its dose, and the doses of these."""
+    (boxes, of), doses = cut, {}
+    figures = list(plan.figures)
+    layers = {layer for f in plan.figures if f.name in EXPOSED for layer in f.polygons}
+    sharing = {layer[0]: sorted({int(j) for j in found.rect_class[_on(plan, of, layer[0])]}) for layer in layers}
+    for f, figure in enumerate(plan.figures):
+        if figure.name not in EXPOSED:
+            continue
+        shapes: dict[LayerNumber, tuple[Array, ...]] = {}
+        for m, layer in enumerate(figure.polygons):
+            mine = (of == (f, m)).all(1)
+            for n, j in enumerate(sharing[layer[0]]):
+                some = boxes[mine & (found.rect_class == j)]
+                if len(some):
+                    own = (layer[0], layer[1] + n)
+                    shapes[own] = tuple(rectilinear.corners(box) for box in some)
+                    doses[own] = float(found.ladder.factors[j])
+        figures[f] = dataclasses.replace(figure, polygons=shapes)
+    return tuple(figures), doses
+
+
+def _on(plan: MaskPlan, of: Array, number: int) -> Array:
+    """(n,) whether each piece is drawn on this layer number."""
+    table = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
+    return np.array([table[f][m] == number for f, m in of.tolist()], bool)

@@ -1,0 +1,177 @@
+"""The mask as a record: lattices of pillar classes, fixed figures, layers. Writers and checks need nothing else.
+
+Coordinates are whole database units (``unit_nm``, 1 nm by default) along the axes of the lens: a pillar of the map at
+(x, y) um is drawn at (x, y). Mask readers show +y upwards, and the mask is seen from the pillar side, against the
+light: along the light (+x right, +y down, +z away, right-handed) the same lens shows +y downwards. So the first row
+of a diameter map is the lowest of the mask, and the first row of a lattice here, its topmost, is the last of the
+map. Millions of pillars stay an array of class numbers: 0 for no
+pillar, k for ``classes[k - 1]``.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from layout.process import LayerNumber, names
+from layout.shapes import polygon
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+MOST_CLASSES = 65535
+FARTHEST = 2**31 - 1
+RowSource = Callable[[int, int], Array]  # (first row, end row) -> (rows, columns) class numbers
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PillarClass:
+    """All pillars of one diameter (and dose): one cell of the mask.
+
+    name: of the cell. diameter_nm, diameter_units: of the circle that ``outline`` stands for, as drawn.
+    layer: (layer, datatype). outline: (n, 2) of the pillar. drawn: polygons that are written (the outline itself,
+    or what is left of the lattice square for a negative tone). dose: relative to the base dose. goal: wanted exposure
+    of the edge, relative to dose-to-size (1 but in a dose test).
+    """
+
+    name: str
+    diameter_nm: float
+    diameter_units: int
+    layer: LayerNumber
+    outline: Array
+    drawn: tuple[Array, ...] = ()
+    dose: float = 1.0
+    goal: float = 1.0
+
+    @property
+    def polygons(self) -> tuple[Array, ...]:
+        """What is written."""
+        return self.drawn or (self.outline,)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lattice:
+    """Pillars on a square lattice, written as one cell.
+
+    rows, columns: of sites. source: gives any block of rows as class numbers (0: none); array: all of them, where
+    they are in memory.
+    x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row * pitch.
+    """
+
+    name: str
+    rows: int
+    columns: int
+    pitch: int
+    x0: int
+    y0: int
+    source: RowSource
+    array: Array | None = None
+
+    def __post_init__(self) -> None:
+        names.check(self.name)
+        corners = (self.x0, self.y0, self.x0 + self.columns * self.pitch, self.y0 - self.rows * self.pitch)
+        if max(map(abs, corners)) > FARTHEST:
+            raise ProcessError(
+                f"lattice {self.name} reaches {max(map(abs, corners))} database units from the origin, beyond 32 bits "
+                f"({FARTHEST}); take a smaller aperture or a coarser unit"
+            )
+
+    @classmethod
+    def of(cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int) -> "Lattice":
+        """A lattice held in memory: (rows, columns) uint8 or uint16."""
+        if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
+            raise ProcessError(f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 (rows, columns)")
+        rows, columns = classes.shape
+        return cls(name, rows, columns, pitch, x0, y0, lambda first, end: classes[first:end], classes)
+
+    def blocks(self, size: int) -> Iterator[tuple[int, Array]]:
+        """(first row, class numbers) in blocks of ``size`` rows."""
+        for first in range(0, self.rows, size):
+            yield first, self.source(first, min(first + size, self.rows))
+
+    def whole(self) -> Array:
+        """All class numbers (rows, columns)."""
+        return self.source(0, self.rows) if self.array is None else self.array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Figure:
+    """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database units."""
+
+    name: str
+    polygons: Mapping[LayerNumber, tuple[Array, ...]]
+
+    def __post_init__(self) -> None:
+        names.check(self.name)
+        for shapes in self.polygons.values():
+            for shape in shapes:
+                if len(shape) and np.abs(np.asarray(shape, np.int64)).max() > FARTHEST:
+                    raise ProcessError(f"figure {self.name} reaches beyond 32 bits; take a smaller die")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MaskPlan:
+    """Everything that goes into a mask file.
+
+    name: of the top cell. unit_nm: database unit. grid: step of all coordinates, in database units.
+    classes: pillar classes; number k of a lattice is ``classes[k - 1]``. lattices: the lens first.
+    layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
+    axis: of the lens in database units (off (0, 0) by at most half a grid step, where the lattice cannot be centred
+    on the grid).
+    """
+
+    name: str
+    classes: tuple[PillarClass, ...]
+    lattices: tuple[Lattice, ...]
+    figures: tuple[Figure, ...] = ()
+    unit_nm: float = 1.0
+    grid: int = 1
+    layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
+    doses: Mapping[LayerNumber, float] = field(default_factory=dict)
+    axis: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.classes) <= MOST_CLASSES:
+            raise ProcessError(
+                f"{len(self.classes)} pillar classes, need 1 to {MOST_CLASSES}; take a coarser diameter_step_nm"
+            )
+        names.distinct(self.cell_names)
+
+    @property
+    def cell_names(self) -> list[str]:
+        """Pillar classes, figures, lattices, top: in the order of the file."""
+        return [*(made.name for made in self.classes), *self.placed_names, self.name]
+
+    @property
+    def placed_names(self) -> list[str]:
+        """Cells that the top cell places: figures and lattices."""
+        return [*(figure.name for figure in self.figures), *(lattice.name for lattice in self.lattices)]
+
+    @property
+    def class_dtype(self) -> type[np.unsignedinteger]:
+        """Narrowest type of the class numbers."""
+        return np.uint8 if len(self.classes) <= 255 else np.uint16
+
+    def counts(self) -> Array:
+        """(classes + 1,) sites of each class number in all lattices."""
+        total = np.zeros(len(self.classes) + 1, np.int64)
+        for lattice in self.lattices:
+            for _, block in lattice.blocks(max(1, (1 << 20) // max(1, lattice.columns))):
+                total += np.bincount(block.ravel(), minlength=len(total))
+        return total
+
+    def replace(self, **changes: object) -> "MaskPlan":
+        """A copy with other values."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+
+def pillar_classes(
+    diameters: Array, *, layer: LayerNumber, grid: int, unit_nm: float, vertices: int, shape: str, prefix: str = "D"
+) -> tuple[PillarClass, ...]:
+    """One class for each drawn diameter (database units, whole), thinnest first; equally long names."""
+    digits = max((len(str(int(d))) for d in diameters), default=1)
+    made = []
+    for d in diameters:
+        outline = polygon.pillar(int(d) / grid, vertices=vertices, shape=shape).points * grid
+        made.append(PillarClass(f"{prefix}{int(d):0{digits}}", float(d) * unit_nm, int(d), layer, outline))
+    return tuple(made)

@@ -1,0 +1,291 @@
+"""What stands in the cells of an OASIS file: placements, rectangles, polygons, circles, texts, with modal values."""
+
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from layout.files import NOTHING, QUARTERS, CellContent, Placed, Turn, paths, placements
+from layout.oasis import bytes as oasis
+from layout.oasis import trapezoids
+from layout.oasis.cursor import Cursor, Repetition
+from metalens.ground.arrays import Array
+
+Child = int | str  # reference number, or name
+Value = TypeVar("Value")
+_BATCH = 1 << 18
+
+
+@dataclass(eq=False, slots=True)
+class Modal:
+    """Values that a record may leave out because an earlier one gave them; forgotten at each cell."""
+
+    relative: bool = False
+    placement_x: int = 0
+    placement_y: int = 0
+    child: Child | None = None
+    x: int = 0
+    y: int = 0
+    text_x: int = 0
+    text_y: int = 0
+    layer: int | None = None
+    datatype: int | None = None
+    width: int | None = None
+    height: int | None = None
+    radius: int | None = None
+    points: Array | None = None
+    half_width: int | None = None
+    path_points: Array | None = None
+    path_ends: tuple[int, int] | None = None
+    kind: int | None = None
+    repetition: Repetition | None = None
+
+
+@dataclass(eq=False, slots=True)
+class OpenCell:
+    """A cell while it is read. names: of children that are placed by name, numbered from -2 down."""
+
+    key: Child
+    polygons: dict[tuple[int, int], list[Array]] = field(default_factory=dict)
+    circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(default_factory=dict)
+    parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
+    names: dict[str, int] = field(default_factory=dict)
+    turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
+    texts: int = 0
+
+    def close(self, name: str, table: dict[int, str]) -> CellContent:
+        """The finished cell; KeyError names a reference number without a name."""
+        return CellContent(name, self.polygons, self.circles, self._placed(table), self.texts)
+
+    def _placed(self, table: dict[int, str]) -> Placed:
+        if not self.parts:
+            return NOTHING
+        child, x, y, turn = (np.concatenate(part) for part in zip(*self.parts, strict=True))
+        low, high = int(child.min()), int(child.max())
+        if high - low < 1 << 22:
+            used = np.flatnonzero(np.bincount(child - low)) + low
+            lookup = np.zeros(high - low + 1, np.int32)
+            lookup[used - low] = np.arange(len(used))
+            index = lookup[child - low]
+        else:
+            used, index = np.unique(child, return_inverse=True)
+        own = {number: name for name, number in self.names.items()}
+        names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
+        return Placed(names, index.astype(np.int32), x, y, turn, tuple(self.turns))
+
+
+class CellReader:
+    """Reads the records of one cell."""
+
+    def __init__(self, cell: OpenCell, limit: int) -> None:
+        self.cell, self.limit, self.modal = cell, limit, Modal()
+
+    def record(self, c: Cursor, kind: int) -> bool:
+        """Read the record of this kind that stands at the cursor; False where cells hold no such record."""
+        if kind in (oasis.XYABSOLUTE, oasis.XYRELATIVE):
+            self.modal.relative = kind == oasis.XYRELATIVE
+        elif kind in (oasis.PLACEMENT, oasis.PLACEMENT_ANY):
+            self._placement(c, kind)
+        elif kind == oasis.TEXT:
+            self._text(c)
+        elif kind == oasis.RECTANGLE:
+            self._rectangle(c)
+        elif kind == oasis.POLYGON:
+            self._polygon(c)
+        elif kind == oasis.CIRCLE:
+            self._circle(c)
+        elif kind == oasis.PATH:
+            self._path(c)
+        elif kind in (oasis.TRAPEZOID, oasis.TRAPEZOID_A, oasis.TRAPEZOID_B):
+            self._trapezoid(c, kind)
+        elif kind == oasis.CTRAPEZOID:
+            self._compact(c)
+        else:
+            return False
+        return True
+
+    def plain_placements(self, c: Cursor) -> None:
+        """Placements in a row, by the compiled loop; stops before anything that it does not know."""
+        m = self.modal
+        state = np.array([m.placement_x, m.placement_y, m.relative, m.child if isinstance(m.child, int) else -1])
+        while True:
+            size = min(_BATCH, c.left // 2 + 1)
+            out = np.empty((4, size), np.int32)
+            at, count = placements(c.data, c.at, c.end, state, out)
+            moved, c.at = at > c.at, int(at)
+            if count:
+                child, x, y, turn = (row.copy() for row in out[:, :count])
+                self._add(c, child, x, y, turn.astype(np.uint8))
+                m.placement_x, m.placement_y, m.child = int(state[0]), int(state[1]), int(state[3])
+            m.relative = bool(state[2])
+            if not moved:
+                return
+
+    def _add(self, c: Cursor, *part: Array) -> None:
+        self._count(c, len(part[0]))
+        self.cell.parts.append(part)  # type: ignore[arg-type]
+
+    def _count(self, c: Cursor, more: int) -> None:
+        self.limit -= more
+        if self.limit < 0:
+            raise c.fail("more placements and copies than the limit that was set")
+
+    def _need(self, c: Cursor, value: Value | None, what: str) -> Value:
+        if value is None:
+            raise c.fail(f"record without {what}, and none before it in this cell")
+        return value
+
+    def _position(self, c: Cursor, info: int, bits: tuple[int, int], now: tuple[int, int]) -> tuple[int, int]:
+        place = []
+        for bit, old in zip(bits, now, strict=True):
+            new = c.coordinate() if info & bit else None
+            relative = self.modal.relative
+            place.append(old if new is None else c.within(old + new) if relative else new)
+        return place[0], place[1]
+
+    def _repeated(self, c: Cursor, info: int, bit: int, x: int, y: int) -> tuple[Array, Array]:
+        if not info & bit:
+            return np.array([x]), np.array([y])
+        self.modal.repetition = c.repetition(self.modal.repetition, self.limit)
+        at_x, at_y = self.modal.repetition.x + x, self.modal.repetition.y + y
+        c.within(int(np.abs(at_x).max()))
+        c.within(int(np.abs(at_y).max()))
+        return at_x, at_y
+
+    def _placement(self, c: Cursor, kind: int) -> None:
+        info, m = c.byte(), self.modal
+        if info & 0x80:
+            m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
+        child = m.child
+        if child is None:
+            raise c.fail("placement without a cell, and none before it in this cell")
+        turn = info >> 1 & 3 | (info & 1) << 2
+        if kind == oasis.PLACEMENT_ANY:
+            size = c.real() if info & 4 else 1.0
+            angle = c.real() if info & 2 else 0.0
+            if not 0 < size < 1e9 or not abs(angle) < 1e9:
+                raise c.fail(f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0")
+            turn = self.cell.turns.setdefault(Turn(angle % 360, bool(info & 1), size), len(self.cell.turns))
+        m.placement_x, m.placement_y = self._position(c, info, (0x20, 0x10), (m.placement_x, m.placement_y))
+        x, y = self._repeated(c, info, 8, m.placement_x, m.placement_y)
+        number = self.cell.names.setdefault(child, -2 - len(self.cell.names)) if isinstance(child, str) else child
+        small = (np.full(len(x), number, np.int32), x.astype(np.int32), y.astype(np.int32))
+        self._add(c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32))
+
+    def _layer(self, c: Cursor, info: int) -> None:
+        if info & 1:
+            self.modal.layer = c.unsigned()
+        if info & 2:
+            self.modal.datatype = c.unsigned()
+
+    def _place(self, c: Cursor, info: int) -> tuple[tuple[int, int], Array, Array]:
+        """Layer and positions of a shape, from the end of its record."""
+        m = self.modal
+        m.x, m.y = self._position(c, info, (0x10, 8), (m.x, m.y))
+        x, y = self._repeated(c, info, 4, m.x, m.y)
+        self._count(c, len(x))
+        return (self._need(c, m.layer, "layer"), self._need(c, m.datatype, "datatype")), x, y
+
+    def _polygons(self, c: Cursor, info: int, points: Array) -> None:
+        layer, x, y = self._place(c, info)
+        c.within(int(np.abs(points).max()) + max(abs(self.modal.x), abs(self.modal.y)))
+        shapes = self.cell.polygons.setdefault(layer, [])
+        shapes.extend(points + np.array(place) for place in zip(x.tolist(), y.tolist(), strict=True))
+
+    def _rectangle(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x40:
+            m.width = c.within(c.unsigned())
+        if info & 0x80:  # a square has no height of its own
+            m.height = m.width
+        elif info & 0x20:
+            m.height = c.within(c.unsigned())
+        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]))
+
+    def _polygon(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x20:
+            m.points = c.points()
+            if len(m.points) < 3:
+                raise c.fail(f"polygon of {len(m.points)} vertices, need 3")
+        self._polygons(c, info, self._need(c, m.points, "point list"))
+
+    def _path(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x40:
+            m.half_width = c.within(c.unsigned())
+        if info & 0x80:
+            m.path_ends = self._ends(c, c.unsigned())
+        if info & 0x20:
+            m.path_points = c.points(closed=False)
+        points, half = self._need(c, m.path_points, "point list"), self._need(c, m.half_width, "width")
+        begin, end = self._need(c, m.path_ends, "ends")
+        if half == 0 or (points == points[0]).all():
+            raise c.fail("path without width or length")
+        self._polygons(c, info, paths.outline(points, half, begin=begin, end=end))
+
+    def _ends(self, c: Cursor, scheme: int) -> tuple[int, int]:
+        """By how much a path goes on at its begin and end: as before, not, by its half width, or as told."""
+        old, half = self.modal.path_ends or (0, 0), self.modal.half_width or 0
+        made = []
+        for n, form in enumerate((scheme >> 2 & 3, scheme & 3)):
+            made.append((old[n], 0, half)[form] if form < 3 else c.coordinate())
+        return made[0], made[1]
+
+    def _trapezoid(self, c: Cursor, kind: int) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        self._size(c, info)
+        a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
+        b = c.coordinate() if kind != oasis.TRAPEZOID_A else 0
+        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        if max(abs(a), abs(b), abs(a - b)) > (h if info & 0x80 else w):
+            raise c.fail(f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross")
+        self._polygons(c, info, trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80)))
+
+    def _size(self, c: Cursor, info: int) -> None:
+        if info & 0x40:
+            self.modal.width = c.within(c.unsigned())
+        if info & 0x20:
+            self.modal.height = c.within(c.unsigned())
+
+    def _compact(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x80:
+            m.kind = c.unsigned()
+        self._size(c, info)
+        kind = self._need(c, m.kind, "type")
+        if kind >= trapezoids.KINDS:
+            raise c.fail(f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}")
+        wide, high = trapezoids.needs(kind)
+        w = self._need(c, m.width, "width") if wide else 0
+        h = self._need(c, m.height, "height") if high else 0
+        self._polygons(c, info, trapezoids.compact(kind, w, h))
+
+    def _circle(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x20:
+            m.radius = c.within(c.unsigned())
+        radius = self._need(c, m.radius, "radius")
+        layer, x, y = self._place(c, info)
+        shapes = self.cell.circles.setdefault(layer, [])
+        shapes.extend((px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True))
+
+    def _text(self, c: Cursor) -> None:
+        """Texts are counted, no more."""
+        info, m = c.byte(), self.modal
+        if info & 0x40:
+            _ = c.unsigned() if info & 0x20 else c.string()
+        for bit in (1, 2):
+            if info & bit:
+                c.unsigned()
+        m.text_x, m.text_y = self._position(c, info, (0x10, 8), (m.text_x, m.text_y))
+        x, _ = self._repeated(c, info, 4, m.text_x, m.text_y)
+        self._count(c, len(x))
+        self.cell.texts += len(x)

@@ -1,0 +1,115 @@
+"""Pillars as OASIS placements, encoded from an array of class numbers.
+
+Raster order inside narrow tiles: the rows above stay within the 32 KiB that deflate looks back on, and a lens
+repeats itself from row to row. That halves the file against whole rows. The other form lists all sites of a
+class as one repetition.
+"""
+
+import numpy as np
+
+from layout.process import compiled
+from metalens.ground.arrays import Array
+
+TILE_COLUMNS, TILE_ROWS = 96, 512
+LARGEST_RECORD = 18  # bytes of one placement
+_LARGEST_DELTA = 10
+
+
+@compiled
+def put_unsigned(out: Array, at: int, value: int) -> int:
+    """Write a variable-length integer; the position after it."""
+    while value > 127:
+        out[at] = value & 127 | 128
+        value >>= 7
+        at += 1
+    out[at] = value
+    return at + 1
+
+
+@compiled
+def _put_signed(out: Array, at: int, value: int) -> int:
+    return put_unsigned(out, at, (-value << 1) | 1 if value < 0 else value << 1)
+
+
+@compiled
+def encode_tile(tile: Array, pitch: int, x0: int, y0: int, out: Array) -> int:
+    """Placements of a tile in raster order: the first at its place, each other relative to the one before.
+
+    Args:
+        tile: (rows, columns) class numbers; x0, y0: its first site.
+        out: room for LARGEST_RECORD bytes a site.
+
+    Returns:
+        bytes used.
+    """
+    at, last_x, last_y, fresh = 0, 0, 0, True
+    for row in range(tile.shape[0]):
+        y = y0 - row * pitch
+        for column in range(tile.shape[1]):
+            kind = tile[row, column]
+            if kind:
+                x = x0 + column * pitch
+                move_x, move_y = fresh or x != last_x, fresh or y != last_y
+                if fresh:
+                    out[0] = 15  # XYABSOLUTE
+                    at = 1
+                out[at] = 17  # PLACEMENT
+                out[at + 1] = 0xC0 | (0x20 if move_x else 0) | (0x10 if move_y else 0)
+                at = put_unsigned(out, at + 2, kind - 1)
+                if move_x:
+                    at = _put_signed(out, at, x - last_x)
+                if move_y:
+                    at = _put_signed(out, at, y - last_y)
+                if fresh:
+                    out[at] = 16  # XYRELATIVE
+                    at += 1
+                last_x, last_y, fresh = x, y, False
+    return at
+
+
+@compiled
+def count_classes(block: Array, counts: Array) -> None:
+    """Add the sites of each class number to ``counts``."""
+    for row in range(block.shape[0]):
+        for column in range(block.shape[1]):
+            counts[block[row, column]] += 1
+
+
+@compiled
+def _put_delta(out: Array, at: int, dx: int, dy: int) -> int:
+    """A g-delta: one of eight directions with a length, or any (x, y)."""
+    ax, ay = abs(dx), abs(dy)
+    if dx == 0 or dy == 0 or ax == ay:
+        if dy == 0:
+            direction = 0 if dx >= 0 else 2
+        elif dx == 0:
+            direction = 1 if dy > 0 else 3
+        elif dx > 0:
+            direction = 4 if dy > 0 else 7
+        else:
+            direction = 5 if dy > 0 else 6
+        return put_unsigned(out, at, max(ax, ay) << 4 | direction << 1)
+    return _put_signed(out, put_unsigned(out, at, ax << 2 | (dx < 0) << 1 | 1), dy)
+
+
+@compiled
+def walk_classes(classes: Array, strip: int, first: Array, last: Array, ends: Array, out: Array, write: bool) -> None:
+    """List the sites of each class, strip by strip and row by row, as g-deltas in lattice steps (y up).
+
+    first, last: (classes + 1, 2) column and row of the first and latest site (-1: none yet).
+    ends: (classes + 1,) where the bytes of each class go on; without ``write`` only the lengths are summed.
+    """
+    scratch = np.empty(_LARGEST_DELTA * 2, np.uint8)
+    for left in range(0, classes.shape[1], strip):
+        for row in range(classes.shape[0]):
+            for column in range(left, min(left + strip, classes.shape[1])):
+                kind = classes[row, column]
+                if kind == 0:
+                    continue
+                if last[kind, 0] < 0:
+                    first[kind, 0], first[kind, 1] = column, row
+                elif write:
+                    ends[kind] = _put_delta(out, ends[kind], column - last[kind, 0], last[kind, 1] - row)
+                else:
+                    ends[kind] += _put_delta(scratch, 0, column - last[kind, 0], last[kind, 1] - row)
+                last[kind, 0], last[kind, 1] = column, row

@@ -1,0 +1,38 @@
+"""The trapezoids of OASIS: three records with two slopes, and 26 compact ones (SEMI P39, figures of CTRAPEZOID)."""
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+
+# corners of the compact trapezoids as (x, y), each a sum of w and h: "w-h" or "2h"
+_CORNERS = (
+    "0,0 0,h w-h,h w,0", "0,0 0,h w,h w-h,0", "0,0 h,h w,h w,0", "h,0 0,h w,h w,0",
+    "0,0 h,h w-h,h w,0", "h,0 0,h w,h w-h,0", "0,0 h,h w,h w-h,0", "h,0 0,h w-h,h w,0",
+    "0,0 0,h w,h-w w,0", "0,0 0,h-w w,h w,0", "0,0 0,h w,h w,w", "0,w 0,h w,h w,0",
+    "0,0 0,h w,h-w w,w", "0,w 0,h-w w,h w,0", "0,0 0,h-w w,h w,w", "0,w 0,h w,h-w w,0",
+    "0,0 0,w w,0", "0,0 0,w w,w", "0,0 w,w w,0", "0,w w,w w,0",
+    "0,0 h,h 2h,0", "0,h 2h,h h,0", "0,0 0,2w w,w", "0,w w,2w w,0",
+    "0,0 0,h w,h w,0", "0,0 0,w w,w w,0",
+)  # fmt: skip
+KINDS = len(_CORNERS)
+
+
+def compact(kind: int, w: int, h: int) -> Array:
+    """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25."""
+    value = {"0": 0, "w": w, "h": h, "w-h": w - h, "h-w": h - w, "2h": 2 * h, "2w": 2 * w}
+    return np.array([[value[c] for c in corner.split(",")] for corner in _CORNERS[kind].split()], np.int64)
+
+
+def needs(kind: int) -> tuple[bool, bool]:
+    """Whether kind needs a width and a height of its own."""
+    text = _CORNERS[kind]
+    return "w" in text, "h" in text
+
+
+def sloped(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
+    """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans."""
+    if upright:
+        corners = [(0, max(a, 0)), (0, h + min(b, 0)), (w, h - max(b, 0)), (w, -min(a, 0))]
+    else:
+        corners = [(max(a, 0), h), (w + min(b, 0), h), (w - max(b, 0), 0), (-min(a, 0), 0)]
+    return np.array(corners, np.int64)

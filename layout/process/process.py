@@ -1,0 +1,303 @@
+"""The process: what the writer and the etch can do, read from PROCESS.toml.
+
+Lengths in nm where a mask is meant and in um where a machine is, as the names say. The defaults suit 100 kV
+electron-beam lithography and a pseudo-Bosch etch of 700 nm amorphous silicon on fused silica.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from metalens.ground import config
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, ProcessError
+from metalens.ground.units import deg
+from metalens.made import Bias, Spread, with_table
+
+LayerNumber = tuple[int, int]  # layer, datatype
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand."""
+
+    x_um: float
+    y_um: float
+    width_um: float
+    height_um: float
+    name: str = "zone"
+
+    def __post_init__(self) -> None:
+        _positive(self, "width_um", "height_um")
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What can be printed, and on which grid.
+
+    minimum_feature_nm, minimum_gap_nm: thinnest pillar and narrowest gap, of the written polygons.
+    minimum_foot_gap_nm: narrowest gap at the foot of the pillars as they come out of the etch, with tilted walls.
+    grid_nm: step of all mask coordinates (whole nm).
+    diameter_step_nm: step of the diameters, a multiple of the grid: one class of pillars each.
+    vertices: of a pillar polygon, 8 to 64, a multiple of 4.
+    shape: ``round``: equal-area polygon of ``vertices``; ``shot``: only horizontal, vertical and diagonal edges.
+    maximum_density, density_window_um: share of the area that pillars may cover in any window of that size.
+    exclusion: zones without pillars.
+    """
+
+    minimum_feature_nm: float = 80.0
+    minimum_gap_nm: float = 70.0
+    minimum_foot_gap_nm: float = 50.0
+    grid_nm: int = 1
+    diameter_step_nm: int = 2
+    vertices: int = 32
+    shape: Literal["round", "shot"] = "round"
+    maximum_density: float = 0.75
+    density_window_um: float = 20.0
+    exclusion: tuple[Zone, ...] = ()
+
+    def __post_init__(self) -> None:
+        _positive(self, "minimum_feature_nm", "minimum_gap_nm", "grid_nm", "diameter_step_nm", "density_window_um")
+        if self.diameter_step_nm % self.grid_nm:
+            raise ProcessError(
+                f"a grid of {self.grid_nm} nm is coarser than, or no divisor of, diameter_step_nm = "
+                f"{self.diameter_step_nm}; make the step a multiple of the grid"
+            )
+        if not 8 <= self.vertices <= 64 or self.vertices % 4:
+            raise ProcessError(f"vertices = {self.vertices}: need a multiple of 4 from 8 to 64")
+        if not 0 < self.maximum_density <= 1:
+            raise ProcessError(f"maximum_density = {self.maximum_density}: need a share above 0 and at most 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array."""
+
+    pillar: LayerNumber = (1, 0)
+    aperture: LayerNumber = (2, 0)
+    marks: LayerNumber = (3, 0)
+    labels: LayerNumber = (4, 0)
+    dose: LayerNumber = (5, 0)
+    witness: LayerNumber = (6, 0)
+    fields: LayerNumber = (7, 0)
+    outline: LayerNumber = (10, 0)
+
+    def __post_init__(self) -> None:
+        seen: dict[LayerNumber, str] = {}
+        for entry in dataclasses.fields(self):
+            number = getattr(self, entry.name)
+            if not all(0 <= n <= 65535 for n in number):
+                raise ProcessError(f"layer {entry.name} = {list(number)}: need numbers from 0 to 65535")
+            if number in seen:
+                raise ProcessError(f"layers {seen[number]} and {entry.name} are both {list(number)}; give each its own")
+            seen[number] = entry.name
+
+
+@dataclass(frozen=True, slots=True)
+class Etch:
+    """Shape of what is made.
+
+    sidewall_deg: tilt of the wall from the vertical, above 0 where the foot is wider than the top.
+    corner_radius_nm: radius to which convex corners of the drawn shape round off.
+    """
+
+    sidewall_deg: float = 0.0
+    corner_radius_nm: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not abs(self.sidewall_deg) < 45:
+            raise ProcessError(f"sidewall_deg = {self.sidewall_deg}: need an angle within +-45")
+        if not (self.corner_radius_nm >= 0 and math.isfinite(self.corner_radius_nm)):
+            raise ProcessError(f"corner_radius_nm = {self.corner_radius_nm}: need a finite length >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Electron exposure: base dose, point-exposure function, dose classes.
+
+    base_uC_cm2: dose that just clears the edge of a wide, uniformly written area.
+    alpha_um, beta_um, eta: double Gaussian of the point exposure (forward range, backscatter range, ratio of
+        the two energies), as measured for your resist, film and voltage: there is no default.
+    gamma_um, nu: a third Gaussian between them (range, ratio of its energy to the forward one), where you have it.
+    csv: a measured radial point-exposure function instead (radius in um, energy density in any unit).
+    tolerance: largest relative exposure error at a pillar's edge that the dose classes may leave.
+    maximum_classes: how many doses the writer can hold in one job.
+    correct: whether the mask carries corrected doses (a datatype each) or a single one; left out: where a point
+        exposure is given.
+    """
+
+    base_uC_cm2: float = 300.0
+    alpha_um: float | None = None
+    beta_um: float | None = None
+    eta: float | None = None
+    gamma_um: float | None = None
+    nu: float = 0.0
+    csv: Path | None = None
+    tolerance: float = 0.01
+    maximum_classes: int = 64
+    correct: bool | None = None
+
+    def __post_init__(self) -> None:
+        _positive(self, "base_uC_cm2", "tolerance", "maximum_classes")
+        _positive(self, *(n for n in ("alpha_um", "beta_um", "gamma_um") if getattr(self, n) is not None))
+        for name in ("eta", "nu"):
+            value = getattr(self, name)
+            if value is not None and not (value >= 0 and math.isfinite(value)):
+                raise ProcessError(f"{name} = {value}: need a finite ratio >= 0")
+        if self.beta_um is not None and self.alpha_um is not None and self.beta_um <= self.alpha_um:
+            raise ProcessError(f"beta_um = {self.beta_um} must exceed alpha_um = {self.alpha_um}")
+        if (self.gamma_um is None) != (self.nu == 0):
+            raise ProcessError(f"gamma_um = {self.gamma_um} and nu = {self.nu}: a third Gaussian needs both")
+        if self.maximum_classes > 255:
+            raise ProcessError(f"maximum_classes = {self.maximum_classes}: need at most 255")
+        if self.correct and not self.known:
+            raise ProcessError(f"exposure.correct = true needs {self.missing}; measure them, or leave correct out")
+
+    @property
+    def known(self) -> bool:
+        """Whether a point exposure is given."""
+        return self.csv is not None or None not in (self.alpha_um, self.beta_um, self.eta)
+
+    @property
+    def missing(self) -> str:
+        """Names of what a point exposure still needs."""
+        return ", ".join(n for n in ("alpha_um", "beta_um", "eta") if getattr(self, n) is None) + " (or csv)"
+
+    @property
+    def corrected(self) -> bool:
+        """Whether the mask is to carry corrected doses."""
+        return self.known if self.correct is None else self.correct
+
+
+@dataclass(frozen=True, slots=True)
+class WriteField:
+    """Write fields of the e-beam tool.
+
+    size_um: largest side of a field.
+    mode: ``shift``: equal fields on a fixed raster that is shifted between the pillars; ``floating``: each border
+        lies where it is best, fields are as few and as equal as possible.
+    stitching_nm: how far two fields may be misplaced (largest error along x and y).
+    """
+
+    size_um: float = 500.0
+    mode: Literal["shift", "floating"] = "floating"
+    stitching_nm: float = 20.0
+
+    def __post_init__(self) -> None:
+        _positive(self, "size_um")
+        if not (self.stitching_nm >= 0 and math.isfinite(self.stitching_nm)):
+            raise ProcessError(f"stitching_nm = {self.stitching_nm}: need a finite length >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Die:
+    """The die around the aperture.
+
+    size_um: (x, y) of the die; left out: the aperture and ``margin_um`` on each side.
+    street_um: strip along the edge that stays empty.
+    mark_um, mark_width_um: arm length and line width of the alignment crosses.
+    thickness_um: of the substrate.
+    label: text on the die; left out: made from the lens.
+    """
+
+    size_um: tuple[float, float] | None = None
+    margin_um: float = 500.0
+    street_um: float = 50.0
+    mark_um: float = 100.0
+    mark_width_um: float = 5.0
+    thickness_um: float = 500.0
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        _positive(self, "margin_um", "mark_um", "mark_width_um", "thickness_um")
+        if self.size_um is not None and not all(0 < s < math.inf for s in self.size_um):
+            raise ProcessError(f"size_um = {list(self.size_um)}: need two finite lengths above 0")
+        if not 0 <= self.street_um < math.inf:
+            raise ProcessError(f"street_um = {self.street_um}: need a finite length >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A fabrication process.
+
+    tone: ``positive``: the drawn shapes become pillars; ``negative``: the gaps between pillars are drawn.
+    """
+
+    name: str = "e-beam, a-Si on fused silica"
+    tone: Literal["positive", "negative"] = "positive"
+    rules: Rules = field(default_factory=Rules)
+    layers: Layers = field(default_factory=Layers)
+    bias: Bias = field(default_factory=Bias)
+    etch: Etch = field(default_factory=Etch)
+    exposure: Exposure = field(default_factory=Exposure)
+    write_field: WriteField = field(default_factory=WriteField)
+    die: Die = field(default_factory=Die)
+    spread: Spread = field(default_factory=Spread)
+
+    def made_diameter_nm(self, written_nm: Array | float, isolation: Array | float = 0.0) -> Array:
+        """Diameter at half height that comes out of a drawn pillar: bias, and corners that round off.
+
+        Args:
+            written_nm: equal-area diameter of the drawn polygon.
+            isolation: of each pillar, see :func:`layout.process.isolation.isolation`.
+        """
+        written = np.asarray(written_nm, float)
+        return self.bias.made_nm(written - self._rounding_nm(written), isolation)
+
+    def written_diameter_nm(self, design_nm: Array | float, isolation: Array | float = 0.0) -> Array:
+        """Inverse of :meth:`made_diameter_nm`, to 1e-9 nm: draw this, and the designed diameter is made."""
+        goal = self.bias.drawn_nm(design_nm, isolation)
+        written = goal.copy()
+        for _ in range(30):
+            before, written = written, goal + self._rounding_nm(written)
+            if np.abs(written - before).max(initial=0.0) < 1e-10:
+                break
+        return np.asarray(written)
+
+    def top_foot_nm(self, diameter_nm: Array | float, height_nm: float) -> tuple[Array, Array]:
+        """Diameters at the top and at the foot of a pillar whose half-height diameter is given."""
+        lean = height_nm * math.tan(self.etch.sidewall_deg * deg)
+        middle = np.asarray(diameter_nm, float)
+        return middle - lean, middle + lean
+
+    def _rounding_nm(self, written_nm: Array) -> Array:
+        """Equal-area diameter lost at n corners: the area n r^2 (tan(pi/n) - pi/n), r within the pillar."""
+        n = self.rules.vertices
+        radius = np.minimum(self.etch.corner_radius_nm, written_nm / 2)
+        area = n * radius**2 * (math.tan(math.pi / n) - math.pi / n)
+        return np.asarray(2 * area / (math.pi * np.maximum(written_nm, 1e-9)))
+
+
+def load(path: str | Path) -> Process:
+    """Read PROCESS.toml; CSV files that it names lie beside it.
+
+    Raises:
+        ConfigError: missing file, unknown key, wrong type or impossible value, with file and key.
+        ProcessError: a bias table that is unreadable or impossible.
+    """
+    path = Path(path)
+    process = config.load(path, Process)
+    return resolve(process, path.parent)
+
+
+def resolve(process: Process, folder: str | Path) -> Process:
+    """``process`` with its CSV files found in ``folder`` and the bias table read in."""
+    folder = Path(folder)
+    process = dataclasses.replace(process, bias=with_table(process.bias, folder))
+    if process.exposure.csv is not None:
+        found = folder / process.exposure.csv
+        if not found.is_file():
+            raise ConfigError(f"exposure.csv: {found}: no such file; need radius and energy density in two columns")
+        process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, csv=found))
+    return process
+
+
+def _positive(record: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(record, name)
+        if not (value > 0 and math.isfinite(value)):
+            raise ProcessError(f"{name} = {value}: need a finite value above 0")

@@ -1,0 +1,267 @@
+"""Design-rule check of the drawn polygons, exact, from the classes of neighbouring pillars.
+
+Five million pillars have some ten thousand kinds of neighbouring pairs. Count the pairs of each kind, and measure
+each kind once, polygon to polygon.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.mask import Lattice, MaskPlan, PillarClass
+from layout.process import Rules
+from layout.rules import loops as drc_loops
+from layout.rules.figures import figures_kept
+from layout.rules.report import DrcReport, Violation
+from layout.rules.zones import in_zones, structures_apart
+from layout.shapes import convex, polygon
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+_SHOWN = 500  # violations of one rule that are listed with their place
+_BLOCK_SITES = 1 << 21
+_MOST_KINDS = 1500
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Shapes:
+    """Different outlines of the classes: ``kind[class number]`` is 0 for none, else 1 + index into ``outlines``."""
+
+    outlines: list[Array]
+    kind: Array
+    reach: Array
+
+    @classmethod
+    def of(cls, classes: tuple[PillarClass, ...]) -> "_Shapes":
+        number: dict[bytes, int] = {}
+        outlines: list[Array] = []
+        kind = np.zeros(len(classes) + 1, np.int64)
+        for k, made in enumerate(classes, 1):
+            key = np.ascontiguousarray(made.outline, np.int64).tobytes()
+            if key not in number:
+                outlines.append(np.asarray(made.outline, np.int64))
+                number[key] = len(outlines)
+            kind[k] = number[key]
+        return cls(outlines, kind, np.array([0.0, *map(convex.reach, outlines)]))
+
+
+def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcReport:
+    """Check gap, overlap, feature, grid, density and exclusion zones of all pillars and figures as they are drawn.
+
+    Args:
+        foot_nm: (classes,) diameter of each class at its foot, as it comes out of the etch: the gaps there are
+            checked too.
+
+    Accuracy:
+        exact for gap, overlap, feature and grid; density in windows that step by half their size.
+    """
+    shapes = _Shapes.of(plan.classes)
+    features = {k: convex.width(o) * plan.unit_nm for k, o in enumerate(shapes.outlines, 1)}
+    report = DrcReport.empty(plan, rules)
+    for lattice in plan.lattices:
+        counts, density = _count(plan, lattice, rules, report)
+        _features(plan, lattice, rules, (shapes, features, counts), report)
+        _gaps(plan, lattice, rules, (shapes, counts), report, foot_nm)
+        report.maximum_density = max(report.maximum_density, density)
+    _off_grid(plan, report)
+    figures_kept(plan, rules, report)
+    in_zones(plan, rules, report, _SHOWN)
+    structures_apart(plan, rules, report)
+    return report
+
+
+def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) -> tuple[Array, float]:
+    """Pillars of each class, and the largest density of any window; dense windows are reported."""
+    side = max(1, round(rules.density_window_um * 1e3 / plan.unit_nm / lattice.pitch / 2))
+    tiles = (math.ceil(lattice.rows / side) + 1, math.ceil(lattice.columns / side) + 1)
+    area = np.array([0.0, *(polygon.twice_area(made.outline) / 2 for made in plan.classes)])
+    counts, cover = np.zeros(len(area), np.int64), np.zeros(tiles)
+    for first, block in lattice.blocks(max(1, _BLOCK_SITES // lattice.columns)):
+        drc_loops.count_and_cover(block, first, area, side, counts, cover)
+    report.pillars += int(counts[1:].sum())
+    windows = cover[:-1, :-1] + cover[1:, :-1] + cover[:-1, 1:] + cover[1:, 1:]
+    share = windows / (2.0 * side * lattice.pitch) ** 2
+    for i, j in np.argwhere(share > rules.maximum_density):
+        x, y = lattice.x0 + j * side * lattice.pitch, lattice.y0 - i * side * lattice.pitch
+        box = (int(x), int(y) - 2 * side * lattice.pitch, int(x) + 2 * side * lattice.pitch, int(y))
+        report.add("density", 1, Violation("density", box, float(share[i, j]), rules.maximum_density, lattice.name))
+    return counts, float(share.max(initial=0.0))
+
+
+def _features(
+    plan: MaskPlan, lattice: Lattice, rules: Rules, found: tuple[_Shapes, dict[int, float], Array], report: DrcReport
+) -> None:
+    shapes, features, counts = found
+    used = np.flatnonzero(counts[1:]) + 1
+    for k in used.tolist():
+        report.minimum_feature_nm = min(report.minimum_feature_nm, features[int(shapes.kind[k])])
+    bad = [k for k in used.tolist() if features[int(shapes.kind[k])] < rules.minimum_feature_nm - 1e-9]
+    for k in bad:
+        report.add("feature", int(counts[k]), None)
+    for x, y, k in itertools.islice(_sites_of(lattice, bad), _SHOWN):
+        width = features[int(shapes.kind[k])]
+        box = _box(plan.classes[k - 1].outline, x, y)
+        report.add("feature", 0, Violation("feature", box, width, rules.minimum_feature_nm, plan.classes[k - 1].name))
+
+
+def _sites_of(lattice: Lattice, classes: list[int]) -> Iterator[tuple[int, int, int]]:
+    """(x, y, class) of all sites of these classes."""
+    if not classes:
+        return
+    for first, block in lattice.blocks(max(1, _BLOCK_SITES // lattice.columns)):
+        for row, column in np.argwhere(np.isin(block, classes)).tolist():
+            yield *_place(lattice, first + row, column), int(block[row, column])
+
+
+def _gaps(
+    plan: MaskPlan,
+    lattice: Lattice,
+    rules: Rules,
+    found: tuple[_Shapes, Array],
+    report: DrcReport,
+    foot_nm: Array | None,
+) -> None:
+    """Measure each kind of pair that can be closer than the rule, or closer than all others."""
+    shapes, counts = found
+    kinds = np.unique(shapes.kind[1:][counts[1:] > 0])
+    if not len(kinds):
+        return
+    if len(kinds) > _MOST_KINDS:
+        raise ProcessError(f"{len(kinds)} different outlines, the check takes {_MOST_KINDS}; raise diameter_step_nm")
+    narrow = np.zeros(len(shapes.outlines) + 1, np.int64)
+    narrow[kinds] = np.arange(1, len(kinds) + 1)
+    kind, outlines = narrow[shapes.kind], [shapes.outlines[k - 1] for k in kinds]
+    widest = float(shapes.reach[kinds].max())
+    limit = rules.minimum_gap_nm / plan.unit_nm
+    foot = np.zeros(len(kinds) + 1)
+    if foot_nm is not None:
+        np.maximum.at(foot, kind[1:][counts[1:] > 0], foot_nm[counts[1:] > 0])
+    reach = max(2 * widest + limit, (foot.max() + rules.minimum_foot_gap_nm) / plan.unit_nm)
+    offsets = _offsets(lattice.pitch, reach)
+    table = np.zeros((len(offsets), len(kinds) + 1, len(kinds) + 1), np.int64)
+    for block, new, _ in _with_rows_above(lattice, int(offsets[:, 1].max())):
+        drc_loops.pair_histogram(block, new, kind, offsets, table)
+    bad, least = _measure(table, offsets * lattice.pitch, outlines, limit)
+    report.minimum_gap_nm = min(report.minimum_gap_nm, least * plan.unit_nm)
+    if bad:
+        _report_gaps(plan, lattice, (kind, offsets, table), bad, report)
+    if foot_nm is not None:
+        _feet(lattice, rules, (offsets, table, foot), report)
+
+
+def _feet(lattice: Lattice, rules: Rules, pairs: tuple[Array, Array, Array], report: DrcReport) -> None:
+    """Gaps between round feet, for each kind of pair; one violation is listed for each lattice."""
+    offsets, table, foot = pairs
+    m, a, b = np.nonzero(table)
+    standing = (a > 0) & (b > 0)
+    m, a, b = m[standing], a[standing], b[standing]
+    gaps = np.hypot(*offsets[m].T) * lattice.pitch * report.unit_nm - (foot[a] + foot[b]) / 2
+    least = float(gaps.min(initial=math.inf))
+    report.minimum_foot_gap_nm = min(report.minimum_foot_gap_nm, least)
+    bad = gaps < rules.minimum_foot_gap_nm - 1e-9
+    if bad.any():
+        box = (lattice.x0, lattice.y0 - lattice.rows * lattice.pitch, lattice.x0 + lattice.columns * lattice.pitch)
+        text = f"feet of etched pillars in {lattice.name}"
+        report.add("foot", int(table[m[bad], a[bad], b[bad]].sum()), None)
+        report.add("foot", 0, Violation("foot", (*box, lattice.y0), least, rules.minimum_foot_gap_nm, text))
+
+
+def _offsets(pitch: int, reach: float) -> Array:
+    """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each opposite pair; at least four."""
+    n = max(1, int(reach // pitch))
+    steps = [
+        (i, j)
+        for j in range(n + 1)
+        for i in range(-n, n + 1)
+        if (j > 0 or i > 0) and (max(abs(i), j) == 1 or math.hypot(i, j) * pitch < reach)
+    ]
+    return np.array(steps)
+
+
+def _with_rows_above(lattice: Lattice, above: int) -> Iterator[tuple[Array, int, int]]:
+    """(block with up to ``above`` rows of the block before it, number of those rows, row number of its first)."""
+    kept = None
+    for first, block in lattice.blocks(max(above, _BLOCK_SITES // lattice.columns, 1)):
+        whole = block if kept is None else np.concatenate([kept, block])
+        new = len(whole) - len(block)
+        yield whole, new, first - new
+        kept = whole[-above:].copy()
+
+
+def _measure(
+    table: Array, moves: Array, outlines: list[Array], limit: float
+) -> tuple[dict[tuple[int, int, int], float], float]:
+    """{(offset, kind, kind): gap} below the limit, and the least gap of all, in database units."""
+    reach = np.array([0.0, *map(convex.reach, outlines)])
+    m, a, b = np.nonzero(table)
+    standing = (a > 0) & (b > 0)
+    m, a, b = m[standing], a[standing], b[standing]
+    least_possible = np.hypot(*moves[m].T) - reach[a] - reach[b]
+    bad: dict[tuple[int, int, int], float] = {}
+    least = math.inf
+    for i in np.argsort(least_possible, kind="stable"):
+        if least_possible[i] >= max(limit, least):
+            break
+        key = int(m[i]), int(a[i]), int(b[i])
+        gap = convex.gap(outlines[key[1] - 1], outlines[key[2] - 1], int(moves[m[i], 0]), int(moves[m[i], 1]))
+        least = min(least, gap)
+        if gap < limit - 1e-9:
+            bad[key] = gap
+    return bad, least
+
+
+def _report_gaps(
+    plan: MaskPlan,
+    lattice: Lattice,
+    pairs: tuple[Array, Array, Array],
+    bad: dict[tuple[int, int, int], float],
+    report: DrcReport,
+) -> None:
+    kind, offsets, table = pairs
+    marked = np.zeros(table.shape, bool)
+    for key, gap in bad.items():
+        marked[key] = True
+        report.add("overlap" if gap <= 0 else "gap", int(table[key]), None)
+    found = np.empty((_SHOWN, 3), np.int64)
+    for block, new, first in _with_rows_above(lattice, int(offsets[:, 1].max())):
+        count = drc_loops.find_pairs(block, new, kind, offsets, marked, found, 0)
+        for row, column, m in found[:count].tolist():
+            right, up = offsets[m].tolist()
+            one, two = int(block[row, column]), int(block[row - up, column + right])
+            gap = bad[m, int(kind[one]), int(kind[two])] * plan.unit_nm
+            here = _box(plan.classes[one - 1].outline, *_place(lattice, first + row, column))
+            there = _box(plan.classes[two - 1].outline, *_place(lattice, first + row - up, column + right))
+            box = (min(here[0], there[0]), min(here[1], there[1]), max(here[2], there[2]), max(here[3], there[3]))
+            text = f"{plan.classes[one - 1].name} to {plan.classes[two - 1].name} in {lattice.name}"
+            rule = "overlap" if gap <= 0 else "gap"
+            report.add(rule, 0, Violation(rule, box, max(gap, 0.0), plan.unit_nm * report.limit_gap, text))
+        if sum(v.rule in ("gap", "overlap") for v in report.violations) >= _SHOWN:
+            return
+
+
+def _off_grid(plan: MaskPlan, report: DrcReport) -> None:
+    grid = plan.grid
+    for made in plan.classes:
+        for shape in made.polygons:
+            if (np.asarray(shape) % grid).any():
+                report.add("off-grid", 1, Violation("off-grid", _box(shape, 0, 0), 0.0, float(grid), made.name))
+    for lattice in plan.lattices:
+        if lattice.pitch % grid or lattice.x0 % grid or lattice.y0 % grid:
+            box = (lattice.x0, lattice.y0, lattice.x0, lattice.y0)
+            report.add("off-grid", 1, Violation("off-grid", box, 0.0, float(grid), lattice.name))
+    for figure in plan.figures:
+        for shape in itertools.chain.from_iterable(figure.polygons.values()):
+            if (np.asarray(shape) % grid).any():
+                report.add("off-grid", 1, Violation("off-grid", _box(shape, 0, 0), 0.0, float(grid), figure.name))
+
+
+def _place(lattice: Lattice, row: int, column: int) -> tuple[int, int]:
+    return lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.pitch
+
+
+def _box(outline: Array, x: int, y: int) -> tuple[int, int, int, int]:
+    low, high = outline.min(0), outline.max(0)
+    return x + int(low[0]), y + int(low[1]), x + int(high[0]), y + int(high[1])

@@ -1,0 +1,99 @@
+"""What a design-rule check found."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from layout.process import Rules
+
+
+class HasUnit(Protocol):
+    """A mask that knows its database unit."""
+
+    @property
+    def unit_nm(self) -> float:
+        """Database unit."""
+        ...
+
+
+RULES = ("gap", "overlap", "foot", "feature", "off-grid", "density", "exclusion", "structures")
+MOST_SHOWN = 500  # of one rule
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """One place where a rule is broken.
+
+    box: (left, bottom, right, top) around it, database units. value, limit: found and allowed (nm, or a share).
+    text: the cells that are concerned.
+    """
+
+    rule: str
+    box: tuple[int, int, int, int]
+    value: float
+    limit: float
+    text: str
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Middle of the box, database units."""
+        return (self.box[0] + self.box[2]) / 2, (self.box[1] + self.box[3]) / 2
+
+
+@dataclass(eq=False, slots=True)
+class DrcReport:
+    """Result of the check.
+
+    pillars: all that were checked. counts: {rule: violations}, all of them; ``violations`` lists up to 500 of each.
+    minimum_gap_nm, minimum_foot_gap_nm, minimum_feature_nm: the smallest found (inf where there is none).
+    maximum_density: of any window.
+    limits: {rule: limit}. limit_gap: in database units.
+    """
+
+    unit_nm: float
+    limits: Mapping[str, float]
+    limit_gap: float
+    pillars: int = 0
+    minimum_gap_nm: float = math.inf
+    minimum_foot_gap_nm: float = math.inf
+    minimum_feature_nm: float = math.inf
+    maximum_density: float = 0.0
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RULES, 0))
+    violations: list[Violation] = field(default_factory=list)
+
+    @classmethod
+    def empty(cls, plan: HasUnit, rules: Rules) -> "DrcReport":
+        """A report before the first finding."""
+        limits = {
+            "gap": rules.minimum_gap_nm,
+            "overlap": 0.0,
+            "foot": rules.minimum_foot_gap_nm,
+            "feature": rules.minimum_feature_nm,
+            "off-grid": float(rules.grid_nm),
+            "density": rules.maximum_density,
+            "exclusion": 0.0,
+            "structures": rules.minimum_gap_nm,
+        }
+        return cls(plan.unit_nm, limits, rules.minimum_gap_nm / plan.unit_nm)
+
+    @property
+    def ok(self) -> bool:
+        """Whether no rule is broken."""
+        return not any(self.counts.values())
+
+    def add(self, rule: str, count: int, violation: Violation | None) -> None:
+        """Count violations; list one."""
+        self.counts[rule] += count
+        if violation is not None and sum(v.rule == rule for v in self.violations[-MOST_SHOWN:]) < MOST_SHOWN:
+            self.violations.append(violation)
+
+    @property
+    def summary(self) -> str:
+        """One line for a person."""
+        found = ", ".join(f"{count} {rule}" for rule, count in self.counts.items() if count)
+        return (
+            f"{self.pillars} pillars: smallest gap {self.minimum_gap_nm:.1f} nm, "
+            f"thinnest {self.minimum_feature_nm:.1f} nm, density up to {self.maximum_density:.1%}; "
+            + (f"violations: {found}" if found else "no violation")
+        )

@@ -1,0 +1,21 @@
+"""Polygons, no process."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from layout.shapes import convex as convex
+    from layout.shapes import polygon as polygon
+    from layout.shapes import rectilinear as rectilinear
+    from layout.shapes import region as region
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "convex": "",
+        "rectilinear": "",
+        "region": "",
+        "polygon": "",
+    },
+)

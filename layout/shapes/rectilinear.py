@@ -1,0 +1,50 @@
+"""Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
+
+import itertools
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+
+def rectangles(points: Array) -> Array:
+    """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by slab.
+
+    Raises:
+        ProcessError: an edge that is neither horizontal nor vertical.
+    """
+    start, end = np.asarray(points, np.int64), np.roll(np.asarray(points, np.int64), -1, axis=0)
+    if ((start != end).all(axis=1)).any():
+        raise ProcessError("a shape with slanted edges where horizontal and vertical ones are needed")
+    upright = start[:, 0] == end[:, 0]
+    x = start[upright, 0]
+    low, high = np.minimum(start, end)[upright, 1], np.maximum(start, end)[upright, 1]
+    levels = np.unique(points[:, 1])
+    found = []
+    for bottom, top in zip(levels[:-1].tolist(), levels[1:].tolist(), strict=True):
+        cut = np.sort(x[(low <= bottom) & (high >= top)])
+        found += [(left, bottom, right, top) for left, right in zip(cut[::2].tolist(), cut[1::2].tolist(), strict=True)]
+    return np.array(found, np.int64).reshape(-1, 4)
+
+
+def cut(boxes: Array, side: float, grid: int) -> tuple[Array, Array]:
+    """Boxes (n, 4) cut on the grid to sides of some ``side`` at most: (m, 4), and (m,) the box of each."""
+    pieces: list[tuple[int, int, int, int]] = []
+    of: list[int] = []
+    for n, (left, bottom, right, top) in enumerate(np.asarray(boxes).tolist()):
+        xs, ys = _steps(left, right, side, grid), _steps(bottom, top, side, grid)
+        pieces += [(a, c, b, d) for a, b in itertools.pairwise(xs) for c, d in itertools.pairwise(ys)]
+        of += [n] * (len(pieces) - len(of))
+    return np.array(pieces, np.int64).reshape(-1, 4), np.array(of, np.int64)
+
+
+def _steps(low: int, high: int, side: float, grid: int) -> list[int]:
+    count = max(1, int(np.ceil((high - low) / side)))
+    return np.unique(low + np.rint(np.linspace(0, high - low, count + 1) / grid).astype(np.int64) * grid).tolist()  # type: ignore[no-any-return]
+
+
+def corners(box: Array) -> Array:
+    """(4, 2) corners of left, bottom, right, top, counter-clockwise."""
+    left, bottom, right, top = np.asarray(box).tolist()
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])

@@ -1,0 +1,35 @@
+"""Solids that ``metalens layout`` writes beside the mask: pillars of a window, and the module that holds the lens."""
+
+from pathlib import Path
+
+from layout.files import Window
+from layout.process import Process
+from layout.solid import verbs as solid
+from metalens.lens import Lens
+
+
+def write_stl(lens: Lens, process: Process, target: Path, window: Window) -> list[Path]:
+    """``pillars.stl``: the tapered pillars of the window, watertight.
+
+    And ``pillars.3mf`` and ``pillars.glb`` where they may hold as many (:data:`layout.solid.verbs.LIMITS`).
+    """
+    pillars = _tile(lens, process, window)
+    made = [target / "pillars.stl"]
+    solid.write_stl(made[0], pillars)
+    for form, write, name in (("3MF", solid.write_3mf, "pillars.3mf"), ("glTF", solid.write_gltf, "pillars.glb")):
+        if len(pillars.kind) <= solid.LIMITS[form]:
+            write(target / name, pillars)
+            made.append(target / name)
+    return made
+
+
+def write_step(lens: Lens, process: Process, target: Path, window: Window) -> list[Path]:
+    """``pillars.step`` of the window, and ``module.step``: filter, mount, die with aperture, sensor, flex."""
+    pillars, whole = target / "pillars.step", target / "module.step"
+    solid.write_step(pillars, _tile(lens, process, window))
+    solid.write_module(whole, solid.around(lens, process))
+    return [pillars, whole]
+
+
+def _tile(lens: Lens, process: Process, window: Window) -> solid.Tile:
+    return solid.tile(lens, process, side_um=window.size_um, centre_um=(window.x_um, window.y_um))

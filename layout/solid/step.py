@@ -1,0 +1,164 @@
+"""STEP assemblies with shared instances, labels and colours, the same bytes for the same input.
+
+The CAD kernel writes shapes and structure; occurrences are renumbered and colours added here, since the kernel counts
+on from file to file and writes colours in the order of memory addresses.
+"""
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from layout.solid.tile import Tile, check_count
+from metalens.ground import store
+from metalens.ground.errors import ProcessError
+
+_TIME = "2000-01-01T00:00:00"  # in the header of every file
+_SOLID = re.compile(
+    r"PRODUCT\('([^']*)','|ADVANCED_BREP_SHAPE_REPRESENTATION\s*\(\s*'[^']*'\s*,\s*\(\s*#\d+\s*,\s*#(\d+)\s*\)\s*,\s*#(\d+)"
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Piece:
+    """A solid of the CAD kernel (``wrapped``, at its own origin) and the locations at which it stands.
+
+    places: (x, y, z) in the unit of the file. colour: red, green, blue from 0 to 1.
+    """
+
+    label: str
+    wrapped: Any
+    colour: tuple[float, float, float]
+    places: Sequence[tuple[float, float, float]]
+
+
+def write_step(path: str | Path, pillars: Tile) -> None:
+    """STEP (AP214) of an assembly ``metalens tile`` of tapered pillars on a slab of substrate.
+
+    Each class of pillars is stored once. Modelled in um, where the kernel's tolerance (1e-7) is far below a
+    pillar, and written in mm as STEP readers expect.
+
+    Raises:
+        ProcessError: too many pillars (a square that would do is named). OSError: the target cannot be written.
+    """
+    check_count(pillars, "STEP")
+    from build123d import Solid
+
+    half_x, half_y = (float(abs(v - v.mean()).max()) + pillars.pitch_um / 2 for v in (pillars.x_um, pillars.y_um))
+    corner = (float(pillars.x_um.mean()) - half_x, float(pillars.y_um.mean()) - half_y, -1.0)
+    pieces = [Piece("substrate", Solid.make_box(2 * half_x, 2 * half_y, 1.0).wrapped, (0.75, 0.85, 0.95), [corner])]
+    for kind, name in enumerate(pillars.names):
+        here = pillars.kind == kind
+        places = [(x, y, 0.0) for x, y in zip(pillars.x_um[here].tolist(), pillars.y_um[here].tolist(), strict=True)]
+        shape = _pillar(float(pillars.foot_um[kind]), float(pillars.top_um[kind]), pillars.height_um)
+        pieces.append(Piece(name, shape, (0.25, 0.35, 0.75), places))
+    write_pieces(path, "metalens tile", pieces, unit_m=1e-6)
+
+
+def write_pieces(path: str | Path, label: str, pieces: Sequence[Piece], *, unit_m: float) -> None:
+    """Write an assembly of placed solids; the numbers are in ``unit_m`` metres, the file in mm.
+
+    Raises:
+        ProcessError: the kernel could not write. OSError: the target cannot be written.
+    """
+    from OCP.gp import gp_Trsf, gp_Vec
+    from OCP.TopLoc import TopLoc_Location
+
+    document, shapes = _document(unit_m)
+    root = shapes.NewShape()
+    _name(root, label)
+    for piece in pieces:
+        stored = shapes.AddShape(piece.wrapped, False)
+        _name(stored, piece.label)
+        for place in piece.places:
+            move = gp_Trsf()
+            move.SetTranslation(gp_Vec(*place))
+            shapes.AddComponent(root, stored, TopLoc_Location(move))
+    shapes.UpdateAssemblies()
+    with store.replacing(path) as part:
+        if not _write(document, part):
+            raise ProcessError(f"{path}: the CAD kernel could not write the STEP file; is the disk full?")
+        text = part.read_text(encoding="utf-8")
+        part.write_text(_painted(_renumbered(text), {p.label: p.colour for p in pieces}), encoding="utf-8")
+
+
+def _pillar(foot_um: float, top_um: float, height_um: float) -> Any:
+    from build123d import Solid
+
+    if abs(foot_um - top_um) < 1e-6:
+        return Solid.make_cylinder(foot_um / 2, height_um).wrapped
+    return Solid.make_cone(foot_um / 2, top_um / 2, height_um).wrapped
+
+
+def _document(unit_m: float) -> tuple[Any, Any]:
+    """(document, its tool for shapes)."""
+    from OCP.TCollection import TCollection_ExtendedString
+    from OCP.TDocStd import TDocStd_Document
+    from OCP.XCAFApp import XCAFApp_Application
+    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+
+    document = TDocStd_Document(TCollection_ExtendedString("XmlOcaf"))
+    XCAFApp_Application.GetApplication_s().NewDocument(TCollection_ExtendedString("MDTV-XCAF"), document)
+    XCAFDoc_DocumentTool.SetLengthUnit_s(document, unit_m)
+    shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
+    shapes.SetAutoNaming_s(False)
+    return document, shapes
+
+
+def _name(label: Any, text: str) -> None:
+    from OCP.TCollection import TCollection_ExtendedString
+    from OCP.TDataStd import TDataStd_Name
+
+    TDataStd_Name.Set_s(label, TCollection_ExtendedString(text))
+
+
+def _write(document: Any, path: Path) -> bool:
+    from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
+    from OCP.IFSelect import IFSelect_ReturnStatus
+    from OCP.Message import Message, Message_Gravity
+    from OCP.STEPCAFControl import STEPCAFControl_Writer
+    from OCP.STEPControl import STEPControl_StepModelType
+    from OCP.TCollection import TCollection_HAsciiString
+
+    for printer in Message.DefaultMessenger_s().Printers():
+        printer.SetTraceLevel(Message_Gravity.Message_Fail)  # else it prints statistics
+    writer = STEPCAFControl_Writer()
+    writer.SetNameMode(True)
+    writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
+    header = APIHeaderSection_MakeHeader(writer.Writer().Model())
+    header.SetTimeStamp(TCollection_HAsciiString(_TIME))
+    return bool(writer.Write(str(path)) == IFSelect_ReturnStatus.IFSelect_RetDone)
+
+
+def _renumbered(text: str) -> str:
+    """Occurrences counted from 1."""
+    count = itertools.count(1)
+    found = r"NEXT_ASSEMBLY_USAGE_OCCURRENCE\('\d+'"
+    return re.sub(found, lambda _: f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{next(count)}'", text)
+
+
+def _painted(text: str, colours: dict[str, tuple[float, float, float]]) -> str:
+    """Colours of the solids, by the name of their product (ISO 10303-46 surface styles)."""
+    end = text.rindex("ENDSEC;")
+    number = itertools.count(1 + max(int(n) for n in re.findall(r"^#(\d+) = ", text, re.MULTILINE)))
+    lines, product = [], ""
+    for name, solid, context in _SOLID.findall(text):
+        product = name or product
+        if not solid or product not in colours:
+            continue
+        n = [next(number) for _ in range(9)]
+        red, green, blue = colours[product]
+        lines += [
+            f"#{n[0]} = COLOUR_RGB('',{red:.6f},{green:.6f},{blue:.6f});",
+            f"#{n[1]} = FILL_AREA_STYLE_COLOUR('',#{n[0]});",
+            f"#{n[2]} = FILL_AREA_STYLE('',(#{n[1]}));",
+            f"#{n[3]} = SURFACE_STYLE_FILL_AREA(#{n[2]});",
+            f"#{n[4]} = SURFACE_SIDE_STYLE('',(#{n[3]}));",
+            f"#{n[5]} = SURFACE_STYLE_USAGE(.BOTH.,#{n[4]});",
+            f"#{n[6]} = PRESENTATION_STYLE_ASSIGNMENT((#{n[5]}));",
+            f"#{n[7]} = STYLED_ITEM('color',(#{n[6]}),#{solid});",
+            f"#{n[8]} = MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION('',(#{n[7]}),#{context});",
+        ]
+    return text[:end] + "\n".join(lines) + "\n" + text[end:]

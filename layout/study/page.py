@@ -1,0 +1,143 @@
+"""Sections of a mask's report on what the process does to the light: stitching, tolerance, tolerant choice."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from layout.mask import FieldPlan
+from layout.process import Process
+from layout.study import stitching, tolerance, tolerant
+from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.stitching import StitchReport
+from layout.study.tolerance import ToleranceReport
+from metalens.ground import report
+from metalens.ground.arrays import Array
+from metalens.ground.report import Figure, Section, Table
+from metalens.lens import Lens
+from metalens.made import Spread
+
+CHOICE_RAD = (0.1, 0.2, 0.3)
+
+
+def sections(lens: Lens, process: Process, plan: FieldPlan, *, answers: Sensitivities | None = None) -> list[Section]:
+    """The three sections; half a minute for a 1 mm lens, most of it for the solver and the Monte Carlo.
+
+    answers: of the pillars to height, wall and index; left out: from the solver.
+
+    Raises:
+        CellError, MaterialError: from the solver of the pillar.
+    """
+    answers = sensitivities(lens) if answers is None else answers
+    return [_stitching(lens, plan, process), _tolerance(lens, process, answers), _choice(lens, process, answers)]
+
+
+def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
+    found = stitching.stitching(lens, plan, process)
+    rows = [
+        ["peak of the PSF", float(found.strehl.mean()), float(found.strehl.min())],
+        ["change of the PSF, relative L2", float(found.change.mean()), float(found.change.max())],
+        ["move of its centroid / nm", float(found.moved_nm.mean()), float(found.moved_nm.max())],
+    ]
+    text = (
+        f"Each of {found.fields} fields misplaced by up to ±{found.stitching_nm:g} nm along x and y, evenly spread, "
+        f"{len(found.strehl)} draws; the common shift, which only moves the image, is taken out."
+    )
+    items: list[Figure | Table] = [
+        Figure(_stitched(found), "The focus, and what the worst draw changes in it.", wide=True),
+        Table(("", "mean", "worst"), rows, digits=5),
+    ]
+    return Section("Stitching", text, items)
+
+
+def _stitched(found: StitchReport) -> bytes:
+    from scipy.signal import resample
+
+    perfect, worst = (
+        resample(resample(image, 6 * image.shape[0], axis=0), 6 * image.shape[1], axis=1)
+        for image in (found.psf, found.worst_psf)
+    )
+    figure, axes = report.canvas(1, 2, size=(7.8, 3.2))
+    edge = float(found.window.x_um[-1])
+    extent = (-edge, edge, edge, -edge)
+    level = 10 * np.log10(np.maximum(perfect / perfect.max(), 1e-5))
+    change = 100 * (worst - perfect) / perfect.max()
+    most = float(abs(change).max())
+    pictures = [
+        axes[0].imshow(level, extent=extent, vmin=-40, vmax=0),
+        axes[1].imshow(change, extent=extent, vmin=-most, vmax=most, cmap="RdBu_r"),
+    ]
+    for ax, shown, title, unit in zip(axes, pictures, ("perfect fields", "change"), ("dB", "% of peak"), strict=True):
+        ax.set(title=title, xlabel="x / µm", ylabel="y / µm")
+        ax.grid(visible=False)
+        figure.colorbar(shown, ax=ax, label=unit)
+    return report.png(figure)
+
+
+def _tolerance(lens: Lens, process: Process, answers: Sensitivities) -> Section:
+    study = tolerance.analyse(lens, process, sens=answers)
+    rows = [
+        [e.cause, e.deviation, e.phase_rad, *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information))]
+        for e in study.effects
+    ]
+    head = ("cause", "deviation", "phase / rad", "peak / %", "efficiency / %", "PSF / %", "I(z) / %")
+    bands = [
+        [name, *(float(v) for v in study.band(name)), float(getattr(study.nominal, name)[0])]
+        for name in ("strehl", "efficiency", "psf_change")
+    ]
+    text = (
+        "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
+        f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
+        f"differences of the solver (known to {100 * answers.error:.0f} %), the diameter through the proxy; the "
+        f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
+    )
+    items: list[Figure | Table] = [
+        Table(head, rows, "Effect of each cause. I(z): axial information (Eq. 11), summed over the depths.", digits=3),
+        Figure(
+            _bands(study), "5 to 95 % of the draws (shade, bars), median, and the designed lens (dashes).", wide=True
+        ),
+        Table(("", "5 %", "50 %", "95 %", "as designed"), bands),
+    ]
+    return Section("Tolerance", text, items)
+
+
+def _bands(study: ToleranceReport) -> bytes:
+    from scipy.signal import resample
+
+    figure, axes = report.canvas(1, 2, size=(7.8, 3.0))
+    x = study.window.x_um
+    fine = np.arange(8 * len(x)) * (x[1] - x[0]) / 8 + x[0]
+    low, middle, high = (_finer(curve, resample(curve, len(fine))) for curve in study.band("psf"))
+    axes[0].fill_between(fine, low, high, alpha=0.3)
+    axes[0].plot(fine, middle)
+    axes[0].plot(fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8)
+    reach = 8 * float(x[1] - x[0])
+    axes[0].set(xlabel="x / µm", ylabel="intensity / designed peak", xlim=(-reach, reach))
+    low, middle, high = study.band("information")
+    depth = study.depths_um / 1e3
+    axes[1].errorbar(depth, middle, [middle - low, high - middle], fmt="o", capsize=4)
+    axes[1].plot(depth, study.nominal.information[0], "k_", ms=14)
+    axes[1].set(xlabel="depth / mm", ylabel="I(z) / µm⁻²", yscale="log")
+    return report.png(figure)
+
+
+def _finer(samples: Array, interpolated: Array) -> Array:
+    """Intensity between samples; interpolation may dip below zero by its ripple."""
+    return np.asarray(np.clip(interpolated, 0, 1.05 * samples.max()))
+
+
+def _choice(lens: Lens, process: Process, answers: Sensitivities) -> Section:
+    sigma = max(process.spread.bias_nm, 1.0)
+    only = replace(process, spread=Spread.only(bias_nm=sigma))
+    before = tolerance.analyse(lens, only, sens=answers, draws=10).effects[0]
+    rows: list[list[float | str]] = [["as designed", 0.0, "-", before.phase_rad, 100 * before.psf]]
+    for allowed in CHOICE_RAD:
+        chosen = tolerant.choose(lens, process, tolerance_rad=allowed)
+        after = tolerance.analyse(chosen.lens, only, sens=answers, draws=10).effects[0]
+        spread = f"{chosen.before:.4f} → {chosen.after:.4f}"
+        rows.append([f"within {allowed} rad", chosen.phase_error_rad, spread, after.phase_rad, 100 * after.psf])
+    head = ("choice", "phase error / rad", "spread of d ln t/dD per nm", "phase / rad", "PSF / %")
+    text = (
+        "Several diameters often do for one phase. Taking those whose light answers most alike to the bias costs some "
+        f"phase and buys tolerance; effect of a bias of ±{sigma:g} nm."
+    )
+    return Section("Tolerant choice", text, [Table(head, rows, digits=3)])

@@ -1,0 +1,112 @@
+"""A lens reduced to what draws of its process need: few sums over the pillars, weighted anew for each draw.
+
+A draw changes t of every pillar through a local bias b(x) and, for the whole lens, through what all pillars answer
+alike (height, wall, index). Over all such changes the curve t(D) stays in a space of few dimensions, found by a
+singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are summed once for each B_k; a draw
+only weights these sums, at the nodes of :mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.study.focus import Focus
+from layout.study.sensitivity import Sensitivities
+from metalens.ground.arrays import Array
+from metalens.lens import Lens
+from metalens.made import Draw, Spread, State, draws, transmission
+
+_ENTRY_UM = 5e-5  # resolution of the diameters in the table
+_BAND = 64
+_LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss
+_DEGREE = 10  # of the dependence on the local bias
+_SAMPLES = 160
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Model:
+    """Sums over the pillars of a lens for all draws of its process.
+
+    diameter_um, count: (entries,) of the pillars, to 0.05 nm. basis: (rank, entries) B_k, orthonormal over pillars.
+    moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
+    """
+
+    lens: Lens
+    sens: Sensitivities
+    focus: Focus
+    diameter_um: Array
+    count: Array
+    basis: Array
+    moments: Array
+    radius_um: float
+
+    def drawn(self, lenses: Sequence[State]) -> Array:
+        """(lenses, nodes y, nodes x) moments of lenses that a process makes of this one."""
+        x, y = self.focus.nodes_x_um / self.radius_um, self.focus.nodes_y_um[:, None] / self.radius_um
+        knots = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+        found = []
+        for state in lenses:
+            bias = state.bias_um(x, y)
+            middle, half = (bias.max() + bias.min()) / 2, (bias.max() - bias.min()) / 2 + 1e-9
+            curves = curve(self.lens, self.sens, self.diameter_um, middle + half * knots, state)
+            weights = (curves * self.count) @ self.basis.conj().T
+            series = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
+            at_nodes = np.polynomial.chebyshev.chebval((bias - middle) / half, series)
+            moments = (at_nodes * self.moments).sum(0)
+            found.append(moments * np.exp(1j * state.phase_rad(x, y)) if state.bends() else moments)
+        return np.stack(found)
+
+
+def reduce(lens: Lens, sens: Sensitivities, focus: Focus, spread: Spread, *, seed: int) -> Model:
+    """Find the basis from random draws of the spread, and sum the pillars for each of its functions."""
+    index, diameter, count = _table(lens)
+    states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
+    rng = np.random.default_rng(seed)
+    place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
+    angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
+    u, v = place * np.cos(angle), place * np.sin(angle)
+    curves = [
+        curve(lens, sens, diameter, state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)
+    ]
+    weight = np.sqrt(count)
+    size, directions = np.linalg.svd(np.stack(curves) * weight, full_matrices=False)[1:]
+    missed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+    rank = max(1, int((missed > _LEFT_OUT).sum()))
+    basis = directions[:rank] / weight
+    columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
+    moments = np.zeros((rank, len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
+    for start in range(0, len(index), _BAND):
+        band = slice(start, min(start + _BAND, len(index)))
+        moments += focus.project(columns[:, index[band]], band)
+    return Model(lens, sens, focus, diameter, count, basis, moments, lens.diameters.radius_um)
+
+
+def missed(model: Model, lenses: Sequence[Draw]) -> float:
+    """Largest rms relative error of t over the pillars in any draw, at the centre and on both sides of the edge."""
+    worst = 0.0
+    for draw in lenses:
+        state, along = draw.state(), np.array([0.0, 1.0, -1.0])
+        bias = state.bias_um(along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad))
+        curves = curve(model.lens, model.sens, model.diameter_um, bias, state)
+        weights = (curves * model.count) @ model.basis.conj().T
+        rest = (abs(curves - weights @ model.basis) ** 2) @ model.count / (abs(curves) ** 2 @ model.count)
+        worst = max(worst, float(np.sqrt(rest.max())))
+    return worst
+
+
+def curve(lens: Lens, sens: Sensitivities, diameter_um: Array, bias_um: Array, state: State) -> Array:
+    """(bias, diameters) complex t of pillars for local biases and one made lens."""
+    d = diameter_um + np.reshape(bias_um, (-1, 1))
+    return transmission(lens.proxy, sens, d, lens.wavelength_um, state.answers())
+
+
+def _table(lens: Lens) -> tuple[Array, Array, Array]:
+    """((y, x) entry of each site, 0 none; (entries,) diameters from entry 1 on; how many of each)."""
+    raw = np.rint(lens.diameters.diameter_um / _ENTRY_UM).astype(np.int32)
+    count = np.bincount(raw.ravel())
+    count[0] = 0
+    used = np.flatnonzero(count)
+    position = np.zeros(len(count), np.int32)
+    position[used] = np.arange(1, len(used) + 1)
+    return position[raw], used * _ENTRY_UM, count[used]

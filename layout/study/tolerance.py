@@ -1,0 +1,181 @@
+"""What the spread of the process does to a lens: effect of each cause, and Monte Carlo with confidence bands."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.process import Process
+from layout.study.focus import Window, peak, prepare, window
+from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.spread_model import Model, curve, missed, reduce
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+from metalens.lens import Lens
+from metalens.made import DRAWN, Draw, State, spread
+
+DEPTH_STEP_UM = 200.0  # of the finite difference in the paper's Eq. 11
+DEPTHS_UM = (16e3, 21e3, 26e3)
+_BATCH = 25
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Outcome:
+    """What is looked at, for draws of the process; the first axis counts them.
+
+    strehl: (draws,) peak at the design depth relative to the nominal lens.
+    efficiency: (draws,) share of the light on the aperture that reaches the window.
+    psf_change: (draws,) relative L2 change of the PSF at the design depth from the nominal one.
+    information: (draws, depths) axial Fisher information of the normalised PSF (paper Eq. 11), 1 / um^2.
+    psf: (draws, x) intensity along x through the middle at the design depth, 1 at the nominal peak.
+    """
+
+    strehl: Array
+    efficiency: Array
+    psf_change: Array
+    information: Array
+    psf: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One cause at its standard deviation, both signs; the worse of the two for each number.
+
+    phase_rad: rms change of the pillars' phases about their mean. transmission: rms change of |T|.
+    strehl, efficiency, information (summed over the depths): relative change; psf: relative L2 change.
+    """
+
+    cause: str
+    deviation: float
+    phase_rad: float
+    transmission: float
+    strehl: float
+    efficiency: float
+    psf: float
+    information: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ToleranceReport:
+    """Result of :func:`analyse`.
+
+    effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte Carlo.
+    depths_um: of the information; window: where the light was looked at.
+    rank: dimensions of the space of t(D). error: largest rms relative error of t over the pillars in any draw.
+    """
+
+    effects: tuple[Effect, ...]
+    nominal: Outcome
+    draws: Outcome
+    depths_um: Array
+    window: Window
+    rank: int
+    error: float
+    seed: int
+
+    def band(self, name: str, percent: tuple[float, ...] = (5, 50, 95)) -> Array:
+        """(percent, ...) percentiles of a quantity of :class:`Outcome` over the draws."""
+        return np.asarray(np.percentile(getattr(self.draws, name), percent, axis=0))
+
+
+def analyse(
+    lens: Lens,
+    process: Process,
+    *,
+    sens: Sensitivities | None = None,
+    depths_um: tuple[float, ...] = DEPTHS_UM,
+    draws: int = 100,
+    seed: int = 0,
+) -> ToleranceReport:
+    """Effects of each cause at its standard deviation (``process.spread``), and Monte Carlo over all of them.
+
+    Args:
+        sens: answers to height, wall and index; left out: from the RCWA solver.
+        depths_um: where the axial information is wanted; the design source is always looked at as well.
+
+    Accuracy: see ``error`` of the report (measured); bands of percentiles carry the sampling error of ``draws``.
+
+    Raises:
+        ProcessError: fewer than 10 draws.
+    """
+    if draws < 10:
+        raise ProcessError(f"draws = {draws}: need 10 or more for confidence bands")
+    sens = sensitivities(lens) if sens is None else sens
+    every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + DEPTH_STEP_UM))])
+    focus = prepare(lens, window(lens, depths_um=every))
+    model = reduce(lens, sens, focus, process.spread, seed=seed)
+    single = [Draw({name: sign * s}) for name, s in process.spread.values().items() for sign in (-1, 1)]
+    everything = [Draw({}), *single, *spread.draws(process.spread, draws, seed=seed + 1)]
+    outcome = _outcome(model, [draw.state() for draw in everything])
+    nominal, alone, many = (
+        _part(outcome, part) for part in (slice(0, 1), slice(1, 1 + len(single)), slice(1 + len(single), None))
+    )
+    effects = tuple(
+        _effect(model, tuple(single[2 * n : 2 * n + 2]), _part(alone, slice(2 * n, 2 * n + 2)), nominal)
+        for n in range(len(DRAWN))
+    )
+    error = missed(model, everything)
+    return ToleranceReport(effects, nominal, many, np.array(depths_um), focus.window, len(model.basis), error, seed)
+
+
+def _outcome(model: Model, lenses: list[State]) -> Outcome:
+    """Everything that is looked at, lens by lens; the first is the nominal one."""
+    view = model.focus.window
+    incident = model.count.sum() * model.lens.diameters.pitch_um**2
+    parts, reference = [], np.zeros((1, 1))
+    for start in range(0, len(lenses), _BATCH):
+        light = model.focus.light(model.drawn(lenses[start : start + _BATCH]))
+        psf = abs(light) ** 2
+        design = psf[:, 0]
+        if start == 0:
+            reference = design[0]
+        unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
+        steps = (unit[:, 1::2] - unit[:, ::2]) / DEPTH_STEP_UM
+        parts.append(
+            (
+                peak(design) / peak(reference),
+                design.sum((1, 2)) * view.cell_um2 / incident,
+                np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
+                (steps**2).sum((2, 3)),
+                design[:, len(view.y_um) // 2] / reference.max(),
+            )
+        )
+    return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _part(outcome: Outcome, rows: slice) -> Outcome:
+    every = (outcome.strehl, outcome.efficiency, outcome.psf_change, outcome.information, outcome.psf)
+    return Outcome(*(values[rows] for values in every))
+
+
+def _effect(model: Model, signs: tuple[Draw, ...], found: Outcome, nominal: Outcome) -> Effect:
+    """The worse of both signs of one cause; pillar statistics at the bias that the cause has at the edge."""
+    ((cause, deviation),) = signs[1].amounts.items()
+    changes = [_pillar_change(model, draw.state()) for draw in signs]
+
+    def worst(values: Array, reference: Array) -> float:
+        return float(abs(values / reference - 1).max())
+
+    return Effect(
+        cause=cause,
+        deviation=deviation,
+        phase_rad=max(phase for phase, _ in changes),
+        transmission=max(level for _, level in changes),
+        strehl=worst(found.strehl, nominal.strehl),
+        efficiency=worst(found.efficiency, nominal.efficiency),
+        psf=float(found.psf_change.max()),
+        information=worst(found.information.sum(1), nominal.information.sum(1)),
+    )
+
+
+def _pillar_change(model: Model, state: State) -> tuple[float, float]:
+    """(rms phase change about the mean, rms change of |T|) over pillars spread evenly over the aperture."""
+    radius, angle = np.sqrt((np.arange(64) + 0.5) / 64), np.arange(64) * np.pi * (3 - np.sqrt(5))
+    u, v = radius * np.cos(angle), radius * np.sin(angle)
+    lens, sens, d = model.lens, model.sens, model.diameter_um
+    before, after = curve(lens, sens, d, np.zeros(1), State.of()), curve(lens, sens, d, state.bias_um(u, v), state)
+    weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
+    turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
+    turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))
+    phase = np.angle(turn)
+    level = abs(after) - abs(before)
+    return float(np.sqrt((phase**2 * weight).sum())), float(np.sqrt((level**2 * weight).sum()))

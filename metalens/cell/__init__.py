@@ -1,0 +1,39 @@
+"""What a pillar cell is: geometry, materials, propagating orders, the answer of a solver."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.cell import materials as materials
+    from metalens.cell import shapes as shapes
+    from metalens.cell.lattice import Lattice as Lattice
+    from metalens.cell.materials import index as index
+    from metalens.cell.materials import slope as slope
+    from metalens.cell.orders import check_subwavelength as check_subwavelength
+    from metalens.cell.record import Blend as Blend
+    from metalens.cell.record import Cell as Cell
+    from metalens.cell.record import Film as Film
+    from metalens.cell.record import Index as Index
+    from metalens.cell.record import Layer as Layer
+    from metalens.cell.record import Material as Material
+    from metalens.cell.response import Response as Response
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Blend": "record",
+        "Cell": "record",
+        "Film": "record",
+        "Index": "record",
+        "Lattice": "lattice",
+        "Layer": "record",
+        "Material": "record",
+        "Response": "response",
+        "check_subwavelength": "orders",
+        "index": "materials",
+        "materials": "",
+        "shapes": "",
+        "slope": "materials",
+    },
+)

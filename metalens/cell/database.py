@@ -1,0 +1,191 @@
+"""Pages of the refractiveindex.info database as they come: dispersion formulas 1 to 9 and tables nk, n or k in YAML.
+
+Wavelengths in um. A page without k is that of a transparent material: k = 0. Where n and k have their own ranges, both
+must hold. The formulas are those of the database's own description (https://refractiveindex.info/about).
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaterialError
+
+LEAST = {1: 3, 2: 3, 3: 3, 4: 5, 5: 3, 6: 3, 7: 2, 8: 3, 9: 3}  # coefficients without which a formula says nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Formula:
+    """n of a wavelength by one of the nine formulas; it holds from range_um[0] to range_um[1]."""
+
+    number: int
+    coefficients: tuple[float, ...]
+    range_um: tuple[float, float]
+
+    def at(self, wavelength_um: float) -> tuple[complex, complex]:
+        """n and dn/d(wavelength_um), the latter by a complex step (exact to rounding).
+
+        Raises:
+            MaterialError: the formula gives no real index there.
+        """
+        step = 1e-20
+        n = self._index(complex(wavelength_um, step))
+        if not (math.isfinite(n.real) and n.real > 0 and abs(n.imag) < 1e-6):
+            raise MaterialError(
+                f"formula {self.number} gives n = {n.real:g} at {wavelength_um} um: no real index there"
+            )
+        return complex(n.real), complex(n.imag / step)
+
+    def _index(self, w: complex) -> complex:
+        c = self.coefficients
+        first, pairs = c[0], list(zip(c[1::2], c[2::2], strict=False))
+        w2 = w * w
+        if self.number == 1:
+            return complex(np.sqrt(1 + first + sum(b * w2 / (w2 - d * d) for b, d in pairs)))
+        if self.number == 2:
+            return complex(np.sqrt(1 + first + sum(b * w2 / (w2 - d) for b, d in pairs)))
+        if self.number == 3:
+            return complex(np.sqrt(first + sum(b * w**d for b, d in pairs)))
+        if self.number == 4:
+            return self._rational(w)
+        if self.number == 5:
+            return complex(first + sum(b * w**d for b, d in pairs))
+        if self.number == 6:
+            return complex(1 + first + sum(b / (d - w**-2) for b, d in pairs))
+        return self._rare(w)
+
+    def _rational(self, w: complex) -> complex:
+        """n² = c1 + c2 w^c3 / (w² - c4^c5) + c6 w^c7 / (w² - c8^c9) + c10 w^c11 + ..."""
+        c = self.coefficients
+        square: complex = complex(c[0])
+        for start in (1, 5):
+            if len(c) > start:
+                a, p, b, q = (*c[start : start + 4], 0.0, 0.0, 0.0)[:4]
+                square += a * w**p / (w * w - b**q)
+        return complex(np.sqrt(square + sum(a * w**p for a, p in zip(c[9::2], c[10::2], strict=False))))
+
+    def _rare(self, w: complex) -> complex:
+        """Formulas 7 (Herzberger), 8 (Lorentz-Lorenz) and 9."""
+        c = (*self.coefficients, *(0.0,) * 6)
+        w2 = w * w
+        if self.number == 7:
+            near = 1 / (w2 - 0.028)
+            return c[0] + c[1] * near + c[2] * near**2 + c[3] * w2 + c[4] * w2**2 + c[5] * w2**3
+        if self.number == 8:
+            polar = c[0] + c[1] * w2 / (w2 - c[2]) + c[3] * w2
+            return complex(np.sqrt((1 + 2 * polar) / (1 - polar)))
+        square = c[0] + c[1] / (w2 - c[2])
+        if len(self.coefficients) > 3:
+            square += c[3] * (w - c[4]) / ((w - c[4]) ** 2 + c[5])
+        return complex(np.sqrt(square))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Table:
+    """Straight lines between rows: (2, rows) wavelength_um and values."""
+
+    rows: Array
+
+    @property
+    def range_um(self) -> tuple[float, float]:
+        """First and last wavelength."""
+        return float(self.rows[0, 0]), float(self.rows[0, -1])
+
+    def at(self, wavelength_um: float) -> tuple[complex, complex]:
+        """Value and slope."""
+        x, y = self.rows
+        i = int(np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2))
+        rate = (y[i + 1] - y[i]) / (x[i + 1] - x[i])
+        return complex(y[i] + rate * (wavelength_um - x[i])), complex(rate)
+
+
+Part = Formula | Table
+
+
+def read(text: str, where: str) -> tuple[Part, Part | None, str]:
+    """n, k (None: transparent) and the source in words of a page.
+
+    Raises:
+        MaterialError: not such a page, an unknown formula, a bad row (``where`` and the row are named).
+    """
+    try:
+        page = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise MaterialError(f"{where}: not YAML: {str(error).splitlines()[0]}") from None
+    blocks = page.get("DATA") if isinstance(page, dict) else None
+    if not isinstance(blocks, list):
+        raise MaterialError(f"{where}: no list DATA; need a page of refractiveindex.info")
+    n: Part | None = None
+    k: Part | None = None
+    for block in blocks:
+        kind = str(block.get("type", ""))
+        if kind.startswith("formula"):
+            n = _formula(block, kind, where)
+        elif kind.startswith("tabulated"):
+            columns = kind.split()[-1]
+            table = _rows(str(block.get("data", "")), len(columns) + 1, f"{where}, {kind}")
+            if columns not in ("nk", "n", "k"):
+                raise MaterialError(f"{where}: type {kind!r}, need tabulated nk, n or k")
+            n = Table(table[:2]) if "n" in columns else n
+            k = Table(table[[0, -1]]) if "k" in columns else k
+    if n is None:
+        raise MaterialError(f"{where}: neither a formula nor a table of n; need one of them")
+    return n, k, _source(page)
+
+
+def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
+    numbers = str(block.get("coefficients", "")).split()
+    span = str(block.get("wavelength_range", block.get("range", ""))).split()
+    try:
+        number, values, ends = int(kind.split()[-1]), tuple(map(float, numbers)), tuple(map(float, span))
+    except ValueError:
+        raise MaterialError(f"{where}, {kind}: coefficients or wavelength_range are not numbers") from None
+    if number not in LEAST or len(values) < LEAST[number] or len(ends) != 2:
+        raise MaterialError(
+            f"{where}, {kind}: {len(values)} coefficients, range {span}; need formula 1 to 9 with its coefficients and "
+            "two ends of wavelength_range"
+        )
+    return Formula(number, values, (ends[0], ends[1]))
+
+
+def _rows(text: str, width: int, where: str) -> Array:
+    rows = []
+    for i, line in enumerate(filter(str.strip, text.splitlines()), 1):
+        try:
+            row = [float(v) for v in line.replace(",", " ").split()]
+        except ValueError:
+            row = []
+        if len(row) != width or not all(map(math.isfinite, row)) or row[0] <= 0:
+            raise MaterialError(f"{where}, row {i}: {line.strip()!r}; need {width} finite numbers, wavelength in um")
+        rows.append(row)
+    table = np.array(rows).reshape(-1, width).T
+    if table.size:
+        table = table[:, np.argsort(table[0], kind="stable")]
+    if table.shape[1] < 2 or (np.diff(table[0]) <= 0).any():
+        raise MaterialError(f"{where}: {table.shape[1]} rows; need two or more at distinct wavelengths")
+    return np.asarray(table)
+
+
+def _source(page: dict[str, Any]) -> str:
+    """References and comments without markup, in one line."""
+    import re
+
+    parts = [str(page.get(key, "")) for key in ("REFERENCES", "COMMENTS")]
+    plain = re.sub(r"<[^>]+>", "", " ".join(parts))
+    return " ".join(plain.split()) or "a page of refractiveindex.info"
+
+
+def load(path: Path, where: str) -> tuple[Part, Part | None, str]:
+    """:func:`read` of a file.
+
+    Raises:
+        MaterialError: also where the file is missing or no text.
+    """
+    try:
+        return read(path.read_text(encoding="utf-8-sig"), where)
+    except (OSError, UnicodeDecodeError) as error:
+        raise MaterialError(f"{where}: not a readable text file ({error}); need a YAML page") from None

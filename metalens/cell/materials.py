@@ -1,0 +1,326 @@
+"""Refractive index of the materials of a cell: published ones with source and range, own CSV or YAML, plain numbers.
+
+YAML files are pages of refractiveindex.info (:mod:`metalens.cell.database`).
+Time factor exp(-iwt): an absorbing material has k > 0. Nothing is extrapolated.
+"""
+
+import csv
+import importlib.resources
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from metalens import cell
+from metalens.cell import database
+from metalens.cell.database import Part
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaterialError, nearest
+
+COLUMNS = ("wavelength_um", "n", "k")
+_WAVELENGTHS = {"wavelength_um": 1.0, "wavelength, um": 1.0, "wavelength, µm": 1.0, "wl": 1.0, "wavelength_nm": 1e-3}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Material:
+    """Optical constants of one material.
+
+    name, source: what it is, and where the numbers come from.
+    range_um: shortest and longest vacuum wavelength for which they hold.
+    table: (3, rows) wavelength_um, n, k; empty for a Sellmeier material.
+    sellmeier: ((B, resonance_um), ...) of n² = 1 + sum B l² / (l² - resonance²); empty for a table.
+    page: n, and k where it is not 0, of a database page instead.
+    """
+
+    name: str
+    source: str
+    range_um: tuple[float, float]
+    table: Array
+    sellmeier: tuple[tuple[float, float], ...] = ()
+    page: tuple[Part, ...] = ()
+
+
+_TABLES = {
+    "a-Si": "a-Si.csv",
+    "Si": "Si.csv",
+}
+_NO_TABLE = np.empty((3, 0))
+_FORMULAS = {
+    "air": Material("air", "vacuum: n = 1 by definition", (0.0, math.inf), _NO_TABLE),
+    "SiO2": Material(
+        "SiO2",
+        "fused silica at 20 C: I. H. Malitson, J. Opt. Soc. Am. 55, 1205 (1965); used up to 3.71 um",
+        (0.21, 3.71),
+        _NO_TABLE,
+        ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161)),
+    ),
+}
+_PAGES = {  # deposited films where the database has them, bulk else; o and e: ordinary and extraordinary ray
+    "TiO2": "TiO2_Siefke",
+    "TiO2-sputtered": "TiO2_Sarkar",
+    "TiO2-rutile-o": "TiO2_Devore-o",
+    "TiO2-rutile-e": "TiO2_Devore-e",
+    "Si3N4": "Si3N4_Luke",
+    "SiN": "Si3N4_Vogt-1",
+    "GaN": "GaN_Barker-o",
+    "GaN-e": "GaN_Barker-e",
+    "sapphire": "Al2O3_Malitson-o",
+    "sapphire-e": "Al2O3_Malitson-e",
+    "Al2O3": "Al2O3_Boidin",
+    "Ge": "Ge_Nunley",
+    "Ge-infrared": "Ge_Burnett",
+    "HfO2": "HfO2_Al-Kuhaili",
+    "ITO": "ITO_Konig",
+    "N-BK7": "SCHOTT_N-BK7",
+    "Borofloat33": "SCHOTT_BOROFLOAT33",
+    "D263": "SCHOTT_D263TECO",
+    "PMMA": "PMMA_Beadie",
+    "SU-8": "SU-8-2000_specs",
+    "polycarbonate": "polycarbonate_Sultanova",
+    "polystyrene": "polystyrene_Sultanova",
+    "MgF2": "MgF2_Dodge-o",
+    "MgF2-e": "MgF2_Dodge-e",
+    "CaF2": "CaF2_Malitson",
+    "Au": "Au_Johnson",
+    "Ag": "Ag_Jiang",
+    "Al": "Al_Cheng",
+    "Cr": "Cr_Sytchkova",
+    "TiN": "TiN_Beliaev-ALD",
+    "Nb2O5": "Nb2O5_Lemarchand",
+    "Ta2O5": "Ta2O5_Gao",
+    "GaAs": "GaAs_Papatryfonos",
+    "GaP": "GaP_Khmelevskaia",
+    "AlN": "AlN_Beliaev1",
+    "ZnS": "ZnS_Amotchkina",
+    "c-Si": "Si_Schinke",
+    "Si-infrared": "Si_Li-293K",
+}
+NAMES = tuple(sorted((*_TABLES, *_FORMULAS, *_PAGES)))
+
+
+def index(material: cell.Material | Material, wavelength_um: float) -> complex:
+    """Refractive index n + ik at a vacuum wavelength.
+
+    Args:
+        material: a name of ``NAMES``, the path of a CSV file (:func:`read_csv`) or of a YAML page of
+            refractiveindex.info, plain numbers (``cell.Index``), a ``cell.Blend``, or a ``Material``.
+        wavelength_um: vacuum wavelength.
+
+    Accuracy: that of the source. Between the rows of a table n and k are straight lines in the wavelength (the
+        slope jumps at the rows).
+
+    Raises:
+        MaterialError: unknown name, unreadable CSV, or a wavelength outside the range of the source.
+
+    >>> round(index("SiO2", 0.85).real, 4)
+    1.4525
+    """
+    return _index_and_slope(material, wavelength_um)[0]
+
+
+def slope(material: cell.Material | Material, wavelength_um: float) -> complex:
+    """Dispersion d(n + ik)/d(wavelength_um), with the arguments and errors of :func:`index`."""
+    return _index_and_slope(material, wavelength_um)[1]
+
+
+def material(name: str) -> Material:
+    """The record behind a name of ``NAMES`` or behind the path of a CSV file.
+
+    Raises:
+        MaterialError: the name is unknown, or the file cannot be used.
+    """
+    if name in _FORMULAS:
+        return _FORMULAS[name]
+    if name in _TABLES or name in _PAGES:
+        return _shipped(name)
+    path = Path(name)
+    if path.suffix.lower() in (".yml", ".yaml"):
+        return read_yaml(path)
+    if path.suffix.lower() == ".csv" or len(path.parts) > 1:
+        return read_csv(path)
+    raise MaterialError(f"unknown material {name!r}{_hint(name)}; or give the path of a CSV file or of a page (.yml)")
+
+
+def _hint(name: str) -> str:
+    """The same name in another case, one that it begins with, or the nearest."""
+    lower = name.lower().replace(" ", "").replace("_", "-")
+    same = [known for known in NAMES if known.lower() == lower]
+    return f"; did you mean {same[0]!r}?" if same else nearest(name, NAMES)
+
+
+def read_yaml(path: str | Path) -> Material:
+    """A material from a page of refractiveindex.info.
+
+    Raises:
+        MaterialError: no such file, or no such page; see :mod:`metalens.cell.database`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MaterialError(f"{path}: no such file; need a YAML page of refractiveindex.info")
+    stat = path.stat()
+    return _read_yaml(path, (stat.st_mtime_ns, stat.st_size))
+
+
+@lru_cache(maxsize=64)
+def _read_yaml(path: Path, stamp: tuple[int, int]) -> Material:
+    return _of_page(database.load(path, str(path)), str(path))
+
+
+def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
+    n, k, source = page
+    low, high = n.range_um
+    if k is not None:
+        low, high = max(low, k.range_um[0]), min(high, k.range_um[1])
+    if low >= high:
+        raise MaterialError(f"{name}: n and k hold at no common wavelength")
+    return Material(name, source, (low, high), _NO_TABLE, (), (n,) if k is None else (n, k))
+
+
+def read_csv(path: str | Path) -> Material:
+    """A material from a CSV file with the columns wavelength_um, n, k; lines that open with # are comments.
+
+    Raises:
+        MaterialError: no such file, a missing column, or a bad row; the message gives the line.
+    """
+    path = Path(path)
+    try:
+        stat = path.stat()
+    except OSError:
+        raise MaterialError(f"{path}: no such file; need a CSV with columns {', '.join(COLUMNS)}") from None
+    return _read_csv(path, (stat.st_mtime_ns, stat.st_size))
+
+
+@lru_cache(maxsize=64)
+def _read_csv(path: Path, stamp: tuple[int, int]) -> Material:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise MaterialError(f"{path}: not a readable text file ({error}); need a CSV table") from None
+    return _parse(text, name=str(path), where=str(path))
+
+
+@lru_cache(maxsize=64)
+def _shipped(name: str) -> Material:
+    if name in _PAGES:
+        file = importlib.resources.files("metalens") / "data" / "materials" / f"{_PAGES[name]}.yml"
+        return _of_page(database.read(file.read_text(encoding="utf-8"), file.name), name)
+    text = (importlib.resources.files("metalens") / "data" / _TABLES[name]).read_text(encoding="utf-8")
+    return _parse(text, name=name, where=_TABLES[name])
+
+
+def _parse(text: str, *, name: str, where: str) -> Material:
+    lines = text.splitlines()
+    comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
+    body = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if not body:
+        raise MaterialError(f"{where}: empty; need a header {','.join(COLUMNS)} and at least two rows")
+    body = _unstacked(body, where)
+    header = [field.strip().lower().replace("μ", "µ") for field in next(csv.reader([body[0][1]]))]
+    place = next((header.index(column) for column in _WAVELENGTHS if column in header), None)
+    missing = [] if place is not None else ["wavelength_um"]
+    missing += [] if "n" in header else ["n"]
+    if missing or place is None:
+        raise MaterialError(f"{where}, line {body[0][0]}: no column {', '.join(missing)} in {header}; need {COLUMNS}")
+    scale = _WAVELENGTHS[header[place]]
+    order = [place, header.index("n"), header.index("k") if "k" in header else -1]
+    rows = [_row(line, order, len(header), f"{where}, line {i}", scale) for i, line in body[1:]]
+    _check_rows(rows, [i for i, _ in body[1:]], where)
+    table = np.array(rows).T
+    return Material(name, " ".join(comments) or f"the file {where}", (table[0, 0], table[0, -1]), table)
+
+
+def _unstacked(body: list[tuple[int, str]], where: str) -> list[tuple[int, str]]:
+    """The rows of a file whose k follows its n as a second table (as refractiveindex.info exports) in one table."""
+    heads = [i for i, (_, line) in enumerate(body) if line.replace(" ", "").lower().startswith("wl,")]
+    if len(heads) != 2:
+        return body
+    first, second = body[: heads[1]], body[heads[1] + 1 :]
+    waves = [line.split(",")[0].strip() for _, line in first[1:]]
+    if waves != [line.split(",")[0].strip() for _, line in second]:
+        raise MaterialError(f"{where}, line {body[heads[1]][0]}: n and k stand at different wavelengths; need the same")
+    rows = [(i, f"{line},{other.split(',')[1]}") for (i, line), (_, other) in zip(first[1:], second, strict=True)]
+    return [(first[0][0], "wl,n,k"), *rows]
+
+
+def _row(line: str, order: list[int], width: int, where: str, scale: float) -> list[float]:
+    fields = next(csv.reader([line]))
+    if len(fields) != width:
+        raise MaterialError(f"{where}: {len(fields)} fields, the header has {width}")
+    try:
+        values = [float(fields[column]) if column >= 0 else 0.0 for column in order]
+    except ValueError:
+        raise MaterialError(f"{where}: {line!r} is not numbers; need wavelength_um, n, k") from None
+    wavelength_um, n, k = values = [values[0] * scale, *values[1:]]
+    if not (all(math.isfinite(v) for v in values) and wavelength_um > 0 and n > 0 and k >= 0):
+        raise MaterialError(f"{where}: {line!r}; need finite wavelength_um > 0, n > 0 and k >= 0 (exp(-iwt))")
+    return values
+
+
+def _check_rows(rows: list[list[float]], numbers: list[int], where: str) -> None:
+    if len(rows) < 2:
+        raise MaterialError(f"{where}: {len(rows)} rows of numbers; need at least two")
+    for before, after, number in zip(rows, rows[1:], numbers[1:], strict=False):
+        if after[0] <= before[0]:
+            raise MaterialError(
+                f"{where}, line {number}: wavelength {after[0]} um follows {before[0]} um; need increasing wavelengths"
+            )
+
+
+def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> tuple[complex, complex]:
+    if not (math.isfinite(wavelength_um) and wavelength_um > 0):
+        raise MaterialError(f"wavelength {wavelength_um} um: need a finite length above 0")
+    if isinstance(wanted, cell.Index):
+        return complex(wanted.n, wanted.k), 0j
+    if isinstance(wanted, cell.Blend):
+        return _blended(wanted, wavelength_um)
+    record = material(wanted) if isinstance(wanted, str) else wanted
+    low, high = record.range_um
+    if not low <= wavelength_um <= high:
+        raise MaterialError(
+            f"{record.name} at {wavelength_um} um: its source holds from {low} to {high} um ({record.source}); "
+            "choose a wavelength inside, another material, or plain n and k"
+        )
+    if record.page:
+        n, k = (record.page[0].at(wavelength_um), record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0))
+        return complex(n[0].real, max(0.0, k[0].real)), complex(n[1].real, k[1].real)
+    if record.table.size:
+        return _from_table(record, wavelength_um)
+    return _from_sellmeier(record, wavelength_um)
+
+
+def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
+    """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) / (a + 2 e) + (1 - f) (b - e) /
+    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b; then the offsets."""
+    base, base_rate = _index_and_slope(wanted.base, wavelength_um)
+    n, rate = base, base_rate
+    if wanted.other:
+        other, other_rate = _index_and_slope(wanted.other, wavelength_um)
+        f = 1 - wanted.share
+        a, b, da, db = base**2, other**2, 2 * base * base_rate, 2 * other * other_rate
+        h, dh = (3 * f - 1) * a + (2 - 3 * f) * b, (3 * f - 1) * da + (2 - 3 * f) * db
+        root = np.sqrt(h * h + 8 * a * b + 0j)
+        e, de = (h + root) / 4, (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
+        n = complex(np.sqrt(e))
+        rate = complex(de / (2 * n))
+    n += complex(wanted.n_offset, wanted.k_offset)
+    if n.real <= 0 or n.imag < 0:
+        raise MaterialError(f"blend of {wanted.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0")
+    return n, rate
+
+
+def _from_sellmeier(record: Material, wavelength_um: float) -> tuple[complex, complex]:
+    """n² = 1 + sum B l² / (l² - c²), and d(n²)/dl = -2 l sum B c² / (l² - c²)²."""
+    l2 = wavelength_um**2
+    n = math.sqrt(1 + sum(b * l2 / (l2 - c * c) for b, c in record.sellmeier))
+    rate = -wavelength_um / n * sum(b * c * c / (l2 - c * c) ** 2 for b, c in record.sellmeier)
+    return complex(n), complex(rate)
+
+
+def _from_table(record: Material, wavelength_um: float) -> tuple[complex, complex]:
+    x, n, k = record.table
+    i = int(np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2))
+    rate = complex(n[i + 1] - n[i], k[i + 1] - k[i]) / (x[i + 1] - x[i])
+    share = (wavelength_um - x[i]) / (x[i + 1] - x[i])
+    return complex(n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]), rate

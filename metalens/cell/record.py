@@ -1,0 +1,159 @@
+"""The unit cell: one pillar of any shape on its lattice, between a substrate and a cover."""
+
+import math
+from dataclasses import dataclass, field
+
+from metalens.cell.lattice import Lattice
+from metalens.cell.shapes import Outline
+from metalens.cell.shapes.every import Shape
+from metalens.cell.shapes.round import Circle
+from metalens.ground.errors import CellError
+
+
+@dataclass(frozen=True, slots=True)
+class Index:
+    """A refractive index given as plain numbers, the same at every wavelength (exp(-iwt): k >= 0 absorbs)."""
+
+    n: float
+    k: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.n > 0 and math.isfinite(self.n) and self.k >= 0 and math.isfinite(self.k)):
+            raise CellError(f"refractive index {self.n}+{self.k}i: need finite n > 0 and k >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Blend:
+    """A deposited film: a material with offsets, or mixed with another (Bruggeman's effective medium).
+
+    base, other: names or files of materials; share: volume of ``other``. n_offset, k_offset: added to the result.
+    """
+
+    base: str
+    other: str = ""
+    share: float = 0.0
+    n_offset: float = 0.0
+    k_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1 or (self.share > 0 and not self.other):
+            raise CellError(f"blend share = {self.share} of {self.other!r}: need 0 to 1, and the name of the other")
+        if not (math.isfinite(self.n_offset) and math.isfinite(self.k_offset)):
+            raise CellError(f"blend offsets {self.n_offset}, {self.k_offset}: need finite numbers")
+
+
+Material = str | Index | Blend  # a name known to metalens.materials, the path of a CSV or YAML file, numbers, a blend
+
+
+@dataclass(frozen=True, slots=True)
+class Film:
+    """A homogeneous layer of a coating or substrate stack."""
+
+    material: Material
+    thickness_um: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.thickness_um) and self.thickness_um >= 0):
+            raise CellError(f"film thickness {self.thickness_um} um: need a finite value >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One section of a layered pillar: a pedestal, the pillar itself, the residual mask on it.
+
+    height_um: of the section. grow_um: its width less that of the mask, along every edge pair.
+    material: of the section; None for that of the cell's pillar. between: likewise, around it.
+    coat_um, coat: a conformal film on its wall.
+    """
+
+    height_um: float
+    grow_um: float = 0.0
+    material: Material | None = None
+    between: Material | None = None
+    coat_um: float = 0.0
+    coat: Material | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.height_um) and self.height_um > 0):
+            raise CellError(f"layer height_um = {self.height_um}: need a finite length above 0")
+        if not (math.isfinite(self.grow_um) and math.isfinite(self.coat_um) and self.coat_um >= 0):
+            raise CellError(f"layer grow_um = {self.grow_um}, coat_um = {self.coat_um}: need finite lengths, coat >= 0")
+        if (self.coat_um > 0) != (self.coat is not None):
+            raise CellError(f"layer coat_um = {self.coat_um} with coat = {self.coat!r}: need both or neither")
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One pillar; light comes from the substrate and leaves into the cover.
+
+    pitch_um: lattice constant (along x).
+    height_um: of the pillar.
+    pillar, substrate, cover, between: materials (``between`` fills the space around the pillar).
+    sidewall_rad: tilt of the wall from the vertical, above 0 where the foot is wider than the top; the
+        diameter of a pillar is the one at half its height.
+    under, over: films between substrate and pillar, and between pillar and cover, in the order that the
+        light meets them.
+    shape: of the section; its size is what other stages call the diameter.
+    lattice: how the pillar repeats.
+    layers: sections of the pillar, foot first, whose heights add up to ``height_um``; none: one section.
+    """
+
+    pitch_um: float
+    height_um: float = 0.7
+    pillar: Material = "a-Si"
+    substrate: Material = "SiO2"
+    cover: Material = "air"
+    between: Material = "air"
+    sidewall_rad: float = 0.0
+    under: tuple[Film, ...] = ()
+    over: tuple[Film, ...] = ()
+    shape: Shape = field(default_factory=Circle)
+    lattice: Lattice = field(default_factory=Lattice)
+    layers: tuple[Layer, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.pitch_um) and self.pitch_um > 0):
+            raise CellError(f"pitch_um = {self.pitch_um}: need a finite length above 0")
+        if not (math.isfinite(self.height_um) and self.height_um >= 0):
+            raise CellError(f"height_um = {self.height_um}: need a finite length >= 0")
+        if not abs(self.sidewall_rad) < math.pi / 4:
+            raise CellError(f"sidewall_rad = {self.sidewall_rad}: need an angle within +-pi/4")
+        total = sum(layer.height_um for layer in self.layers)
+        if self.layers and abs(total - self.height_um) > 1e-9:
+            raise CellError(f"layers add up to {total:.6g} um, height_um is {self.height_um:.6g}: need the same height")
+
+    @property
+    def round(self) -> bool:
+        """Whether it is a plain round pillar on a square lattice, tilted wall and films allowed."""
+        return (
+            isinstance(self.shape, Circle) and not self.shape.hole and self.lattice.kind == "square" and not self.layers
+        )
+
+    @property
+    def described(self) -> str:
+        """Shape, lattice and layers in words."""
+        layers = f" in {len(self.layers)} layers" if self.layers else ""
+        return f"{self.shape.name}{' (hole)' if self.shape.hole else ''} on a {self.lattice.kind} lattice{layers}"
+
+    @property
+    def sections(self) -> tuple[Layer, ...]:
+        """The layers, or the one section that the pillar is."""
+        return self.layers or (Layer(self.height_um),)
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of a pillar of this size, wider by ``grow_um``."""
+        return self.shape.outline(size_um, grow_um=grow_um)
+
+    def widest_um(self, gap_um: float) -> float:
+        """The size at which neighbours are this far apart (0 where even the thinnest are nearer)."""
+        if self.round:
+            return self.pitch_um - gap_um
+        low, high = 0.0, 4 * self.pitch_um
+        while high - low > 1e-4 * self.pitch_um:
+            middle = (low + high) / 2
+            low, high = (middle, high) if self.gap_um(middle) > gap_um else (low, middle)
+        return round(low, 4)
+
+    def gap_um(self, size_um: float, *, grow_um: float = 0.0) -> float:
+        """Least distance between neighbouring pillars of this size; 0 where they touch."""
+        return self.outline(size_um, grow_um=grow_um).gap_um(self.lattice.steps_um(self.pitch_um))

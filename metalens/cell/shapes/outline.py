@@ -1,0 +1,196 @@
+"""The section of a pillar of a given size: signed ellipses and polygons, with everything that follows from them.
+
+Whatever asks for area, Fourier factors, boundary or mask polygon asks here; a new shape only says which ellipses and
+polygons it is made of. Lengths in um, +x right, +y down, the site of the pillar at the origin.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+
+Point = tuple[float, float]
+_ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
+_PROBES = np.array([[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]])  # over the radius, no two alike
+
+
+@dataclass(frozen=True, slots=True)
+class Conic:
+    """An ellipse about the origin with half axes a (along x before the turn) and b; sign -1 cuts it out."""
+
+    half_x_um: float
+    half_y_um: float
+    angle_rad: float = 0.0
+    sign: int = 1
+
+    @property
+    def area_um2(self) -> float:
+        """pi a b, with its sign."""
+        return self.sign * math.pi * self.half_x_um * self.half_y_um
+
+    def fourier(self, gx: Array, gy: Array) -> Array:
+        """∫ exp(-i g r) d²r = pi a b 2 J1(s) / s, s = |(a gx', b gy')| in the axes of the ellipse."""
+        from scipy.special import j1
+
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = self.half_x_um * (c * gx + s * gy), self.half_y_um * (c * gy - s * gx)
+        x = np.hypot(along, across)
+        safe = np.where(x < 1e-6, 1.0, x)
+        return np.asarray(self.area_um2 * np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe), complex)
+
+    def vertices(self, count: int) -> Array:
+        """(count, 2) points, anticlockwise, of the inscribed polygon with the area of the ellipse."""
+        turn = 2 * np.pi * np.arange(count) / count
+        swell = math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
+        x, y = swell * self.half_x_um * np.cos(turn), swell * self.half_y_um * np.sin(turn)
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        return np.stack([c * x - s * y, s * x + c * y], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A polygon without crossings; sign -1 cuts it out."""
+
+    corners_um: tuple[Point, ...]
+    sign: int = 1
+
+    @property
+    def area_um2(self) -> float:
+        """Half the sum of cross products of neighbouring corners, with the sign of the part."""
+        return self.sign * abs(_signed_area(np.array(self.corners_um)))
+
+    def fourier(self, gx: Array, gy: Array) -> Array:
+        """∫ exp(-i g r) d²r by Green's theorem over the edges: sum of i (g x d) / g² exp(-i g m) sinc(g d / 2).
+
+        m is the middle and d the vector of an edge; below |g| size = 1e-4 the area and the centroid are used.
+        """
+        points = _anticlockwise(np.array(self.corners_um))
+        edge = np.roll(points, -1, axis=0) - points
+        middle = points + edge / 2
+        g = np.stack(np.broadcast_arrays(gx, gy), axis=-1).astype(float)
+        square = (g**2).sum(axis=-1)
+        small = np.sqrt(square) * np.abs(points).max() < 1e-4
+        half = g @ edge.T / 2
+        cross = g[..., :1] * edge[:, 1] - g[..., 1:] * edge[:, 0]
+        total = (cross * np.sinc(half / np.pi) * np.exp(-1j * (g @ middle.T))).sum(axis=-1)
+        area = _signed_area(points)
+        centre = _centroid(points, area)
+        near = area * (1 - 1j * (g @ centre))
+        return np.asarray(self.sign * np.where(small, near, 1j * total / np.where(small, 1.0, square)))
+
+    def vertices(self, count: int) -> Array:
+        """(n, 2) corners, anticlockwise; a polygon needs no more points than it has."""
+        return _anticlockwise(np.array(self.corners_um))
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A section: ellipses and polygons that do not overlap but where one cuts another out.
+
+    parts: with signs; the first is the outermost.
+    """
+
+    parts: tuple[Conic | Loop, ...]
+
+    @property
+    def area_um2(self) -> float:
+        """Of the solid part."""
+        return sum(part.area_um2 for part in self.parts)
+
+    @property
+    def radius_um(self) -> float:
+        """Of the circle about the origin that holds it."""
+        return max(float(np.hypot(*part.vertices(64).T).max()) for part in self.parts)
+
+    def fourier(self, gx: Array, gy: Array) -> Array:
+        """(...) ∫ exp(-i (gx x + gy y)) dx dy over the solid part, um²; exact."""
+        return np.asarray(sum(part.fourier(gx, gy) for part in self.parts))
+
+    def polygons(self, count: int = 64) -> tuple[tuple[int, Array], ...]:
+        """(sign, (n, 2) corners) of every part: what a mask or a solid is made of; ellipses keep their area."""
+        return tuple((part.sign, part.vertices(count)) for part in self.parts)
+
+    def boundary(self, step_um: float) -> tuple[Array, Array]:
+        """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit normals there, out of the part."""
+        points, normals = [], []
+        for part in self.parts:
+            count = max(32, math.ceil(2 * math.pi * self.radius_um / step_um)) if isinstance(part, Conic) else 0
+            corners = part.vertices(count)
+            edge = np.roll(corners, -1, axis=0) - corners
+            for start, d in zip(corners, edge, strict=True):
+                n = max(1, math.ceil(float(np.hypot(*d)) / step_um))
+                points.append(start + (np.arange(n)[:, None] + 0.5) / n * d)
+                normals.append(np.tile([d[1], -d[0]] / np.hypot(*d), (n, 1)))
+        return np.concatenate(points), np.concatenate(normals)
+
+    def inside(self, x_um: Array, y_um: Array) -> Array:
+        """(...) whether points lie in the solid part."""
+        from matplotlib.path import Path as Polygon
+
+        points = np.stack(np.broadcast_arrays(x_um, y_um), axis=-1)
+        depth = np.zeros(points.shape[:-1], int)
+        for sign, corners in self.polygons(256):
+            depth += sign * Polygon(corners).contains_points(points.reshape(-1, 2)).reshape(depth.shape)
+        return np.asarray(depth > 0)
+
+    def keeps(self, flip_x: int, flip_y: int) -> bool:
+        """Whether (x, y) -> (flip_x x, flip_y y), flips +-1, leaves it as it is (judged by its Fourier factors)."""
+        gx, gy = (_PROBES / self.radius_um).T
+        apart = np.abs(self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)).max()
+        return bool(apart <= _ALIKE * self.area_um2)
+
+    def gap_um(self, steps: tuple[Point, ...]) -> float:
+        """Least distance to its copies at these lattice steps; 0 where they touch or overlap (within 1 % of radius)."""
+        from scipy.spatial import cKDTree
+
+        points, _ = self.boundary(self.radius_um / 100)
+        tree, gap = cKDTree(points), math.inf
+        for x, y in steps:
+            if math.hypot(x, y) - 2 * self.radius_um >= gap:
+                continue
+            there = points + np.array([x, y])
+            if self.inside(*there.T).any():
+                return 0.0
+            gap = min(gap, float(tree.query(there)[0].min()))
+        return gap
+
+
+def moved(corners: Array, grow_um: float) -> tuple[Point, ...]:
+    """Corners of the polygon whose edges lie ``grow_um`` / 2 further out, mitred.
+
+    Raises:
+        CellError: so far in that an edge vanishes.
+    """
+    points = _anticlockwise(corners)
+    edge = np.roll(points, -1, axis=0) - points
+    out = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    before = np.roll(out, 1, axis=0)
+    mitre = (out + before) / (1 + (out * before).sum(axis=1))[:, None]
+    made = points + grow_um / 2 * mitre
+    if ((np.roll(made, -1, axis=0) - made) * edge).sum(axis=1).min() <= 0:
+        raise CellError(f"an outline moved in by {-grow_um / 2:.4g} um loses an edge; need a larger size or less bias")
+    return tuple((float(x), float(y)) for x, y in made)
+
+
+def turned(corners: Array, angle_rad: float) -> Array:
+    """(n, 2) corners turned from +x towards +y."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.asarray(corners @ np.array([[c, s], [-s, c]]))
+
+
+def _anticlockwise(points: Array) -> Array:
+    return points if _signed_area(points) > 0 else points[::-1]
+
+
+def _signed_area(points: Array) -> float:
+    x, y = points.T
+    return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+
+
+def _centroid(points: Array, area: float) -> Array:
+    after = np.roll(points, -1, axis=0)
+    cross = points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]
+    return np.asarray(((points + after) * cross[:, None]).sum(axis=0) / (6 * area))

@@ -1,0 +1,155 @@
+"""Sections with straight edges: square, rectangle, cross, regular polygon, and the user's own polygon."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from metalens.cell.shapes.outline import Loop, Outline, Point, moved, turned
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+
+
+def _made(corners: Array, angle_rad: float, grow_um: float) -> Outline:
+    return Outline((Loop(moved(turned(corners, angle_rad), grow_um)),))
+
+
+def _box(width_um: float, depth_um: float) -> Array:
+    return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width_um / 2, depth_um / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an opening in a film."""
+
+    angle_rad: float = 0.0
+    hole: bool = False
+    kind: Literal["square"] = "square"
+
+    @property
+    def name(self) -> str:
+        """In words, for reports."""
+        return "square"
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this edge, wider by ``grow_um``."""
+        return _made(_box(size_um, size_um), self.angle_rad, grow_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """Its size is the edge along x before the turn; ratio: of the other edge to it. hole: an opening in a film."""
+
+    ratio: float
+    angle_rad: float = 0.0
+    hole: bool = False
+    kind: Literal["rectangle"] = "rectangle"
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.ratio <= 100:
+            raise CellError(f"rectangle ratio = {self.ratio}: need the other edge over the size, 0.01 to 100")
+
+    @property
+    def name(self) -> str:
+        """In words, for reports."""
+        return f"rectangle 1:{self.ratio:g}"
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this size, both edges longer by ``grow_um``."""
+        return _made(_box(size_um, self.ratio * size_um), self.angle_rad, grow_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Cross:
+    """Two bars of equal length at right angles; its size is the length. ratio: of the width of a bar to its length."""
+
+    ratio: float = 1 / 3
+    angle_rad: float = 0.0
+    hole: bool = False
+    kind: Literal["cross"] = "cross"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ratio < 1:
+            raise CellError(f"cross ratio = {self.ratio}: need the width over the length of a bar, between 0 and 1")
+
+    @property
+    def name(self) -> str:
+        """In words, for reports."""
+        return f"cross {self.ratio:g}"
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this length, every edge moved out by half of ``grow_um``."""
+        a, b = size_um / 2, self.ratio * size_um / 2
+        corner = np.array([(b, -a), (b, -b), (a, -b)])
+        return _made(
+            np.concatenate([turned(corner, quarter * math.pi / 2) for quarter in range(4)]), self.angle_rad, grow_um
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RegularPolygon:
+    """``sides`` equal edges; its size is the diameter of the circle through the corners, the first corner at +x."""
+
+    sides: int = 6
+    angle_rad: float = 0.0
+    hole: bool = False
+    kind: Literal["regular-polygon"] = "regular-polygon"
+
+    def __post_init__(self) -> None:
+        if not 3 <= self.sides <= 256:
+            raise CellError(f"regular polygon sides = {self.sides}: need 3 to 256")
+
+    @property
+    def name(self) -> str:
+        """In words, for reports."""
+        return f"polygon of {self.sides} sides"
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this circumscribed diameter, every edge moved out by half of ``grow_um``."""
+        turn = 2 * np.pi * np.arange(self.sides) / self.sides
+        return _made(size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1), self.angle_rad, grow_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """The user's own corners (x, y), in units of the size of the pillar; any order of turning, no crossings.
+
+    corners: e.g. [[-0.5, -0.3], [0.5, -0.3], [0.0, 0.6]].
+    """
+
+    corners: tuple[Point, ...]
+    angle_rad: float = 0.0
+    hole: bool = False
+    kind: Literal["polygon"] = "polygon"
+
+    def __post_init__(self) -> None:
+        points = np.array(self.corners, float)
+        if len(points) < 3 or not np.isfinite(points).all():
+            raise CellError(f"polygon with {len(points)} corners: need at least 3, finite")
+        edges = np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+        if (np.hypot(*(edges[:, 1] - edges[:, 0]).T) == 0).any():
+            raise CellError("polygon with two equal neighbouring corners: leave one of them out")
+        n = len(points)
+        for i in range(n):
+            for j in range(i + 2, n - (i == 0)):
+                if _cross(*edges[i], *edges[j]):
+                    raise CellError(f"polygon edges {i} and {j} cross: need a polygon without crossings")
+
+    @property
+    def name(self) -> str:
+        """In words, for reports."""
+        return f"own polygon of {len(self.corners)} corners"
+
+    def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
+        """The section of this size, every edge moved out by half of ``grow_um``."""
+        return _made(size_um * np.array(self.corners, float), self.angle_rad, grow_um)
+
+
+def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
+    """Whether the edges a-b and c-d meet."""
+
+    def side(p: Array, q: Array, r: Array) -> float:
+        return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
+
+    return side(a, b, c) * side(a, b, d) <= 0 and side(c, d, a) * side(c, d, b) <= 0

@@ -1,0 +1,229 @@
+"""The chain as a list of commands: the stages that a set of settings files asks for, and what each leaves."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from metalens.ground import config, store
+from metalens.ground.errors import ConfigError
+
+SHIPPED = ("cell", "design", "process", "run", "bench_truth")
+
+
+@dataclass(frozen=True, slots=True)
+class ChainFiles:
+    """CHAIN.toml: settings files, relative to it; a stage whose file is left out is not run.
+
+    cell, design, process: of library, lens and mask. psf: of the PSF stack; its defaults without it.
+    run: of a co-design run. bench_truth, bench_metrology: hidden errors and other measurements of a virtual bench; it
+        measures the lens of the run, which is then retrained for, or without a run the one of bench_design.
+    budget: whether the error budget is computed.
+    """
+
+    cell: Path
+    design: Path
+    process: Path
+    psf: Path | None = None
+    bench_design: Path | None = None
+    bench_truth: Path | None = None
+    bench_metrology: Path | None = None
+    run: Path | None = None
+    budget: bool = True
+
+    def __post_init__(self) -> None:
+        if self.bench_design is not None and (self.bench_truth is None or self.run is not None):
+            raise ConfigError(
+                "bench_design belongs to a bench_truth without a run: a run's bench measures its own lens"
+            )
+        if self.bench_truth is not None and self.bench_design is None and self.run is None:
+            raise ConfigError("bench_truth has no lens to measure: give a run or a bench_design")
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One verb of the chain.
+
+    words: of the command line, relative to the chain's folder. error: entry of the result that says how wrong it may
+    be, and what it means. pictures: files that the verb leaves, with captions.
+    """
+
+    title: str
+    text: str
+    words: tuple[str, ...]
+    error: tuple[str, str]
+    pictures: tuple[tuple[str, str], ...] = ()
+
+
+def shipped() -> ChainFiles:
+    """The demo's own settings, as names of files that :func:`lay_out` writes."""
+    return _named(SHIPPED, budget=False)  # a minute more: asked for with a CHAIN.toml, or metalens budget
+
+
+def load(path: Path) -> ChainFiles:
+    """Read CHAIN.toml.
+
+    Raises:
+        ConfigError: see :func:`metalens.ground.config.load`; a settings file that is not there.
+    """
+    found = config.load(path, ChainFiles)
+    for name, value in _given(found):
+        if not (path.parent / value).is_file():
+            raise ConfigError(f"{path}: {name} = {str(value)!r}: no such file beside it")
+    return found
+
+
+def lay_out(folder: Path, files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> ChainFiles:
+    """Copy the settings into the chain's folder under plain names; the files under those names.
+
+    Args:
+        source: folder that the files lie in; None for the shipped ones.
+        aperture_mm: put in place of the aperture of the design.
+    """
+    for name, value in _given(files):
+        if source is None:
+            text = resources.files("metalens").joinpath("data", "demo", value.name).read_text(encoding="utf-8")
+        else:
+            text = (source / value).read_text(encoding="utf-8")
+        if name == "design" and aperture_mm is not None:
+            lines = [line for line in text.splitlines() if not line.startswith("aperture_mm")]
+            text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
+        store.write_text(folder / f"{name}.toml", text)
+    return _named(tuple(name for name, _ in _given(files)), budget=files.budget)
+
+
+def _named(names: tuple[str, ...], *, budget: bool = True) -> ChainFiles:
+    """Files under plain names."""
+    entries: dict[str, Any] = {name: Path(f"{name}.toml") for name in names}
+    return ChainFiles(**entries, budget=budget)
+
+
+def _given(files: ChainFiles) -> Iterator[tuple[str, Path]]:
+    for field in fields(files):
+        value = getattr(files, field.name)
+        if isinstance(value, Path):
+            yield field.name, value
+
+
+def stages(files: ChainFiles) -> Iterator[Stage]:
+    """The chain, in order."""
+    yield from _making(files)
+    if files.budget:
+        yield _budget(files)
+    if files.run:
+        yield _codesign()
+    if files.bench_truth:
+        yield from _bench(files)
+        if files.run:
+            yield _retrain()
+
+
+def _making(files: ChainFiles) -> Iterator[Stage]:
+    yield Stage(
+        "Pillar library",
+        "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
+        "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
+        ("library", "cell.toml", "-o", "library.h5"),
+        ("max_error", "largest error bar of |t|"),
+        (("library.png", "Phase and transmission of the pillars with their error bars, and the proxy's residual."),),
+    )
+    yield Stage(
+        "Lens",
+        "Every site takes the printable diameter whose phase is the wanted one. A direct Rayleigh-Sommerfeld sum "
+        "over all pillars then shows where the light really meets.",
+        ("design", "design.toml", "-o", "lens.h5"),
+        ("max_phase_error_rad", "rad between wanted and made phase"),
+        (("lens.png", "Phase and diameter of the pillars across the lens, and a zoom to single pillars."),),
+    )
+    yield Stage(
+        "Point spread functions",
+        "Images of point sources over the depths of an eye, computed on the sensor window only, to a stated error.",
+        ("psf", "lens.h5", "-o", "psf.h5", *(("--config", "psf.toml") if files.psf else ())),
+        ("error", "relative error of the PSFs"),
+        (
+            ("psf_xz.png", "Slice through the PSF along depth."),
+            ("psf_montage.png", "PSFs over depth and field angle."),
+            ("psf_information.png", "Axial information of Eq. 11; the normalisation decides the ranking."),
+            ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
+        ),
+    )
+    yield Stage(
+        "Mask",
+        "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
+        "witness cells; checked against the design rules, written, read back and compared.",
+        ("layout", "lens.h5", "--process", "process.toml", "-o", "mask", "--oasis", "--gds"),
+        ("differences", "differences between plan and written files"),
+        (
+            ("mask/die.png", "The whole die."),
+            ("mask/pillars.png", "Single pillars as polygons of the mask."),
+            ("mask/diameters.png", "How many pillars of each diameter."),
+            ("mask/margins.png", "Distance to the design rules."),
+        ),
+    )
+
+
+def _budget(files: ChainFiles) -> Stage:
+    return Stage(
+        "Error budget",
+        "Each link of the chain is changed alone and carried through pillars, PSFs and images of rendered eyes to the "
+        "gaze that the linear estimator of least variance reads. It knows the population but not the subject; a "
+        "network has its own, larger, error.",
+        ("budget", "lens.h5", "--library", "library.h5", "--process", "process.toml", "-o", "budget.h5"),
+        ("gaze_error_deg", "deg of gaze from all links together"),
+        (("budget.png", "Gaze error of each link, log scale."),),
+    )
+
+
+def _bench(files: ChainFiles) -> Iterator[Stage]:
+    metrology = ("--metrology", "bench_metrology.toml") if files.bench_metrology else ()
+    if files.bench_design:
+        yield Stage(
+            "A lens for the bench",
+            "A small sister of the lens, of the same pillars, to be made wrong in hidden ways and measured.",
+            ("design", "bench_design.toml", "-o", "bench_lens.h5"),
+            ("max_phase_error_rad", "rad between wanted and made phase"),
+        )
+    measured = "bench_lens.h5" if files.bench_design else "run/lens.h5"
+    yield Stage(
+        "Captures",
+        "A virtual bench: the lens is made with errors that the fit never sees, and shot through focus with the noise "
+        "of a real sensor.",
+        ("capture", measured, "--truth", "bench_truth.toml", "-o", "captures"),
+        ("peak_e", "electrons in the brightest pixel"),
+    )
+    yield Stage(
+        "The lens as built",
+        "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
+        ("fit", "captures", "--design", measured, *metrology, "-o", "asbuilt.h5"),
+        ("chi2_per_dof", "chi² per degree of freedom, 1 where model and noise explain the frames"),
+        (
+            ("asbuilt_frames.png", "As designed, measured, as built, and the residual in standard deviations."),
+            ("asbuilt_parameters.png", "Fitted parameters with their 95 % intervals."),
+        ),
+    )
+
+
+def _codesign() -> Stage:
+    return Stage(
+        "Co-design",
+        "Lens, pixel pitch and network trained together on rendered eyes, then searched under compute budgets.",
+        ("codesign", "run.toml", "-o", "run"),
+        ("error", "see the rows"),
+        (("run/pareto.png", "Accuracy against compute."),),
+    )
+
+
+def _retrain() -> Stage:
+    words = ("retrain", "run", "--optics", "asbuilt.h5", "--truth", "bench_truth.toml", "--process", "process.toml")
+    return Stage(
+        "Before and after retraining",
+        "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
+        "made. Seconds of training read the pupil and the sideways slippage, which the errors of this lens hardly "
+        "touch, so little is lost here and little won. With a lens of 1 mm and a network that reads the distance "
+        "(docs/loop.md), a hundred hidden lenses raised the slippage error from 0.44 mm to 0.59 mm in the median, and "
+        "retraining won it back.",
+        (*words, "-o", "retrained"),
+        ("slip_mm", "mm of slippage error after retraining"),
+        (("retrained/cases.png", "Slippage error with the lens as designed, as made, and after retraining."),),
+    )

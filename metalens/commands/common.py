@@ -1,0 +1,99 @@
+"""The verbs of the command line, one module each: ``Options`` and ``run``."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from metalens.ground import executor, transaction
+from metalens.ground.console import Console
+from metalens.ground.transaction import Draft, Terms
+
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+MaybeOutput = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """Options of every verb.
+
+    Attributes:
+        quiet: show nothing but errors.
+        json: print the result as JSON.
+        force: replace what exists, if it was made by this toolchain.
+    """
+
+    quiet: bool = False
+    json: bool = False
+    force: bool = False
+
+    @property
+    def console(self) -> Console:
+        """Where the verb shows its progress and result."""
+        return Console(self.quiet, self.json)
+
+    def claim(
+        self, target: Path, *, beside: Sequence[str] = (), inputs: Sequence[Path] = (), room: int = transaction.ROOM
+    ) -> contextlib.AbstractContextManager[Draft]:
+        """Claim a file and its companions before the work; they appear together at the end of the block, or not at all.
+
+        Args:
+            beside: endings of the companions, as ``_xz.png``.
+            inputs: files that are read, beside those that the options name.
+            room: bytes that the output needs.
+
+        Raises:
+            OutputError: see :func:`metalens.ground.transaction.file`.
+        """
+        return transaction.file(target, beside=beside, terms=self._terms(inputs, room))
+
+    def claim_folder(
+        self, target: Path, *, inputs: Sequence[Path] = (), room: int = transaction.ROOM
+    ) -> contextlib.AbstractContextManager[Draft]:
+        """Claim a folder before the work; it appears whole with its manifest at the end of the block, or not at all.
+
+        Raises:
+            OutputError: see :func:`metalens.ground.transaction.folder`.
+        """
+        return transaction.folder(target, terms=self._terms(inputs, room))
+
+    def claim_work(
+        self, target: Path, *, keep: Sequence[str], resume: bool = False, grow: bool = False
+    ) -> contextlib.AbstractContextManager[Draft]:
+        """Claim a folder for long work that an interruption leaves resumable.
+
+        Raises:
+            OutputError: see :func:`metalens.ground.transaction.long_work`.
+        """
+        terms = dataclasses.replace(self._terms((), transaction.ROOM), parents=True)
+        return transaction.long_work(target, keep=keep, resume=resume, grow=grow, terms=terms)
+
+    def _terms(self, inputs: Sequence[Path], room: int) -> Terms:
+        return Terms(force=self.force, inputs=(*self._paths(), *inputs), room=room)
+
+    def _paths(self) -> Iterator[Path]:
+        """Every path among the options that is read."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name != "output":
+                yield from (v for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, Path))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distributed(Common):
+    """Options of verbs whose work is spread over processes.
+
+    Attributes:
+        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the work; left out: the cores of this
+            machine. The result is the same.
+    """
+
+    scheduler: str | None = None
+
+    def workers(self) -> contextlib.AbstractContextManager[None]:
+        """Where the work of the block is done."""
+        return executor.on(self.scheduler)

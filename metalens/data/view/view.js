@@ -1,0 +1,274 @@
+"use strict";
+// Arrays come deflated in base 64; the browser inflates them. Nothing is fetched from anywhere.
+const KINDS = { Float32Array, Uint8Array, Uint16Array };
+async function unpacked(p) {
+  const bytes = Uint8Array.from(atob(p.data), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return { values: new KINDS[p.type](await new Response(stream).arrayBuffer()), shape: p.shape };
+}
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const text = (v) => (typeof v === "number" ? (Number.isInteger(v) ? String(v) : Number(v.toPrecision(4)).toString()) : String(v));
+function element(tag, parent, attributes = {}, content = "") {
+  const e = document.createElement(tag);
+  for (const [k, v] of Object.entries(attributes)) e.setAttribute(k, v);
+  if (content !== "") e.textContent = content;
+  parent?.append(e);
+  return e;
+}
+// cividis in nine steps (perceptually even, for colour-blind readers), and blue-white-red for values with a sign
+const CIVIDIS = [[0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115], [138, 134, 120], [165, 156, 116], [195, 179, 105], [255, 234, 70]];
+const SIGNED = [[5, 48, 97], [67, 147, 195], [209, 229, 240], [247, 247, 247], [253, 219, 199], [214, 96, 77], [103, 0, 31]];
+function colour(scale, t) {
+  const x = Math.max(0, Math.min(1, t)) * (scale.length - 1), i = Math.min(scale.length - 2, Math.floor(x)), f = x - i;
+  return scale[i].map((a, k) => a + f * (scale[i + 1][k] - a));
+}
+const TABLE = (scale) => Array.from({ length: 256 }, (_, i) => colour(scale, i / 255));
+
+function sliders(panel, controls, changed) {
+  const at = panel.axes.map(() => 0);
+  panel.axes.forEach((axis, i) => {
+    if (axis.values.length < 2) return;
+    const label = element("label", controls, {}, axis.name);
+    const input = element("input", label, { type: "range", min: 0, max: axis.values.length - 1, value: 0, step: 1 });
+    const shown = element("output", label);
+    const say = () => { const v = `${text(axis.values[at[i]])} ${axis.unit}`; shown.textContent = v; input.setAttribute("aria-valuetext", v); };
+    input.addEventListener("input", () => { at[i] = Number(input.value); say(); changed(); });
+    say();
+  });
+  return () => at.reduce((sum, k, i) => sum * panel.axes[i].values.length + k, 0);
+}
+
+function tableOf(parent, head, rows, name = "Data") {
+  const box = element("details", parent);
+  element("summary", box, {}, name);
+  let made = false;
+  box.addEventListener("toggle", () => { if (box.open && !made) { made = true; fill(element("div", box, { class: "scroll", tabindex: 0 }), head, rows()); } });
+  return box;
+}
+function fill(parent, head, rows) {
+  const table = element("table", parent), top = element("tr", element("thead", table)), body = element("tbody", table);
+  head.forEach((h) => element("th", top, { scope: "col" }, h));
+  rows.slice(0, 2000).forEach((row) => { const tr = element("tr", body); row.forEach((v) => element("td", tr, {}, text(v))); });
+  if (rows.length > 2000) element("p", parent, {}, `first 2000 of ${rows.length} rows`);
+}
+
+function plot(parent, title, xName, yName, log) {
+  let chart = null;
+  return (x, lines, bands = []) => {
+    const width = Math.max(260, parent.clientWidth), colours = ["--a", "--b", "--c", "--d"].map(css);
+    const series = [{ label: xName }], data = [Array.from(x)], shade = [];
+    Object.entries(lines).forEach(([name, line], i) => {
+      series.push({ label: name, stroke: colours[i % 4], width: 2, points: { show: x.length < 40 } });
+      data.push(Array.from(line.y));
+      if (line.error) {
+        const n = data.length;
+        series.push({ label: `${name} + bar`, stroke: "transparent", points: { show: false } }, { label: `${name} - bar`, stroke: "transparent", points: { show: false } });
+        data.push(Array.from(line.y, (v, k) => v + line.error[k]), Array.from(line.y, (v, k) => v - line.error[k]));
+        shade.push({ series: [n, n + 1], fill: colours[i % 4] + "33" });
+      }
+    });
+    if (log) for (let i = 1; i < data.length; i++) data[i] = data[i].map((v) => (v > 0 ? v : null));
+    const ink = { stroke: css("--soft"), grid: { stroke: css("--line"), width: 1 } };
+    const drawn = { hooks: { drawAxes: (u) => { u.ctx.save(); u.ctx.fillStyle = css("--b") + "40"; bands.forEach(([a, b]) => { const l = u.valToPos(a, "x", true), r = u.valToPos(b, "x", true); u.ctx.fillRect(l, u.bbox.top, Math.max(1, r - l), u.bbox.height); }); u.ctx.restore(); } } };
+    chart?.destroy();
+    chart = new uPlot({ width, height: 260, title, series, bands: shade, plugins: [drawn], scales: { x: { time: false }, y: log ? { distr: 3 } : {} }, legend: { show: Object.keys(lines).length > 1 },
+      axes: [{ label: xName, ...ink }, { label: yName, size: 64, ...ink }] }, data, parent);
+    chart.root.querySelectorAll(".u-legend .u-series").forEach((row) => { if (/ [+-] bar$/.test(row.textContent.trim().split(":")[0].trim())) row.style.display = "none"; });
+  };
+}
+
+async function images(panel, section) {
+  const { values, shape } = await unpacked(panel.values), [ny, nx] = shape.slice(-2), size = ny * nx;
+  const controls = element("div", section, { class: "controls" }), views = element("div", section, { class: "views" });
+  const figure = element("figure", views, { style: "margin:0" });
+  const canvas = element("canvas", figure, { class: "image", width: nx, height: ny, tabindex: 0, role: "img", "aria-label": `${panel.title}; arrow keys move the cross` });
+  const readout = element("p", section, { class: "readout", "aria-live": "polite" });
+  const right = element("div", views, { class: "plot" }), profile = plot(right, "Along the cross", "x / µm", panel.unit, false);
+  const optics = panel.optics ? { mtf: plot(right, "MTF", "cycles / mm", "contrast", false), energy: plot(right, "Encircled energy", "radius / µm", "share", false) } : null;
+  let cross = [Math.floor(ny / 2), Math.floor(nx / 2)], log = false, own = true;
+  const table = panel.signed ? TABLE(SIGNED) : TABLE(CIVIDIS);
+  let all = 0;
+  for (const v of values) if (Math.abs(v) > all) all = Math.abs(v);
+  const place = sliders(panel, controls, () => draw());
+  const tick = (name, start, act) => { const l = element("label", controls, { class: "tick" }), b = element("input", l, { type: "checkbox" }); b.checked = start; l.append(name); b.addEventListener("change", () => { act(b.checked); draw(); }); };
+  if (!panel.signed) tick("logarithmic", false, (v) => { log = v; });
+  tick("own scale", true, (v) => { own = v; });
+  const image = () => values.subarray(place() * size, (place() + 1) * size);
+  const um = (k, n) => (k - (n - 1) / 2) * panel.step;
+  function draw() {
+    const at = image(), context = canvas.getContext("2d"), out = context.createImageData(nx, ny);
+    let top = 0;
+    if (own) { for (const v of at) top = Math.max(top, Math.abs(v)); } else top = all;
+    top = top || 1;
+    for (let i = 0; i < size; i++) {
+      let t = panel.signed ? 0.5 + at[i] / top / 2 : at[i] / top;
+      if (log) t = 1 + Math.log10(Math.max(t, 1e-4)) / 4;
+      const c = table[Math.max(0, Math.min(255, Math.round(255 * t)))];
+      out.data.set([c[0], c[1], c[2], 255], 4 * i);
+    }
+    context.putImageData(out, 0, 0);
+    context.fillStyle = "#ffffff50";
+    context.fillRect(0, cross[0], nx, 0.5); context.fillRect(cross[1], 0, 0.5, ny);
+    const x = Array.from({ length: nx }, (_, k) => um(k, nx));
+    profile(x, { "along x": { y: at.subarray(cross[0] * nx, (cross[0] + 1) * nx) }, ...(nx === ny ? { "along y": { y: x.map((_, k) => at[k * nx + cross[1]]) } } : {}) });
+    readout.textContent = `x ${text(um(cross[1], nx))} µm, y ${text(um(cross[0], ny))} µm: ${text(at[cross[0] * nx + cross[1]])} ${panel.unit}` + (log ? "; four decades shown" : "");
+    if (optics) {
+      const t = transfer(at, ny, nx, panel.step), e = encircled(at, ny, nx, panel.step);
+      optics.mtf(t.f, { "along x": { y: t.x }, "along y": { y: t.y } });
+      optics.energy(e.r, { share: { y: e.share } });
+    }
+  }
+  const move = (dy, dx) => { cross = [Math.max(0, Math.min(ny - 1, cross[0] + dy)), Math.max(0, Math.min(nx - 1, cross[1] + dx))]; draw(); };
+  canvas.addEventListener("click", (event) => { const r = canvas.getBoundingClientRect(); cross = [Math.min(ny - 1, Math.floor((event.clientY - r.top) / r.height * ny)), Math.min(nx - 1, Math.floor((event.clientX - r.left) / r.width * nx))]; draw(); });
+  canvas.addEventListener("keydown", (event) => { const step = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key]; if (step) { event.preventDefault(); move(...step); } });
+  tableOf(section, ["y / µm", "x / µm", panel.unit || "value"], () => { const at = image(), rows = []; for (let i = 0; i < ny; i += Math.ceil(ny / 40)) for (let k = 0; k < nx; k += Math.ceil(nx / 40)) rows.push([um(i, ny), um(k, nx), at[i * nx + k]]); return rows; }, "Data of this image (every few samples)");
+  draw();
+}
+// |Fourier transform| of the sums over one axis: the slice of the transfer function along the other; 1 at zero
+function transfer(at, ny, nx, step) {
+  const sums = (n, value) => Array.from({ length: n }, (_, k) => value(k));
+  const x = sums(nx, (k) => { let s = 0; for (let i = 0; i < ny; i++) s += at[i * nx + k]; return s; });
+  const y = sums(ny, (i) => { let s = 0; for (let k = 0; k < nx; k++) s += at[i * nx + k]; return s; });
+  const most = 0.5 / step, n = 120, f = Array.from({ length: n }, (_, k) => 1e3 * most * k / (n - 1));
+  const slice = (line) => { const whole = line.reduce((a, b) => a + b, 0) || 1; return f.map((v) => { let re = 0, im = 0; line.forEach((value, k) => { const p = 2 * Math.PI * v * 1e-3 * k * step; re += value * Math.cos(p); im += value * Math.sin(p); }); return Math.hypot(re, im) / whole; }); };
+  return { f, x: slice(x), y: slice(y) };
+}
+// share of the light of the window inside circles about its centroid
+function encircled(at, ny, nx, step) {
+  let whole = 0, cx = 0, cy = 0;
+  for (let i = 0; i < ny; i++) for (let k = 0; k < nx; k++) { const v = at[i * nx + k]; whole += v; cx += v * k; cy += v * i; }
+  whole = whole || 1; cx /= whole; cy /= whole;
+  const n = 80, reach = Math.min(nx, ny) / 2, sums = new Float64Array(n + 1);
+  for (let i = 0; i < ny; i++) for (let k = 0; k < nx; k++) { const bin = Math.ceil(Math.hypot(i - cy, k - cx) / reach * n); if (bin <= n) sums[bin] += at[i * nx + k]; }
+  for (let i = 1; i <= n; i++) sums[i] += sums[i - 1];
+  return { r: Array.from(sums, (_, i) => i * reach * step / n), share: Array.from(sums, (v) => v / whole) };
+}
+
+async function curves(panel, section) {
+  const x = (await unpacked(panel.x)).values, lines = {}, errors = {};
+  for (const [name, p] of Object.entries(panel.lines)) lines[name] = (await unpacked(p)).values;
+  for (const [name, p] of Object.entries(panel.errors)) errors[name] = (await unpacked(p)).values;
+  const controls = element("div", section, { class: "controls" }), box = element("div", section, { class: "plot" });
+  const show = plot(box, "", panel.xName, panel.yName, panel.scale === "log"), n = x.length;
+  const place = sliders(panel, controls, () => draw());
+  const slice = (a) => a.subarray(place() * n, (place() + 1) * n);
+  const now = () => Object.fromEntries(Object.entries(lines).map(([name, y]) => [name, { y: slice(y), error: errors[name] && slice(errors[name]) }]));
+  const draw = () => show(x, now(), panel.bands);
+  tableOf(section, [panel.xName, ...Object.keys(lines).flatMap((name) => (errors[name] ? [name, `error bar of ${name}`] : [name]))], () => {
+    const at = now();
+    return Array.from(x, (v, i) => [v, ...Object.values(at).flatMap((l) => (l.error ? [l.y[i], l.error[i]] : [l.y[i]]))]);
+  });
+  draw();
+  addEventListener("resize", draw);
+}
+
+// Every site of a map: sums and counts over 2, 4, 8 ... sites, so that far away the mean of a screen pixel is drawn.
+function pyramid(index, sizes, ny, nx) {
+  const levels = [];
+  let sum = new Float32Array(ny * nx), count = new Float32Array(ny * nx), h = ny, w = nx;
+  for (let i = 0; i < index.length; i++) if (index[i]) { sum[i] = sizes[index[i] - 1]; count[i] = 1; }
+  while (h > 1 && w > 1) {
+    const H = Math.ceil(h / 2), W = Math.ceil(w / 2), s = new Float32Array(H * W), c = new Float32Array(H * W);
+    for (let i = 0; i < h; i++) for (let k = 0; k < w; k++) { const to = (i >> 1) * W + (k >> 1); s[to] += sum[i * w + k]; c[to] += count[i * w + k]; }
+    [sum, count, h, w] = [s, c, H, W];
+    levels.push({ sum, count, h, w, sites: 2 ** (levels.length + 1) });
+  }
+  return levels;
+}
+async function classes(panel, section) {
+  const { values: index, shape: [ny, nx] } = await unpacked(panel.index), sizes = panel.sizes;
+  const controls = element("div", section, { class: "controls" });
+  const canvas = element("canvas", section, { class: "map", tabindex: 0, role: "img", "aria-label": `${panel.title}: ${nx} by ${ny} sites; arrow keys move, plus and minus zoom, 0 shows all` });
+  const readout = element("p", section, { class: "readout", "aria-live": "polite" });
+  const levels = pyramid(index, sizes, ny, nx), table = TABLE(CIVIDIS);
+  let low = Infinity, high = -Infinity;
+  for (const v of sizes) { low = Math.min(low, v); high = Math.max(high, v); }
+  const shade = (v) => table[Math.max(0, Math.min(255, Math.round(255 * (v - low) / (high - low || 1))))];
+  let scale = 1, cx = nx / 2, cy = ny / 2, fit = 1, queued = false; // pixels a site; site at the middle of the canvas
+  function sized() {
+    const ratio = devicePixelRatio || 1;
+    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+    fit = Math.min(canvas.width / nx, canvas.height / ny) * 0.98;
+  }
+  const whole = () => { sized(); scale = fit; cx = nx / 2; cy = ny / 2; later(); };
+  function draw() {
+    queued = false;
+    const c = canvas.getContext("2d"), W = canvas.width, H = canvas.height;
+    c.fillStyle = "#fff"; c.fillRect(0, 0, W, H);
+    if (scale >= 6) near(c, W, H); else far(c, W, H);
+    for (const [x, y, what] of panel.marks) { const [px, py] = [(x / panel.pitch + nx / 2 - cx) * scale + W / 2, (y / panel.pitch + ny / 2 - cy) * scale + H / 2]; c.strokeStyle = "#c0392b"; c.lineWidth = 2; c.strokeRect(px - 5, py - 5, 10, 10); }
+    bar(c, H);
+  }
+  function near(c, W, H) {
+    const i0 = Math.max(0, Math.floor(cy - H / 2 / scale)), i1 = Math.min(ny, Math.ceil(cy + H / 2 / scale)), k0 = Math.max(0, Math.floor(cx - W / 2 / scale)), k1 = Math.min(nx, Math.ceil(cx + W / 2 / scale));
+    for (let i = i0; i < i1; i++) for (let k = k0; k < k1; k++) {
+      const one = index[i * nx + k];
+      if (!one) continue;
+      const v = sizes[one - 1], radius = v * (panel.unit === "nm" ? 1e-3 : 1) / panel.pitch / 2 * scale;
+      c.fillStyle = `rgb(${shade(v).map(Math.round).join()})`;
+      c.beginPath(); c.arc((k + 0.5 - cx) * scale + W / 2, (i + 0.5 - cy) * scale + H / 2, radius, 0, 7); c.fill();
+    }
+  }
+  function far(c, W, H) {
+    const level = scale >= 1 || !levels.length ? null : levels[Math.min(levels.length - 1, Math.max(0, Math.ceil(Math.log2(1 / scale)) - 1))];
+    const sites = level ? level.sites : 1, w = level ? level.w : nx, h = level ? level.h : ny, out = c.createImageData(W, H);
+    for (let y = 0; y < H; y++) {
+      const i = Math.floor((cy + (y + 0.5 - H / 2) / scale) / sites);
+      if (i < 0 || i >= h) continue;
+      for (let x = 0; x < W; x++) {
+        const k = Math.floor((cx + (x + 0.5 - W / 2) / scale) / sites);
+        if (k < 0 || k >= w) continue;
+        const at = i * w + k, count = level ? level.count[at] : index[at] ? 1 : 0;
+        if (!count) continue;
+        const rgb = shade(level ? level.sum[at] / count : sizes[index[at] - 1]), part = level ? Math.min(1, count / (sites * sites)) : 1;
+        out.data.set([...rgb.map((v) => 255 + part * (v - 255)), 255], 4 * (y * W + x));
+      }
+    }
+    c.putImageData(out, 0, 0);
+  }
+  function bar(c, H) {
+    const wanted = 120 / scale * panel.pitch, power = 10 ** Math.floor(Math.log10(wanted)), length = [5, 2, 1].map((m) => m * power).find((v) => v <= wanted) || power, px = length / panel.pitch * scale;
+    c.fillStyle = "#fff"; c.fillRect(8, H - 44, px + 16, 36); c.fillStyle = "#111"; c.fillRect(16, H - 18, px, 4);
+    c.font = `${13 * (devicePixelRatio || 1)}px system-ui`; c.fillText(`${text(length)} µm`, 16, H - 24);
+  }
+  const later = () => { if (!queued) { queued = true; requestAnimationFrame(draw); } };
+  const zoom = (factor) => { scale = Math.max(fit / 2, Math.min(400, scale * factor)); later(); };
+  function say(event) {
+    const r = canvas.getBoundingClientRect(), ratio = canvas.width / r.width;
+    const k = Math.floor(cx + ((event.clientX - r.left) * ratio - canvas.width / 2) / scale), i = Math.floor(cy + ((event.clientY - r.top) * ratio - canvas.height / 2) / scale);
+    if (i < 0 || k < 0 || i >= ny || k >= nx) { readout.textContent = ""; return; }
+    const one = index[i * nx + k], x = (k - (nx - 1) / 2) * panel.pitch, y = (i - (ny - 1) / 2) * panel.pitch;
+    const more = one ? Object.entries(panel.columns).map(([name, column]) => `, ${name} ${text(column[one - 1])}`).join("") : "";
+    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx - x, my - y) < Math.max(panel.pitch, 6 / scale * panel.pitch));
+    readout.textContent = `row ${i}, column ${k} (x ${text(x)}, y ${text(y)} µm): ` + (one ? `${text(sizes[one - 1])} ${panel.unit}${more}` : "nothing here") + (mark ? `. ${mark[2]}` : "");
+  }
+  let drag = null;
+  canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
+  canvas.addEventListener("pointerup", () => { drag = null; });
+  canvas.addEventListener("pointermove", (e) => { const ratio = canvas.width / canvas.clientWidth; if (drag) { cx -= (e.clientX - drag[0]) * ratio / scale; cy -= (e.clientY - drag[1]) * ratio / scale; drag = [e.clientX, e.clientY]; later(); } say(e); });
+  canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(2 ** (-e.deltaY / 300)); }, { passive: false });
+  canvas.addEventListener("keydown", (e) => {
+    const step = canvas.width / 8 / scale, move = { ArrowUp: [0, -step], ArrowDown: [0, step], ArrowLeft: [-step, 0], ArrowRight: [step, 0] }[e.key];
+    if (move) { cx += move[0]; cy += move[1]; later(); } else if (e.key === "+") zoom(1.5); else if (e.key === "-") zoom(1 / 1.5); else if (e.key === "0") whole(); else return;
+    e.preventDefault();
+  });
+  for (const [name, act] of [["zoom in", () => zoom(2)], ["zoom out", () => zoom(0.5)], ["whole", whole], ["one pillar", () => { scale = 80; later(); }]]) element("button", controls, { type: "button" }, name).addEventListener("click", act);
+  addEventListener("resize", () => { const keep = scale / fit; sized(); scale = keep * fit; later(); });
+  tableOf(section, [`size / ${panel.unit}`, "sites", ...Object.keys(panel.columns)], () => { const n = new Float64Array(sizes.length + 1); for (const v of index) n[v]++; return sizes.map((v, i) => [v, n[i + 1], ...Object.values(panel.columns).map((c) => c[i])]).filter((row) => row[1]); }, "Sizes and how many sites have them");
+  whole();
+}
+
+const DRAW = { Images: images, Curves: curves, Classes: classes, Numbers: async (panel, section) => fill(element("div", section, { class: "scroll", tabindex: 0 }), panel.head, panel.rows) };
+(async () => {
+  const data = JSON.parse(document.getElementById("data").textContent), main = document.getElementById("panels"), status = document.getElementById("status");
+  for (const panel of data.panels) {
+    const section = element("section", main, { "aria-label": panel.title });
+    element("h2", section, {}, panel.title);
+    try { await DRAW[panel.type](panel, section); } catch (error) { element("p", section, { class: "failed" }, `cannot be shown: ${error.message}`); }
+    if (panel.caption) element("figcaption", section, {}, panel.caption);
+  }
+  const about = document.getElementById("about");
+  for (const [name, value] of Object.entries(data.about)) { element("dt", about, {}, name); element("dd", about, {}, typeof value === "object" ? Object.entries(value).map(([k, v]) => `${k}: ${v}`).join("\n") : String(value)); }
+  status.textContent = `${data.panels.length} figures`;
+  document.body.dataset.ready = "true";
+})();

@@ -1,0 +1,45 @@
+"""A wanted phase made of pillars, and the check that it focuses."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.design import neighbours as neighbours
+    from metalens.design import profiles as profiles
+    from metalens.design.focus_check import FocusCheck as FocusCheck
+    from metalens.design.focus_check import check_focus as check_focus
+    from metalens.design.of_phase import Limits as Limits
+    from metalens.design.of_phase import PhaseOf as PhaseOf
+    from metalens.design.of_phase import Quality as Quality
+    from metalens.design.of_phase import field_angle as field_angle
+    from metalens.design.of_phase import make as make
+    from metalens.design.of_phase import phase_of as phase_of
+    from metalens.design.of_phase import printable as printable
+    from metalens.design.profiles import Cubic as Cubic
+    from metalens.design.profiles import DoubleHelix as DoubleHelix
+    from metalens.design.profiles import Focus as Focus
+    from metalens.design.profiles import PhaseMap as PhaseMap
+    from metalens.design.profiles import hyperbolic as hyperbolic
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Cubic": "profiles",
+        "DoubleHelix": "profiles",
+        "Focus": "profiles",
+        "FocusCheck": "focus_check",
+        "Limits": "of_phase",
+        "PhaseMap": "profiles",
+        "PhaseOf": "of_phase",
+        "Quality": "of_phase",
+        "check_focus": "focus_check",
+        "field_angle": "of_phase",
+        "hyperbolic": "profiles",
+        "make": "of_phase",
+        "neighbours": "",
+        "phase_of": "of_phase",
+        "printable": "of_phase",
+        "profiles": "",
+    },
+)

@@ -1,0 +1,125 @@
+"""What a free-form design is worth: honest figures beside simple lenses tuned as hard; as text, numbers and picture."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.design.free_form import simple_lenses as baselines
+from metalens.design.free_form.objective import Score, score
+from metalens.design.free_form.search import FisherPhase, phase_on
+from metalens.design.free_form.settings import SAMPLE_UM, Fisher
+from metalens.ground.report import canvas, png
+from metalens.image import Field, Pupil
+from metalens.image import pupil as pupils
+
+SHOWN_UM = 48.0  # of the PSFs in the picture
+STRIP = 6  # depths of them
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Judged:
+    """A lens on the quick pupil. phase_rad: (nodes, nodes) without its focus. score: over (angles, depths)."""
+
+    name: str
+    phase_rad: Tensor
+    focus_um: float
+    score: Score
+
+
+def judged(made: FisherPhase, pupil: Pupil, settings: Fisher) -> tuple[Judged, ...]:
+    """The design, and the best hyperbolic lens and double helix for the same pixels, depths and angles.
+
+    Intensities every 0.75 um, averaged over sub-pixel positions, at 11 depths.
+    """
+    lenses = [("free form", phase_on(pupil, made), made.focus_um)]
+    for simple in baselines.tuned_pair(pupil, settings):
+        lenses.append((f"{simple.name}, tuned", baselines.baseline_phase(pupil, simple.zones), simple.focus_um))
+    out = []
+    for name, phase, focus in lenses:
+        found = score(phase, pupil, focus_um=focus, settings=settings)
+        rows = [t.reshape(len(settings.angles_deg), -1) for t in (found.information, found.encircled)]
+        out.append(Judged(name, phase, focus, Score(rows[0], rows[1])))
+    return tuple(out)
+
+
+def times(lenses: tuple[Judged, ...]) -> float:
+    """Mean information of the first lens over that of the best of the others."""
+    means = [float(lens.score.information.mean()) for lens in lenses]
+    return means[0] / max(means[1:])
+
+
+def values(lenses: tuple[Judged, ...], settings: Fisher) -> dict[str, Any]:
+    """Every figure, ready for JSON."""
+    return {
+        "depths_mm": _depths(lenses, settings).tolist(),
+        "angles_deg": list(settings.angles_deg),
+        "pixel_um": settings.pixel_um,
+        "normalisation": settings.normalisation,
+        "times_the_better_baseline": times(lenses),
+        "lenses": {
+            lens.name: {
+                "information_per_mm2": lens.score.information.tolist(),
+                "encircled_energy": lens.score.encircled.tolist(),
+            }
+            for lens in lenses
+        },
+    }
+
+
+def text(lenses: tuple[Judged, ...], settings: Fisher) -> str:
+    """A table: information (mean over the depths) at every angle, and the least energy over the depths."""
+    low, high = settings.depths_mm
+    lines = [
+        f"I(z) per mm², mean over {low:g}-{high:g} mm (least energy in {settings.radius_um:g} um); pixels of "
+        f"{settings.pixel_um:g} um, {settings.normalisation} normalisation, smooth phases",
+        f"  {'lens':<36}" + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
+    ]
+    for lens in lenses:
+        pairs = zip(lens.score.information.mean(1), lens.score.encircled.amin(1), strict=True)
+        lines.append(f"  {lens.name:<36}" + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs))
+    energy = ", ".join(
+        f"{depth:g} mm {share:.2f}"
+        for depth, share in zip(_depths(lenses, settings)[::2], lenses[0].score.encircled.amin(0)[::2], strict=True)
+    )
+    return "\n".join([*lines, f"  {times(lenses):.2f} x the better baseline; energy of the free form: {energy}"])
+
+
+def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes:
+    """Information and energy over depth at the first angle, and PSFs of the lenses through the range."""
+    figure, _ = canvas(1, 1, size=(10, 7.6))
+    figure.clear()
+    top, bottom = figure.subfigures(2, 1, height_ratios=(3, 0.4 + 1.3 * len(lenses)))
+    left, right = top.subplots(1, 2)
+    depths, angle = _depths(lenses, settings), settings.angles_deg[0]
+    for lens in lenses:
+        left.plot(depths, lens.score.information[0].numpy(), ".-", label=lens.name)
+        right.plot(depths, lens.score.encircled[0].numpy(), ".-")
+    right.axhline(settings.encircled, color="0.5", ls=":")
+    left.set(ylabel="I(z) / mm⁻²", xlabel="source depth / mm", title=f"axial information at {angle:g}°", ylim=(0, None))
+    right.set(ylabel=f"energy in {settings.radius_um:g} µm", xlabel="source depth / mm", ylim=(0, 1))
+    right.set_title("encircled energy; dotted: what was asked for")
+    left.legend(fontsize=7)
+    planes = torch.linspace(1e3 * settings.depths_mm[0], 1e3 * settings.depths_mm[1], STRIP, dtype=torch.float64)
+    fields = [Field(float(np.radians(angle)))] * STRIP
+    panels = bottom.subplots(len(lenses), STRIP, squeeze=False)
+    for row, lens in enumerate(lenses):
+        samples = int(SHOWN_UM / SAMPLE_UM)
+        stack = pupils.psf(lens.phase_rad, pupil, depths_um=planes, fields=fields, focus_um=lens.focus_um,
+                                  sample_um=SAMPLE_UM, samples=samples)  # fmt: skip
+        for column, image in enumerate(stack):
+            panel = panels[row, column]
+            panel.imshow(torch.sqrt(image).numpy(), cmap="inferno")
+            panel.set(xticks=[], yticks=[])
+            if row == 0:
+                panel.set_title(f"{planes[column] / 1e3:g} mm", fontsize=8)
+            if column == 0:
+                panel.set_ylabel(lens.name.replace(", ", "\n"), fontsize=7)
+    bottom.supxlabel(f"PSFs, {SHOWN_UM:g} µm wide, square root of the intensity, each at its own scale", fontsize=8)
+    return png(figure)
+
+
+def _depths(lenses: tuple[Judged, ...], settings: Fisher) -> Any:
+    return np.linspace(*settings.depths_mm, lenses[0].score.information.shape[1])

@@ -1,0 +1,94 @@
+"""Baselines tuned as hard as a design: the focus of a hyperbolic lens, zones and focus of a double helix."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.design import DoubleHelix, Focus, PhaseOf, phase_of
+from metalens.design.free_form.search import score, vortices
+from metalens.design.free_form.settings import Fisher
+from metalens.ground.errors import ConfigError
+from metalens.image import Pupil
+from metalens.image import pupil as pupils
+
+FOCI_MM = (12.0, 50.0)  # searched for the hyperbolic lens
+HELIX_FOCI_MM = (14.0, 30.0)
+ZONES = (1, 2, 3, 4, 5, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """A simple lens and what it is worth.
+
+    zones: of the double helix, 0 for a hyperbolic lens. focus_um: source distance of best focus.
+    information: mean of I(z) over the depths, per mm². encircled: least share of the light over the depths.
+    """
+
+    zones: int
+    focus_um: float
+    information: float
+    encircled: float
+
+    @property
+    def name(self) -> str:
+        """Kind and focus, for tables."""
+        kind = f"helix of {self.zones} zone{'s' * (self.zones > 1)}" if self.zones else "hyperbolic"
+        return f"{kind}, {self.focus_um / 1e3:.1f} mm"
+
+    def phase(self, focus: Focus, *, radius_um: float) -> tuple[PhaseOf, Focus]:
+        """The wanted phase as a function of position, and what it images onto what."""
+        mine = Focus(focus.wavelength_um, focus.sensor_distance_um, self.focus_um)
+        shape = DoubleHelix(zones=self.zones) if self.zones else None
+        return phase_of(shape, mine, radius_um=radius_um), mine
+
+
+def judged(pupil: Pupil, settings: Fisher, *, zones: int, focus_um: float) -> Baseline:
+    """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``."""
+    phase = baseline_phase(pupil, zones)
+    found = score(phase, pupil, focus_um=focus_um, settings=settings)
+    return Baseline(zones, focus_um, float(found.information.mean()), float(found.encircled.min()))
+
+
+def baseline_phase(pupil: Pupil, zones: int) -> Tensor:
+    """(nodes, nodes) vortices on the pupil's nodes."""
+    x, y = (a.numpy() for a in pupils.coordinates(pupil))
+    return torch.from_numpy(vortices(x, y, radius_um=pupil.radius_um, zones=zones))
+
+
+def tuned(
+    pupil: Pupil,
+    settings: Fisher,
+    *,
+    zones: Sequence[int] = (0,),
+    foci_mm: tuple[float, float] = FOCI_MM,
+    count: int = 12,
+) -> Baseline:
+    """Most informative lens over zones and focus: a scan at equal steps of 1/z, then twice a finer one around the best.
+
+    Raises:
+        ConfigError: no zones, foci that do not ascend, or fewer than 3 foci.
+    """
+    low, high = foci_mm
+    if not (zones and 0 < low < high and count >= 3):
+        raise ConfigError(f"zones = {zones}, foci_mm = {foci_mm}, count = {count}: need 0 < least < largest and 3 foci")
+    tried: list[Baseline] = []
+    for rings in zones:
+        here = 1e3 / np.linspace(1 / low, 1 / high, count)
+        step = (1 / low - 1 / high) / (count - 1)
+        found = [judged(pupil, settings, zones=rings, focus_um=float(f)) for f in here]
+        for _ in range(2):
+            best = max(found, key=lambda b: b.information)
+            step /= 2
+            near = [1 / (1e3 / best.focus_um + side * step) for side in (-1, 1)]
+            found += [judged(pupil, settings, zones=rings, focus_um=1e3 * f) for f in near if low <= f <= high]
+        tried += found
+    return max(tried, key=lambda b: b.information)
+
+
+def tuned_pair(pupil: Pupil, settings: Fisher) -> tuple[Baseline, Baseline]:
+    """The best hyperbolic lens and the best double helix."""
+    helix = tuned(pupil, settings, zones=ZONES, foci_mm=HELIX_FOCI_MM, count=6)
+    return tuned(pupil, settings), helix

@@ -1,0 +1,230 @@
+"""A phase profile made of pillars: every site takes the diameter whose proxy phase is the wanted one."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from metalens.cell import Cell
+from metalens.design import phase_map, profiles
+from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, LensError
+from metalens.ground.paths import source_path
+from metalens.ground.store import Provenance
+from metalens.lens import DiameterMap, Lens
+from metalens.pillars import Proxy
+
+PhaseOf = Callable[[Array, Array], Array]  # (x,) and (y,) positions in um to (y, x) phase in rad
+_BLOCK_SITES = 1 << 21  # sites worked on at a time, so that memory does not grow with the lens
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How well the pillars make the profile at the design wavelength.
+
+    pillars: count.
+    numerical_aperture: of the cone that leaves the lens towards the sensor.
+    efficiency: |sum T exp(i error)|² / N²: power in the ideal spot, against a perfect lens without loss.
+    transmission: mean |T|², the light that passes.
+    strehl: |sum T exp(i error)|² / (sum T)²: what the phase errors of the pillars leave of the peak.
+    field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a Strehl ratio of 0.8
+        (Maréchal's criterion on the wave-front error).
+    max_phase_error_rad: largest difference between wanted and made phase.
+    rms_phase_error_rad: root mean square of it over the pillars.
+    turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the phases that none has.
+    """
+
+    pillars: int
+    numerical_aperture: float
+    efficiency: float
+    transmission: float
+    strehl: float
+    field_of_view_rad: float
+    max_phase_error_rad: float
+    rms_phase_error_rad: float = 0.0
+    turns: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the process can print.
+
+    min_diameter_nm: thinnest pillar.
+    min_gap_nm: least distance between neighbouring pillars.
+    """
+
+    min_diameter_nm: float = 82.0
+    min_gap_nm: float = 70.0
+
+    def __post_init__(self) -> None:
+        if not (self.min_diameter_nm > 0 and self.min_gap_nm > 0):
+            raise ConfigError(
+                f"min_diameter_nm = {self.min_diameter_nm}, min_gap_nm = {self.min_gap_nm}: need both above 0"
+            )
+
+
+def phase_of(shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float) -> PhaseOf:
+    """The wanted phase as a function of position: ``shape`` on top of the focus, None for hyperbolic."""
+    if isinstance(shape, PhaseMap):
+        samples = phase_map.read(shape)
+
+        def mapped(x_um: Array, y_um: Array) -> Array:
+            phase = phase_map.interpolate(samples, x_um, y_um, radius_um=radius_um)
+            return phase + profiles.hyperbolic(x_um, y_um[:, None], focus) if shape.add_focus else phase
+
+        return mapped
+    if isinstance(shape, DoubleHelix):
+        return lambda x, y: profiles.double_helix(x, y[:, None], focus, shape, radius_um=radius_um)
+    if isinstance(shape, Cubic):
+        return lambda x, y: profiles.cubic(x, y[:, None], focus, shape, radius_um=radius_um)
+    return lambda x, y: profiles.hyperbolic(x, y[:, None], focus)
+
+
+def make(
+    phase: PhaseOf,
+    focus: Focus,
+    *,
+    aperture_um: float,
+    cell: Cell,
+    proxy: Proxy,
+    limits: Limits | None = None,
+    profile: str = "map",
+    provenance: Provenance | None = None,
+    accept_partial_turn: bool = False,
+) -> tuple[Lens, Quality]:
+    """Fill a round aperture with pillars (paper Eq. 2 inverted).
+
+    Args:
+        phase: wanted phase; see :func:`phase_of`.
+        aperture_um: diameter of the aperture; every pillar's centre lies half a pitch inside it.
+        limits: of the process; the proxy's domain is narrowed to them.
+        profile: name kept in the lens.
+        accept_partial_turn: where the pillars cover less than a turn, take the nearest phase that they have; the
+            quality says what it costs.
+
+    Returns:
+        The lens (float32 diameters: 2e-8 um, below 1e-6 rad) and its quality.
+
+    Raises:
+        LensError: the aperture holds no pillar, or the printable diameters reach less than a full turn.
+    """
+    within = printable(proxy, cell, limits or Limits(), focus.wavelength_um, accept_partial_turn=accept_partial_turn)
+    gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"
+    count = int(aperture_um / cell.pitch_um) if math.isfinite(aperture_um) else 0
+    if count < 1:
+        raise LensError(f"empty aperture: {aperture_um} um holds no cell of pitch {cell.pitch_um} um")
+    axis = (np.arange(count) - (count - 1) / 2) * cell.pitch_um
+    reach = aperture_um / 2 - cell.pitch_um / 2 if count > 1 else 0.0
+    diameter = np.zeros((count, count), np.float32)
+    sums = _Sums()
+    block = max(1, _BLOCK_SITES // count)
+    for start in range(0, count, block):
+        rows = slice(start, start + block)
+        inside = axis[rows, None] ** 2 + axis**2 <= reach**2 * (1 + 1e-12)
+        wanted = phase(axis, axis[rows])[inside]
+        made = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within, gap=gap)
+        diameter[rows][inside] = made
+        sums.add(wanted, diameter[rows][inside].astype(float), proxy, focus.wavelength_um)
+    lens = Lens(
+        diameters=DiameterMap(diameter, cell.pitch_um),
+        cell=cell,
+        proxy=proxy,
+        wavelength_um=focus.wavelength_um,
+        sensor_distance_um=focus.sensor_distance_um,
+        source_distance_um=focus.source_distance_um,
+        profile=profile,
+        provenance=provenance or Provenance(),
+    )
+    return lens, sums.quality(
+        focus, aperture_um / 2, proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
+    )
+
+
+def printable(
+    proxy: Proxy, cell: Cell, limits: Limits, wavelength_um: float, *, accept_partial_turn: bool = False
+) -> tuple[float, float]:
+    """(least, largest) diameter in um that both the proxy holds and the process prints.
+
+    Raises:
+        LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
+    """
+    if cell.lattice.kind != "square":
+        raise LensError(f"a lens holds its pillars on a square lattice, the cell is {cell.described}")
+    thinnest, widest = limits.min_diameter_nm * 1e-3, cell.widest_um(limits.min_gap_nm * 1e-3)
+    low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
+    if low >= high:
+        raise LensError(
+            f"no printable pillar: the library holds {proxy.domain_um[0]:.4f}-{proxy.domain_um[1]:.4f} um, the "
+            f"process prints {thinnest:.4f}-{widest:.4f} um"
+        )
+    turns = proxy.coverage_rad(wavelength_um, within_um=(low, high)) / (2 * math.pi)
+    if turns < 1 and not accept_partial_turn:
+        raise LensError(
+            f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um} um, need 1; "
+            "take a smaller pitch, taller pillars or looser process limits, or accept the nearest pillar "
+            "(accept_partial_turn) at the loss of efficiency that the design then states"
+        )
+    return low, high
+
+
+class _Sums:
+    """Running sums over all pillars that :class:`Quality` is made of."""
+
+    def __init__(self) -> None:
+        self.count, self.field, self.level, self.power, self.worst = 0, 0j, 0.0, 0.0, 0.0
+        self.square = 0.0
+
+    def add(self, wanted: Array, made_um: Array, proxy: Proxy, wavelength_um: float) -> None:
+        error = np.remainder(proxy.phase_rad(made_um, wavelength_um) - wanted + np.pi, 2 * np.pi) - np.pi
+        level = proxy.transmission(made_um, wavelength_um)
+        self.count += error.size
+        self.field += complex((level * np.exp(1j * error)).sum())
+        self.level += float(level.sum())
+        self.power += float((level**2).sum())
+        self.square += float((error**2).sum())
+        self.worst = max(self.worst, float(np.abs(error).max(initial=0)))
+
+    def quality(self, focus: Focus, radius_um: float, turns: float) -> Quality:
+        peak = abs(self.field) ** 2
+        return Quality(
+            pillars=self.count,
+            numerical_aperture=float(np.sin(np.arctan(radius_um / focus.sensor_distance_um))),
+            efficiency=peak / self.count**2,
+            transmission=self.power / self.count,
+            strehl=peak / self.level**2,
+            field_of_view_rad=2 * field_angle(focus, radius_um),
+            max_phase_error_rad=self.worst,
+            rms_phase_error_rad=math.sqrt(self.square / self.count),
+            turns=turns,
+        )
+
+
+def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:
+    """Half field in rad at which coma and astigmatism of the hyperbolic lens leave exp(-sigma²) = ``strehl``.
+
+    sigma is the wave-front error over the aperture, with piston, tilt and best focus taken out.
+    """
+    low, high = 0.0, np.pi / 3
+    for _ in range(40):
+        middle = (low + high) / 2
+        if math.exp(-_wavefront_variance(focus, radius_um, middle)) >= strehl:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
+    unit = np.linspace(-1, 1, 61)
+    x, y = (g[np.hypot(*np.meshgrid(unit, unit)) <= 1] * radius_um for g in np.meshgrid(unit, unit))
+    tangent = math.tan(angle_rad)
+    path = profiles.hyperbolic(x, y, focus)
+    for distance, side in ((focus.sensor_distance_um, -tangent), (focus.source_distance_um, tangent)):
+        path = path + 2 * np.pi / focus.wavelength_um * source_path(x, y, (side, 0.0), 1 / distance)
+    basis = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=1)
+    basis /= np.abs(basis).max(axis=0)
+    residual = path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]
+    return float((residual**2).mean())

@@ -1,0 +1,104 @@
+"""Phase profiles of lenses: hyperbolic, double helix, cubic, and a map from file.
+
+All focus a point source on the axis at ``source_distance_um`` before the lens onto the sensor at
+``sensor_distance_um`` behind it; the last three add their own term to that hyperbolic phase.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, LensError
+from metalens.ground.paths import path_difference
+
+
+@dataclass(frozen=True, slots=True)
+class Focus:
+    """What the lens images onto what.
+
+    source_distance_um: object distance of best focus; inf for a collimated beam.
+    """
+
+    wavelength_um: float
+    sensor_distance_um: float
+    source_distance_um: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("wavelength_um", "sensor_distance_um", "source_distance_um"):
+            if not getattr(self, name) > 0:
+                raise LensError(f"{name} = {getattr(self, name)}: need a length above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class DoubleHelix:
+    """Annular vortices: ring l of ``zones`` carries the charge 2l - 1 (after Pavani et al. 2009, Prasad 2013).
+
+    zones: number of rings.
+    exponent: ring l ends at radius R (l / zones)**exponent; 1/2 gives rings of equal area.
+    """
+
+    zones: int = 4
+    exponent: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.zones < 1 or not self.exponent > 0:
+            raise ConfigError(f"double helix of {self.zones} zones, exponent {self.exponent}: need both above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Cubic:
+    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey 1995)."""
+
+    strength_rad: float = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseMap:
+    """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see :mod:`metalens.design.phase_map`.
+
+    file: its path (.npy, .mat, a Zemax grid phase .dat, else text).
+    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the phasor exp(i phase).
+    add_focus: whether the hyperbolic focus is added to the map.
+    variable: name of the matrix in a .mat file that holds several.
+    conjugate: change the sign, for maps made with exp(+iwt).
+    """
+
+    file: Path
+    pitch_um: float | None = None
+    add_focus: bool = False
+    variable: str | None = None
+    conjugate: bool = False
+
+    def __post_init__(self) -> None:
+        if self.pitch_um is not None and not self.pitch_um > 0:
+            raise ConfigError(f"pitch_um = {self.pitch_um} of the phase map: need a length above 0")
+
+
+def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
+    """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both sides).
+
+    Args:
+        x_um, y_um: positions that broadcast to (y, x).
+
+    Returns:
+        (y, x) phase in rad, 0 on the axis and negative outwards, float64.
+    """
+    radius2 = x_um**2 + y_um**2
+    path = path_difference(radius2, focus.sensor_distance_um) + path_difference(radius2, focus.source_distance_um)
+    return np.asarray(-2 * np.pi / focus.wavelength_um * path)
+
+
+def double_helix(x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float) -> Array:
+    """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes that turn with depth."""
+    fraction = np.hypot(x_um, y_um) / radius_um
+    ring = np.clip(np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones)
+    return np.asarray(hyperbolic(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um))
+
+
+def cubic(x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float) -> Array:
+    """Hyperbolic phase plus :class:`Cubic`."""
+    x, y = x_um / radius_um, y_um / radius_um
+    return np.asarray(hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3))

@@ -1,0 +1,47 @@
+"""The true image: PSFs that vary over field, depth and spectrum, through the films around the lens."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.field.engine import imager as imager
+    from metalens.field.engine import node_psfs as node_psfs
+    from metalens.field.forming import Imager as Imager
+    from metalens.field.forming import with_psfs as with_psfs
+    from metalens.field.media import Media as Media
+    from metalens.field.plan import Grid as Grid
+    from metalens.field.plan import Plan as Plan
+    from metalens.field.points import Layers as Layers
+    from metalens.field.points import Optics as Optics
+    from metalens.field.points import Window as Window
+    from metalens.field.points import psfs as psfs
+    from metalens.field.subset import node_light as node_light
+    from metalens.field.subset import surrogate as surrogate
+    from metalens.field.subset import with_light as with_light
+    from metalens.field.waves import PillarWave as PillarWave
+    from metalens.field.waves import SmoothWave as SmoothWave
+    from metalens.field.waves import Wave as Wave
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Grid": "plan",
+        "Imager": "forming",
+        "Layers": "points",
+        "Media": "media",
+        "Optics": "points",
+        "PillarWave": "waves",
+        "Plan": "plan",
+        "SmoothWave": "waves",
+        "Wave": "waves",
+        "Window": "points",
+        "imager": "engine",
+        "node_light": "subset",
+        "node_psfs": "engine",
+        "psfs": "points",
+        "surrogate": "subset",
+        "with_light": "subset",
+        "with_psfs": "forming",
+    },
+)

@@ -1,0 +1,186 @@
+"""From a lens to an imager: field points, PSFs, patches, and the error that it says."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.field import patches as cutting
+from metalens.field.forming import Imager, blurred, trimmed, vergence, with_psfs
+from metalens.field.patches import dense, relative
+from metalens.field.plan import SHARES, Grid, Plan, planned, spectral
+from metalens.field.points import Layers, Optics, psfs, sampling
+from metalens.field.stray import stray_of
+from metalens.field.waves import SmoothWave, Wave, wave_of
+from metalens.image import Frames
+from metalens.lens import Lens
+from metalens.psf import Nodes, Source
+
+PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
+LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
+OVERLAP = 4  # samples that two patches share
+
+
+def imager(
+    lens: Lens | Wave,
+    scene_grid: Grid,
+    *,
+    spectrum: Source | Nodes | None = None,
+    layers: Layers | None = None,
+    field: tuple[float, float] = (0.0, 0.0),
+    tolerance: float = 1e-2,
+    distance_um: float | None = None,
+    device: torch.device | str = "cpu",
+) -> Imager:
+    """Prepare a lens for frames of a grid.
+
+    Args:
+        lens: a lens file's content, or a wave (:class:`SmoothWave`, :class:`PillarWave`).
+        spectrum: a diode, wavelengths with weights, or None for the design wavelength alone.
+        layers: films around the lens; by default none: the cell's cover fills the gap.
+        field: (x, y) angle in rad of the middle of the grid.
+        tolerance: of the image of a 1/f texture, relative L2.
+        distance_um: lens to sensor, by default the design's.
+
+    Raises:
+        SceneError: the tolerance cannot be met; PropagationError: films thicker than the gap.
+
+    Accuracy: ``error`` of the result, by cause in ``parts``.
+    """
+    wave = wave_of(lens)
+    focus = wave.focus  # type: ignore[attr-defined]
+    if layers is None:
+        layers = Layers(cover=lens.cell.cover) if isinstance(lens, Lens) else Layers()
+    optics = Optics(wave, layers, focus.sensor_distance_um if distance_um is None else distance_um)
+    source = spectrum or Nodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
+    reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
+    middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
+    round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
+    plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_)
+    stack, energy = node_psfs(optics, plan)
+    made = prepared(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
+    parts = {**made.parts, **_held_out(optics, made)}
+    return replace(made, parts=parts, stray=stray_of(optics, scene_grid, float(plan.depths_um.mean()), middle))
+
+
+def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
+    """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in the wave's factor."""
+    if plan.folds:
+        light = _folded(optics, plan)
+    else:
+        y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
+        at = torch.stack([x.flatten(), y.flatten()], -1)
+        light = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
+        light = light.reshape(*x.shape, *light.shape[1:])
+    return normalised(light, optics, plan)
+
+
+def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
+    """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
+    total = light.sum((-2, -1))
+    reduced = optics.layers.after(optics.distance_um, float(plan.waves.wavelengths_um.mean())).reduced_um
+    cosine2 = 1 / (1 + (plan.y_um[:, None] ** 2 + plan.x_um**2) / reduced**2)
+    return light / total[..., None, None], total * (cosine2**2)[..., None].to(total)
+
+
+def _folded(optics: Optics, plan: Plan) -> Tensor:
+    """PSFs of a round lens on a square grid about its axis, from one eighth of the nodes."""
+    count = len(plan.x_um)
+    half = (count + 1) // 2
+    pairs = [(i, j) for i in range(half) for j in range(i, half)]
+    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs])
+    few = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
+    out = few.new_zeros(count, count, *few.shape[1:])
+    for (i, j), psf in zip(pairs, few, strict=True):
+        for row, up in ((i, psf), (count - 1 - i, psf.flip(-2))):
+            for column, whole in ((j, up), (count - 1 - j, up.flip(-1))):
+                out[row, column], out[column, row] = whole, whole.mT
+    return out
+
+
+def prepared(grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float) -> Imager:
+    """Cut the field into patches with their kernels; differentiable in the PSFs and their illumination.
+
+    As few kernels as image a texture of two sheets (:func:`trial`) within their share of the tolerance: what a patch
+    lacks differs from pixel to pixel, and adds up to less than the worst PSF says.
+    """
+    share = tolerance * SHARES["kernels"]
+    count = max(1, round(min(grid.frame) / PATCH))
+    made = cutting.cut(stack, energy, grid.frame, patches=count, overlap=OVERLAP, tolerance=share / 4)
+    whole = with_psfs(Imager(grid, plan, stack, energy, made, [], {"kernels": 0.0}), stack, energy)
+    seen = trial(grid)
+    with torch.no_grad():
+        want = blurred(seen, whole)
+        for looser in LOOSER:
+            few = trimmed(whole, share * looser)
+            error = float((blurred(seen, few) - want).norm() / want.norm())
+            if error <= share * 0.97:
+                break
+    few = trimmed(whole, share * looser)
+    return replace(few, parts={"kernels": math.hypot(error, share / 4)})
+
+
+def trial(grid: Grid) -> Frames:
+    """One frame of two sheets over all depths with 1/f texture of mean 1 and contrast about 0.3."""
+    draw = torch.Generator().manual_seed(11)
+    y, x = grid.frame
+    fy, fx = torch.fft.fftfreq(y)[:, None], torch.fft.rfftfreq(x)
+    white = torch.fft.rfft2(torch.randn(2, y, x, generator=draw))
+    rough = torch.fft.irfft2(white / torch.sqrt(fy**2 + fx**2 + (0.5 / max(x, y)) ** 2), s=(y, x))
+    texture = (1 + 0.3 * (rough - rough.mean()) / rough.std()).clamp_min(0)
+    down = torch.linspace(-1, 1, y)[:, None].expand(y, x)
+    across = torch.linspace(-1, 1, x).expand(y, x)
+    near = torch.sigmoid((-down - 0.25 + 0.2 * across) * y / 4)
+    cover = torch.stack([near, 1 - near])
+    low, high = (1 / d for d in grid.depths_um)
+    depth = 1 / torch.stack([low + (high - low) * (0.2 + 0.2 * across), low + (high - low) * (0.6 + 0.35 * down)])
+    return Frames((cover * texture)[None], cover[None], depth[None])
+
+
+def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
+    """Errors at places, depths and wavelengths that no node holds: interpolation, transform; light left outside."""
+    plan = made.plan
+    draw = np.random.default_rng(7)
+    unit = torch.from_numpy(draw.uniform(-1, 1, (5, 2)))
+    span = [(axis[-1] - axis[0]) / 2 for axis in (plan.x_um, plan.y_um)]
+    middle = [(axis[-1] + axis[0]) / 2 for axis in (plan.x_um, plan.y_um)]
+    at = torch.stack([m + s * unit[:, i] for i, (m, s) in enumerate(zip(middle, span, strict=True))], -1)
+    ends = 1 / plan.depths_um[[0, -1]]
+    depths = 1 / (ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64))
+    true = spectral(optics, at, depths, plan.waves, plan.window).detach()
+    outside = 1 - float(true.sum((-1, -2)).mean())
+    true = true / true.sum((-1, -2), keepdim=True)
+    grids = [
+        dense((at[:, i] - axis[0]) / (axis[-1] - axis[0]) * (len(axis) - 1), len(axis))
+        for i, axis in enumerate((plan.x_um, plan.y_um))
+    ]
+    deep = dense(vergence(depths, plan.depths_um).double(), len(plan.depths_um))
+    got = torch.einsum("nb,na,zd,abdyx->nzyx", *grids, deep, made.stack.detach().cpu().double())
+    nodes = float((relative(got, true.double()) ** 2).mean().sqrt())
+    rms = _width(true) * plan.window.step_um
+    one = replace(plan.waves, wavelengths_um=plan.waves.wavelengths_um[:1], weights=np.ones(1))
+    shift = (rms * 0.6, rms * 0.8)
+    moved = [_shifted(optics, at, depths, one, plan, s) for s in ((0.0, 0.0), shift)]
+    transform = float((relative(moved[1], moved[0]) ** 2).mean().sqrt())
+    edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
+    found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
+    return {**found, "edge": edge, "outside": outside}
+
+
+def _shifted(
+    optics: Optics, at: Tensor, depths: Tensor, one: Nodes, plan: Plan, shift_um: tuple[float, float]
+) -> Tensor:
+    wave = float(one.wavelengths_um[0])
+    return psfs(optics, at, depths_um=depths, wavelength_um=wave, window=plan.window, shift_um=shift_um).detach()
+
+
+def _width(psfs: Tensor) -> float:
+    """Root mean square distance of the light from its centroid, samples, mean over the PSFs."""
+    n = psfs.shape[-1]
+    place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
+    total = psfs.sum((-1, -2))
+    x, y = (psfs.sum(-2) * place).sum(-1) / total, (psfs.sum(-1) * place).sum(-1) / total
+    square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
+    return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())

@@ -1,0 +1,216 @@
+"""Image of a scene through a lens whose PSF varies over the field, with depth, and over the spectrum.
+
+    I(X) = Σ_sheets Σ_points L(x) E(x, z) P(X; x, z)
+
+E: relative illumination: cos⁴ of the field angle (projected aperture and solid angle of a sample) times the light of
+the PSF's window. 1 is what an ideal lens of the same aperture sends to a sample on the axis from radiance 1; the
+irradiance in watts is that times π NA'² L with sin of the rim's angle NA' (small angles: area / distance²).
+The near sheet hides the far one as in :mod:`metalens.image.scene`; where one sheet is seen, the sum is as above.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import scipy.fft
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from metalens.field import compiled
+from metalens.field.patches import Patch, dense, lagrange
+from metalens.field.plan import Grid, Plan
+from metalens.field.stray import Stray, add_stray
+from metalens.ground.errors import SceneError
+from metalens.image import Frames
+
+FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
+COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Imager:
+    """A lens ready to image frames of one grid.
+
+    grid, plan: where the scene is sampled, and where the PSFs are known.
+    stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1. energy: (rows, columns, depths) E of each.
+    patches: of the frame. transfer: of each patch's kernels, (rank, Y, X // 2 + 1).
+    parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, edge (light that the rim bends
+        out of the window, and that the transform folds back). Beside them ``outside``: light that windows leave out.
+    stray: light of other diffraction orders, None where the lens tells nothing of them.
+    """
+
+    grid: Grid
+    plan: Plan
+    stack: Tensor
+    energy: Tensor
+    patches: list[Patch]
+    transfer: list[Tensor]
+    parts: Mapping[str, float]
+    stray: Stray | None = field(default=None)
+
+    @property
+    def error(self) -> float:
+        """Relative L2 error to expect of the image of a 1/f texture."""
+        return math.hypot(*(value for name, value in self.parts.items() if name != "outside"))
+
+    def __call__(self, frames: Frames) -> Tensor:
+        """(frames, y, x) irradiance; see the module.
+
+        Raises:
+            SceneError: frames of another size than the grid's with its margin.
+        """
+        return image(frames, self)
+
+
+def image(frames: Frames, optics: Imager, *, chunk: int = 4) -> Tensor:
+    """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time stay in a processor's cache."""
+    grid = optics.grid
+    size = tuple(n + 2 * grid.margin for n in grid.samples)
+    if tuple(frames.radiance.shape[-2:]) != size:
+        raise SceneError(f"frames of {tuple(frames.radiance.shape[-2:])} samples, need {size}: grid and margin")
+    out = []
+    for start in range(0, len(frames.radiance), chunk):
+        part = [_continued(getattr(frames, n)[start : start + chunk], grid.spare) for n in Frames.__slots__]
+        few = Frames(*part)
+        total = blurred(few, optics)
+        edge = grid.margin + grid.spare
+        total = total[..., edge : edge + grid.samples[0], edge : edge + grid.samples[1]]
+        out.append(total if optics.stray is None else add_stray(total, few, optics.stray, grid))
+    return torch.cat(out)
+
+
+def _continued(field: Tensor, spare: int) -> Tensor:
+    """The border samples repeated outward."""
+    if not spare:
+        return field
+    return torch.nn.functional.pad(field, (spare, spare, spare, spare), mode="replicate")
+
+
+def blur(frames: Frames, optics: Imager) -> Tensor:
+    """(frames, light and coverage, sheets, y, x) of frames as large as the grid's, through every patch."""
+    grid, size = optics.grid, optics.stack.shape[-1]
+    reach = size // 2
+    count = len(frames.radiance)
+    out = frames.radiance.new_zeros(count, 2, 2, grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach)
+    position = vergence(frames.depth_um, optics.plan.depths_um)
+    for patch, transfer in zip(optics.patches, optics.transfer, strict=True):
+        high, wide = patch.rows[1] - patch.rows[0] + 2 * reach, patch.columns[1] - patch.columns[0] + 2 * reach
+        shape = _size(patch, size)
+        sources = _sources(patch, frames, position, len(optics.plan.depths_um), shape)
+        for kind, source in enumerate(sources):
+            mixed = _mixed(torch.fft.rfft2(source, s=shape), transfer)
+            seen = torch.fft.irfft2(mixed, s=shape)[..., :high, :wide]
+            place = out[:, kind, :, patch.rows[0] : patch.rows[0] + high, patch.columns[0] : patch.columns[0] + wide]
+            place += seen
+    return out[..., reach : reach + grid.frame[0], reach : reach + grid.frame[1]]
+
+
+def _sources(
+    patch: Patch, frames: Frames, position: Tensor, depths: int, shape: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """(rank, frames, sheets, …) light and coverage of a patch, weighted for its kernels."""
+    rows, columns = slice(*patch.rows), slice(*patch.columns)
+    light, cover, place = (a[..., rows, columns] for a in (frames.radiance, frames.coverage, position))
+    tables = patch.weights, patch.energy
+    if all(_plain(a) for a in (light, cover, place, *tables)):
+        given = light.numpy(), cover.numpy(), place.numpy()
+        made = compiled.weighted(given, (tables[0].numpy(), tables[1].numpy()), shape, patch.coverage)
+        return torch.from_numpy(made[0]), torch.from_numpy(made[1])
+    weights, level = at_depth(patch, place, depths)
+    return weights * (light * level), weights[: patch.coverage] * cover
+
+
+def _mixed(spectrum: Tensor, transfer: Tensor) -> Tensor:
+    """Sum over the kernels of spectrum times transfer, without the products in memory."""
+    total = spectrum[0] * transfer[0]
+    for part, kernel in zip(spectrum[1:], transfer[1:], strict=False):
+        total = torch.addcmul(total, part, kernel)
+    return total
+
+
+def _plain(a: Tensor) -> bool:
+    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
+    if a.dtype != torch.float32 or a.device.type != "cpu" or a.requires_grad:
+        return False
+    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
+
+
+def vergence(depth_um: Tensor, depths_um: Tensor) -> Tensor:
+    """Depths in units of the nodes, 0 … depths - 1, at equal steps of 1/z; outside the nodes the outermost."""
+    near, far = float(depths_um[0]), float(depths_um[-1])
+    span = 1 / near - 1 / far
+    if span <= 0:
+        return torch.zeros_like(depth_um)
+    return (1 / near - 1 / depth_um.clamp(near, far)) * ((len(depths_um) - 1) / span)
+
+
+def at_depth(patch: Patch, position: Tensor, depths: int) -> tuple[Tensor, Tensor]:
+    """(rank, frames, sheets, y, x) weights and (frames, sheets, y, x) E of sources at these depths."""
+    first, taps = lagrange(position, depths)
+    pixel = torch.arange(patch.energy.shape[0], device=position.device).reshape(position.shape[-2:])
+    index = pixel * depths + first
+    table, level = patch.weights.to(position).flatten(0, 1), patch.energy.to(position).flatten()
+    weights: Tensor = torch.zeros((), device=position.device)
+    light: Tensor = torch.zeros((), device=position.device)
+    for k in range(taps.shape[-1]):
+        weights = weights + taps[..., k, None] * table[index + k]
+        light = light + taps[..., k] * level[index + k]
+    return weights.movedim(-1, 0), light
+
+
+def _over(light: Tensor, cover: Tensor) -> Tensor:
+    """Near sheet over far sheet: (frames, 2, y, x) each to (frames, y, x); the plain sum where one sheet is seen."""
+    free = (1 - cover[:, 0]).clamp(0, 1)
+    share = (cover[:, 1] / FAINT).clamp(0, 1)
+    behind = free * share * (3 - 2 * share) / cover[:, 1].clamp_min(FAINT)
+    weight = cover[:, 0] + behind * cover[:, 1]
+    return (light[:, 0] + behind * light[:, 1]) * (cover.sum(1) / weight.clamp_min(FAINT))
+
+
+def _size(patch: Patch, window: int) -> tuple[int, int]:
+    high, wide = patch.rows[1] - patch.rows[0], patch.columns[1] - patch.columns[0]
+    y, x = (scipy.fft.next_fast_len(n + window - 1, real=True) for n in (high, wide))
+    return int(y), int(x)
+
+
+def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
+    """(rank, Y, X // 2 + 1); the image of a patch starts half a window before it."""
+    transfer: Tensor = torch.fft.rfft2(kernels, s=shape)
+    return transfer
+
+
+def blurred(frames: Frames, optics: Imager) -> Tensor:
+    """(frames, y, x) image on the whole frame, without stray light."""
+    both = blur(frames, optics)
+    return _over(both[:, 0], both[:, 1])
+
+
+def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
+    """The same patches with other PSFs: kernels as the first ones were mixed, differentiable in both arguments.
+
+    The gradient is that of the PSFs projected on the kept weights: changes that vary over field and depth in a way
+    that the first stack does not show need patches of their own (:func:`prepared`).
+    """
+    flat = stack.flatten(0, 2)
+    transfer, made = [], []
+    for patch in optics.patches:
+        kernels = torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes])
+        transfer.append(_transfer(kernels, _size(patch, stack.shape[-1])))
+        made.append(replace(patch, energy=_illumination(patch, optics.grid, energy)))
+    return replace(optics, stack=stack, energy=energy, patches=made, transfer=transfer)
+
+
+def _illumination(patch: Patch, grid: Grid, energy: Tensor) -> Tensor:
+    """(pixels, depths) E at every pixel of a patch."""
+    ends = []
+    for (a, b), n, k in zip((patch.rows, patch.columns), grid.frame, energy.shape, strict=False):
+        ends.append(dense(torch.arange(a, b, dtype=torch.float64) * ((k - 1) / max(n - 1, 1)), k).to(energy))
+    return torch.einsum("ya,xb,abz->yxz", *ends, energy).flatten(0, 1)
+
+
+def trimmed(optics: Imager, tolerance: float) -> Imager:
+    """The first kernels of every patch, as many as its own account of the tolerance needs."""
+    made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]
+    transfer = [t[: len(p.mix)] for t, p in zip(optics.transfer, made, strict=True)]
+    return replace(optics, patches=made, transfer=transfer)

@@ -1,0 +1,145 @@
+"""What a lens does to light, as the pupil of a field point sees it: a known carrier and a slowly varying factor.
+
+The focusing phase runs through thousands of radians; it is formed in float64 at every ray and joined with the paths
+before anything is rounded. What is left (polynomials of a design, pillars less the ideal phase) fits single precision.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.design import Focus
+from metalens.ground.errors import SceneError
+from metalens.lens import Lens
+
+CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
+
+
+class Wave(Protocol):
+    """A lens plane: radius of the open aperture, carrier and factor."""
+
+    @property
+    def radius_um(self) -> float:
+        """Of the open aperture."""
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """Phase in float64 that is known beforehand and carries no gradient."""
+
+    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+        """Complex transmission less the carrier, differentiable; None where it is 1."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SmoothWave:
+    """A hyperbolic focus and an added phase, the same at all wavelengths and angles.
+
+    added_rad: (x_um, y_um) to the added phase in rad, float64, differentiable; None for none.
+    """
+
+    focus: Focus
+    radius_um: float
+    added_rad: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """The hyperbolic phase of the focus."""
+        return focusing(self.focus, x_um, y_um)
+
+    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+        """exp(i added)."""
+        if self.added_rad is None:
+            return None
+        phase = self.added_rad(x_um, y_um)
+        turns = torch.round(phase.detach() / (2 * math.pi))
+        angle = (phase - 2 * math.pi * turns).to(torch.float32)
+        return torch.polar(torch.ones_like(angle), angle)
+
+
+class PillarWave:
+    """The pillars of a lens through its proxy: mean of t exp(-i carrier) over cells of a few micrometres.
+
+    diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in.
+
+    Light that single pillars scatter out of their cell's mean is lost to the image; it lands far outside the window.
+    """
+
+    def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
+        self.lens = lens
+        self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
+        d = lens.diameters
+        self.radius_um = d.radius_um + d.pitch_um / 2
+        self.diameter_um = torch.as_tensor(np.ascontiguousarray(d.diameter_um)) if diameter_um is None else diameter_um
+        self._block = max(1, round(CELL_UM / d.pitch_um))
+        self._cells: dict[tuple[float, float], Tensor] = {}
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """The hyperbolic phase that the design aims at."""
+        return focusing(self.focus, x_um, y_um)
+
+    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+        """Cells interpolated to the rays; the pillars answer at the angle of the light where the library has angles."""
+        tilt = angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
+        key = (wavelength_um, tilt)
+        cells = self._cells.get(key)
+        if cells is None:
+            cells = self._gathered(wavelength_um, tilt).to(x_um.device)
+            if not cells.requires_grad:
+                self._cells = {**dict(list(self._cells.items())[-15:]), key: cells}
+        half_y, half_x = (n * self._block * self.lens.diameters.pitch_um / 2 for n in cells.shape[-2:])
+        place = torch.stack([x_um / half_x, y_um / half_y], -1).to(cells)
+        found = torch.nn.functional.grid_sample(
+            cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
+        )
+        return torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+
+    def orders(self, wavelength_um: float, orders: tuple[int, ...]) -> dict[int, float]:
+        """Share of the light on the aperture that leaves in each diffraction order of the zones: 1 focuses."""
+        t, ideal, open_ = self._pillars(wavelength_um, 0.0)
+        return {m: float((t * torch.polar(open_, -m * ideal)).sum().abs() / open_.sum()) ** 2 for m in orders}
+
+    def _pillars(self, wavelength_um: float, tilt: float) -> tuple[Tensor, Tensor, Tensor]:
+        """(complex t, carrier, 1 where a pillar stands) of every pillar, in single precision."""
+        d, proxy = self.diameter_um, self.lens.proxy
+        open_ = (d > 0).to(torch.float32)
+        inside = torch.where(d > 0, d, torch.full_like(d, proxy.domain_um[0]))
+        phase: Any = proxy.phase_rad(inside, wavelength_um, tilt)
+        level: Any = proxy.transmission(inside, wavelength_um, tilt)
+        x, y = (torch.as_tensor(a, device=d.device) for a in (self.lens.diameters.x_um, self.lens.diameters.y_um))
+        ideal = torch.remainder(self.carrier_rad(x, y[:, None]), 2 * math.pi).to(torch.float32)
+        return torch.polar(level.to(torch.float32) * open_, phase.to(torch.float32)), ideal, open_
+
+    def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
+        """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
+        t, ideal, open_ = self._pillars(wavelength_um, tilt)
+        rest = torch.view_as_real(t * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
+        layers = torch.cat([rest, open_[None]])
+        size = layers.shape[-2:]
+        spare = [(-n) % self._block for n in size]
+        pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
+        mean = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
+        near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
+        filled = torch.where(mean[2] > 0, mean[:2], near[:2])
+        return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
+
+
+def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
+    """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d (paper Eq. 1, exp(-iωt))."""
+    r2 = x_um * x_um + y_um * y_um
+    d, s = focus.sensor_distance_um, focus.source_distance_um
+    total = r2 / (torch.sqrt(r2 + d * d) + d)
+    if math.isfinite(s):
+        total = total + r2 / (torch.sqrt(r2 + s * s) + s)
+    return -2 * math.pi / focus.wavelength_um * total
+
+
+def wave_of(lens: Lens | Wave) -> Wave:
+    """The lens plane of a lens file, or the one that was given."""
+    if isinstance(lens, Lens):
+        return PillarWave(lens)
+    if not hasattr(lens, "carrier_rad"):
+        raise SceneError(f"{type(lens).__name__} is no lens: need a Lens, a SmoothWave or a PillarWave")
+    return lens

@@ -1,0 +1,64 @@
+"""Orthonormal Legendre polynomials: nodes, interpolation, and how many are needed for a given function."""
+
+import functools
+
+import numpy as np
+from scipy.special import roots_legendre
+
+from metalens.ground.arrays import Array
+
+
+@functools.lru_cache(maxsize=64)
+def nodes(count: int) -> tuple[Array, Array]:
+    """(count,) Gauss-Legendre nodes and weights on [-1, 1]; treat as read-only."""
+    t, w = roots_legendre(count)
+    return np.asarray(t), np.asarray(w)
+
+
+def values(count: int, t: Array) -> Array:
+    """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by the stable recurrence."""
+    t = np.asarray(t, float)
+    out = np.empty((count, *t.shape))
+    for m in range(count):
+        if m == 0:
+            out[0] = 1
+        elif m == 1:
+            out[1] = t
+        else:
+            out[m] = ((2 * m - 1) * t * out[m - 1] - (m - 1) * out[m - 2]) / m
+    scale = np.sqrt(np.arange(count) + 0.5)
+    return np.asarray(np.ascontiguousarray(np.moveaxis(out, 0, -1)) * scale)
+
+
+def interpolation(count: int, t: Array) -> Array:
+    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`nodes`: L_a = w_a Σ_m P̂_m(t_a) P̂_m(t)."""
+    return np.asarray(values(count, t) @ to_nodes(count))
+
+
+@functools.lru_cache(maxsize=64)
+def to_nodes(count: int) -> Array:
+    """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in the modes."""
+    t, w = nodes(count)
+    return values(count, t).T * w
+
+
+def mapped(count: int, low: float, high: float) -> Array:
+    """(count,) Gauss-Legendre nodes on [low, high]."""
+    return (low + high) / 2 + (high - low) / 2 * nodes(count)[0]
+
+
+def needed(samples: Array, tolerance: float) -> int:
+    """Number of nodes that represent all lines to ``tolerance``.
+
+    Args:
+        samples: (line, count) complex values on :func:`nodes` (count), count well above what is needed.
+        tolerance: of the root mean square over lines and position, relative to that of the samples.
+
+    Returns:
+        The least n with a tail of modes n, n+1, … below tolerance; ``count`` + 1 where the samples are too few to tell.
+    """
+    count = samples.shape[-1]
+    power = (np.abs(samples.reshape(-1, count) @ to_nodes(count).T) ** 2).sum(0)
+    tail = np.sqrt(np.cumsum(power[::-1])[::-1] / power.sum())
+    small = np.nonzero(tail <= tolerance)[0]
+    return int(small[0]) if small.size and small[0] <= 0.85 * count else count + 1

@@ -1,0 +1,105 @@
+"""One writer an output: a lock file beside it that names its owner; the lock of a dead owner is free."""
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextvars import ContextVar
+from pathlib import Path
+
+from metalens.ground.errors import OutputError
+
+COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")  # words of the command line, for locks and manifests
+_open: set[int] = set()
+
+
+@contextlib.contextmanager
+def held(target: Path) -> Iterator[None]:
+    """Hold ``.NAME.lock`` beside ``target``; the kernel frees it when its owner dies, and the file goes at the end.
+
+    Raises:
+        OutputError: another process writes this output; the message names it.
+        OSError: the folder cannot be written.
+    """
+    path = target.with_name(f".{target.name}.lock")
+    handle = _taken(path, target)
+    try:
+        owner = {"process": os.getpid(), "host": socket.gethostname(), "command": COMMAND.get()}
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, json.dumps(owner).encode(), 0)
+        _open.add(handle)
+        yield
+    finally:
+        _open.discard(handle)
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def folder(path: Path) -> Iterator[None]:
+    """Hold a folder for the moment of a renaming; waits for others."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks: the lock file alone must do
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def free(path: Path) -> bool:
+    """Whether no living process holds a lock on a file."""
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return True
+
+
+def _taken(path: Path, target: Path) -> int:
+    """An open handle of the lock file, locked; the file may have been removed by its last owner in between."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            who = _owner(handle)
+            os.close(handle)
+            raise OutputError(f"{target} is being written by {who}; wait for it or give another name") from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOTSUP):
+                os.close(handle)
+                raise
+        with contextlib.suppress(FileNotFoundError):
+            if os.stat(path).st_ino == os.fstat(handle).st_ino:
+                return handle
+        os.close(handle)
+
+
+def _owner(handle: int) -> str:
+    try:
+        told = json.loads(os.pread(handle, 65536, 0))
+        return f"process {told['process']} on {told['host']} (metalens {told['command']})"
+    except (ValueError, KeyError, TypeError):
+        return "another process"
+
+
+def _let_go() -> None:
+    """A forked child must not keep the lock when its parent dies."""
+    for handle in _open:
+        with contextlib.suppress(OSError):
+            os.close(handle)
+    _open.clear()
+
+
+os.register_at_fork(after_in_child=_let_go)

@@ -1,0 +1,131 @@
+"""What a folder of ours holds: manifest.json with the SHA-256 of every file, the command and the versions."""
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from metalens.ground import store
+from metalens.ground.errors import StoreError
+
+NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
+_LARGEST = 1 << 26  # bytes of a manifest
+_HEAD = 4096
+# first bytes of a file, and what ours has soon after
+_MARKS = (
+    (b"\x89PNG", b"Software\0metalens"),
+    (b"<!doctype html>", b'name="generator" content="metalens'),
+    (b"MATLAB 5.0 MAT-file, metalens", b""),
+    (b"file,depth_um,angle_deg,exposure_s", b""),
+)
+
+
+def write(folder: Path, command: str, *, finished: bool = True) -> None:
+    """Write the manifest of everything in a folder; unfinished: of one that is still being made."""
+    listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
+              for name in (sorted(files(folder)) if finished else ())}  # fmt: skip
+    about = {
+        "kind": KIND,
+        "version": VERSION,
+        "finished": finished,
+        "command": command,
+        "versions": dict(store.package_versions()),
+        "files": listed,
+    }
+    store.write_text(folder / NAME, json.dumps(about, indent=1) + "\n")
+
+
+def read(folder: Path) -> dict[str, Any] | None:
+    """The manifest of a folder; None where it has none.
+
+    Raises:
+        StoreError: it is damaged or none of ours.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError("too large")
+        found: dict[str, Any] = json.loads(path.read_bytes())
+        if (found["kind"], found["version"]) != (KIND, VERSION):
+            raise ValueError(f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}")
+        entries = {str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])} for n, e in found["files"].items()}
+        return found | {"files": entries, "finished": bool(found["finished"]), "command": str(found["command"])}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise StoreError(f"{path}: damaged or no manifest of a metalens folder ({error}); make it again") from None
+
+
+def check(folder: Path) -> None:
+    """Refuse a folder of ours that is unfinished or no longer what was written; one without a manifest passes.
+
+    Files that were added since are left alone.
+
+    Raises:
+        StoreError: what is missing or differs, and what to do.
+    """
+    found = read(folder)
+    if found is None:
+        return
+    if not found["finished"]:
+        raise StoreError(f"{folder} is unfinished: go on with --resume, or make it again")
+    for name, entry in found["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise StoreError(f"{path} is missing; {NAME} lists it: make the folder again")
+        if path.stat().st_size != entry["bytes"] or store.sha256(path) != entry["sha256"]:
+            raise StoreError(
+                f"{path} is not what was written (SHA-256 differs): make the folder again, or remove {NAME} to use it "
+                "as it stands"
+            )
+
+
+def files(folder: Path) -> Iterator[str]:
+    """Names of all files below a folder, the manifest aside; folders that hold nothing end in a slash."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place).relative_to(folder)
+        yield from ((here / n).as_posix() for n in names if (here / n).as_posix() != NAME)
+        yield from ((here / n).as_posix() for n in folders if os.path.islink(os.path.join(place, n)))
+
+
+def foreign(path: Path) -> str:
+    """Why a file or folder may not be replaced as one of ours; '' where it may.
+
+    A folder is ours with a manifest and no file beyond those that it lists; a file by its kind or mark.
+    """
+    if path.is_dir():
+        return _foreign_folder(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD)
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    if any(head.startswith(first) and mark in head for first, mark in _MARKS):
+        return ""
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return "" if _is_our_tiff(path) else "was not made by metalens"
+    return "" if store.kind_of(path) else "was not made by metalens"
+
+
+def _foreign_folder(path: Path) -> str:
+    present = set(files(path))
+    if not present and not (path / NAME).exists():
+        return ""
+    try:
+        found = read(path)
+    except StoreError as error:
+        return str(error)
+    if found is None:
+        return f"holds {min(present)} and no {NAME}: not made by metalens"
+    others = present - found["files"].keys()
+    if found["finished"] and others:
+        return f"holds {min(others)}, which metalens did not make"
+    return ""
+
+
+def _is_our_tiff(path: Path) -> bool:
+    with open(path, "rb") as file:
+        head = file.read(65536)
+        file.seek(max(0, path.stat().st_size - 65536))
+        return b"metalens" in head + file.read()

@@ -1,0 +1,143 @@
+"""One self-contained report.html with a shared look: sections of text, figures, tables and key figures."""
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from metalens import __version__
+from metalens.ground import store
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A picture with a caption that says what to see in it.
+
+    png: the file's bytes; see :func:`png`.
+    """
+
+    png: bytes
+    caption: str
+    wide: bool = False
+
+    @property
+    def source(self) -> str:
+        """The picture as a data address, so that the page works offline."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode()
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text or numbers under a head; numbers are shown to ``digits`` significant digits."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    caption: str = ""
+    digits: int = 4
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Rows as text."""
+        return [[self._text(value) for value in row] for row in self.rows]
+
+    def _text(self, value: Any) -> str:
+        return f"{value:.{self.digits}g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Markup:
+    """A piece of ready HTML (an interactive view); it must be self-contained."""
+
+    html: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A titled part of the report; ``text`` holds plain paragraphs separated by blank lines."""
+
+    title: str
+    text: str = ""
+    items: Sequence[Figure | Table | Markup] = ()
+
+    @property
+    def paragraphs(self) -> list[str]:
+        """The text split at blank lines."""
+        return [part.strip() for part in self.text.split("\n\n") if part.strip()]
+
+
+@dataclass(frozen=True, slots=True)
+class KeyFigure:
+    """A number that stands at the top of the page; ``good`` colours it (None: neutral)."""
+
+    label: str
+    value: str
+    good: bool | None = None
+
+
+def png(figure: "Canvas", *, dpi: int = 110) -> bytes:
+    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the figure is closed."""
+    from matplotlib import pyplot
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight", metadata={"Software": "metalens"})
+    pyplot.close(figure)
+    return buffer.getvalue()
+
+
+def canvas(rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0, 3.4), **options: Any) -> Any:
+    """(figure, axes) of matplotlib in the look of the reports, drawn without a display."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from cycler import cycler
+    from matplotlib import pyplot
+
+    style: dict[Any, Any] = {
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.alpha": 0.25,
+        "axes.titlesize": 10,
+        "axes.titleweight": "bold",
+        "figure.facecolor": "white",
+        "image.cmap": "magma",
+        "axes.prop_cycle": cycler(color=["#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#444"]),
+    }
+    with matplotlib.rc_context(style):
+        return pyplot.subplots(rows, columns, figsize=size, layout="constrained", **options)
+
+
+def write(
+    path: str | Path,
+    title: str,
+    sections: Sequence[Section],
+    *,
+    lead: str = "",
+    key_figures: Sequence[KeyFigure] = (),
+) -> None:
+    """Write the page: title, one lead paragraph, key figures, then the sections with a contents list.
+
+    Raises:
+        OSError: the target cannot be written.
+    """
+    from jinja2 import Environment
+
+    source = resources.files("metalens").joinpath("data/report.html").read_text(encoding="utf-8")
+    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+    kinds = {Figure: "figure", Table: "table", Markup: "markup"}
+    page = template.render(
+        title=title,
+        lead=lead,
+        key_figures=key_figures,
+        sections=sections,
+        version=__version__,
+        kind_of=lambda item: kinds[type(item)],
+    )
+    store.write_text(path, page)

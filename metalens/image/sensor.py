@@ -1,0 +1,235 @@
+"""The sensor: continuous pixel pitch, photon and read noise, full well, quantisation (paper Sec. 3.1)."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from metalens.ground.errors import SceneError
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What turns irradiance into numbers. Defaults: a small global-shutter pixel of 3 um with 10 bits.
+
+    pitch_um: effective pixel pitch (the paper's p hat).
+    base_pitch_um: pitch for which the electron counts below hold.
+    exposure_e: electrons that one unit of irradiance gives in a base pixel.
+    ambient_e: electrons of background light in a base pixel.
+    full_well_e: capacity of a base pixel; it grows with the area, like the light.
+    read_noise_e: standard deviation of the Gaussian noise of one read-out pixel.
+    bits: of the converter, whose full scale is the full well.
+
+    Raises:
+        SceneError: a value is not finite or not in its range.
+    """
+
+    pitch_um: float = 3.0
+    base_pitch_um: float = 3.0
+    exposure_e: float = 4000.0
+    ambient_e: float = 0.0
+    full_well_e: float = 8000.0
+    read_noise_e: float = 3.0
+    bits: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("pitch_um", "base_pitch_um", "full_well_e"):
+            _check(name, getattr(self, name), above=True)
+        for name in ("exposure_e", "ambient_e", "read_noise_e"):
+            _check(name, getattr(self, name), above=False)
+        if self.bits not in range(1, 17):
+            raise SceneError(f"bits = {self.bits}: need 1 to 16")
+
+
+def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
+    """Light of a pixel relative to a base pixel: (pitch / base pitch)², the paper's energy-preserving factor."""
+    return (pitch_um / base_pitch_um) ** 2
+
+
+def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
+    """Pixels of this pitch that cover ``samples`` samples; one where the pixel is larger than the image."""
+    return max(1, math.ceil(samples * sample_um / pitch_um * (1 - 1e-12)))
+
+
+def whole_pixels(samples: int, sample_um: float, pitch_um: float) -> int:
+    """Pixels of this pitch that lie wholly inside ``samples`` samples, however the lengths are rounded."""
+    return math.floor(samples * sample_um / pitch_um * (1 + 1e-12))
+
+
+def pixel_weights(
+    samples: int,
+    sample_um: float,
+    *,
+    pitch_um: float | Tensor,
+    count: int | None = None,
+    shift_um: float = 0.0,
+    grid_um: float | None = None,
+) -> Tensor:
+    """(pixels, samples) share of each sample's light that falls on each pixel, in float64.
+
+    The cumulative light at the sample edges is interpolated by a Catmull-Rom cubic and differenced at the pixel
+    edges: exact area overlap where the edges coincide, telescoping (so the energy is kept), and with a continuous
+    derivative in the pitch everywhere. Plain overlap has a kink wherever a pixel edge meets a sample edge.
+
+    Args:
+        samples: of the image along this axis; the image is centred on the pixel row.
+        pitch_um: float, or a tensor that the weights are differentiable in.
+        count: of pixels; by default as many as cover the image.
+        shift_um: of the pixel row towards + along the axis.
+        grid_um: distance of the pixels, the pitch by default. Where it is given the places stay and ``pitch_um`` is
+            the width of the box alone (the paper's learnable box filter), in the light of a box of ``grid_um``.
+
+    Accuracy:
+        Column sums are 1 to rounding where the pixels reach one sample beyond the image. A pixel cut by an
+        isolated bright sample takes up to -0.075 of it: the overshoot of the cubic; none on sampled PSFs.
+    """
+    pitch = torch.as_tensor(pitch_um, dtype=torch.float64)
+    pixels = pixel_count(samples, sample_um, float(pitch.detach()) if grid_um is None else grid_um)
+    pixels = pixels if count is None else count
+    place = torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2
+
+    def light(edge_um: Tensor) -> Tensor:
+        position = (edge_um + shift_um) / sample_um + samples / 2
+        return _smooth_step(position[:, None] - torch.arange(samples, dtype=torch.float64))
+
+    if grid_um is None:
+        step = light(place * pitch)
+        return step[1:] - step[:-1]
+    middle = (place[:-1] + 0.5) * grid_um
+    return (light(middle + pitch / 2) - light(middle - pitch / 2)) * (grid_um / pitch)
+
+
+def integrate(
+    image: Tensor,
+    sample_um: float,
+    *,
+    pitch_um: float | Tensor,
+    shape: tuple[int, int] | None = None,
+    shift_um: tuple[float, float] = (0.0, 0.0),
+    grid_um: float | None = None,
+) -> Tensor:
+    """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's area.
+
+    Args:
+        image: (..., y, x).
+        shape: (rows, columns) of pixels; by default as many as cover the image.
+        shift_um: (y, x) of the pixel grid.
+        grid_um: see :func:`pixel_weights`.
+
+    Returns:
+        (..., rows, columns) in the dtype of ``image``; differentiable in image and pitch.
+    """
+    sizes = (None, None) if shape is None else shape
+    rows, columns = (
+        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um).to(image)
+        for n, count, shift in zip(image.shape[-2:], sizes, shift_um, strict=True)
+    )
+    return rows @ image @ columns.mT
+
+
+def mean_electrons(
+    irradiance: Tensor,
+    sample_um: float,
+    *,
+    sensor: Sensor,
+    pitch_um: Tensor | None = None,
+    count: int | None = None,
+    grid_um: float | None = None,
+) -> Tensor:
+    """Expected electrons of every pixel, before noise and saturation.
+
+    Args:
+        irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e`` electrons.
+        pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
+        count: pixels along each axis.
+        grid_um: see :func:`pixel_weights`; light and ambient are then those of a pixel of this size.
+
+    Returns:
+        (..., rows, columns): kappa times (exposure times mean irradiance plus ambient), at least 0.
+    """
+    pitch = torch.as_tensor(sensor.pitch_um, dtype=torch.float64) if pitch_um is None else pitch_um
+    shape = None if count is None else (count, count)
+    light = integrate(irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um)
+    light = light * (sample_um / sensor.base_pitch_um) ** 2
+    scale = torch.as_tensor(kappa(pitch if grid_um is None else grid_um, sensor.base_pitch_um)).to(irradiance)
+    return (sensor.exposure_e * light + sensor.ambient_e * scale).clamp_min(0)
+
+
+def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Poisson counts k of this mean m, with a gradient that has the right moments: dk/dm = (1 + k / m) / 2.
+
+    The expectation of the gradient of k is 1 and of k² is 2m + 1, those of the true distribution for every m > 0;
+    for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong skewness, and negative counts.
+    """
+    count = torch.poisson(mean.detach(), generator=generator)
+    safe = mean.detach().clamp_min(torch.finfo(mean.dtype).tiny)
+    slope = torch.where(mean.detach() > 0, 0.5 * (1 + count / safe), 1.0)
+    return count + slope * (mean - mean.detach())
+
+
+def expose(
+    mean: Tensor, *, sensor: Sensor, generator: torch.Generator | None = None, reads: float | Tensor = 1.0
+) -> Tensor:
+    """Electrons read from pixels that expect ``mean``: photon noise, full well, read noise of ``reads`` reads each.
+
+    Saturated pixels have gradient 0.
+    """
+    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
+    collected = photons(mean, generator).clamp(max=well)
+    noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
+    return collected + sensor.read_noise_e * torch.as_tensor(reads).to(noise).sqrt() * noise
+
+
+def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
+    """Numbers 0 .. 2^bits - 1, full scale at the full well; the gradient is that of the straight line."""
+    top = 2**sensor.bits - 1
+    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
+    level = (electrons * (top / well)).clamp(0, top)
+    rounded: Tensor = level + (level.round() - level).detach()
+    return rounded
+
+
+def capture(
+    irradiance: Tensor, sample_um: float, *, sensor: Sensor, generator: torch.Generator | None = None
+) -> Tensor:
+    """Frames in digital numbers from irradiance (..., y, x): integrate, expose, digitise."""
+    mean = mean_electrons(irradiance, sample_um, sensor=sensor)
+    return digitise(expose(mean, sensor=sensor, generator=generator), sensor=sensor)
+
+
+def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
+    """Noise variance of a pixel that expects ``mean`` electrons: photon, read and rounding noise, electrons²."""
+    well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
+    total: Tensor = mean + sensor.read_noise_e**2 + (well / (2**sensor.bits - 1)) ** 2 / 12
+    return total
+
+
+def low_snr(sensor: Sensor, mean_irradiance: float, *, snr_db: float = 15.0, ambient_ratio: float = 4.0) -> Sensor:
+    """The sensor with dimmed light under strong ambient light, so that a pixel has this signal-to-noise ratio.
+
+    Signal-to-noise ratio: 20 log10(mean signal electrons / standard deviation), with the ambient light's shot noise
+    and the read noise, at the sensor's own pitch. The ambient light is ``ambient_ratio`` times the signal and, as
+    the paper's low-light test has it, enters before the photon noise.
+    """
+    _check("mean_irradiance", mean_irradiance, above=True)
+    _check("ambient_ratio", ambient_ratio, above=False)
+    q2, area = 10 ** (snr_db / 10), float(kappa(sensor.pitch_um, sensor.base_pitch_um))
+    shot = q2 * (1 + ambient_ratio)
+    signal = (shot + math.sqrt(shot**2 + 4 * q2 * sensor.read_noise_e**2)) / 2 / area
+    return replace(sensor, exposure_e=signal / mean_irradiance, ambient_e=signal * ambient_ratio)
+
+
+def _smooth_step(t: Tensor) -> Tensor:
+    """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left of -1, 1 right of 2."""
+    u, w = t + 1, t - 1
+    before = 0.5 * u**2 * (u - 1)
+    inside = t * (0.5 + t * (1.5 - t))
+    after = 1 + 0.5 * w * (1 - w) ** 2
+    left = torch.where(t < 0, torch.where(t < -1, 0.0, before), inside)  # one piece each: its slope counts once
+    return torch.where(t < 1, left, torch.where(t < 2, after, 1.0))
+
+
+def _check(name: str, value: float, *, above: bool) -> None:
+    if not (math.isfinite(value) and (value > 0 if above else value >= 0)):
+        raise SceneError(f"{name} = {value}: need a finite value {'above 0' if above else '>= 0'}")

@@ -1,0 +1,162 @@
+"""The lens that is handed on: a diameter map, and what is needed to know its phase at any wavelength."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens.cell import Cell
+from metalens.ground import config, store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import LensError
+from metalens.ground.reading import reader
+from metalens.ground.store import Provenance
+from metalens.pillars import Proxy
+
+_BLOCK_ROWS = 256
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DiameterMap:
+    """Pillar diameters on a square lattice; the lens axis sits at index ((ny-1)/2, (nx-1)/2).
+
+    diameter_um: (y, x), 0 where there is no pillar and no light passes; +x right, +y down.
+    pitch_um: lattice constant.
+
+    Raises:
+        LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and column named); no pillar.
+    """
+
+    diameter_um: Array
+    pitch_um: float
+
+    def __post_init__(self) -> None:
+        d = self.diameter_um
+        if d.ndim != 2:
+            raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
+        widest, thinnest = float(d.max(initial=0)), float(d.min(initial=0))
+        if not (thinnest >= 0 and widest < self.pitch_um):
+            row, column = (int(i) for i in np.argwhere(~((d >= 0) & (d < self.pitch_um)))[0])
+            raise LensError(
+                f"diameter at row {row}, column {column} is {d[row, column]} um, "
+                f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
+            )
+        if widest == 0:
+            raise LensError("empty aperture: the map holds no pillar; check the aperture and the profile")
+
+    @property
+    def x_um(self) -> Array:
+        """(x,) positions of the columns."""
+        return _axis(self.diameter_um.shape[1], self.pitch_um)
+
+    @property
+    def y_um(self) -> Array:
+        """(y,) positions of the rows."""
+        return _axis(self.diameter_um.shape[0], self.pitch_um)
+
+    @property
+    def radius_um(self) -> float:
+        """Distance from the axis to the outermost pillar centre; memory of a few rows."""
+        farthest = 0.0
+        for start in range(0, len(self.diameter_um), _BLOCK_ROWS):
+            rows = slice(start, start + _BLOCK_ROWS)
+            there = self.diameter_um[rows] > 0
+            held = there.any(axis=1)
+            if held.any():
+                first, last = there.argmax(axis=1), there.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
+                outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
+                farthest = max(farthest, float(np.hypot(outer, self.y_um[rows])[held].max()))
+        return farthest
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A designed (or as-built) metalens.
+
+    diameters: of every pillar.
+    cell: the pillar cell that the proxy was made for.
+    proxy: diameter and wavelength to phase and transmission (paper Eq. 2).
+    wavelength_um: of the design.
+    sensor_distance_um: lens to sensor, in the cover medium.
+    source_distance_um: object distance of best focus (inf for a collimated beam).
+    profile: name of the design (hyperbolic, double-helix, cubic, fisher, map, as-built).
+    provenance: config and inputs that made it.
+    """
+
+    diameters: DiameterMap
+    cell: Cell
+    proxy: Proxy
+    wavelength_um: float
+    sensor_distance_um: float
+    source_distance_um: float
+    profile: str
+    provenance: Provenance = field(default_factory=Provenance)
+
+    def phase_rad(self, wavelength_um: float | None = None) -> Array:
+        """(y, x) phase of every pillar through the proxy; 0 where there is none."""
+        d = self.diameters.diameter_um
+        phase = self.proxy.phase_rad(np.where(d > 0, d, self.proxy.domain_um[0]), self._at(wavelength_um))
+        return np.where(d > 0, phase, 0)
+
+    def transmission(self, wavelength_um: float | None = None) -> Array:
+        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none."""
+        d = self.diameters.diameter_um
+        level = self.proxy.transmission(np.where(d > 0, d, self.proxy.domain_um[0]), self._at(wavelength_um))
+        return np.where(d > 0, level, 0)
+
+    def _at(self, wavelength_um: float | None) -> float:
+        return self.wavelength_um if wavelength_um is None else wavelength_um
+
+
+def save(path: str | Path, lens: Lens) -> None:
+    """Write a lens file (kind ``lens``); diameters keep their dtype."""
+    arrays, attributes = parts(lens)
+    store.save(path, "lens", arrays, attributes=attributes, provenance=lens.provenance)
+
+
+@reader
+def load(path: str | Path) -> Lens:
+    """Read a lens file.
+
+    Raises:
+        StoreError: not a lens file; LensError: its diameters are invalid.
+    """
+    stored = store.load(path, "lens")
+    lens = from_parts(stored.arrays, stored.attributes, where=str(path))
+    return replace(lens, provenance=stored.provenance)
+
+
+def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:
+    """(arrays, attributes) of a lens for a store file; ``group`` stands before the names of the arrays."""
+    arrays: dict[str, Array] = {f"{group}diameter_um": lens.diameters.diameter_um}
+    arrays |= {f"{group}proxy/{name}": array for name, array in lens.proxy.to_arrays().items()}
+    attributes = {
+        "pitch_um": lens.diameters.pitch_um,
+        "cell": config.dumps(lens.cell),
+        "wavelength_um": lens.wavelength_um,
+        "sensor_distance_um": lens.sensor_distance_um,
+        "source_distance_um": lens.source_distance_um,
+        "profile": lens.profile,
+    }
+    return arrays, attributes
+
+
+def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, where: str, group: str = "") -> Lens:
+    """Inverse of :func:`parts`; ``where`` names the file in errors."""
+    start = f"{group}proxy/"
+    proxy = {name[len(start) :]: array for name, array in arrays.items() if name.startswith(start)}
+    return Lens(
+        diameters=DiameterMap(arrays[f"{group}diameter_um"], attributes["pitch_um"]),
+        cell=config.loads(attributes["cell"], Cell, where=f"{where}: cell"),
+        proxy=Proxy.from_arrays(proxy),
+        wavelength_um=attributes["wavelength_um"],
+        sensor_distance_um=attributes["sensor_distance_um"],
+        source_distance_um=attributes["source_distance_um"],
+        profile=attributes["profile"],
+    )
+
+
+def _axis(count: int, pitch_um: float) -> Array:
+    return (np.arange(count) - (count - 1) / 2) * pitch_um

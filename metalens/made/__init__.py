@@ -1,0 +1,71 @@
+"""The made lens: one table of causes with their derivatives, states of them, their spread, and the bias of a mask."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.made import causes as causes
+    from metalens.made import spread as spread
+    from metalens.made.bias import STEEPEST as STEEPEST
+    from metalens.made.bias import Bias as Bias
+    from metalens.made.bias import read_csv as read_csv
+    from metalens.made.causes import CAUSES as CAUSES
+    from metalens.made.causes import Answers as Answers
+    from metalens.made.causes import Bends as Bends
+    from metalens.made.causes import Cause as Cause
+    from metalens.made.causes import Drawn as Drawn
+    from metalens.made.causes import Guide as Guide
+    from metalens.made.causes import Widens as Widens
+    from metalens.made.causes import maps as maps
+    from metalens.made.causes import named as named
+    from metalens.made.causes import of_kind as of_kind
+    from metalens.made.printed import Printed as Printed
+    from metalens.made.printed import of_process as of_process
+    from metalens.made.printed import with_table as with_table
+    from metalens.made.response import Sensitivity as Sensitivity
+    from metalens.made.response import Slopes as Slopes
+    from metalens.made.response import designed as designed
+    from metalens.made.response import guide as guide
+    from metalens.made.response import sensitivity as sensitivity
+    from metalens.made.response import transmission as transmission
+    from metalens.made.spread import DRAWN as DRAWN
+    from metalens.made.spread import Draw as Draw
+    from metalens.made.spread import Spread as Spread
+    from metalens.made.spread import draws as draws
+    from metalens.made.state import State as State
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Answers": "causes",
+        "Bends": "causes",
+        "Bias": "bias",
+        "CAUSES": "causes",
+        "Cause": "causes",
+        "DRAWN": "spread",
+        "Draw": "spread",
+        "Drawn": "causes",
+        "Guide": "causes",
+        "Printed": "printed",
+        "STEEPEST": "bias",
+        "Sensitivity": "response",
+        "Slopes": "response",
+        "Spread": "spread",
+        "State": "state",
+        "Widens": "causes",
+        "causes": "",
+        "designed": "response",
+        "draws": "spread",
+        "guide": "response",
+        "maps": "causes",
+        "named": "causes",
+        "of_kind": "causes",
+        "of_process": "printed",
+        "read_csv": "bias",
+        "sensitivity": "response",
+        "spread": "",
+        "transmission": "response",
+        "with_table": "printed",
+    },
+)

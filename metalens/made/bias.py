@@ -1,0 +1,112 @@
+"""Etch and exposure bias: what is drawn is not what is made; draw so that the designed pillar is made."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+STEEPEST = 0.5  # |d bias / d diameter| above this is refused: the inverse would not be a contraction
+_PROBES_NM = np.linspace(10, 2000, 1991)
+
+
+@dataclass(frozen=True, slots=True)
+class Bias:
+    """Bias = made diameter - drawn diameter, both at half the height of the pillar, for the drawn diameter.
+
+    table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond the ends.
+    curve_nm: or coefficients c_k of bias = sum c_k (drawn diameter / 100 nm)^k.
+    csv: or a file of two columns, drawn diameter and bias in nm, with or without a head.
+    isolated_nm: what a pillar without neighbours gains beyond one in a full lattice.
+    range_um: distance (Gaussian 1/e radius) over which neighbours count for that.
+
+    Raises:
+        ProcessError: more than one source of the bias, a table that does not rise, a slope beyond +-0.5.
+    """
+
+    table_nm: tuple[tuple[float, float], ...] = ()
+    curve_nm: tuple[float, ...] = ()
+    csv: Path | None = None
+    isolated_nm: float = 0.0
+    range_um: float = 1.0
+
+    def __post_init__(self) -> None:
+        if sum((bool(self.table_nm), bool(self.curve_nm), self.csv is not None)) > 1:
+            raise ProcessError("bias is given more than once; keep one of table_nm, curve_nm and csv")
+        numbers = np.array([*np.ravel(self.table_nm), *self.curve_nm, self.isolated_nm, self.range_um], float)
+        if not np.isfinite(numbers).all():
+            raise ProcessError("bias holds a value that is not finite; need numbers in nm")
+        if self.range_um <= 0:
+            raise ProcessError(f"range_um = {self.range_um}: need a distance above 0")
+        drawn = np.array([pair[0] for pair in self.table_nm])
+        if (np.diff(drawn) <= 0).any() or (drawn <= 0).any():
+            raise ProcessError(f"diameters of the bias table must rise and be above 0, found {drawn.tolist()}")
+        self._check_slope()
+
+    def _check_slope(self) -> None:
+        probes = np.array([pair[0] for pair in self.table_nm]) if self.table_nm else _PROBES_NM
+        slope = np.diff(self.at(probes)) / np.diff(probes)
+        if slope.size and abs(slope).max() > STEEPEST:
+            at = int(abs(slope).argmax())
+            raise ProcessError(
+                f"bias changes by {slope[at]:.2f} nm per nm at {probes[at]:g} nm, need at most {STEEPEST}: "
+                "the drawn diameter could not be found from the made one; check the table"
+            )
+
+    def at(self, drawn_nm: Array | float) -> Array:
+        """Bias in nm of pillars in a full lattice; shape of ``drawn_nm``."""
+        drawn = np.asarray(drawn_nm, float)
+        if self.table_nm:
+            knots, values = np.array(self.table_nm).T
+            return np.asarray(np.interp(drawn, knots, values))
+        if self.curve_nm:
+            clipped = np.clip(drawn, _PROBES_NM[0], _PROBES_NM[-1])
+            return np.asarray(np.polynomial.polynomial.polyval(clipped / 100, self.curve_nm))
+        return np.zeros_like(drawn)
+
+    def made_nm(self, drawn_nm: Array | float, isolation: Array | float = 0.0) -> Array:
+        """Diameter that comes out; ``isolation``: 0 in a full lattice, 1 alone."""
+        drawn = np.asarray(drawn_nm, float)
+        return np.asarray(drawn + self.at(drawn) + self.isolated_nm * np.asarray(isolation))
+
+    def drawn_nm(self, made_nm: Array | float, isolation: Array | float = 0.0) -> Array:
+        """Inverse of :meth:`made_nm`: what to draw so that ``made_nm`` comes out, to 1e-9 nm.
+
+        The fixed point of drawn = made - bias(drawn): each round halves the error at least.
+        """
+        goal = np.asarray(made_nm, float) - self.isolated_nm * np.asarray(isolation)
+        drawn = goal.copy()
+        for _ in range(60):
+            before, drawn = drawn, goal - self.at(drawn)
+            if np.abs(drawn - before).max(initial=0.0) < 1e-10:
+                break
+        return np.asarray(drawn)
+
+
+def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
+    """(drawn diameter, bias) pairs in nm from a file of two columns.
+
+    Raises:
+        ProcessError: missing file, a line that is not two numbers (line named), or no line at all.
+    """
+    path = Path(path)
+    pairs = []
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = [(n, row) for n, row in enumerate(csv.reader(file), 1) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ProcessError(f"{path}: cannot be read as a table ({error})") from None
+    for number, row in rows:
+        try:
+            first, second = (float(cell) for cell in row)
+        except ValueError:
+            if number == rows[0][0]:
+                continue
+            raise ProcessError(f"{path}, line {number}: {','.join(row)!r}, need two numbers") from None
+        pairs.append((first, second))
+    if not pairs:
+        raise ProcessError(f"{path}: holds no numbers; need lines of two columns")
+    return tuple(pairs)

@@ -1,0 +1,219 @@
+"""What can be wrong with a made lens: one table of causes, each with its unit, prior, bounds and derivative.
+
+Fit, tolerance study, error budget, training spread and mask correction read this table and nothing else: a new cause is
+a new row. Three kinds of derivative hold all of them:
+
+    Widens    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
+    Answers   t of every pillar alike, by its diameter                          t exp(sum a_c s_c(D))
+    Bends     phase of the wave front at (u, v)                                 t exp(i sum a_c z_c(u, v))
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from metalens.cell import Cell, Index, index
+from metalens.ground.arrays import Array
+
+Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """Pillars as guides of one mode, over their diameters; what the quick derivatives are made of.
+
+    k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,) effective index and its derivatives
+    by the diameter. index, around: of pillar and surroundings. height_um, sidewall_rad: of the design.
+    """
+
+    k: float
+    diameter_um: Array
+    effective: Array
+    slope: Array
+    curvature: Array
+    index: float
+    around: float
+    height_um: float
+    sidewall_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Widens:
+    """Derivative of the diameter: um a unit of the cause, a polynomial in (u, v)."""
+
+    terms: Terms
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Derivative of ln t of every pillar alike, by ``unit`` of the row.
+
+    quick: from the effective index, (n,) complex for the diameters of a guide. changed: the cell with so much more of
+    the cause. step: of differences through a solver. exact: where :class:`metalens.modal.Gradient` has dt/d(cause).
+    """
+
+    quick: Callable[[Guide], Array]
+    changed: Callable[[Cell, float, float], Cell]
+    step: float
+    exact: Literal["height_um", "n", ""] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Bends:
+    """Derivative of the wave front's phase: rad a unit of the cause, a polynomial in (u, v)."""
+
+    terms: Terms
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """How a process spreads a cause, in PROCESS.toml's table ``spread``.
+
+    name, sigma: entry there and its default. share: of the entry's amount that the cause gets; two causes of one entry
+    are the x and y of a direction that every lens draws anew.
+    """
+
+    name: str
+    sigma: float
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One row: a number that says how a made lens differs from its design; 0 is the design.
+
+    meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without metrology.
+    low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name. free: fitted unless told
+    otherwise. drawn: how the process spreads it, where it does.
+    """
+
+    name: str
+    meaning: str
+    scale: float
+    sigma: float
+    low: float
+    high: float
+    acts: Widens | Answers | Bends
+    unit: float = 1.0
+    free: bool = True
+    drawn: Drawn | None = None
+
+
+def _by_height(g: Guide) -> Array:
+    return 1j * g.k * g.effective
+
+
+def _by_index(g: Guide) -> Array:
+    """With b = (n_eff² - 1) / (n² - 1) a function of D sqrt(n² - 1): d n_eff / dn = (b n + n D b' / 2) / n_eff."""
+    contrast = g.index**2 - g.around**2
+    b = (g.effective**2 - g.around**2) / contrast
+    by_diameter = 2 * g.effective * g.slope / contrast
+    return 1j * g.k * g.height_um * (b * g.index + g.index * g.diameter_um * by_diameter / 2) / g.effective
+
+
+def _by_sidewall(g: Guide) -> Array:
+    """Pillars are measured at half height: the wall acts in second order, k n_eff'' s h³ / 3."""
+    return 1j * g.k * g.curvature * g.sidewall_rad * g.height_um**3 / 3
+
+
+def _taller(cell: Cell, amount: float, wavelength_um: float) -> Cell:
+    return dataclasses.replace(cell, height_um=cell.height_um + amount)
+
+
+def _denser(cell: Cell, amount: float, wavelength_um: float) -> Cell:
+    n = index(cell.pillar, wavelength_um)
+    return dataclasses.replace(cell, pillar=Index(n.real + amount, n.imag))
+
+
+def _leaning(cell: Cell, amount: float, wavelength_um: float) -> Cell:
+    return dataclasses.replace(cell, sidewall_rad=cell.sidewall_rad + amount)
+
+
+def _widens(name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: object) -> Cause:
+    nm = tuple((c * 1e-3, i, j) for c, i, j in terms)
+    return Cause(name, meaning, 1.0, sigma, -bound, bound, Widens(nm), 1e-3, **more)  # type: ignore[arg-type]
+
+
+def _bends(name: str, norm: float, terms: Terms) -> Cause:
+    """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
+    rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
+    return Cause(f"{name}_rad", f"Zernike {name} of the wave front, rms", 0.05, 1.0, -6.0, 6.0, Bends(rad))
+
+
+DEG = math.pi / 180
+CAUSES: tuple[Cause, ...] = (
+    _widens(
+        "bias_nm", "diameter minus design, mean over the lens", 15.0, 26.0, ((1, 0, 0),), drawn=Drawn("bias_nm", 4.0)
+    ),
+    _widens(
+        "bias_x_nm", "diameter bias at the +x rim less that at the axis", 10.0, 15.0, ((1, 1, 0),),
+        drawn=Drawn("gradient_nm", 3.0, 0.5),
+    ),
+    _widens(
+        "bias_y_nm", "diameter bias at the +y rim less that at the axis", 10.0, 15.0, ((1, 0, 1),),
+        drawn=Drawn("gradient_nm", 3.0, 0.5),
+    ),
+    _widens(
+        "bias_r_nm", "diameter bias at the rim less that at the axis, times 1/2 (2 rho² - 1)", 10.0, 15.0,
+        ((1, 2, 0), (1, 0, 2), (-0.5, 0, 0)), drawn=Drawn("bow_nm", 2.0),
+    ),
+    _widens(
+        "bias_a_nm", "saddle of the diameter bias, x² - y² over R²", 10.0, 15.0, ((1, 2, 0), (-1, 0, 2)), free=False
+    ),
+    _widens("bias_o_nm", "oblique saddle of the diameter bias, 2xy over R²", 10.0, 15.0, ((2, 1, 1),), free=False),
+    Cause(
+        "height_nm", "pillar height minus design", 5.0, 10.0, -28.0, 28.0,
+        Answers(_by_height, _taller, 0.01, "height_um"), 1e-3, drawn=Drawn("height_nm", 7.0),
+    ),
+    Cause(
+        "index", "refractive index of the pillars minus design", 0.02, 0.02, -0.075, 0.075,
+        Answers(_by_index, _denser, 0.02, "n"), free=False, drawn=Drawn("index", 0.02),
+    ),
+    Cause(
+        "sidewall_deg", "sidewall angle minus design", 0.3, 0.5, -1.6, 1.6,
+        Answers(_by_sidewall, _leaning, DEG / 2), DEG, free=False, drawn=Drawn("sidewall_deg", 0.5),
+    ),
+    _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
+    _bends("oblique_astigmatism", 6, ((2, 1, 1),)),
+    _bends("coma_x", 8, ((3, 3, 0), (3, 1, 2), (-2, 1, 0))),
+    _bends("coma_y", 8, ((3, 0, 3), (3, 2, 1), (-2, 0, 1))),
+    _bends("trefoil_x", 8, ((1, 3, 0), (-3, 1, 2))),
+    _bends("trefoil_y", 8, ((3, 2, 1), (-1, 0, 3))),
+    _bends("spherical", 5, ((6, 4, 0), (12, 2, 2), (6, 0, 4), (-6, 2, 0), (-6, 0, 2), (1, 0, 0))),
+)  # fmt: skip
+
+
+def of_kind(kind: type[Widens] | type[Answers] | type[Bends]) -> Iterator[tuple[int, Cause]]:
+    """(place in the table, row) of the causes that act in one way, in order."""
+    return ((n, row) for n, row in enumerate(CAUSES) if isinstance(row.acts, kind))
+
+
+def named(kind: type[Widens] | type[Answers] | type[Bends]) -> tuple[str, ...]:
+    """Names of the causes that act in one way, in order."""
+    return tuple(row.name for _, row in of_kind(kind))
+
+
+def polynomials(kind: type[Widens] | type[Bends]) -> Array:
+    """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each cause."""
+    return _polynomials(kind.__name__)
+
+
+@functools.cache
+def _polynomials(kind: str) -> Array:
+    found = [row.acts.terms for row in CAUSES if type(row.acts).__name__ == kind and not isinstance(row.acts, Answers)]
+    size = 1 + max((max(i, j) for terms in found for _, i, j in terms), default=0)
+    out = np.zeros((len(found), size, size))
+    for n, terms in enumerate(found):
+        for c, i, j in terms:
+            out[n, i, j] += c
+    return out
+
+
+def maps(kind: type[Widens] | type[Bends], u: Array, v: Array) -> Array:
+    """(rows of the kind, *shape) derivative maps at lens places (u, v) over the radius."""
+    return np.stack([np.polynomial.polynomial.polyval2d(u, v, each) for each in polynomials(kind)])

@@ -1,0 +1,129 @@
+"""What the answering causes do to every pillar: derivatives of ln t over the diameter, and t itself under a change."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from metalens.cell import Cell, Index
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.lens import Lens
+from metalens.made.causes import Answers, Guide, of_kind
+from metalens.pillars import Proxy
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sensitivity:
+    """First-order change of ln t with the answering causes, as polynomials of the diameter.
+
+    coefficients: (answering causes, degree + 1) complex power series in (D - center_um) of d ln t by the base unit
+        (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row that is not there.
+    error: of the slopes, relative to their change across the lens; nan where not known.
+    low_um, high_um: diameters that the polynomials were made for; beyond them they go on along their tangents.
+    """
+
+    coefficients: Array
+    center_um: float
+    error: float = math.nan
+    low_um: float = -math.inf
+    high_um: float = math.inf
+
+    def at(self, diameter_um: Array) -> Array:
+        """(answering causes, *shape) derivatives of ln t."""
+        inside = np.clip(diameter_um, self.low_um, self.high_um)
+        offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
+        values = [polynomial.polyval(offset, row) for row in self.coefficients]
+        if beyond.any():
+            slopes = [polynomial.polyval(offset, polynomial.polyder(row)) for row in self.coefficients]
+            values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
+        missing = len(list(of_kind(Answers))) - len(values)
+        return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+
+
+class Slopes(Protocol):
+    """Anything that knows d ln t by the answering causes."""
+
+    def at(self, diameter_um: Array) -> Array:
+        """(answering causes, *shape) derivatives of ln t by the base unit of each."""
+        ...
+
+
+def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
+    """Derivatives from the effective index of the pillars that the proxy's phase implies.
+
+    Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by index; interference between
+    foot and top is left out. The cell solvers say it better, at seconds a lens.
+    """
+    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    low, high = max(float(d.min()), lens.proxy.domain_um[0]), min(float(d.max()), lens.proxy.domain_um[1])
+    seen = guide(lens.cell, lens.proxy, lens.wavelength_um, np.linspace(low, high, 61), degree=degree)
+    center = float(seen.diameter_um.mean())
+    rows = [
+        polynomial.polyfit(seen.diameter_um - center, row.acts.quick(seen), degree)
+        for _, row in of_kind(Answers)
+        if isinstance(row.acts, Answers)
+    ]
+    return Sensitivity(np.array(rows), center, 0.5, low, high)
+
+
+def guide(cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array, *, degree: int = 5) -> Guide:
+    """Effective indices of pillars: phase(D) = k n_eff(D) h, smoothed by a polynomial.
+
+    Anchored at the thinnest pillar by the effective medium of thin cylinders across the field (Rayleigh 1892, two
+    dimensions).
+    """
+    from metalens.cell import materials
+
+    index, outer = (
+        m.n if isinstance(m, Index) else materials.index(m, wavelength_um).real for m in (cell.pillar, cell.between)
+    )
+    k, h = 2 * math.pi / wavelength_um, cell.height_um
+    fill = math.pi * diameter_um[0] ** 2 / 4 / cell.pitch_um**2
+    inside, around = index**2, outer**2
+    thin = around * (inside * (1 + fill) + around * (1 - fill)) / (inside * (1 - fill) + around * (1 + fill))
+    phase = proxy.phase_rad(diameter_um, wavelength_um)
+    offset = diameter_um - diameter_um.mean()
+    fit = np.polynomial.Polynomial.fit(offset, math.sqrt(thin) + (phase - phase[0]) / (k * h), degree)
+    return Guide(
+        k, diameter_um, fit(offset), fit.deriv()(offset), fit.deriv(2)(offset), index, outer, h, cell.sidewall_rad
+    )
+
+
+def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0) -> Array:
+    """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at an angle of incidence.
+
+    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (held within 0 to 1).
+
+    Raises:
+        FitError: a wavelength where the proxy says nothing.
+    """
+    low, high = proxy.wavelengths_um
+    if high > low and not low <= wavelength_um <= high:
+        raise FitError(f"wavelength {wavelength_um:.4f} um outside the proxy's {low:.4f} to {high:.4f} um")
+    at = low if high == low else wavelength_um, angle_rad
+    inside = np.clip(d_um, *proxy.domain_um)
+    beyond = d_um - inside
+    phase = proxy.phase_rad(inside, *at) + beyond * proxy.dphase_ddiameter(inside, *at)
+    level = proxy.transmission(inside, *at) + beyond * proxy.dtransmission_ddiameter(inside, *at)
+    return np.asarray(np.clip(level, 0, 1) * np.exp(1j * phase))
+
+
+def transmission(
+    proxy: Proxy,
+    response: Slopes,
+    d_um: Array,
+    wavelength_um: float,
+    answers: Array,
+    *,
+    angle_rad: float = 0.0,
+) -> Array:
+    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc).
+
+    Args:
+        answers: (answering causes,) amounts in base units: :meth:`State.answers`.
+    """
+    changed = np.exp(np.tensordot(answers, response.at(d_um), 1))
+    return np.asarray(designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed)

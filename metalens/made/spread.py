@@ -1,0 +1,72 @@
+"""What a process leaves uncertain: standard deviations by name, and lenses drawn from them."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.errors import ProcessError
+from metalens.made.causes import CAUSES, Drawn
+from metalens.made.state import State
+
+DRAWN: dict[str, Drawn] = {row.drawn.name: row.drawn for row in CAUSES if row.drawn}  # by entry, in the table's order
+_Entries: Any = dataclasses.make_dataclass(
+    "_Entries", [(name, float, entry.sigma) for name, entry in DRAWN.items()], frozen=True
+)
+
+
+@dataclass(frozen=True)
+class Spread(_Entries):  # type: ignore[misc]
+    """Standard deviations of what the process leaves uncertain, one of every entry of :data:`DRAWN`.
+
+    bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the other, in a random direction.
+    bow_nm: bias from centre to edge. height_nm, index, sidewall_deg: of the whole lens.
+    """
+
+    def __post_init__(self) -> None:
+        for name, value in self.values().items():
+            if not (value >= 0 and math.isfinite(value)):
+                raise ProcessError(f"{name} = {value}: need a finite value >= 0")
+
+    def values(self) -> dict[str, float]:
+        """Standard deviations by entry."""
+        return {name: float(getattr(self, name)) for name in DRAWN}
+
+    @classmethod
+    def only(cls, **values: float) -> "Spread":
+        """These standard deviations, and none of anything else."""
+        return cls(**(dict.fromkeys(DRAWN, 0.0) | values))
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """One lens of a process: amounts by entry of the spread, and the direction that the lens drew for its gradients."""
+
+    amounts: dict[str, float]
+    turn_rad: float = 0.0
+
+    def state(self) -> State:
+        """The causes that these amounts mean."""
+        found: dict[str, float] = {}
+        for row in CAUSES:
+            if row.drawn and row.drawn.name in self.amounts:
+                found[row.name] = self.amounts[row.drawn.name] * row.drawn.share * self._direction(row.name)
+        return State.of(found)
+
+    def _direction(self, cause: str) -> float:
+        """1, or cosine and sine of the direction for the first and second cause of one entry."""
+        entry = next(row.drawn.name for row in CAUSES if row.name == cause and row.drawn)
+        together = [row.name for row in CAUSES if row.drawn and row.drawn.name == entry]
+        return 1.0 if len(together) == 1 else (math.cos, math.sin)[together.index(cause)](self.turn_rad)
+
+
+def draws(spread: Spread, count: int, *, seed: int) -> list[Draw]:
+    """``count`` lenses of a process: normal amounts, gradients in any direction."""
+    random = np.random.default_rng(seed)
+    sigma = np.array(list(spread.values().values()))
+    normal, turns = random.standard_normal((count, len(sigma))) * sigma, random.uniform(0, 2 * np.pi, count)
+    return [
+        Draw(dict(zip(DRAWN, row.tolist(), strict=True)), float(turn)) for row, turn in zip(normal, turns, strict=True)
+    ]

@@ -1,0 +1,62 @@
+"""A made lens as numbers: so much of every cause, and what that does to its pillars."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, nearest
+from metalens.made.causes import CAUSES, Answers, Bends, Widens, of_kind, polynomials
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class State:
+    """How much of each cause a lens has: (causes,) in the order and units of :data:`metalens.made.CAUSES`."""
+
+    amounts: Array
+
+    @classmethod
+    def of(cls, values: Mapping[str, float] | None = None) -> Self:
+        """The state with these amounts by name, the rest as designed.
+
+        Raises:
+            ConfigError: an unknown name.
+        """
+        names = [row.name for row in CAUSES]
+        for name in values or {}:
+            if name not in names:
+                raise ConfigError(f"unknown cause {name!r}{nearest(name, names)}")
+        return cls(np.array([(values or {}).get(name, 0.0) for name in names]))
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.amounts[[row.name for row in CAUSES].index(name)])
+
+    def bias_polynomial_um(self) -> Array:
+        """(i, j) coefficients of u^i v^j of the change of the diameters."""
+        return self._polynomial(Widens)
+
+    def bias_um(self, u: Array, v: Array) -> Array:
+        """Change of the diameters at lens places over the radius; shapes broadcast."""
+        u, v = np.broadcast_arrays(u, v)
+        return np.asarray(np.polynomial.polynomial.polyval2d(u, v, self.bias_polynomial_um()))
+
+    def phase_rad(self, u: Array, v: Array) -> Array:
+        """Phase added to the wave front at lens places over the radius; shapes broadcast."""
+        u, v = np.broadcast_arrays(u, v)
+        return np.asarray(np.polynomial.polynomial.polyval2d(u, v, self._polynomial(Bends)))
+
+    def bends(self) -> bool:
+        """Whether the wave front has any phase of its own."""
+        return bool(self._of(Bends).any())
+
+    def answers(self) -> Array:
+        """(answering causes,) amounts in um, rad and 1, as the pillars' derivatives take them."""
+        return self._of(Answers) * [row.unit for _, row in of_kind(Answers)]
+
+    def _of(self, kind: type[Widens] | type[Answers] | type[Bends]) -> Array:
+        return self.amounts[[n for n, _ in of_kind(kind)]]
+
+    def _polynomial(self, kind: type[Widens] | type[Bends]) -> Array:
+        return np.asarray(np.tensordot(self._of(kind), polynomials(kind), 1))

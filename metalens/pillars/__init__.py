@@ -1,0 +1,41 @@
+"""From solves to t(D): sweep, rational curve, library, proxy and its inverse."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.pillars import engines as engines
+    from metalens.pillars import fit as fit
+    from metalens.pillars import record as record
+    from metalens.pillars import study as study
+    from metalens.pillars import study_plots as study_plots
+    from metalens.pillars.engines import Light as Light
+    from metalens.pillars.fit import ProxyFit as ProxyFit
+    from metalens.pillars.fit import Wanted as Wanted
+    from metalens.pillars.proxy import Proxy as Proxy
+    from metalens.pillars.record import DEFAULT_CELL as DEFAULT_CELL
+    from metalens.pillars.record import PillarLibrary as PillarLibrary
+    from metalens.pillars.record import Sweep as Sweep
+    from metalens.pillars.study import Study as Study
+    from metalens.pillars.study_plots import library_figure as library_figure
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "study_plots": "",
+        "DEFAULT_CELL": "record",
+        "Light": "engines",
+        "PillarLibrary": "record",
+        "Proxy": "proxy",
+        "ProxyFit": "fit",
+        "Study": "study",
+        "Sweep": "record",
+        "Wanted": "fit",
+        "engines": "",
+        "fit": "",
+        "library_figure": "study_plots",
+        "record": "",
+        "study": "",
+    },
+)

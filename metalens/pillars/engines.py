@@ -1,0 +1,116 @@
+"""Which solver takes a pillar cell, and one whose error changes smoothly with the diameter."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from metalens.cell import Cell, Response
+from metalens.ground.errors import CellError
+
+Engine = Literal["auto", "rcwa", "modal"]
+Polarization = Literal["x", "y", "s", "p"]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """One plane wave: vacuum wavelength, angle of incidence in air, and polarisation (x at normal incidence, s, p)."""
+
+    wavelength_um: float
+    angle_rad: float = 0.0
+    polarization: Polarization = "x"
+
+
+def choose(cell: Cell, engine: Engine = "auto") -> str:
+    """``modal`` for upright round pillars without films (faster and more precise), ``rcwa`` for everything else."""
+    upright = cell.round and not (cell.under or cell.over or cell.sidewall_rad)
+    if engine == "modal" and not upright:
+        raise CellError(
+            "the modal engine takes upright pillars without films, round and on a square lattice; use engine 'rcwa'"
+        )
+    if engine == "auto":
+        return "modal" if upright else "rcwa"
+    return engine
+
+
+def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Callable[[float], Response]:
+    """Response at a diameter, refined until its own error estimate meets the tolerance."""
+    if engine == "modal":
+        return functools.partial(_modal, cell, light, tolerance)
+    return functools.partial(_rcwa, cell, light, tolerance, None)
+
+
+def smooth(
+    cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str
+) -> Callable[[float], Response]:
+    """As :func:`precise`, on one discretisation for all diameters of ``span_um``.
+
+    It is the least that meets the tolerance at three probes. Elsewhere the error may exceed the tolerance (it is
+    reported), but it has no jumps that a rational fit would take for resonances.
+    """
+    if cell.height_um == 0:
+        return precise(cell, light, tolerance=tolerance, engine=engine)
+    make = _modal_levels if engine == "modal" else _rcwa_levels
+    levels = make(cell, light, span_um[1], tolerance)
+    probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 1.0)]
+    for at in levels[:-1]:
+        if all(at(d).converged for d in probes):
+            return at
+    return levels[-1]
+
+
+def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
+    """One mesh a level: the one that the ladder takes for the largest diameter."""
+    from metalens.modal import RUNGS, Rung, case_of, evaluate, first_rung
+
+    def level(rung: Rung) -> Callable[[float], Response]:
+        mesh = rung.choice(largest_um / cell.pitch_um)
+
+        def at(diameter_um: float) -> Response:
+            case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
+            made = evaluate(case, mesh.plan, weak=rung.weak)
+            shared = max(rung.choice(case.rho).thin, mesh.thin) - mesh.thin + mesh.shared(case.rho, case.bloch)
+            error = rung.bound(shared, made, case.rho)
+            t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
+            return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
+
+        return at
+
+    return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
+
+
+def _rcwa_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
+    reaches: tuple[int, ...] = (6, 8, 10, 12, 14)
+    if not cell.round:
+        from metalens.rcwa import most_harmonics
+
+        most = most_harmonics(cell, largest_um, angle_rad=light.angle_rad)
+        reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
+    return [functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches]
+
+
+def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Response:
+    from metalens import modal
+
+    return modal.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+    )
+
+
+def _rcwa(cell: Cell, light: Light, tolerance: float, harmonics: int | None, diameter_um: float) -> Response:
+    from metalens import rcwa
+
+    return rcwa.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+        harmonics=harmonics,
+    )

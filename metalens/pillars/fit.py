@@ -1,0 +1,261 @@
+"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least coefficients in tolerance."""
+
+import contextlib
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import DomainError
+from metalens.pillars import polynomial
+from metalens.pillars.proxy import Proxy
+from metalens.pillars.record import PillarLibrary
+from metalens.pillars.stretch import Stretch, stretch
+
+TURN = 2 * math.pi
+POWERS = (3, 2, 1)
+HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
+MOST_TERMS = 24  # coefficients in the diameter of one curve
+MOST_NODES = 5  # coefficients in the wavelength, and in the angle
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a proxy must meet.
+
+    phase_tolerance_rad, transmission_tolerance: largest deviation from the library entries.
+    coefficients: real ones, of phase and |T| together at one wavelength and angle; more are taken only where
+        fewer would leave less than a full turn.
+    least_transmission: a domain ends where |t| falls below.
+    least_half_width_um: a domain ends at resonances narrower than this: a pillar so little off would jump.
+    within_um: (least, largest) diameter to consider; all entries without it.
+    """
+
+    phase_tolerance_rad: float = 1e-3
+    transmission_tolerance: float = 1e-3
+    coefficients: int = 24
+    least_transmission: float = 0.7
+    least_half_width_um: float = 0.005
+    within_um: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One line of the table of error against coefficients."""
+
+    coefficients: int
+    power: int
+    phase_error_rad: float
+    transmission_error: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ProxyFit:
+    """A proxy and why it is as it is.
+
+    notes: where its domain was cut, and why. table: error against the number of coefficients on that domain.
+    turns: covered by the domain, the least over wavelengths and angles.
+    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their mean.
+    """
+
+    proxy: Proxy
+    notes: tuple[str, ...]
+    table: tuple[Trial, ...]
+    turns: float
+    polarization_spread: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Data:
+    """Phase and |T| on (angle, wavelength, diameter), and the coordinates."""
+
+    phase: Array
+    level: Array
+    diameter: Array
+    wavelength: Array
+    angle: Array
+
+
+def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
+    """The proxy of a library.
+
+    Every other diameter is fitted (least largest deviation, by Lawson's weights), all are judged: half of them
+    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have their own polynomials in
+    diameter^power; |T| is scaled until its certified bound lies below 1.
+
+    Raises:
+        DomainError: no stretch of diameters without resonance holds enough entries.
+    """
+    wanted = wanted or Wanted()
+    smooth = stretch(
+        library,
+        least_transmission=wanted.least_transmission,
+        least_half_width_um=wanted.least_half_width_um,
+        within_um=wanted.within_um,
+    )
+    data = _Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
+    terms = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
+    kept, proxy = _longest(data, wanted, terms)
+    while terms < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
+        terms += 2
+        kept, proxy = _longest(data, wanted, terms)
+    counts = range(4, max(18, 2 * terms + 5), 2)
+    trials = (_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
+    table = tuple(trial for trial in trials if trial is not None)
+    return ProxyFit(proxy, _notes(smooth, data, kept, terms), table, _turns(kept), smooth.polarization_spread)
+
+
+def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
+    """The proxy of a library alone; :func:`fit` gives its table of error against coefficients too."""
+    return fit(library, wanted).proxy
+
+
+def proxy_of(library: PillarLibrary) -> Proxy:
+    """The proxy that a library holds, fitted now where it holds none."""
+    return library.proxy if library.proxy is not None else fit_proxy(library)
+
+
+def _longest(data: _Data, wanted: Wanted, terms: int) -> tuple[_Data, Proxy]:
+    """The longest sub-domain from the thin end on which ``terms`` coefficients meet the tolerances."""
+    good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
+    best = _best(_head(data, good), wanted, terms)
+    if best is None:
+        raise DomainError(
+            f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
+            f"{data.diameter[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+        )
+    while bad - good > 1:
+        middle = (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
+        trial = _best(_head(data, middle), wanted, terms)
+        if trial is not None and _meets(trial, wanted):
+            good, best = middle, trial
+        else:
+            bad = middle
+    return _head(data, good), best
+
+
+def _meets(proxy: Proxy, wanted: Wanted) -> bool:
+    return _cost(proxy, wanted) <= 1
+
+
+def _best(data: _Data, wanted: Wanted, terms: int) -> Proxy | None:
+    """Of the powers of the diameter, the one with the least error in units of the tolerances; None where each takes
+    |T| below 0 between the entries."""
+    found = []
+    for power in POWERS:
+        with contextlib.suppress(DomainError):
+            found.append(fit_terms(data, power, terms))
+    return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
+
+
+def _cost(proxy: Proxy, wanted: Wanted) -> float:
+    """The larger error in units of its tolerance; infinite where the phase turns back (the library's does not)."""
+    middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
+    if not all(proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}):
+        return math.inf
+    return max(
+        proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
+        proxy.max_transmission_error / wanted.transmission_tolerance,
+    )
+
+
+def fit_terms(data: _Data, power: int, terms: int) -> Proxy:
+    """The proxy with ``terms`` coefficients in diameter^power for the phase, and as many for |T|."""
+    axes = _axes(data, power)
+    phase = _minimax(axes, data.phase, terms)
+    level = _minimax(axes, data.level, terms)
+    high = polynomial.bounds(level, points=64 if level.size > terms else 512)[1]
+    if high > 1 - HEADROOM:
+        level = level * ((1 - HEADROOM) / high)
+    errors = [
+        float(np.abs(_evaluate(axes, c) - values).max()) for c, values in ((phase, data.phase), (level, data.level))
+    ]
+    flat = len(data.angle) == 1
+    return Proxy(
+        phase[0] if flat else phase,
+        level[0] if flat else level,
+        (float(data.diameter[0]), float(data.diameter[-1])),
+        (float(data.wavelength[0]), float(data.wavelength[-1])),
+        errors[0],
+        errors[1],
+        power,
+        0.0 if flat else float(data.angle[-1]),
+    )
+
+
+def _axes(data: _Data, power: int) -> tuple[Array, Array, Array]:
+    """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
+    sine = np.sin(data.angle) ** 2
+    return (
+        2 * sine / sine[-1] - 1 if len(sine) > 1 else np.zeros(1),
+        _unit(data.wavelength) if len(data.wavelength) > 1 else np.zeros(1),
+        _unit(data.diameter**power),
+    )
+
+
+def _unit(values: Array) -> Array:
+    return np.asarray((2 * values - values[0] - values[-1]) / (values[-1] - values[0]))
+
+
+def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
+    a, w, d = (chebyshev.chebvander(x, n - 1) for x, n in zip(axes, coefficients.shape, strict=True))
+    return np.asarray(np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True))
+
+
+def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
+    """Tensor coefficients: every curve by itself in the diameter, then its coefficients in wavelength and angle.
+
+    Up to five wavelengths or angles are met exactly by polynomials of them, more by least squares.
+    """
+    curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
+    for axis in (0, 1):
+        basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), MOST_NODES) - 1)
+        curves = np.moveaxis(np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis)
+    return curves
+
+
+def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
+    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson 1961: weights times
+    deviation)."""
+    weight = np.full(values.shape, 1 / values.shape[-1])
+    best, least = np.zeros((*values.shape[:-1], basis.shape[1])), np.full(values.shape[:-1], np.inf)
+    for _ in range(rounds):
+        root = np.sqrt(weight)[..., None]
+        q, r = np.linalg.qr(basis * root)
+        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[..., 0]
+        off = np.abs(np.einsum("nk,...k->...n", basis, c) - values)
+        worst = off.max(axis=-1)
+        better = worst < least
+        best[better], least[better] = c[better], worst[better]
+        weight *= off / np.maximum(worst, 1e-300)[..., None] + 1e-9
+        weight /= weight.sum(axis=-1, keepdims=True)
+    return best
+
+
+def _trial(data: _Data, power: int, coefficients: int) -> Trial | None:
+    """One line of the table; None where |T| falls below 0 between the entries."""
+    try:
+        proxy = fit_terms(data, power, coefficients // 2)
+    except DomainError:
+        return None
+    return Trial(coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error)
+
+
+def _head(data: _Data, count: int) -> _Data:
+    return _Data(data.phase[..., :count], data.level[..., :count], data.diameter[:count], data.wavelength, data.angle)
+
+
+def _turns(data: _Data) -> float:
+    return float((data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
+
+
+def _notes(smooth: Stretch, data: _Data, kept: _Data, terms: int) -> tuple[str, ...]:
+    if len(kept.diameter) == len(data.diameter):
+        return smooth.notes
+    return (
+        *smooth.notes,
+        f"cut at {kept.diameter[-1]:.4f} um: up to {data.diameter[-1]:.4f} um the phase is smooth, but {2 * terms} "
+        "coefficients do not describe it within the tolerances",
+    )

@@ -1,0 +1,72 @@
+"""The polynomials of :mod:`metalens.pillars.polynomial` for torch tensors, with exact derivatives of every order."""
+
+from typing import Any, cast
+
+import torch
+
+from metalens.pillars import polynomial
+from metalens.pillars.polynomial import Curve
+
+
+def value(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+    """p(D) on the device and in the dtype of ``diameter``; differentiable by backward, forward and vmap."""
+    return cast(torch.Tensor, _Polynomial.apply(diameter, p, 0))  # type: ignore[no-untyped-call]
+
+
+def slope(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+    """dp/dD, differentiable again."""
+    return cast(torch.Tensor, _Polynomial.apply(diameter, p, 1))  # type: ignore[no-untyped-call]
+
+
+def _bend(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+    """d²p/dD², in differentiable operations: x' = a D^m gives p'' x'² + p' x''."""
+    m = p.power - 1
+    bend = value(p.slope.slope, diameter) * (p.inner_slope * diameter**m) ** 2
+    return bend + value(p.slope, diameter) * (p.inner_slope * m * diameter ** (m - 1)) if m else bend
+
+
+class _Polynomial(torch.autograd.Function):
+    """Elementwise p(D) (order 0) or dp/dD (order 1) that keeps only its input for the backward pass."""
+
+    @staticmethod
+    def forward(diameter: torch.Tensor, p: Curve, order: int) -> torch.Tensor:
+        if diameter.device.type == "cpu":
+            verb = polynomial.slope if order else polynomial.value
+            return torch.from_numpy(verb(p, diameter.detach().numpy()))
+        polynomial.check(p, diameter)
+        x = diameter**p.power * p.scale + p.shift
+        if order:
+            return _horner(p.slope, x) * (p.inner_slope * diameter ** (p.power - 1))
+        return _horner(p, x).clamp_max(p.ceiling)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        diameter, ctx.curve, ctx.order = inputs
+        ctx.save_for_backward(diameter)
+        ctx.save_for_forward(diameter)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        (diameter,) = ctx.saved_tensors
+        weight = gradients[0]
+        plain = not (ctx.order or torch.is_grad_enabled() or torch._C._functorch.maybe_current_level())
+        if plain and diameter.device.type == "cpu" and weight.dtype == diameter.dtype:
+            fused = polynomial.pulled_back(ctx.curve, diameter.detach().numpy(), weight.detach().numpy())
+            return torch.from_numpy(fused), None, None
+        return weight * (_bend if ctx.order else slope)(ctx.curve, diameter), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        (diameter,) = ctx.saved_tensors
+        return tangents[0] * (_bend if ctx.order else slope)(ctx.curve, diameter)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], diameter: torch.Tensor, p: Curve, order: int) -> tuple[Any, Any]:
+        return (slope if order else value)(p, diameter), in_dims[0]
+
+
+def _horner(p: Curve, x: torch.Tensor) -> torch.Tensor:
+    total = torch.full_like(x, p.monomials[-1])
+    for c in p.monomials[-2::-1]:
+        total = total * x + c
+    return total

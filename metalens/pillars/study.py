@@ -1,0 +1,262 @@
+"""Which pillar cell to take: over pitch, height and wavelength, how much phase do printable pillars cover smoothly?"""
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.cell import Blend, Cell, Material, check_subwavelength, index
+from metalens.ground.arrays import Array
+from metalens.ground.console import Console
+from metalens.ground.errors import ConfigError
+from metalens.pillars import curve as reduced
+from metalens.pillars import engines, workers
+from metalens.pillars.curve import Curve, Nodes
+from metalens.pillars.engines import Light
+from metalens.pillars.record import PLAIN
+from metalens.pillars.stretch import REACH
+
+TURN = 2 * math.pi
+SAMPLES = 600
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What is compared.
+
+    pitches_um, heights_um, wavelengths_um: every combination.
+    pillar: material of the pillars; substrate and cover are those of :class:`metalens.cell.Cell`.
+    min_diameter_um, min_gap_um: what can be printed.
+    least_transmission: |t| below this ends a smooth stretch.
+    least_half_width_um: so does a resonance narrower than this.
+    tolerance: error of t.
+    others: materials that the chosen cell is tried with as well.
+    """
+
+    pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
+    heights_um: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    wavelengths_um: tuple[float, ...] = (0.85, 0.94)
+    pillar: Material = PLAIN
+    min_diameter_um: float = 0.08
+    min_gap_um: float = 0.06
+    least_transmission: float = 0.8
+    least_half_width_um: float = 0.005
+    tolerance: float = 3e-3
+    others: tuple[str, ...] = ("a-Si",)
+
+    def __post_init__(self) -> None:
+        if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
+            raise ConfigError(
+                f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
+                f"{self.min_gap_um} um"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One cell at one wavelength.
+
+    turns: of phase that the longest smooth stretch covers; from_um, to_um: its diameters.
+    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
+    ends: what bounds it above.
+    max_angle_deg: of incidence in air up to which no diffraction order propagates.
+    error: largest error estimate of t on the stretch.
+    pillar: name of the material, or n + ik.
+    """
+
+    pitch_um: float
+    height_um: float
+    wavelength_um: float
+    turns: float
+    from_um: float
+    to_um: float
+    least_transmission: float
+    mean_power: float
+    ends: str
+    max_angle_deg: float
+    error: float
+    pillar: str
+
+
+def run(study: Study, console: Console | None = None) -> list[Verdict]:
+    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell with other materials.
+
+    Raises:
+        CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none.
+    """
+    for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
+        check_subwavelength(Cell(pitch, pillar=study.pillar), wavelength)
+    shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
+    cases = [(Cell(pitch, height, study.pillar), wavelength) for wavelength, height, pitch in shapes]
+    verdicts = _judged(study, cases, console or Console(quiet=True))
+    best = choice(study, verdicts)
+    if best is None:
+        return verdicts
+    cells = [Cell(*best, other) for other in study.others]
+    return verdicts + _judged(study, [(c, w) for c in cells for w in study.wavelengths_um], Console(quiet=True))
+
+
+def _judged(study: Study, cases: list[tuple[Cell, float]], console: Console) -> list[Verdict]:
+    """One rational curve t(D) a case, on all cores."""
+    tasks = []
+    for cell, wavelength in cases:
+        span = (study.min_diameter_um, cell.pitch_um - study.min_gap_um)
+        engine = engines.choose(cell)
+        tasks.append(workers.curve_task(cell, Light(wavelength), span, tolerance=study.tolerance, engine=engine))
+    found = dict(console.track(workers.run(tasks), total=len(tasks), label="cells"))
+    return [judge(study, *case, curve_of(found[i], study.tolerance)) for i, case in enumerate(cases)]
+
+
+def curve_of(result: workers.Result, tolerance: float) -> Curve:
+    """The rational curve behind a worker's answer."""
+    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
+    error, energy = np.array(result["error"]), np.array(result["energy"])
+    diameter = np.array(result["diameter_um"])
+    nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, result["converged"], result["reason"])
+    return reduced.curve(nodes, tolerance=workers.FIT_SHARE * tolerance)
+
+
+def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdict:
+    """The smooth stretch that covers most phase on one curve."""
+    d = np.linspace(curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES)
+    value, error = curve(d)
+    level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0]))
+    faults = {"|t| falls": level < study.least_transmission, "the phase falls": np.diff(phase, append=np.inf) < 0}
+    sharp = np.zeros(SAMPLES, bool)
+    for centre, width in curve.resonances(study.least_half_width_um):
+        sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
+    faults["a narrow resonance"] = sharp
+    start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
+    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or ["the printable range"]
+    run = slice(start, stop)
+    return Verdict(
+        cell.pitch_um,
+        cell.height_um,
+        wavelength_um,
+        float(phase[stop - 1] - phase[start]) / TURN if stop > start else 0.0,
+        float(d[start]),
+        float(d[max(start, stop - 1)]),
+        float(level[run].min(initial=1.0)),
+        _mean_over_phase(phase[run], level[run] ** 2),
+        " and ".join(why),
+        max_angle_deg(cell, wavelength_um),
+        float(error[run].max(initial=0.0)),
+        named(cell.pillar),
+    )
+
+
+def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
+    """Angle of incidence in air up to which no order propagates: sin = wavelength / pitch - n of the substrate."""
+    sine = wavelength_um / cell.pitch_um - index(cell.substrate, wavelength_um).real
+    return math.degrees(math.asin(min(1.0, max(0.0, sine))))
+
+
+def _most_phase(phase: Array, good: Array) -> tuple[int, int]:
+    """(start, stop) of the run of good samples that covers most phase; (0, 0) where there is none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2).tolist()
+    return max(((a, b) for a, b in edges), key=lambda run: phase[run[1] - 1] - phase[run[0]], default=(0, 0))
+
+
+def _mean_over_phase(phase: Array, power: Array) -> float:
+    if len(phase) < 2:
+        return 0.0
+    return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
+
+
+def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
+    """The study as a page with one table a wavelength: turns covered (least |t|), pitch across, height down."""
+    lines = [
+        "# Cell study",
+        "",
+        f"Round pillars of {named(study.pillar)} on fused silica in air. Printable: diameter from "
+        f"{1e3 * study.min_diameter_um:g} nm to the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, "
+        "in turns, that the longest stretch of diameters covers on which the phase rises, |t| >= "
+        f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
+        "in brackets the mean |t|² over it. **Bold**: a full turn.",
+        "",
+        f"Made by `{command}`; numbers with diameters and reasons in `cell_study.json`.",
+        "",
+        "![coverage](cell_study.png)",
+    ]
+    for wavelength in study.wavelengths_um:
+        lines += [
+            "",
+            f"## {1e3 * wavelength:g} nm",
+            "",
+            *_table(study, [v for v in _own(study, verdicts) if v.wavelength_um == wavelength]),
+        ]
+    return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
+
+
+def named(material: Material) -> str:
+    """A material in words."""
+    if isinstance(material, Blend):
+        mixed = f" with {material.share:.0%} {material.other}" if material.other else ""
+        return f"{material.base}{mixed} {material.n_offset:+g} {material.k_offset:+g}i"
+    return material if isinstance(material, str) else f"n = {material.n:g} + {material.k:g}i"
+
+
+def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
+    return [v for v in verdicts if v.pillar == named(study.pillar)]
+
+
+def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
+    found = {(v.height_um, v.pitch_um): v for v in verdicts}
+    head = "| height \\ pitch (nm) | " + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um) + " |"
+    lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
+    for height in study.heights_um:
+        cells = [found[height, pitch] for pitch in study.pitches_um]
+        texts = [
+            f"**{v.turns:.2f}** ({v.mean_power:.2f})" if v.turns >= 1 else f"{v.turns:.2f} ({v.mean_power:.2f})"
+            for v in cells
+        ]
+        lines.append(f"| {1e3 * height:g} | " + " | ".join(texts) + " |")
+    return lines
+
+
+def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
+    """(pitch, height) in um that covers a full turn at every wavelength with most turns at the worst of them, at the
+    least height; None where no cell does."""
+    by_cell: dict[tuple[float, float], list[float]] = {}
+    for v in _own(study, verdicts):
+        by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
+    good = {cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1}
+    if not good:
+        return None
+    height = min(cell[0] for cell in good)
+    best = max((cell for cell in good if cell[0] == height), key=lambda cell: good[cell])
+    return best[1], best[0]
+
+
+def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
+    waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
+    best = choice(study, verdicts)
+    if best is None:
+        return [f"No cell covers a full turn at {waves} nm."]
+    found = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
+    lines = [
+        "## Choice",
+        "",
+        f"The lowest pillars that cover a full turn at {waves} nm with one cell are {1e3 * best[1]:g} nm high; among "
+        f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
+        "",
+    ]
+    for v in found:
+        lines.append(
+            f"- {v.pillar}, {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
+            f"{1e3 * v.to_um:.0f} nm "
+            f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
+            f"order up to {v.max_angle_deg:.0f} deg"
+        )
+    return lines
+
+
+def rounded(value: object) -> object:
+    """Six significant digits: what the tolerance carries, and the same text on any machine."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {k: rounded(v) for k, v in value.items()}
+    return [rounded(v) for v in value] if isinstance(value, list | tuple) else value

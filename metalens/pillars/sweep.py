@@ -1,0 +1,225 @@
+"""Run a library sweep: one rational curve t(D) for every wavelength, angle and polarisation, on all cores."""
+
+import dataclasses
+import functools
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from metalens import __version__
+from metalens.cell import Cell
+from metalens.ground import config, store
+from metalens.ground.arrays import Array
+from metalens.ground.console import Console
+from metalens.ground.store import Provenance
+from metalens.pillars import curve as reduced
+from metalens.pillars import engines, few_nodes, workers
+from metalens.pillars.curve import Curve, Nodes
+from metalens.pillars.engines import Light
+from metalens.pillars.few_nodes import Rows
+from metalens.pillars.record import PillarLibrary, Sweep, check
+from metalens.pillars.workers import Result, Task
+
+AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where diameters are added
+FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
+MOST_ADDED = 400
+POINTS = 8  # entries a task when solved one by one
+WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
+
+
+def sweep(
+    cell: Cell,
+    settings: Sweep | None = None,
+    *,
+    wavelengths_um: tuple[float, ...] | None = None,
+    console: Console | None = None,
+    checkpoint: Path | None = None,
+) -> PillarLibrary:
+    """Compute a library.
+
+    Args:
+        settings: what it holds; wavelengths_um: instead of those of the settings.
+        console: where progress is shown.
+        checkpoint: file for finished curves; a sweep that was interrupted goes on from it, to the same result.
+
+    Raises:
+        CellError, MaterialError: see :func:`metalens.pillars.record.check`.
+    """
+    settings = settings or Sweep()
+    if wavelengths_um is not None:
+        settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
+    check(cell, settings)
+    return _run(cell, settings, console=console, checkpoint=checkpoint)
+
+
+def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path | None) -> PillarLibrary:
+    """The library of a sweep that was checked.
+
+    Curves are solved at a few wavelengths and angles first; those that polynomials between them do not give within
+    the tolerance are solved too, and single entries that are still above it one by one.
+    """
+    console = console or Console(quiet=True)
+    engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
+    journal = _Journal(checkpoint, cell, sweep)
+    span = sweep.span_um(cell)
+
+    def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
+        tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
+        return dict(zip(lights, map(functools.partial(_curve, sweep), journal.run(tasks, console, label)), strict=True))
+
+    first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg))
+    curves = solved(first, "curves")
+    diameters = _diameters(span, sweep.samples, list(curves.values()))
+    rows = {light: _evaluate(curve, diameters) for light, curve in curves.items()}
+    full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+    weak = [light for light, row in full.items() if light not in curves and _misses(row, sweep).sum() > WORTH_A_CURVE]
+    if weak:
+        more = solved(weak, "more curves")
+        curves |= more
+        rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
+        full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+    extra = _points(cell, sweep, engine, diameters, full)
+    for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
+        _replace(full[Light(*task["light"])], diameters, result)
+    solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(len(t["diameters_um"]) for t in extra)
+    made = _library(cell, sweep, (engine, solves), diameters, curves, full)
+    journal.finish()
+    return made
+
+
+def _curve(sweep: Sweep, result: Result) -> Curve:
+    return reduced.curve(_nodes(result), tolerance=workers.FIT_SHARE * sweep.tolerance)
+
+
+def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
+    return {light: curve.resonances() for light, curve in curves.items()}
+
+
+def _misses(row: Array, sweep: Sweep) -> Array:
+    return np.asarray(row[2].real > sweep.tolerance)
+
+
+def _nodes(result: Result) -> Nodes:
+    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
+    error, energy = np.array(result["error"]), np.array(result["energy"])
+    return Nodes(
+        np.array(result["diameter_um"]), np.stack([t, r], 1), error, energy, result["converged"], result["reason"]
+    )
+
+
+def _evaluate(curve: Curve, diameters: Array) -> Array:
+    value, error = curve(diameters)
+    return np.stack([value[:, 0], value[:, 1], error + 0j])
+
+
+def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> Array:
+    """Even samples, and more where t turns fast: around every resonance, on its own scale."""
+    low, high = span
+    even = np.linspace(low, high, samples)
+    sharp = np.concatenate([curve.resonances() for curve in curves])
+    wide = 3 * (even[1] - even[0])  # well sampled already
+    sharp = sharp[(sharp[:, 1] > FINEST_UM) & (sharp[:, 1] < wide)]
+    added = (sharp[:, :1] + np.array(AROUND) * sharp[:, 1:]).ravel()
+    added = np.unique(np.round(added[(added > low) & (added < high)], 6))
+    return np.unique(np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]]))
+
+
+def _points(cell: Cell, sweep: Sweep, engine: str, diameters: Array, full: Rows) -> list[Task]:
+    """Tasks for the entries whose error bar is above the tolerance."""
+    tasks = []
+    for light, row in full.items():
+        bad = diameters[_misses(row, sweep)].tolist()
+        for start in range(0, len(bad), POINTS):
+            some = bad[start : start + POINTS]
+            tasks.append(workers.points_task(cell, light, some, tolerance=sweep.tolerance, engine=engine))
+    return tasks
+
+
+def _replace(row: Array, diameters: Array, result: Result) -> None:
+    """Put single solves in place of the curve's values where their error is less."""
+    places: list[int] = np.searchsorted(diameters, np.array(result["diameter_um"])).tolist()
+    for place, t, r, error in zip(places, result["t"], result["r"], result["error"], strict=True):
+        if error < row[2, place].real:
+            row[:, place] = complex(*t), complex(*r), error
+
+
+def _library(
+    cell: Cell, sweep: Sweep, effort: tuple[str, int], diameters: Array, curves: dict[Light, Curve], full: Rows
+) -> PillarLibrary:
+    shape = (len(sweep.polarizations), len(sweep.angles_deg), len(sweep.wavelengths_um), len(diameters))
+    t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
+    resonances = []
+    for i, j, k in np.ndindex(*shape[:3]):
+        light = few_nodes.light(sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i])
+        row = full[light]
+        t[i, j, k], r[i, j, k], error[i, j, k] = row[0], row[1], row[2].real
+        if light in curves:
+            poles = curves[light].resonances()
+            resonances += [(i, light.angle_rad, light.wavelength_um, *pole) for pole in poles]
+    return PillarLibrary(
+        cell,
+        sweep,
+        sweep.polarizations,
+        np.radians(sweep.angles_deg),
+        np.array(sweep.wavelengths_um),
+        diameters,
+        t,
+        r,
+        error,
+        np.abs(t) ** 2 + np.abs(r) ** 2,
+        np.array(resonances, float).reshape(-1, 5),
+        *effort,
+        provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
+    )
+
+
+def _entry(line: str) -> tuple[str, Result] | None:
+    """(task, result) of a line of a journal; None for one that is damaged: its task is done again."""
+    try:
+        task, result = json.loads(line)
+        listed = [np.array(result[name]) for name in ("diameter_um", "t", "r", "error", "energy")]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return (str(task), result) if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,) else None
+
+
+class _Journal:
+    """Finished tasks as JSON lines beside the output, so that an interrupted sweep goes on where it stopped.
+
+    The first line names the sweep; a file of another sweep is started afresh, a line cut short is dropped.
+    """
+
+    def __init__(self, path: Path | None, cell: Cell, sweep: Sweep) -> None:
+        self._path = path
+        self._title = json.dumps([__version__, config.dumps(cell), config.dumps(sweep)])
+        self._known: dict[str, Result] = {}
+        if path is None:
+            return
+        lines = store.whole_lines(path)
+        if lines and lines[0] == self._title:
+            self._known = dict(filter(None, map(_entry, lines[1:])))
+        else:
+            store.write_text(path, self._title + "\n")
+
+    def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
+        """Results of the tasks in order; those in the journal are not computed again."""
+        keys = [json.dumps(task, sort_keys=True) for task in tasks]
+        left = [i for i, key in enumerate(keys) if key not in self._known]
+        if left and len(left) < len(tasks):
+            console.say(f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before")
+        stream = workers.run([tasks[i] for i in left])
+        for i, result in console.track(stream, total=len(left), label=label):
+            self._keep(keys[left[i]], result)
+        return [self._known[key] for key in keys]
+
+    def _keep(self, key: str, result: Result) -> None:
+        self._known[key] = result
+        if self._path is not None:
+            store.append_line(self._path, json.dumps([key, result]))
+
+    def finish(self) -> None:
+        """The sweep is complete: its journal is no longer needed."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

@@ -1,0 +1,175 @@
+"""Blocks of neighbouring pillars: a few nodes stand for each, and a polynomial carries the known phase across it.
+
+The kernel from a block to the window, its carrier removed, is smooth over some dozens of pillars, so that its values
+at ``nodes`` points inside the block give it at every pillar by interpolation. Read the other way round, the pillars'
+light may be moved to those points with the same weights.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.ground.paths import sensor_path, source_path
+from metalens.propagate.geometry import Case
+
+LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  # of rows, of columns
+ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
+ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding of the path itself
+SHARE = 40  # of the tolerance that interpolation inside blocks may take
+PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
+TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
+CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Pillars along one axis in blocks of ``length``, ``nodes`` points in each.
+
+    The last block is as long as the others and overlaps the one before it; every pillar belongs to the first block
+    that holds it. Where a block would need as many nodes as pillars, the nodes are the pillars.
+    """
+
+    pillars: int
+    length: int
+    nodes: int
+
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return -(-self.pillars // self.length)
+
+    @property
+    def bases(self) -> Array:
+        """(block,) index of the first pillar."""
+        return np.minimum(np.arange(self.count) * self.length, self.pillars - self.length)
+
+    @property
+    def places(self) -> Array:
+        """(nodes,) positions of the nodes from the block's middle, in half-lengths."""
+        return np.asarray(legendre.nodes(self.nodes)[0] if self.nodes < self.length else self.along)
+
+    @property
+    def along(self) -> Array:
+        """(length,) positions of the pillars from the block's middle, in half-lengths."""
+        return np.linspace(-1, 1, self.length) if self.length > 1 else np.zeros(1)
+
+    @property
+    def weights(self) -> Array:
+        """(nodes, length): share of a pillar's light that each node gets."""
+        if self.nodes == self.length:
+            return np.eye(self.length)
+        return np.ascontiguousarray(legendre.interpolation(self.nodes, self.along).T)
+
+    def middles_um(self, pitch_um: float) -> Array:
+        """(block,) middles of the blocks from the lens axis."""
+        return (self.bases + (self.length - self.pillars) / 2) * pitch_um
+
+    def nodes_um(self, pitch_um: float) -> Array:
+        """(block · nodes,) positions of all nodes from the lens axis."""
+        half = (self.length - 1) / 2 * pitch_um
+        return np.asarray((self.middles_um(pitch_um)[:, None] + half * self.places).ravel())
+
+
+Kernel = Callable[[Any, Any], Array]
+
+
+def choose(case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int) -> tuple[Blocks, Blocks]:
+    """(rows, columns) blocks that cost least.
+
+    Args:
+        kernel: (y, x) in um to (line, …) values whose variation over a block must be met, broadcasting.
+        tolerance: root mean square error of the interpolation, relative.
+    """
+    height = next(n for n in LENGTHS[0] if n <= case.shape[0] and _carried(case, reference, n, itemsize))
+    found = []
+    for axis, longest in ((0, height), (1, LENGTHS[1][0])):
+        options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
+        blocks = [_needed(case, axis, n, kernel, tolerance) for n in options]
+        found.append(min(blocks, key=lambda b: b.nodes * (1 + 60 / b.length)))
+    return found[0], found[1]
+
+
+def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float) -> Blocks:
+    """Blocks of a length along an axis with as few nodes as the kernel needs at its ends and its middle."""
+    if length < 4:
+        return Blocks(case.shape[axis], length, length)
+    bases = Blocks(case.shape[axis], length, length).middles_um(case.pitch_um)
+    middles = bases[[0, len(bases) // 2, -1], None, None]
+    across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
+    line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * case.pitch_um
+    values = kernel(line, across) if axis == 0 else kernel(across, line)
+    count = max(legendre.needed(values, tolerance), 2)
+    return Blocks(case.shape[axis], length, length if count > PROBES else min(count, length))
+
+
+def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
+    """Source path (of the reference depth) plus sensor path (to the window centre), in wavelengths."""
+    path = source_path(x, y, case.tangents, reference)
+    return (path + sensor_path(x, y, case.centre_um, case.sensor_distance_um)) / case.wavelength_um
+
+
+def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
+    """Whether polynomials over blocks of ``length`` rows are as exact as asked."""
+    rows = Blocks(case.shape[0], length, length)
+    picked = np.unique([0, rows.count // 4, rows.count // 2, rows.count - 1])
+    x = case.pillars_um[1][:: max(1, case.shape[1] // 16)]
+    y = rows.middles_um(case.pitch_um)[picked, None, None]
+    half = (length - 1) / 2 * case.pitch_um
+    got = _powers(case, reference, (y, half), x, ORDER[itemsize])
+    want = carrier_turns(case, reference, x, y + half * rows.along[:, None])
+    error = np.abs(rows.along[:, None] ** np.arange(ORDER[itemsize]) @ got - want).max()
+    return bool(error <= ACCURACY[itemsize] + 4e-15 * np.abs(want).max())
+
+
+def _powers(case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int) -> Array:
+    """(block, order, x) power coefficients of the carrier in turns along the rows of blocks at ``rows`` middles."""
+    u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
+    values = carrier_turns(case, reference, x, rows[0] + rows[1] * u[:, None])
+    return np.asarray(_to_powers(order) @ values)
+
+
+@functools.cache
+def _to_powers(order: int) -> Array:
+    """(power, node): power coefficients of the polynomial through values at the Chebyshev nodes."""
+    u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
+    coefficients = np.linalg.inv(chebyshev.chebvander(u, order - 1))
+    columns = [np.pad(chebyshev.cheb2poly(c), (0, order))[:order] for c in coefficients.T]
+    return np.array(columns).T
+
+
+@dataclass(frozen=True, slots=True)
+class Carrier:
+    """The known phase in turns, c(u) = Σ_n coefficients[n] uⁿ for u in [-1, 1] along the rows of a block."""
+
+    case: Case
+    reference: float
+    rows: Blocks
+    chunk: int
+
+    def table(self, start: int, stop: int, dtype: Any) -> Array:
+        """(block, chunk, order, column) coefficients of block rows start to stop; whole turns are left out."""
+        order, columns = ORDER[np.dtype(dtype).itemsize], self.case.shape[1]
+        chunks = -(-columns // self.chunk)
+        out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
+        for first in range(start, stop, TABLE_ROWS):
+            some = slice(first, min(first + TABLE_ROWS, stop))
+            found = self._coefficients(some, order)
+            padded = np.zeros((*found.shape[:2], chunks * self.chunk), dtype)
+            padded[..., :columns] = found
+            parts = padded.reshape(*found.shape[:2], chunks, self.chunk)
+            out[some.start - start : some.stop - start] = parts.swapaxes(1, 2)
+        return out
+
+    def _coefficients(self, some: slice, order: int) -> Array:
+        """(block, order, column) float64 of some block rows."""
+        middles = self.rows.middles_um(self.case.pitch_um)[some, None, None]
+        half = (self.rows.length - 1) / 2 * self.case.pitch_um
+        found = _powers(self.case, self.reference, (middles, half), self.case.pillars_um[1], order)
+        found[:, 0] -= np.rint(found[:, 0])
+        return found

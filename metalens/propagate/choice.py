@@ -1,0 +1,85 @@
+"""Which method is cheapest for a case at a tolerance, and why."""
+
+import functools
+from dataclasses import dataclass
+
+from metalens.ground.errors import PropagationError
+from metalens.propagate.geometry import Case, windows
+from metalens.propagate.nodes import MOST_NODES, Layout, layout
+
+# seconds on one core: per pillar and point, and per pillar, point and depth of the exact sum; per pillar of the
+# windowed method, and for the plan of a tile
+_EXACT = (4e-9, 1.5e-9)
+_PILLAR = 3e-9
+_PLAN_SECONDS = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """method: ``exact``, ``windowed`` or ``tiled``; tiles: windows that are computed apart; seconds: expected, one
+    core, planning included."""
+
+    method: str
+    reason: str
+    tiles: tuple[tuple[Case, ...], ...]
+    seconds: float
+
+
+@functools.lru_cache(maxsize=64)
+def choose(case: Case, tolerance: float, *, differentiable: bool = False) -> Choice:
+    """The cheapest method that meets the tolerance.
+
+    Args:
+        differentiable: leave out the exact sum, which has no derivatives.
+
+    The angular spectrum is never chosen: its error (lattice, padding) has no bound. Radial lenses known by their
+    radial profile have a faster way of their own, :mod:`benchmarks.rivals.radial`.
+    """
+    cut = _windows(case, tolerance)
+    found = [_layout(window, tolerance) for row in cut for window in row]
+    pillars = case.shape[0] * case.shape[1]
+    plans = [(one.seconds + one.parts**2 * _PLAN_SECONDS, one.nodes) for one in found if one is not None]
+    windowed = sum(seconds + pillars * _PILLAR for seconds, _ in plans)
+    exact = exact_seconds(case)
+    if exact < windowed and not differentiable:
+        size = f"{pillars} pillars at {_points(case)} points"
+        reason = f"exact sum: {size} take {exact:.2g} s, windowed {windowed:.2g} s"
+        return Choice("exact", reason, ((case,),), exact)
+    times = f"{windowed:.2g} s, exact sum {exact:.2g} s"
+    if len(found) > 1:
+        why = f"the whole window would need over {MOST_NODES} nodes or a large table"
+        return Choice("tiled", f"windowed in {len(found)} tiles: {why}; {times}", cut, windowed)
+    rows, columns = plans[0][1]
+    return Choice("windowed", f"windowed: {rows} x {columns} nodes, {times}", cut, windowed)
+
+
+def exact_seconds(case: Case) -> float:
+    """Expected time of the exact sum."""
+    each, depth = _EXACT
+    pillars = case.shape[0] * case.shape[1]
+    return pillars * _points(case) * (each + depth * len(case.inverse_depths_per_um)) + 1e-4
+
+
+def _points(case: Case) -> int:
+    return case.samples[0] * case.samples[1]
+
+
+def _windows(case: Case, tolerance: float) -> tuple[tuple[Case, ...], ...]:
+    """The window, cut into equal parts until each can be planned with a useful number of nodes."""
+    parts = 1
+    while True:
+        rows = windows(case, parts)
+        if all(_layout(window, tolerance) is not None for window in (rows[0][0], rows[-1][-1])):
+            return rows
+        if parts >= max(case.samples):
+            raise PropagationError(
+                "the windowed method cannot reach this geometry even sample by sample; use propagate.exact"
+            )
+        parts *= 2
+
+
+def _layout(case: Case, tolerance: float) -> Layout | None:
+    try:
+        return layout(case, tolerance)
+    except PropagationError:
+        return None

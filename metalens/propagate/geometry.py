@@ -1,0 +1,143 @@
+"""What is propagated: pillars, one direction of light at several depths, and the window on the sensor.
+
+Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor at z = +d. Time factor exp(-iωt).
+A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray meets the sensor at (d·tx, d·ty).
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Geometry of one propagation; hashable, so that plans can be kept.
+
+    shape: (y, x) pillars; pitch_um: their lattice constant.
+    wavelength_um: in the medium on both sides of the lens.
+    sensor_distance_um: lens plane to sensor plane.
+    tangents: (x, y) tangents of the field angle.
+    inverse_depths_per_um: 1/z of every source, 0 for a source at infinity.
+    centre_um: (x, y) of the window on the sensor; step_um: its sampling; samples: (y, x) points of the window.
+
+    Raises:
+        PropagationError: a length that is not positive and finite, no depth, no sample.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    wavelength_um: float
+    sensor_distance_um: float
+    tangents: tuple[float, float]
+    inverse_depths_per_um: tuple[float, ...]
+    centre_um: tuple[float, float]
+    step_um: float
+    samples: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        for name in ("pitch_um", "wavelength_um", "sensor_distance_um", "step_um"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise PropagationError(f"{name} is {value}, need a positive length in um")
+        if min(self.shape) < 1 or min(self.samples) < 1:
+            raise PropagationError(f"{self.shape} pillars and {self.samples} samples, need at least one of each")
+        inverse = np.array(self.inverse_depths_per_um)
+        if inverse.size == 0 or not (np.isfinite(inverse) & (inverse >= 0)).all():
+            raise PropagationError("depths_um must hold at least one source depth above 0 (inf for a far source)")
+        if not np.isfinite([*self.tangents, *self.centre_um]).all():
+            raise PropagationError(f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}")
+
+    @property
+    def wavenumber(self) -> float:
+        """k = 2π/λ in rad/um."""
+        return 2 * np.pi / self.wavelength_um
+
+    @property
+    def half_size_um(self) -> tuple[float, float]:
+        """(y, x) distance from the axis to the outermost pillar centre, at least half a pitch."""
+        ny, nx = self.shape
+        return max(ny - 1, 1) / 2 * self.pitch_um, max(nx - 1, 1) / 2 * self.pitch_um
+
+    @property
+    def half_window_um(self) -> tuple[float, float]:
+        """(y, x) distance from the window centre to its outermost sample, at least a hundredth of a step."""
+        my, mx = self.samples
+        return max(my - 1, 0.02) / 2 * self.step_um, max(mx - 1, 0.02) / 2 * self.step_um
+
+    @property
+    def pillars_um(self) -> tuple[Array, Array]:
+        """(y,), (x,) positions of the pillar rows and columns."""
+        return axis(self.shape[0], self.pitch_um), axis(self.shape[1], self.pitch_um)
+
+    @property
+    def window_um(self) -> tuple[Array, Array]:
+        """(y,), (x,) positions of the window samples from the window centre."""
+        return axis(self.samples[0], self.step_um), axis(self.samples[1], self.step_um)
+
+
+def axis(count: int, step: float) -> Array:
+    """(count,) positions about the centre of the row."""
+    return (np.arange(count) - (count - 1) / 2) * step
+
+
+def windows(case: Case, parts: int) -> tuple[tuple[Case, ...], ...]:
+    """The window cut into rows of parts, at most ``parts`` along each axis, equal to within one sample."""
+    rows, columns = (_cut(count, min(parts, count)) for count in case.samples)
+    return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+
+
+def tiles(case: Case, parts: int) -> tuple[tuple[list[int], list[int]], tuple[tuple[Case, ...], ...]]:
+    """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size: neighbours may overlap."""
+    firsts, sizes = [], []
+    for count in case.samples:
+        number = min(parts, count)
+        sizes.append(-(-count // number))
+        firsts.append([i * (count - sizes[-1]) // max(number - 1, 1) for i in range(number)])
+    rows, columns = ([(a, a + size) for a in first] for first, size in zip(firsts, sizes, strict=True))
+    return (firsts[0], firsts[1]), tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+
+
+def _part(case: Case, row: tuple[int, int], column: tuple[int, int]) -> Case:
+    """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
+    (my, mx), (x, y) = case.samples, case.centre_um
+    centre = x + (sum(column) - mx) / 2 * case.step_um, y + (sum(row) - my) / 2 * case.step_um
+    return replace(case, centre_um=centre, samples=(row[1] - row[0], column[1] - column[0]))
+
+
+def _cut(count: int, parts: int) -> list[tuple[int, int]]:
+    return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
+
+
+def chief_path(case: Case) -> float:
+    """Distance from the lens centre to the window centre, um: the phase that all methods share."""
+    return float(np.sqrt(case.centre_um[0] ** 2 + case.centre_um[1] ** 2 + case.sensor_distance_um**2))
+
+
+def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:
+    """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or infinity.
+
+    Args:
+        phase_rad, transmission: (y, x) numpy arrays of float.
+
+    Raises:
+        PropagationError: naming row and column.
+    """
+    for name, array in (("phase_rad", phase_rad), ("transmission", transmission)):
+        if array.shape != case.shape:
+            raise PropagationError(f"{name} has shape {array.shape}, need {case.shape} (y, x)")
+    light = 0.0
+    for start in range(0, case.shape[0], 256):
+        rows = slice(start, start + 256)
+        total = float(phase_rad[rows].sum()) + float(transmission[rows].sum())  # NaN and infinity survive a sum
+        if not np.isfinite(total):
+            bad = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
+            row, column = (int(i) for i in np.argwhere(bad)[0])
+            raise PropagationError(f"phase or transmission at row {start + row}, column {column} is not finite")
+        light = light or float(transmission[rows].max()) or float(transmission[rows].min())
+    if light == 0:
+        raise PropagationError("empty aperture: transmission is 0 everywhere; check the aperture and the lens")

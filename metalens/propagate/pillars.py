@@ -1,0 +1,211 @@
+"""From millions of pillars to a few thousand Legendre moments, with the known phase taken off.
+
+M_mn = Σ_ij P̂_m(y_i) P̂_n(x_j) T_ij exp(i(φ_ij + k·carrier_ij)), the carrier being source path plus sensor path of a
+reference. Pillars are first gathered at the nodes of small blocks (:mod:`metalens.propagate.blocks`), and the
+polynomials are taken there: the moments stand for those nodes, which give the same light on the window.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.ground.threads import split
+from metalens.propagate.blocks import CHUNK, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
+from metalens.propagate.compiled import gather, spread
+from metalens.propagate.geometry import Case
+
+KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once
+DEVICE_ROWS = 256
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moments:
+    """How pillars are reduced.
+
+    blocks: of rows and columns; carrier: the phase that is taken off; table: its polynomials, where they are small
+    enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks (on other devices than the
+    processor: at the pillars).
+    """
+
+    blocks: tuple[Blocks, Blocks]
+    carrier: Carrier
+    table: Any
+    rows: torch.Tensor
+    columns: torch.Tensor
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """(m, n) numbers of moments."""
+        return self.rows.shape[1], self.columns.shape[1]
+
+    @property
+    def panels(self) -> list[slice]:
+        """Block rows that are handled at once, so that their nodes and their carrier stay below ``KEEP_BYTES``."""
+        rows, columns = self.blocks
+        itemsize = self.rows.element_size()
+        nodes, carrier = 2 * rows.nodes * columns.count * columns.nodes, ORDER[itemsize] * self.carrier.case.shape[1]
+        step = max(4, int(KEEP_BYTES / ((nodes + carrier) * itemsize)))
+        return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
+
+
+def moments(
+    case: Case,
+    reference: float,
+    counts: tuple[int, int],
+    kernel: Kernel,
+    *,
+    tolerance: float,
+    dtype: torch.dtype,
+    device: torch.device | None = None,
+) -> Moments:
+    """Blocks and polynomials for ``counts`` = (m, n) moments; ``kernel`` as :func:`propagate_blocks.choose`."""
+    itemsize = torch.finfo(dtype).bits // 8
+    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize)
+    rows, columns = blocks
+    width = columns.length
+    wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
+    places = (rows.nodes_um(case.pitch_um), columns.nodes_um(case.pitch_um))
+    table = None
+    if device is not None and device.type != "cpu":
+        places = case.pillars_um
+    elif case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
+        table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
+    found = [legendre.values(n, p / h) for n, p, h in zip(counts, places, case.half_size_um, strict=True)]
+    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found]
+    return Moments(blocks, wave, table, polynomials[0], polynomials[1])
+
+
+def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """(m, n) complex moments of a lens, and the sum of squares of its transmission.
+
+    Differentiable in phase and transmission, (y, x) real of the plan's dtype. Values that are not finite give moments
+    or a sum that is not; closed pillars are passed over where a whole tile is closed.
+
+    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars, incoherent, and the interpolation
+    inside blocks that the plan allows.
+    """
+    parts, power = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
+    return torch.complex(parts[0], parts[1]), float(power)
+
+
+class _Reduce(torch.autograd.Function):
+    """Moments (2, m, n); the backward pass forms the phasors again rather than keep them."""
+
+    @staticmethod
+    def forward(ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, torch.Tensor]:
+        ctx.save_for_backward(phase, level)
+        ctx.plan = plan
+        gathered = _gather if phase.device.type == "cpu" else _gather_plain
+        out, power = gathered(phase, level, plan)
+        total = torch.tensor(power, dtype=torch.float64)
+        ctx.mark_non_differentiable(total)
+        return out, total
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
+        phase, level = ctx.saved_tensors
+        need = ctx.needs_input_grad
+        out_phase = torch.empty_like(phase) if need[0] else None
+        out_level = torch.empty_like(level) if need[1] else None
+        spread_out = _spread if phase.device.type == "cpu" else _spread_plain
+        spread_out((phase, level), ctx.plan, grads[0], (out_phase, out_level))
+        return out_phase, out_level, None
+
+
+def _table(plan: Moments, panel: slice, dtype: Any) -> Any:
+    """Carrier polynomials of a panel."""
+    return plan.carrier.table(panel.start, panel.stop, dtype) if plan.table is None else plan.table[panel]
+
+
+def _fixed(plan: Moments, dtype: Any) -> tuple[Array, Any, Any]:
+    """What both loops know of the blocks: positions of the rows, shares of the nodes, first pillars."""
+    rows, columns = plan.blocks
+    return rows.along.astype(dtype), tuple(b.weights.astype(dtype) for b in plan.blocks), (rows.bases, columns.bases)
+
+
+def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """Moments by the compiled loops."""
+    maps = phase.detach().numpy(), level.detach().numpy()
+    (rows, columns), (m, n) = plan.blocks, plan.counts
+    out = torch.zeros((m, 2 * n), dtype=phase.dtype)
+    kernel: Any = gather
+    powers: list[float] = []
+    fixed = _fixed(plan, maps[0].dtype)
+    for panel in plan.panels:
+        table = _table(plan, panel, maps[0].dtype)
+        count = panel.stop - panel.start
+        nodes = torch.zeros((count * rows.nodes, 2, columns.count * columns.nodes), dtype=phase.dtype)
+        view = nodes.numpy()
+
+        def work(a: int, b: int, table: Any = table, view: Any = view, panel: slice = panel) -> None:
+            part = view[a * rows.nodes : b * rows.nodes]
+            powers.append(kernel(*maps, table[a:b], *fixed, panel.start + a, part))
+
+        split(count, work)
+        sums = (nodes.flatten(0, 1) @ plan.columns).view(-1, 2 * n)
+        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
+        out = torch.addmm(out, plan.rows[at].T, sums)
+    return out.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(powers)
+
+
+def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]) -> None:
+    """Gradients of the moments to those of phase and transmission by the compiled loops."""
+    phase, level = (m.detach().numpy() for m in maps)
+    none = np.empty((0, 0), phase.dtype)
+    targets = tuple(none if t is None else t.numpy() for t in out)
+    (rows, columns), (m, n) = plan.blocks, plan.counts
+    inner = grad.movedim(0, 1).reshape(m, 2 * n)
+    kernel: Any = spread
+    fixed = _fixed(plan, phase.dtype)
+    for panel in plan.panels:
+        table = _table(plan, panel, phase.dtype)
+        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
+        nodes = (
+            ((plan.rows[at] @ inner).view(-1, n) @ plan.columns.T).view(-1, 2, columns.count * columns.nodes).numpy()
+        )
+
+        def work(a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel) -> None:
+            part = nodes[a * rows.nodes : b * rows.nodes]
+            kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
+
+        split(panel.stop - panel.start, work)
+
+
+def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
+    """(y, x) complex phasors of some rows, for devices without compiled loops."""
+    wave = plan.carrier
+    y, x = (torch.tensor(v, device=phase.device) for v in wave.case.pillars_um)
+    y = y[start : start + phase.shape[0], None]
+    turns = phase.double() / (2 * torch.pi) + carrier_turns(wave.case, wave.reference, x, y)
+    angle = ((turns - turns.round()) * 2 * torch.pi).to(phase.dtype)
+    return torch.complex(torch.cos(angle), torch.sin(angle))
+
+
+def _gather_plain(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+    """Moments by plain tensor operations, for devices without compiled loops: every pillar is a node."""
+    out = torch.zeros(plan.counts, dtype=torch.complex(phase[0, 0], phase[0, 0]).dtype, device=phase.device)
+    for start in range(0, phase.shape[0], DEVICE_ROWS):
+        rows = slice(start, start + DEVICE_ROWS)
+        light = level[rows] * _phasors(phase[rows], plan, start)
+        out = out + plan.rows[rows].T.to(light.dtype) @ (light @ plan.columns.to(light.dtype))
+    return torch.stack([out.real, out.imag]), float((level.double() ** 2).sum())
+
+
+def _spread_plain(
+    maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]
+) -> None:
+    """Gradients by plain tensor operations."""
+    both = torch.complex(grad[0], grad[1])
+    for start in range(0, maps[0].shape[0], DEVICE_ROWS):
+        rows = slice(start, start + DEVICE_ROWS)
+        at = plan.rows[rows].to(both.dtype) @ both @ plan.columns.T.to(both.dtype)
+        turned = at * _phasors(maps[0][rows], plan, start).conj()  # its real part: along the phasor
+        if out[0] is not None:
+            out[0][rows] = turned.imag * maps[1][rows]
+        if out[1] is not None:
+            out[1][rows] = turned.real

@@ -1,0 +1,142 @@
+"""Light from a point source through the pillars to the sensor window: the exact sum, and faster ways to the same field.
+
+All functions take one direction of light and return complex fields (depth, y, x), incident amplitude 1, phase zero
+at the lens centre. The window is a square grid of ``samples`` cells of width ``window_um / samples``, sampled at their
+centres and centred on the chief ray, which meets the sensor at d·(tan angle_x, tan angle_y).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.propagate.choice import Choice, choose
+from metalens.propagate.direct import field_at, field_exact
+from metalens.propagate.geometry import Case
+from metalens.propagate.textbook import angular_spectrum as _angular_spectrum
+
+__all__ = ["Case", "Choice", "angular_spectrum", "case", "choose", "exact", "field_at", "field_exact", "windowed"]
+
+
+def case(
+    shape: Sequence[int],
+    *,
+    pitch_um: float,
+    wavelength_um: float,
+    sensor_distance_um: float,
+    depths_um: Any,
+    angle_rad: Any = 0.0,
+    window_um: float,
+    samples: int,
+    offset_um: tuple[float, float] = (0.0, 0.0),
+) -> Case:
+    """Geometry of one propagation.
+
+    Args:
+        shape: (y, x) pillars.
+        depths_um: source depths, any sequence or a number; inf for a collimated beam.
+        angle_rad: field angle along x, or the pair (x, y); light of a positive angle moves to +x (+y).
+        window_um, samples: full width of the square window, and cells along it.
+        offset_um: (x, y) of the window centre from the chief ray.
+
+    Raises:
+        PropagationError: a length that is not positive, an angle of 90° or more, no depth.
+    """
+    ax, ay = angles(angle_rad)
+    tangents = float(np.tan(ax)), float(np.tan(ay))
+    depths = np.atleast_1d(np.asarray(depths_um, float))
+    if not (depths > 0).all():
+        depths = np.array([np.nan])
+    centre = (
+        sensor_distance_um * tangents[0] + float(offset_um[0]),
+        sensor_distance_um * tangents[1] + float(offset_um[1]),
+    )
+    return Case(
+        shape=(int(shape[-2]), int(shape[-1])),
+        pitch_um=float(pitch_um),
+        wavelength_um=float(wavelength_um),
+        sensor_distance_um=float(sensor_distance_um),
+        tangents=tangents,
+        inverse_depths_per_um=tuple((1 / depths).tolist()),
+        centre_um=centre,
+        step_um=float(window_um) / max(int(samples), 1),
+        samples=(int(samples), int(samples)),
+    )
+
+
+def angles(angle_rad: Any) -> tuple[float, float]:
+    """(x, y) field angle from a number or a pair.
+
+    Raises:
+        PropagationError: not one or two finite numbers within ±90°.
+    """
+    pair = np.atleast_1d(np.asarray(angle_rad, float))
+    if pair.shape == (1,):
+        pair = np.array([pair[0], 0.0])
+    if pair.shape != (2,) or not (np.abs(pair) < np.pi / 2).all():
+        raise PropagationError(f"angle_rad is {angle_rad}, need one angle or a pair (x, y) within ±pi/2")
+    return float(pair[0]), float(pair[1])
+
+
+def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
+    """The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64 (see :func:`field_exact`).
+
+    Args:
+        phase_rad, transmission: (y, x) numpy arrays.
+        geometry: as :func:`case`.
+
+    Returns:
+        (depth, y, x) complex128.
+
+    Raises:
+        PropagationError: empty aperture, NaN, or maps and geometry that do not fit.
+    """
+    phase, level = np.asarray(phase_rad), np.asarray(transmission)
+    return field_exact(phase, level, case(phase.shape, **geometry))
+
+
+def angular_spectrum(
+    phase_rad: Array,
+    transmission: Array,
+    *,
+    pad: int = 2,
+    band_limited: bool = False,
+    single: bool = False,
+    **geometry: Any,
+) -> Array:
+    """Textbook angular spectrum on the zero-padded pillar lattice (see :mod:`metalens.propagate.textbook`).
+
+    Args:
+        pad, band_limited, single: padding factor, band limit, complex64.
+        geometry: as :func:`case`; the window must lie on the pillars' lattice.
+    """
+    phase, level = np.asarray(phase_rad), np.asarray(transmission)
+    one = case(phase.shape, **geometry)
+    return _angular_spectrum(phase, level, one, pad=pad, band_limited=band_limited, single=single)
+
+
+def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **geometry: Any) -> Any:
+    """Windowed propagation: only the field on the window, differentiable in torch phase and transmission.
+
+    Args:
+        phase_rad, transmission: (y, x) torch tensors or numpy arrays, float32 or float64.
+        tolerance: relative error of the field that the node counts are chosen for.
+        geometry: as :func:`case`.
+
+    Returns:
+        (depth, y, x) complex, of the kind that came in.
+
+    Raises:
+        PropagationError: the window is too large for the method; otherwise as :func:`exact`.
+    """
+    import torch
+
+    from metalens.propagate.window import field_windowed, plan
+
+    phase = torch.as_tensor(phase_rad)
+    level = torch.as_tensor(transmission).to(phase)
+    made = plan(case(phase.shape, **geometry), tolerance, phase.dtype, phase.device)
+    field, _, _ = field_windowed(phase, level, made)
+    return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

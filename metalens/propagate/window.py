@@ -1,0 +1,224 @@
+"""Windowed propagation: only the field on the sensor window, from Legendre moments of the lens."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.ground.paths import sensor_path
+from metalens.propagate.estimate import MORE
+from metalens.propagate.geometry import Case, tiles
+from metalens.propagate.nodes import (
+    Depths,
+    Layout,
+    depth_basis,
+    depth_factors,
+    layout,
+    operators,
+    over_blocks,
+    pairs,
+    reference_depth,
+)
+from metalens.propagate.pillars import Moments, moments, reduce
+
+BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """Everything that depends on the geometry alone, ready for many lenses.
+
+    The moments go ``MORE`` orders beyond what the method uses, for the error estimate. tensors: the operators in the
+    dtype and on the device in use, those of the tiles stacked (tile, …); ``turn`` (tile, e, x) is the phase from the
+    window's centre to the tile's own on the nodes of the whole window.
+    """
+
+    case: Case
+    tolerance: float
+    layout: Layout
+    depths: Depths
+    moments: Moments
+    tensors: dict[str, torch.Tensor]
+
+    @property
+    def nodes_um(self) -> tuple[Array, Array]:
+        """(e,), (x,) positions of the lens nodes of the tiles."""
+        return _nodes_um(self.case, self.layout.sizes.nodes)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moving:
+    """Geometry that carries gradients, float64 tensors: tangents (2,), inverse depths (depth,), sensor distance (),
+    window centre (2,). Values must be those of the plan's case."""
+
+    tangents: torch.Tensor
+    inverse_depths: torch.Tensor
+    distance: torch.Tensor
+    centre: torch.Tensor
+
+
+@functools.lru_cache(maxsize=12)
+def plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, moving: bool = False) -> Plan:
+    """Plan a windowed propagation; the last few are kept. ``moving``: for use with :class:`Moving`.
+
+    Raises:
+        PropagationError: the window is too large for the method.
+    """
+    found = layout(case, tolerance)
+    if found is None:
+        raise PropagationError("the window is too large for one plan; see propagate.choose, or make it smaller")
+    ny, nx = found.nodes
+    reference = reference_depth(case)
+    pillars = moments(
+        case,
+        reference,
+        (ny + MORE, nx + MORE),
+        over_blocks(case),
+        tolerance=tolerance,
+        dtype=dtype,
+        device=device,
+    )
+    depths = depth_basis(case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving)
+    tensors = _shared(case, found, depths, dtype, device) | _stacked(case, found, depths, tolerance, (dtype, device))
+    return Plan(case, tolerance, found, depths, pillars, tensors)
+
+
+def _complex(dtype: torch.dtype) -> torch.dtype:
+    return torch.complex64 if dtype == torch.float32 else torch.complex128
+
+
+def _nodes_um(case: Case, counts: tuple[int, int]) -> tuple[Array, Array]:
+    hy, hx = case.half_size_um
+    return np.asarray(legendre.mapped(counts[0], -hy, hy)), np.asarray(legendre.mapped(counts[1], -hx, hx))
+
+
+def _shared(
+    case: Case, found: Layout, depths: Depths, dtype: torch.dtype, device: torch.device
+) -> dict[str, torch.Tensor]:
+    """Moments to the nodes of the window, those to the nodes of the tiles, and the depths."""
+    arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
+    for name, all_, few in zip(("rows", "columns"), found.nodes, found.sizes.nodes, strict=True):
+        arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
+        arrays[f"{name}_to_tile"] = legendre.interpolation(few, legendre.nodes(all_)[0])
+    e, x = _nodes_um(case, found.nodes)
+    parts = [part for row in tiles(case, found.parts)[1] for part in row]
+    away = [sensor_path(x, e[:, None], c.centre_um, c.sensor_distance_um) for c in (case, *parts)]
+    arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
+    return {name: torch.tensor(a, dtype=_complex(dtype), device=device) for name, a in arrays.items()}
+
+
+def _stacked(
+    case: Case,
+    found: Layout,
+    depths: Depths,
+    tolerance: float,
+    kind: tuple[torch.dtype, torch.device],
+    slope: int | None = None,
+) -> dict[str, torch.Tensor]:
+    """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any of them needs; ``fields`` are
+    the depth fields of the pairs."""
+    parts = [part for row in tiles(case, found.parts)[1] for part in row]
+    made = [operators(part, found.sizes, tolerance, slope=slope) for part in parts]
+    most = max(len(one.strength) for one in made)
+    strength = np.max([_padded(one.strength, most) for one in made], axis=0)
+    kept = pairs(strength, depths.strength, tolerance / 2)
+    arrays = {name: np.stack([getattr(one, name) for one in made]) for name in ("along_y", "along_x")}
+    for name in ("lens_terms", "window_terms"):
+        arrays[name] = np.stack([_padded(getattr(one, name), most)[..., kept[0]] for one in made])
+    out = {name: torch.tensor(a, dtype=_complex(kind[0]), device=kind[1]) for name, a in arrays.items()}
+    directions = np.concatenate([one.to_directions for one in made])
+    out["to_directions"] = torch.tensor(directions, dtype=kind[0], device=kind[1])
+    out["fields"] = torch.tensor(kept[1], device=kind[1])
+    return out
+
+
+def _padded(array: Array, count: int) -> Array:
+    """With zeros to ``count`` along the last axis."""
+    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
+
+
+@functools.lru_cache(maxsize=12)
+def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
+    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2)."""
+    rows = plan.moments.rows
+    return _stacked(plan.case, plan.layout, plan.depths, plan.tolerance, (rows.dtype, rows.device), axis)
+
+
+def field_windowed(
+    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Plan, moving: Moving | None = None
+) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of squares of its transmission.
+
+    Differentiable in phase and transmission (y, x), and in ``moving`` where given (first derivatives).
+    """
+    gathered, power = reduce(phase_rad, transmission, plan.moments)
+    return from_moments(gathered, plan, moving), gathered.detach(), power
+
+
+def from_moments(gathered: torch.Tensor, plan: Plan, moving: Moving | None = None) -> torch.Tensor:
+    """(depth, y, x) field on the window from the moments of a lens."""
+    t = plan.tensors
+    ny, nx = plan.layout.nodes
+    light = t["rows_to_nodes"].T @ gathered[:ny, :nx] @ t["columns_to_nodes"]
+    fewer = t["rows_to_tile"].T @ (light * t["turn"]) @ t["columns_to_tile"]
+    coefficients = t["coefficients"] if moving is None else _coefficients(plan, moving)
+    given = fewer[:, None] * t["basis"]
+    field = _at_depths(zoom(given, t), coefficients)
+    if moving is not None:
+        for axis, value in enumerate((moving.distance, moving.centre[0], moving.centre[1])):
+            if value.requires_grad:
+                rate = _at_depths(zoom(given, _slope(plan, axis)), coefficients)
+                field = field + (value - value.detach()) * rate  # adds nothing but the derivative
+    return _joined(field, plan)
+
+
+def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+    """(tile, depth, Y, X) from fields of the depth basis (tile, X, Y, b)."""
+    return (fields @ coefficients.T).permute(0, 3, 2, 1)
+
+
+def _joined(field: torch.Tensor, plan: Plan) -> torch.Tensor:
+    """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where the next one begins."""
+    (rows, columns), _ = tiles(plan.case, plan.layout.parts)
+    (my, mx), n = plan.case.samples, len(columns)
+    heights, widths = np.diff([*rows, my]).tolist(), np.diff([*columns, mx]).tolist()
+    bands = [
+        torch.cat([field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1)
+        for i, height in enumerate(heights)
+    ]
+    return torch.cat(bands, -2)
+
+
+def _coefficients(plan: Plan, moving: Moving) -> torch.Tensor:
+    """(depth, b) of the depth basis, differentiable in the source's position."""
+    device = moving.tangents.device
+    e, x = (torch.tensor(v, device=device) for v in plan.nodes_um)
+    ny, nx = plan.layout.sizes.nodes
+    inverse = moving.inverse_depths[:, None, None]
+    angle = depth_factors(plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse)
+    weight = torch.tensor(np.outer(legendre.nodes(ny)[1], legendre.nodes(nx)[1]), device=device)
+    basis = torch.tensor(plan.depths.basis, device=device)
+    found = (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
+    return found.to(plan.tensors["coefficients"].dtype)
+
+
+def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Light on the lens nodes, a field for every tile and basis function (tile, b, e, x), to (tile, X, Y, b)."""
+    count, b, e, _ = light.shape
+    p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]
+    real = torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
+    cosines = torch.bmm(real, t["to_directions"]).view(count, e, b, 2, p).permute(0, 4, 1, 2, 3).contiguous()
+    spread = torch.view_as_complex(cosines)
+    out = light.new_zeros((count, X, Y, b))
+    most = max(1, int(BUDGET_BYTES / (count * p * (Y + e) * light.element_size())))
+    for start in range(0, len(t["fields"]), most):
+        some = slice(start, start + most)
+        terms = t["lens_terms"][..., some] * spread.index_select(3, t["fields"][some])
+        columns = t["along_y"].flatten(0, 1) @ terms.flatten(0, 1)
+        window = (t["along_x"] @ columns.view(count, p, -1)).view(count, X, Y, -1)
+        out = out.index_add(3, t["fields"][some], window * t["window_terms"][..., some])
+    return out

@@ -1,0 +1,43 @@
+"""Point spread functions of a lens over depth, field angle and wavelength (paper Sec. 3.1, Eqs. 1-3).
+
+``psf_stack`` takes phase and transmission maps, ``from_lens`` a lens file's content; ``on_pixels`` gives what a sensor
+sees; ``save`` and ``load`` keep a stack as a file.
+"""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.psf import export as export
+    from metalens.psf import plots as plots
+    from metalens.psf import spectrum as spectrum
+    from metalens.psf.of_lens import View as View
+    from metalens.psf.of_lens import depth_samples as depth_samples
+    from metalens.psf.of_lens import from_lens as from_lens
+    from metalens.psf.pixels import on_pixels as on_pixels
+    from metalens.psf.record import PsfStack as PsfStack
+    from metalens.psf.record import load as load
+    from metalens.psf.record import save as save
+    from metalens.psf.spectrum import Nodes as Nodes
+    from metalens.psf.spectrum import Source as Source
+    from metalens.psf.stack import psf_stack as psf_stack
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Nodes": "spectrum",
+        "PsfStack": "record",
+        "Source": "spectrum",
+        "View": "of_lens",
+        "depth_samples": "of_lens",
+        "export": "",
+        "from_lens": "of_lens",
+        "load": "record",
+        "on_pixels": "pixels",
+        "plots": "",
+        "psf_stack": "stack",
+        "save": "record",
+        "spectrum": "",
+    },
+)

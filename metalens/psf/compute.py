@@ -1,0 +1,144 @@
+"""Intensity of one lens in one direction, by the cheapest method, checked and repeated until the tolerance is met."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from metalens.ground.errors import PropagationError
+from metalens.propagate import (
+    SHARE,
+    Case,
+    Choice,
+    Moving,
+    Sample,
+    check_aperture,
+    chief_path,
+    choose,
+    field_exact,
+    field_windowed,
+    plan,
+    relative_error,
+)
+
+FINEST = 1e-12  # setting below which float64 has nothing left to give
+ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
+OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
+KEPT = {torch.float32: 4e-8, torch.float64: 0.0}  # of intensities brought back to the caller's type
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Result:
+    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped."""
+
+    intensity: torch.Tensor
+    error: float
+    reason: str
+
+
+def intensity(
+    phase: torch.Tensor,
+    level: torch.Tensor,
+    cases: list[Case],
+    weights: list[float],
+    *,
+    tolerance: float,
+    moving: Any = None,
+) -> Result:
+    """|U|² on the window, wavelengths added with their weights.
+
+    Args:
+        phase, level: (wavelength, y, x).
+        cases: one a wavelength, alike in everything else.
+        moving: :class:`Moving` or None.
+
+    The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
+    tolerance; the result of the last try is returned with its estimate in any case.
+    """
+    needs_grad = phase.requires_grad or level.requires_grad or moving is not None
+    choices = [choose(case, tolerance, differentiable=needs_grad) for case in cases]
+    if all(choice.method == "exact" for choice in choices) and phase.device.type == "cpu":
+        return _exact(phase, level, cases, weights, choices[0].reason)
+    first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
+    # gradients see the kernel's error pillar by pillar, and at a focus their parts nearly cancel
+    start = max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
+    tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
+    for setting, dtype in tries:
+        result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, max(setting, FINEST), moving)
+        error = math.hypot(result.error, OUTPUT[dtype])
+        if error <= tolerance:
+            break
+    error = math.hypot(error, KEPT[phase.dtype])
+    return Result(result.intensity.to(phase.dtype), error, result.reason)
+
+
+def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights: list[float], reason: str) -> Result:
+    arrays = [np.abs(field_exact(p.numpy(), t.numpy(), c)) ** 2 for p, t, c in zip(phase, level, cases, strict=True)]
+    total = sum(w * a for w, a in zip(weights, arrays, strict=True))
+    error = 1e-12 if phase.dtype == torch.float64 else 1e-7
+    return Result(torch.as_tensor(total).to(phase.dtype), error, reason)
+
+
+def _windowed(
+    maps: tuple[torch.Tensor, torch.Tensor], cases: list[Case], weights: list[float], tolerance: float, moving: Any
+) -> Result:
+    """One try: every wavelength and window, then the estimate from all of them."""
+    choice = choose(cases[0], tolerance, differentiable=True)
+    samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
+    total: Any = 0
+    for p, t, case, weight in zip(*maps, cases, weights, strict=True):
+        rows, index = [], 0
+        for row in _windows(case, choice, tolerance):
+            parts = []
+            for window in row:
+                made = plan(window, tolerance, p.dtype, p.device, moving is not None)
+                field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
+                _check(p, t, case, power, gathered)
+                noise = math.hypot(ROUNDING[p.dtype], tolerance / SHARE) * _incoherent(power, case)
+                values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
+                samples[index].append(Sample(window, weight, *values, noise, made.layout.parts))
+                parts.append(field)
+                index += 1
+            rows.append(torch.cat(parts, -1))
+        field = torch.cat(rows, -2)
+        total = total + weight * (field.real**2 + field.imag**2)
+    if not bool((total.detach().sum((-1, -2)) > 0).all()):
+        raise PropagationError("no light reaches the window at some depth; move or widen the window")
+    return Result(total, relative_error(samples), choice.reason)
+
+
+def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:
+    """Windows of a wavelength that are computed apart: cut as at the first wavelength."""
+    found = choose(case, tolerance, differentiable=True).tiles
+    if [len(row) for row in found] == [len(row) for row in choice.tiles]:
+        return found
+    return tuple(tuple(replace(w, wavelength_um=case.wavelength_um) for w in row) for row in choice.tiles)
+
+
+def _check(phase: torch.Tensor, level: torch.Tensor, case: Case, power: float, moments: torch.Tensor) -> None:
+    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars tell.
+
+    Raises:
+        PropagationError: naming row and column.
+    """
+    if power > 0 and math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all()):
+        return
+    check_aperture(phase.detach().cpu().numpy(), level.detach().cpu().numpy(), case)
+    if not (math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())):
+        raise PropagationError("phase or transmission is too large for its dtype; use float64, or wrap the phase")
+
+
+def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
+    """Moving geometry seen from a tile of the window."""
+    if moving is None or tile.centre_um == case.centre_um:
+        return moving
+    shift = [a - b for a, b in zip(tile.centre_um, case.centre_um, strict=True)]
+    return replace(moving, centre=moving.centre + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device))
+
+
+def _incoherent(power: float, case: Case) -> float:
+    """Magnitude of the field at the window centre if all pillars added with random phases."""
+    area = case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
+    return math.sqrt(power) * area

@@ -1,0 +1,92 @@
+"""PSF stacks for other programs: HDF5 (the project's own file), TIFF pages, MATLAB arrays."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.ground.store import write_bytes
+from metalens.psf.record import PsfStack, save
+
+SUFFIXES = (".h5", ".tif", ".tiff", ".mat")
+_NAMES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
+_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
+
+
+def check(path: str | Path) -> None:
+    """Refuse a file name that says no known format.
+
+    Raises:
+        PropagationError: naming the formats there are.
+    """
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise PropagationError(f"{path}: cannot write this format; name it {', '.join(SUFFIXES)}")
+
+
+def write(path: str | Path, stack: PsfStack) -> None:
+    """Write a stack in the format that the name's ending says; same stack, same bytes.
+
+    ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32 page for every PSF, the last axis
+    before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON in the image description.
+    ``.mat``: MATLAB 5 variables of the same names and shapes as in the HDF5 file.
+
+    Raises:
+        PropagationError: another ending.
+    """
+    check(path)
+    suffix = Path(path).suffix.lower()
+    if suffix == ".h5":
+        save(path, stack)
+    else:
+        write_bytes(path, matlab(stack) if suffix == ".mat" else tiff(stack))
+
+
+def tiff(stack: PsfStack) -> bytes:
+    """TIFF file of all PSFs."""
+    import tifffile
+
+    plain = stack.numpy()
+    about = {name: getattr(plain, name) for name in _NUMBERS} | {n: v.tolist() for n, v in _arrays(plain).items()}
+    about |= {"shape": list(plain.intensity.shape), "axes": _axes(plain), "length_unit": "um", "angle_unit": "rad"}
+    pages = np.asarray(plain.intensity, np.float32).reshape(-1, *plain.intensity.shape[-2:])
+    file = io.BytesIO()
+    per_cm = (1e4 / plain.step_um, 1e4 / plain.step_um)
+    tifffile.imwrite(
+        file,
+        pages,
+        photometric="minisblack",
+        metadata=None,
+        software="metalens",
+        description=json.dumps(about, sort_keys=True),
+        resolution=per_cm,
+        resolutionunit="CENTIMETER",
+    )
+    return file.getvalue()
+
+
+def matlab(stack: PsfStack) -> bytes:
+    """MATLAB 5 file; the header holds no date."""
+    from scipy.io import savemat
+
+    plain = stack.numpy()
+    values: dict[str, Any] = {name: getattr(plain, name) for name in _NUMBERS} | _arrays(plain)
+    values |= {"intensity": np.asarray(plain.intensity), "axes": _axes(plain)}
+    file = io.BytesIO()
+    savemat(file, values, oned_as="column")
+    return b"MATLAB 5.0 MAT-file, metalens PSF stack, um and rad".ljust(116) + file.getvalue()[116:]
+
+
+def _arrays(plain: PsfStack) -> dict[str, Array]:
+    """Axes and energies by name."""
+    return {name: np.asarray(getattr(plain, name)) for name in (*_NAMES, "energy_um2")}
+
+
+def _axes(plain: PsfStack) -> str:
+    """Names of the axes of the intensity, slowest first."""
+    extra = plain.intensity.ndim - 3
+    angle = extra > 0 and plain.intensity.shape[extra - 1] == len(plain.angles_rad)
+    return " ".join([*["lens"] * (extra - angle), *["angle"] * angle, "depth", "y", "x"])

@@ -1,0 +1,96 @@
+"""The PSF stack as a record and as a file."""
+
+import dataclasses
+import functools
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.reading import reader
+from metalens.ground.store import Provenance
+from metalens.propagate import axis
+
+
+@functools.lru_cache(maxsize=1)
+def _made_here() -> Provenance:
+    """Provenance of a stack made in this process; package versions are looked up once."""
+    return Provenance()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PsfStack:
+    """PSFs over depth (and field angle, and lens), each of sum 1, with their energy beside them.
+
+    intensity: (…, depth, y, x), sum over (y, x) is 1 (paper: normalised PSF); numpy or torch, as the lens came in.
+        With several field angles the axis before depth is the angle; axes before that are a batch of lenses.
+    energy_um2: (…, depth) light in the window for unit incident irradiance: Σ|U|²·step².
+    depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are; wavelengths are summed with the weights.
+    step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a row per angle.
+    sensor_distance_um: lens to sensor. tolerance: that was asked for.
+    error: estimated relative L2 error of the intensity, the worst over angles and lenses; reason: method, and why.
+    """
+
+    intensity: Any
+    energy_um2: Any
+    depths_um: Array
+    angles_rad: Array
+    wavelengths_um: Array
+    weights: Array
+    step_um: float
+    centres_um: Array
+    sensor_distance_um: float
+    tolerance: float
+    error: float
+    reason: str
+    provenance: Provenance = field(default_factory=_made_here)
+
+    @property
+    def x_um(self) -> Array:
+        """(x,) positions from the window centre."""
+        return axis(self.intensity.shape[-1], self.step_um)
+
+    @property
+    def y_um(self) -> Array:
+        """(y,) positions from the window centre."""
+        return axis(self.intensity.shape[-2], self.step_um)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the error estimate is within the tolerance."""
+        return self.error <= self.tolerance
+
+    def numpy(self) -> "PsfStack":
+        """The same record with numpy arrays, detached from any graph."""
+        return dataclasses.replace(self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2))
+
+
+def _array(value: Any) -> Array:
+    return value if isinstance(value, np.ndarray) else np.asarray(value.detach().cpu().numpy())
+
+
+_AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
+_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
+
+
+def save(path: str | Path, stack: PsfStack) -> None:
+    """Write a PSF file (kind ``psf``)."""
+    plain = stack.numpy()
+    arrays = {name: np.asarray(getattr(plain, name)) for name in ("intensity", "energy_um2", *_AXES)}
+    about = {name: getattr(plain, name) for name in _NUMBERS}
+    store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
+
+
+@reader
+def load(path: str | Path) -> PsfStack:
+    """Read a PSF file.
+
+    Raises:
+        StoreError: missing, truncated, or not a PSF file.
+    """
+    stored = store.load(path, "psf")
+    fields: dict[str, Any] = {name: stored.attributes[name] for name in _NUMBERS} | stored.arrays
+    return PsfStack(**fields, provenance=stored.provenance)

@@ -1,0 +1,105 @@
+"""LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.ground.paths import path_difference
+
+MOST_NODES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A light-emitting diode seen by a silicon sensor.
+
+    peak_nm, fwhm_nm: of the diode, a Gaussian line.
+    silicon_um: thickness of silicon that collects charge; the response is 1 - exp(-4πk·thickness/λ) with k of
+        crystalline silicon, times λ (photons per watt).
+    """
+
+    peak_nm: float = 850.0
+    fwhm_nm: float = 30.0
+    silicon_um: float = 6.0
+
+    def __post_init__(self) -> None:
+        if not (self.peak_nm > 0 and self.fwhm_nm > 0 and self.silicon_um > 0):
+            raise PropagationError(f"{self}: peak, width and thickness must be above 0")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Nodes:
+    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band that was asked for."""
+
+    wavelengths_um: Array
+    weights: Array
+    error: float
+
+
+def weight(source: Source) -> tuple[Array, Array]:
+    """(wavelengths in um, weight of sum 1) of diode times silicon, every 0.25 nm over ±2.5 FWHM.
+
+    Raises:
+        MaterialError: the line leaves the range of the silicon data.
+    """
+    import colour
+
+    from metalens.cell import materials
+
+    reach = 2.5 * source.fwhm_nm
+    shape = colour.SpectralShape(round(source.peak_nm - reach), round(source.peak_nm + reach), 0.25)
+    line = colour.sd_gaussian(source.peak_nm, source.fwhm_nm, shape, method="FWHM")
+    um = np.asarray(line.wavelengths, float) * 1e-3
+    k = np.array([materials.index("Si", w).imag for w in um])
+    seen = um * (1 - np.exp(-4 * np.pi * k * source.silicon_um / um))
+    value = np.asarray(line.values, float) * seen
+    return um, value / value.sum()
+
+
+def nodes(source: Source, *, path_um: float, tolerance: float) -> Nodes:
+    """As few wavelengths as meet the tolerance.
+
+    Args:
+        path_um: largest difference in optical path between two parts of the lens, for light that reaches the window
+            (:func:`path_span`): intensities vary with wavelength as exp(2πi·path/λ), and no faster.
+        tolerance: of the mean over the spectrum of every such exponential.
+
+    Raises:
+        PropagationError: more than 64 wavelengths would be needed.
+    """
+    um, share = weight(source)
+    paths = np.linspace(0, path_um, 65)[:, None]
+    want = np.exp(2j * np.pi * paths / um) @ share
+    for count in range(1, MOST_NODES + 1):
+        x, w = gauss(um, share, count)
+        error = float(np.abs(np.exp(2j * np.pi * paths / x) @ w - want).max())
+        if error <= tolerance:
+            return Nodes(x, w, error)
+    raise PropagationError(
+        f"more than {MOST_NODES} wavelengths needed for paths of {path_um:.3g} um under a line of {source.fwhm_nm} nm; "
+        "raise the tolerance or narrow the line"
+    )
+
+
+def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
+    """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1 (Lanczos, Golub and Welsch)."""
+    count = min(count, len(points))
+    basis, diagonal, beside = np.zeros((count, len(points))), np.zeros(count), np.zeros(count)
+    q = np.sqrt(share)
+    for i in range(count):
+        basis[i] = q
+        r = points * q
+        diagonal[i] = q @ r
+        r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
+        r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
+        beside[i] = np.linalg.norm(r)
+        q = r / beside[i] if beside[i] > 0 else r
+    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
+    return values, vectors[0] ** 2 * share.sum()
+
+
+def path_span(radius_um: float, sensor_distance_um: float, nearest_depth_um: float) -> float:
+    """Path from axis to rim on both sides, um: bounds how fast a PSF changes with wavelength."""
+    return float(path_difference(radius_um**2, nearest_depth_um) + path_difference(radius_um**2, sensor_distance_um))

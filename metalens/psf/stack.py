@@ -1,0 +1,153 @@
+"""PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from metalens import propagate
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.propagate import Case, Moving
+from metalens.psf.compute import Result, intensity
+from metalens.psf.record import PsfStack
+
+
+def psf_stack(
+    phase_rad: Any,
+    transmission: Any,
+    *,
+    pitch_um: float,
+    wavelength_um: float | Sequence[float],
+    sensor_distance_um: Any,
+    depths_um: Any,
+    angle_rad: Any = 0.0,
+    window_um: float,
+    samples: int,
+    tolerance: float = 1e-4,
+    weights: Sequence[float] | None = None,
+    offset_um: Any = (0.0, 0.0),
+) -> PsfStack:
+    """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
+
+    Args:
+        phase_rad, transmission: (…, y, x) maps, numpy or torch, float32 or float64; leading axes are a batch of
+            lenses. With several wavelengths the axis before y is the wavelength. Torch maps are differentiable.
+        wavelength_um: one, or several with ``weights`` (equal if None), whose intensities add (incoherent light).
+        depths_um: source depths from the lens, inf for collimated light.
+        angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles.
+        window_um, samples: full width of the square window, and cells along it; samples lie at cell centres.
+        tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
+        offset_um: (x, y) of the window from the chief ray.
+
+    Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
+    window moves with the chief ray, and so do the derivatives.
+
+    Returns:
+        PsfStack with intensity (…, [angle,] depth, y, x) of the kind and dtype that came in.
+
+    Raises:
+        PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window.
+
+    Accuracy: ``error`` of the record, 1 to 3 times the true error.
+    """
+    maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
+    about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
+    about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
+    about |= {"offset_um": _value(offset_um)}
+    several = np.ndim(_value(angle_rad)) == 2
+    cases, found = [], []
+    for angle in angle_rad if several else [angle_rad]:
+        cases.append([propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves])
+        moving = _moving(angle, depths_um, sensor_distance_um, offset_um)
+        found.append(_direction(maps, cases[-1], share.tolist(), tolerance, moving))
+    light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
+    worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
+    axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
+    stack = _record(light, [row[0] for row in cases], axes, worst, tolerance)
+    return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
+
+
+def _direction(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    cases: list[Case],
+    weights: list[float],
+    tolerance: float,
+    moving: Moving | None,
+) -> tuple[torch.Tensor, list[Result]]:
+    """(…, depth, y, x) intensity of every lens in one direction, and the results it is made of."""
+    shape = maps[0].shape
+    lenses = [m.reshape(-1, *shape[-3:]) for m in maps]
+    found = [intensity(p, t, cases, weights, tolerance=tolerance, moving=moving) for p, t in zip(*lenses, strict=True)]
+    light = torch.stack([result.intensity for result in found])
+    return light.view(*shape[:-3], *light.shape[1:]), found
+
+
+def _record(
+    light: torch.Tensor, cases: list[Case], axes: tuple[Array, Array, Array], worst: Result, tolerance: float
+) -> PsfStack:
+    """The stack for intensities (…, depth, y, x), a case for each angle; axes are depths, wavelengths, weights."""
+    energy = light.sum((-1, -2))
+    return PsfStack(
+        light / energy[..., None, None],
+        energy * cases[0].step_um ** 2,
+        depths_um=axes[0],
+        angles_rad=np.arctan([c.tangents for c in cases]),
+        wavelengths_um=axes[1],
+        weights=axes[2],
+        step_um=cases[0].step_um,
+        centres_um=np.array([c.centre_um for c in cases]),
+        sensor_distance_um=cases[0].sensor_distance_um,
+        tolerance=tolerance,
+        error=worst.error,
+        reason=worst.reason,
+    )
+
+
+def _value(argument: Any) -> Any:
+    """An argument without its graph; sequences of tensors become arrays."""
+    if isinstance(argument, torch.Tensor):
+        return argument.detach().cpu().numpy()
+    if isinstance(argument, list | tuple):
+        return np.array([_value(a) for a in argument])
+    return argument
+
+
+def _moving(angle: Any, depths: Any, distance: Any, offset: Any) -> Moving | None:
+    """Geometry as tensors where any of it carries a gradient."""
+    given = [angle, depths, distance, *(offset if isinstance(offset, list | tuple) else [offset])]
+    if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in given):
+        return None
+    pair = _double(angle).reshape(-1)
+    tangents = torch.tan(pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)]))
+    d = _double(distance).reshape(())
+    shift = torch.stack([_double(o).reshape(()) for o in offset])
+    return Moving(tangents, 1 / _double(depths).reshape(-1), d, d * tangents + shift)
+
+
+def _double(argument: Any) -> torch.Tensor:
+    if isinstance(argument, torch.Tensor):
+        return argument.double()
+    return torch.as_tensor(np.asarray(argument, float))
+
+
+def _maps(
+    phase: Any, level: Any, wavelength_um: float | Sequence[float], weights: Sequence[float] | None
+) -> tuple[tuple[torch.Tensor, torch.Tensor], list[float], Array]:
+    """Maps (…, wavelength, y, x) as tensors of one dtype, the wavelengths, and their weights of sum 1."""
+    waves = np.atleast_1d(np.asarray(wavelength_um, float)).tolist()
+    share = np.full(len(waves), 1 / len(waves)) if weights is None else np.asarray(weights, float)
+    if share.shape != (len(waves),) or not (share >= 0).all() or not share.sum() > 0:
+        raise PropagationError(f"{len(waves)} wavelengths with weights {share}, need one weight >= 0 for each")
+    phase = torch.as_tensor(phase)
+    if not phase.is_floating_point():
+        raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
+    level = torch.as_tensor(level).to(phase).expand(phase.shape)
+    if np.ndim(wavelength_um) == 0:
+        phase, level = phase.unsqueeze(-3), level.unsqueeze(-3)
+    elif phase.ndim < 3 or phase.shape[-3] != len(waves):
+        raise PropagationError(
+            f"{len(waves)} wavelengths, but maps of shape {tuple(phase.shape)}; need (…, wavelength, y, x)"
+        )
+    return (phase, level), waves, share / share.sum()

@@ -1,0 +1,306 @@
+"""Cells of any shape, lattice and layers: the 2 x 2 Jones matrices of transmission and reflection, with error bars."""
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.cell import Cell, Film, Layer, Response, materials
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+from metalens.rcwa import layer as modes
+from metalens.rcwa import mirrors, pattern
+from metalens.rcwa.conditions import Polarization, check_direction, direction
+from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
+from metalens.rcwa.stack import Media, respond
+from metalens.rcwa.taper import sections
+from metalens.rcwa.waves import Waves
+
+_FIRST = 3  # orders of the first truncation
+_LAST = {4: 15, 2: 10, 1: 7}  # by the number of operations: about a second a solve
+_COMPARED = 4
+_SAFETY = 3.0
+_ROUNDING = 1e-13
+_STRAIGHT = 1e-12
+_STEPS = 2  # of a tilted wall in each section, at first; doubled once to see what they leave
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Jones:
+    """Zero-order response of one cell to both polarisations, power-normalised, exp(-iwt), incidence from the substrate.
+
+    basis: ("x", "y") at normal incidence, ("s", "p") else: s across the plane of incidence, p in it.
+    t, r: (2, 2); column: polarisation that comes, row: that leaves. (For r, p is taken along the same tangential
+        direction as that of the light that comes.)
+    t_error: estimate of the largest |t - exact|, not below the true error; it serves for r as well.
+    energy: (2,) power of all propagating orders, for each polarisation that comes.
+    orders: harmonics of the finest truncation. converged, reason: whether the tolerance is met, and why it ended.
+    """
+
+    basis: tuple[str, str]
+    t: Array
+    r: Array
+    t_error: float
+    energy: Array
+    orders: int
+    converged: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Light:
+    """Tangential wave vector over k0, azimuth (0 at normal incidence) and wavelength."""
+
+    kx: float
+    ky: float
+    azimuth_rad: float
+    wavelength_um: float
+
+    @property
+    def normal(self) -> bool:
+        return self.kx == 0 == self.ky
+
+
+def jones(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    tolerance: float = 1e-3,
+    harmonics: int | None = None,
+) -> Jones:
+    """Both polarisations of a cell of any shape, at the least number of harmonics that meets the tolerance.
+
+    Args:
+        size_um: of the shape (what other stages call the diameter).
+        angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of incidence, from +x to +y.
+        harmonics: fix the largest truncation instead (orders as on a square lattice of the same area).
+
+    Accuracy: ``t_error`` is three times the farthest of the four truncations before the last, and what doubling the
+        steps of a tilted wall does. Corners and high contrast converge slowly: 1e-2 is usual where 1e-3 is asked.
+
+    Raises:
+        CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order.
+        MaterialError: a wavelength outside the range of a material.
+    """
+    if not (math.isfinite(tolerance) and tolerance > 0):
+        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    check_direction(angle_rad, azimuth_rad)
+    sine = math.sin(angle_rad)
+    flat = 0.0 if sine == 0 else azimuth_rad
+    kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(flat), sine * math.sin(flat)))
+    light = _Light(kx, ky, flat, wavelength_um)
+    media = _media(cell, light)
+    check_size(cell, size_um)
+    classes = _classes(cell, size_um, light)
+    last = _LAST[min(len(operations) for operations in classes)] if harmonics is None else harmonics
+    first = _FIRST if harmonics is None else max(1, harmonics - _COMPARED)
+    history: list[Array] = []
+    for reach in range(first, last + 1):
+        found = _truncated(cell, size_um, light, (media, classes), reach, _STEPS)
+        history.append(found.t)
+        if len(history) <= 2 and reach < last:
+            continue
+        moved = max(float(np.abs(found.t - before).max()) for before in history[-1 - _COMPARED : -1] or [found.t + 1])
+        error = min(_SAFETY * moved + _ROUNDING, 2.0)
+        if len(history) > _COMPARED and error <= tolerance:
+            break
+    cut = 0.0
+    if cell.sidewall_rad:
+        finer = _truncated(cell, size_um, light, (media, classes), min(reach, 5), 2 * _STEPS)
+        coarse = _truncated(cell, size_um, light, (media, classes), min(reach, 5), _STEPS)
+        cut = float(np.abs(finer.t - coarse.t).max())
+    error = min(error + cut, 2.0)
+    met = error <= tolerance
+    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
+    return dataclasses.replace(found, t_error=error, converged=met, reason=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Incident:
+    """A plane wave, as :func:`metalens.rcwa.solve` takes it."""
+
+    wavelength_um: float
+    angle_rad: float
+    azimuth_rad: float
+    polarization: Polarization
+
+
+def co_polarised(cell: Cell, size_um: float, light: Incident, *, tolerance: float, harmonics: int | None) -> Response:
+    """One diagonal element of :func:`jones`; the same arguments and refusals."""
+    place = ("x", "y").index(light.polarization) if light.polarization in ("x", "y") else None
+    if light.angle_rad:
+        place = ("s", "p").index(direction(light.angle_rad, light.azimuth_rad, light.polarization)[-1])
+    elif place is None:  # p lies in the plane of incidence that the azimuth names
+        turned = round(light.azimuth_rad / (math.pi / 2)) % 2
+        place = turned if light.polarization == "p" else 1 - turned
+    about = {"angle_rad": light.angle_rad, "azimuth_rad": light.azimuth_rad}
+    found = jones(cell, size_um, light.wavelength_um, **about, tolerance=tolerance, harmonics=harmonics)
+    t, r, energy = complex(found.t[place, place]), complex(found.r[place, place]), float(found.energy[place])
+    return Response(t, r, found.t_error, found.orders, energy, "rcwa", found.converged, found.reason)
+
+
+def most_harmonics(cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimuth_rad: float = 0.0) -> int:
+    """Largest truncation that :func:`jones` takes by itself: less for a cell without mirrors."""
+    sine = math.sin(angle_rad)
+    kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad)))
+    return _LAST[min(len(found) for found in _classes(cell, size_um, _Light(kx, ky, azimuth_rad, 1.0)))]
+
+
+def check_size(cell: Cell, size_um: float) -> None:
+    """Refuse sizes that leave nothing or overlap, for every section.
+
+    Raises:
+        CellError: says which section is too wide or too thin.
+    """
+    if not (math.isfinite(size_um) and size_um > 0):
+        raise CellError(f"size = {size_um} um: need a finite length above 0")
+    for (layer, grow), lift in itertools.product(_spread(cell, 0), (-0.5, 0.5)):
+        wide = layer.grow_um + grow + lift * _widening(cell) * layer.height_um + 2 * layer.coat_um
+        if cell.gap_um(size_um, grow_um=wide) <= 0:
+            raise CellError(
+                f"{cell.described}, size {size_um:g} um: a section {wide:+.4g} um wider touches its neighbour on a "
+                f"pitch of {cell.pitch_um:g} um; need a smaller size or a larger pitch"
+            )
+
+
+def _widening(cell: Cell) -> float:
+    """Change of width for each um of height above the middle."""
+    return -2 * math.tan(cell.sidewall_rad)
+
+
+def _spread(cell: Cell, steps: int) -> list[tuple[Layer, float]]:
+    """(section, widening at its middle by the tilted wall), foot first; ``steps`` is not used for upright ones."""
+    found, foot = [], 0.0
+    for layer in cell.sections:
+        middle = foot + layer.height_um / 2 - cell.height_um / 2
+        found.append((layer, _widening(cell) * middle))
+        foot += layer.height_um
+    return found
+
+
+def _media(cell: Cell, light: _Light) -> Media:
+    k0 = 2 * math.pi / light.wavelength_um
+
+    def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
+        return tuple((materials.index(f.material, light.wavelength_um), f.thickness_um * k0) for f in stack)
+
+    below, above = (materials.index(m, light.wavelength_um) for m in (cell.substrate, cell.cover))
+    if below.real <= math.hypot(light.kx, light.ky):
+        raise CellError(
+            f"sin(angle_rad) = {math.hypot(light.kx, light.ky):.6g} in a substrate of n = {below.real:.6g}: the light "
+            "cannot come from there; need a smaller angle_rad or another substrate"
+        )
+    return Media(below, above, films(cell.under), films(cell.over))
+
+
+def _classes(cell: Cell, size_um: float, light: _Light) -> tuple[tuple[Operation, ...], ...]:
+    """Sets of operations whose fields together make every polarisation: one set, or one for each polarisation."""
+    outline = cell.outline(size_um)
+    flip_x = outline.keeps(-1, 1) and light.kx == 0
+    flip_y = outline.keeps(1, -1) and light.ky == 0
+    if flip_x and flip_y:
+        return tuple(
+            (IDENTITY, FLIP_X[way], FLIP_Y[way], HALF_TURN) for way in ("x", "y")
+        )  # the half turn is the product of both
+    if flip_x or flip_y:
+        table = FLIP_X if flip_x else FLIP_Y
+        return tuple((IDENTITY, table[way]) for way in ("x", "y"))
+    return ((IDENTITY, HALF_TURN),) if outline.keeps(-1, -1) and light.normal else ((IDENTITY,),)
+
+
+def _truncated(
+    cell: Cell,
+    size_um: float,
+    light: _Light,
+    about: tuple[Media, tuple[tuple[Operation, ...], ...]],
+    reach: int,
+    steps: int,
+) -> Jones:
+    media, classes = about
+    t, r, energy = np.zeros((2, 2), complex), np.zeros((2, 2), complex), np.zeros(2)
+    for operations in classes:
+        frame = pattern.frame(cell, operations)
+        space = mirrors.orders(reach, frame)
+        ways, places = _waves(space, cell, light)
+        layers, heights = _layers(space, ways, cell, size_um, light, steps)
+        whole = dataclasses.replace(media, heights=heights)
+        for column, come in places.items():
+            found = respond(ways, whole, layers, come[0])
+            energy[column] = float((np.abs(found.t) ** 2).sum() + (np.abs(found.r) ** 2).sum())
+            for row, leave in places.items():
+                sign = come[1] * leave[1]
+                t[row, column], r[row, column] = sign * found.t[leave[0]], sign * found.r[leave[0]]
+    names = ("x", "y") if light.normal else ("s", "p")
+    count = int(np.count_nonzero(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach))
+    return Jones(names, t, r, math.inf, energy, count, False, "")
+
+
+def _layers(
+    space: mirrors.Orders, ways: Waves, cell: Cell, size_um: float, light: _Light, steps: int
+) -> tuple[list[modes.Layer], tuple[float, ...]]:
+    made, heights = [], []
+    for layer, grow in _spread(cell, steps):
+        for part in sections(steps if cell.sidewall_rad else 0):
+            pairs = []
+            for _, lift in part.nodes:
+                wide = grow + lift * _widening(cell) * layer.height_um
+                this = pattern.slab(cell, layer, size_um, light.wavelength_um, grow_um=wide)
+                pairs.append(pattern.operators(space, ways, this, cell))
+            P = sum(weight * P for (weight, _), (P, _) in zip(part.nodes, pairs, strict=True))
+            Q = sum(weight * Q for (weight, _), (_, Q) in zip(part.nodes, pairs, strict=True))
+            symmetric = cell.outline(size_um).keeps(-1, -1)
+            made.append(modes.layer(np.asarray(P), np.asarray(Q), symmetric=symmetric))
+            heights.append(part.share * layer.height_um * 2 * math.pi / light.wavelength_um)
+    return made, tuple(heights)
+
+
+def _waves(space: mirrors.Orders, cell: Cell, light: _Light) -> tuple[Waves, dict[int, tuple[int, float]]]:
+    """The waves, and for each polarisation of the basis that this class holds: its place, and its sign there.
+
+    At normal incidence the zero order has no Ez or Hz of its own: it is put in front where its set lacks it.
+    """
+
+    def holds(part: mirrors.Set) -> bool:
+        return bool(((part.m == 0) & (part.n == 0)).any())
+
+    ex, ey, ez, hz = (holds(part) for part in (space.ex, space.ey, space.ez, space.hz))
+    quarter = 0
+    if light.normal:
+        fits = [not (ez and not p) and not (hz and not s) for p, s in ((ex, ey), (ey, ex))]
+        quarter = 0 if fits[0] else 1
+        if not (ez or hz) and not ex:
+            quarter = 1
+    p_in, s_in = (ex, ey) if quarter == 0 else (ey, ex)
+    bare_p, bare_s = (light.normal and p_in and not ez), (light.normal and s_in and not hz)
+    zero = np.zeros(1, int)
+    p_m, p_n = (np.concatenate([zero[: int(bare_p)], v]) for v in (space.ez.m, space.ez.n))
+    s_m, s_n = (np.concatenate([zero[: int(bare_s)], v]) for v in (space.hz.m, space.hz.n))
+    m, n = np.concatenate([p_m, s_m]), np.concatenate([p_n, s_n])
+    px, py = cell.lattice.periods_um(cell.pitch_um)
+    k = np.stack([light.kx + light.wavelength_um / px * m, light.ky + light.wavelength_um / py * n])
+    kappa = np.hypot(*k)
+    turn = light.azimuth_rad + quarter * math.pi / 2
+    straight = np.array([round(math.cos(turn), 15), round(math.sin(turn), 15)])[:, None]
+    along = np.where(kappa > 0, k / np.where(kappa > 0, kappa, 1.0), straight)
+    p_count = len(p_m)
+    is_p = np.arange(len(m)) < p_count
+    e = np.where(is_p, along, np.stack([-along[1], along[0]]))
+
+    def placed(rows: mirrors.Set) -> Array:
+        return np.asarray((rows.m[:, None] == m) & (rows.n[:, None] == n), float)
+
+    fold = np.concatenate([placed(space.ex) * e[0], placed(space.ey) * e[1]])
+    at = np.flatnonzero((m == 0) & (n == 0))
+    places: dict[int, tuple[int, float]] = {}
+    for place in at.tolist():
+        if light.normal:
+            column = int(abs(e[1, place]) > 0.5)
+            places[column] = (place, float(np.sign(e[column, place])))
+        else:
+            places[1 if place < p_count else 0] = (place, 1.0)
+    return Waves(space, m, n, kappa, along, p_count, int(bare_p), fold, -1, -1), places  # type: ignore[arg-type]

@@ -1,0 +1,147 @@
+"""From a cell, a wavelength and a direction to the numbers of one RCWA case; refuses what cannot be computed."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from metalens.cell import Cell, Film, materials
+from metalens.ground.errors import CellError
+from metalens.rcwa import basis as fourier
+from metalens.rcwa.stack import Media
+from metalens.rcwa.waves import Waves, waves
+
+Polarization = Literal["x", "y", "s", "p"]
+_STRAIGHT = 1e-15  # cos or sin of an azimuth that lies in a mirror plane, to rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One wavelength, direction and polarisation of a cell, whatever the diameter.
+
+    k0: 2 pi / wavelength_um.
+    kx, ky: tangential wave vector over k0; turned into the plane y = 0 where a mirror plane allows it.
+    symmetry: of the fields, see :mod:`metalens.rcwa.basis`; wave: which zero order is incident.
+    pillar, between: indices, exp(-iwt). media: indices and reduced thicknesses around and between.
+    """
+
+    cell: Cell
+    wavelength_um: float
+    k0: float
+    kx: float
+    ky: float
+    azimuth_rad: float
+    symmetry: fourier.Symmetry
+    wave: Literal["s", "p"]
+    pillar: complex
+    between: complex
+    media: Media
+
+    @property
+    def lossless(self) -> bool:
+        """Whether no medium absorbs."""
+        films = (index for index, _ in (*self.media.under, *self.media.over))
+        return not any(n.imag for n in (self.pillar, self.between, self.media.substrate, self.media.cover, *films))
+
+
+def case(cell: Cell, wavelength_um: float, *, angle_rad: float, azimuth_rad: float, polarization: Polarization) -> Case:
+    """The case of a cell; angles are those of the light outside, in vacuum: k = k0 sin(angle_rad).
+
+    Raises:
+        CellError: an impossible angle or polarisation, or a zero order that does not propagate in the substrate.
+        MaterialError: a wavelength outside the range of a material.
+    """
+    if not cell.round:
+        raise CellError(f"this solver takes round pillars on a square lattice, not {cell.described}")
+    wavelength_um, angle_rad, azimuth_rad = float(wavelength_um), float(angle_rad), float(azimuth_rad)
+    k0 = 2 * math.pi / wavelength_um if wavelength_um else math.nan
+
+    def index(material: object) -> complex:
+        return materials.index(material, wavelength_um)  # type: ignore[arg-type]
+
+    def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
+        return tuple((index(film.material), film.thickness_um * k0) for film in stack)
+
+    media = Media(index(cell.substrate), index(cell.cover), films(cell.under), films(cell.over), (cell.height_um * k0,))
+    kx, ky, azimuth_rad, symmetry, wave = direction(angle_rad, azimuth_rad, polarization)
+    if media.substrate.real <= math.hypot(kx, ky):
+        raise CellError(
+            f"sin(angle_rad) = {math.hypot(kx, ky):.6g} in a substrate of n = {media.substrate.real:.6g}: the light "
+            "cannot come from there; need a smaller angle_rad or another substrate"
+        )
+    pillar, between = index(cell.pillar), index(cell.between)
+    return Case(cell, wavelength_um, k0, kx, ky, azimuth_rad, symmetry, wave, pillar, between, media)
+
+
+def case_waves(this: Case, harmonics: int) -> tuple[Waves, int]:
+    """The waves of a case within ``harmonics`` orders, and the place of its incident wave."""
+    ways = waves(
+        fourier.basis(harmonics, this.symmetry),
+        pitch_um=this.cell.pitch_um,
+        wavelength_um=this.wavelength_um,
+        kx=this.kx,
+        ky=this.ky,
+        azimuth_rad=this.azimuth_rad,
+    )
+    return ways, ways.zero_p if this.wave == "p" else ways.zero_s
+
+
+def check_diameter(cell: Cell, diameter_um: float) -> None:
+    """Refuse a diameter that is no length, or pillars that overlap (touching ones can be computed).
+
+    Raises:
+        CellError: says which diameter, of foot or top where the wall is tilted.
+    """
+    if not (math.isfinite(diameter_um) and diameter_um >= 0):
+        raise CellError(f"diameter_um = {diameter_um}: need a finite length >= 0")
+    if diameter_um == 0:
+        return
+    widening = cell.height_um * math.tan(cell.sidewall_rad)
+    for name, wide in (("foot", diameter_um + widening), ("top", diameter_um - widening)):
+        if wide > cell.pitch_um:
+            raise CellError(
+                f"diameter_um = {diameter_um}: pillars overlap, {wide:.6g} um wide at the {name} on a pitch of "
+                f"{cell.pitch_um:.6g} um; need at most the pitch"
+            )
+        if wide < 0:
+            raise CellError(
+                f"diameter_um = {diameter_um}: the wall of {cell.sidewall_rad:.4g} rad over {cell.height_um:.6g} um "
+                f"closes the pillar below its {name}; need at least {abs(widening):.6g} um"
+            )
+
+
+def check_direction(angle_rad: float, azimuth_rad: float) -> None:
+    """Refuse what is no direction of light.
+
+    Raises:
+        CellError: an angle that is not finite, or not below a right angle.
+    """
+    if not (math.isfinite(angle_rad) and abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
+        raise CellError(f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, |angle| < pi/2")
+
+
+def direction(
+    angle_rad: float, azimuth_rad: float, polarization: Polarization
+) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
+    """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into the plane y = 0 where it may be.
+
+    Raises:
+        CellError: an impossible angle or polarisation.
+    """
+    if polarization not in ("x", "y", "s", "p"):
+        raise CellError(f"polarization = {polarization!r}: need 'x', 'y', 's' or 'p'")
+    check_direction(angle_rad, azimuth_rad)
+    if angle_rad == 0:
+        return 0.0, 0.0, 0.0, "x", "p"  # the disc and the lattice look alike from x and y: one solution serves all
+    sine, c, s = math.sin(angle_rad), math.cos(azimuth_rad), math.sin(azimuth_rad)
+    along_x, along_y = abs(s) < _STRAIGHT, abs(c) < _STRAIGHT
+    wave: Literal["s", "p"] = "p" if polarization == "p" else "s"
+    if polarization in ("x", "y"):
+        if not (along_x or along_y):
+            raise CellError(
+                f"polarization = {polarization!r} at angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: ambiguous "
+                "off the axes; need 's' or 'p'"
+            )
+        wave = "p" if along_x == (polarization == "x") else "s"
+    if along_x or along_y:
+        return sine, 0.0, 0.0, wave, wave
+    return sine * c, sine * s, azimuth_rad, "none", wave

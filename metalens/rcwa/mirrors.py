@@ -1,0 +1,101 @@
+"""Fourier orders of any lattice, reduced by whatever mirrors and half turns shape, lattice and light share.
+
+The fields of a case are carried by its operations g into themselves with a sign for each of Ex, Ey, Ez, Hz; one
+amplitude stands for an orbit of orders. The rectangle of a hexagonal lattice holds two sites: orders with m + n even.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+
+Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
+Operation = tuple[int, int, Sign]  # (x, y) -> (sx x, sy y)
+IDENTITY: Operation = (1, 1, (1, 1, 1, 1))
+# An electric field along x (or y) that a mirror leaves as it is has Ex (or Ey) even; see basis._PARITY.
+FLIP_X = {"x": (-1, 1, (1, -1, -1, 1)), "y": (-1, 1, (-1, 1, 1, -1))}
+FLIP_Y = {"x": (1, -1, (1, -1, 1, -1)), "y": (1, -1, (-1, 1, -1, 1))}
+HALF_TURN: Operation = (-1, -1, (1, 1, -1, -1))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What the orders depend on: edges of the rectangle that repeats over the pitch, centred or not, operations."""
+
+    along: float
+    across: float
+    centred: bool
+    operations: tuple[Operation, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Set:
+    """Amplitudes of one scalar field: (k,) orders m, n, sizes of their orbits, sign of each operation."""
+
+    m: Array
+    n: Array
+    size: Array
+    signs: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Link:
+    """How a function couples two sets: (k, l, operations) places in its table of coefficients, and weights."""
+
+    place: Array
+    weight: Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Orders:
+    """The reduced sets of one truncation; coefficients are tabled over m, n from -2 reach to 2 reach."""
+
+    ex: Set
+    ey: Set
+    ez: Set
+    hz: Set
+    reach: tuple[int, int]
+    links: tuple[Link, Link, Link, Link]  # (ex, ex), (ey, ey), (ez, ez), (ex, ey)
+
+
+@lru_cache(maxsize=24)
+def orders(harmonics: int, frame: Frame) -> Orders:
+    """All orders within the circle of radius ``harmonics`` orders of a square lattice of this cell's area."""
+    radius = harmonics / np.sqrt(frame.along * frame.across / (2 if frame.centred else 1))
+    reach = (int(radius * frame.along), int(radius * frame.across))
+    m, n = (a.ravel() for a in np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"))
+    keep = (m / frame.along) ** 2 + (n / frame.across) ** 2 <= radius**2 * (1 + 1e-9)
+    if frame.centred:
+        keep &= (m + n) % 2 == 0
+    m, n = m[keep], n[keep]
+    ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
+    pairs = ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
+    first, second, third, fourth = (_link(rows, columns, frame.operations, reach) for rows, columns in pairs)
+    return Orders(ex, ey, ez, hz, reach, (first, second, third, fourth))
+
+
+def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) -> Set:
+    """One order of each orbit; those that an operation keeps but whose field it turns into its negative vanish."""
+    images = np.stack([(sx * m) * 4096 + sy * n for sx, sy, _ in operations])
+    own, signs = images[0], tuple(sign[field] for _, _, sign in operations)
+    first = own == images.max(axis=0)
+    dead = ((images == own) & (np.array(signs)[:, None] < 0)).any(axis=0)
+    keep = first & ~dead
+    size = np.array([len(set(column)) for column in images[:, keep].T], int)
+    return Set(m[keep], n[keep], size, signs)
+
+
+def _link(rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]) -> Link:
+    dm = np.stack([rows.m[:, None] - sx * columns.m for sx, _, _ in operations], axis=-1)
+    dn = np.stack([rows.n[:, None] - sy * columns.n for _, sy, _ in operations], axis=-1)
+    share = np.sqrt(rows.size[:, None] * columns.size) / len(operations)
+    place = (dm + 2 * reach[0]) * (4 * reach[1] + 1) + dn + 2 * reach[1]
+    return Link(place, share[..., None] * np.array(columns.signs, float))
+
+
+def product(space: Orders, table: Array, link: int) -> Array:
+    """(k, l) matrix of the product with a function of these coefficients ((2 m reach) x (2 n reach) table)."""
+    pair = space.links[link]
+    return np.asarray(np.einsum("ijg,ijg->ij", table.ravel()[pair.place], pair.weight))

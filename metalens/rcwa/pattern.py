@@ -1,0 +1,137 @@
+"""Layers of any section: permittivity from the outline's exact Fourier factors, a normal field from its boundary.
+
+As in :mod:`metalens.rcwa.layer`, E = [eps] - (Delta N + N Delta) / 2 with Delta = [eps] - [1/eps]^-1. Here N = w n n^T,
+n the normal of the nearest point of the boundary (over all neighbouring pillars) and w a weight that falls from 1 at
+the boundary to 0 far from it; the truncated result converges to the same limit for any N.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from metalens.cell import Cell, Layer, materials
+from metalens.cell.shapes import Outline
+from metalens.ground.arrays import Array
+from metalens.rcwa import mirrors
+from metalens.rcwa.mirrors import Frame, Orders
+from metalens.rcwa.waves import Waves
+
+_GRID = 192  # points along the pitch on which normals are sampled
+FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_FAR = 0.5  # of the largest distance to a boundary: there the weight of the normal field is halved
+
+
+@dataclass(frozen=True, slots=True)
+class Slab:
+    """One homogeneous-in-z section: outlines from the inside out with the permittivity inside each, and outside."""
+
+    outlines: tuple[Outline, ...]
+    inside: tuple[complex, ...]
+    outside: complex
+
+
+def slab(cell: Cell, layer: Layer, size_um: float, wavelength_um: float, *, grow_um: float = 0.0) -> Slab:
+    """The section of a layer at a size, wider by ``grow_um`` besides the layer's own; a hole swaps the materials."""
+    pillar = materials.index(cell.pillar if layer.material is None else layer.material, wavelength_um) ** 2
+    around = materials.index(cell.between if layer.between is None else layer.between, wavelength_um) ** 2
+    if cell.shape.hole:
+        pillar, around = around, pillar
+    wide = layer.grow_um + grow_um
+    wall = cell.outline(size_um, grow_um=wide)
+    if layer.coat is None:
+        return Slab((wall,), (pillar,), around)
+    film = materials.index(layer.coat, wavelength_um) ** 2
+    if cell.shape.hole:  # the film lies inside the opening
+        return Slab((cell.outline(size_um, grow_um=wide - 2 * layer.coat_um), wall), (pillar, film), around)
+    return Slab((wall, cell.outline(size_um, grow_um=wide + 2 * layer.coat_um)), (pillar, film), around)
+
+
+def frame(cell: Cell, operations: tuple[mirrors.Operation, ...]) -> Frame:
+    """The rectangle of the lattice in pitches, with the operations of the case."""
+    x, y = cell.lattice.periods_um(1.0)
+    return Frame(x, y, cell.lattice.centred, operations)
+
+
+def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array]:
+    """Fourier coefficients of eps and 1/eps over m, n from -2 reach to 2 reach; real for real, C2 symmetric ones."""
+    x, y = cell.lattice.periods_um(cell.pitch_um)
+    gx, gy = (
+        2 * np.pi / x * np.arange(-2 * reach[0], 2 * reach[0] + 1),
+        2 * np.pi / y * np.arange(-2 * reach[1], 2 * reach[1] + 1),
+    )
+    area = cell.lattice.area_um2(cell.pitch_um)
+    direct = np.zeros((len(gx), len(gy)), complex)
+    inverse = direct.copy()
+    centre = 2 * reach[0], 2 * reach[1]
+    direct[centre], inverse[centre] = this.outside, 1 / this.outside
+    beyond = (*this.inside[1:], this.outside)
+    for outline, inner, outer in zip(this.outlines, this.inside, beyond, strict=True):
+        factor = outline.fourier(gx[:, None], gy) / area
+        direct += (inner - outer) * factor
+        inverse += (1 / inner - 1 / outer) * factor
+    return _real(direct), _real(inverse)
+
+
+@lru_cache(maxsize=16)
+def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Fourier coefficients of w nx nx, w ny ny, w nx ny."""
+    from scipy.spatial import cKDTree
+
+    x, y = cell.lattice.periods_um(cell.pitch_um)
+    counts = [max(4 * r + 2, math.ceil(_GRID * edge / cell.pitch_um)) for r, edge in zip(reach, (x, y), strict=True)]
+    counts = [count + count % 2 for count in counts]
+    found = [outline.boundary(cell.pitch_um / 200) for outline in outlines]
+    points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
+    steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
+    near = np.abs(steps).max(axis=1) < 1.6 * max(x, y)
+    copies = (points[None] + steps[near][:, None]).reshape(-1, 2)
+    px, py = np.meshgrid(np.arange(counts[0]) * (x / counts[0]), np.arange(counts[1]) * (y / counts[1]), indexing="ij")
+    px, py = px - x * (px > x / 2), py - y * (py > y / 2)
+    distance, place = cKDTree(copies).query(np.stack([px, py], axis=-1).reshape(-1, 2))
+    n = np.tile(normals, (int(near.sum()), 1))[place].reshape(*px.shape, 2)
+    far = _FAR * distance.max()
+    weight = (1 / (1 + (distance / far) ** 4)).reshape(px.shape)
+
+    kept = [flips for flips in FLIPS if all(outline.keeps(*flips) for outline in outlines)]
+
+    def table(values: Array, *, odd: bool = False) -> Array:
+        spectrum = np.fft.fft2(values) / values.size
+        m, k = np.arange(-2 * reach[0], 2 * reach[0] + 1), np.arange(-2 * reach[1], 2 * reach[1] + 1)
+        whole = spectrum[m[:, None] % counts[0], k % counts[1]]
+        images = [(sx * sy if odd else 1) * whole[::sx, ::sy] for sx, sy in kept]  # ties are even between neighbours
+        return _real(np.mean(images, axis=0))
+
+    return (
+        table(weight * n[..., 0] ** 2),
+        table(weight * n[..., 1] ** 2),
+        table(weight * n[..., 0] * n[..., 1], odd=True),
+    )
+
+
+def _real(values: Array) -> Array:
+    return np.asarray(values.real if np.abs(values.imag).max() <= 1e-12 * np.abs(values).max() else values)
+
+
+def operators(space: Orders, ways: Waves, this: Slab, cell: Cell) -> tuple[Array, Array]:
+    """P and Q of :mod:`metalens.rcwa.waves` in these orders."""
+    direct, inverse = tables(this, cell, space.reach)
+    xx, yy, xy = normal_tables(this.outlines, cell, space.reach)
+    laurent = [mirrors.product(space, direct, link) for link in (0, 1)]
+    delta = [part - np.linalg.inv(mirrors.product(space, inverse, link)) for link, part in enumerate(laurent)]
+    nx, ny, mixed = mirrors.product(space, xx, 0), mirrors.product(space, yy, 1), mirrors.product(space, xy, 3)
+    top = laurent[0] - (delta[0] @ nx + nx @ delta[0]) / 2
+    bottom = laurent[1] - (delta[1] @ ny + ny @ delta[1]) / 2
+    side = -(delta[0] @ mixed + mixed @ delta[1]) / 2
+    back = mixed.conj().T
+    under = -(delta[1] @ back + back @ delta[0]) / 2
+    whole = np.block([[top, side], [under, bottom]])
+    Q = ways.fold.T @ whole @ ways.fold
+    s = np.arange(ways.p_count, len(ways.kappa))
+    Q[s, s] -= ways.kappa[s] ** 2
+    P = np.eye(len(ways.kappa), dtype=Q.dtype)
+    z = slice(ways.bare, ways.p_count)
+    kappa = ways.kappa[z]
+    P[z, z] -= kappa[:, None] * np.linalg.inv(mirrors.product(space, direct, 2)) * kappa
+    return P, Q

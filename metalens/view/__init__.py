@@ -1,0 +1,27 @@
+"""One self-contained page to explore an artefact: figures that can be turned, their numbers beside them."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.view.page import write as write
+    from metalens.view.panels import Axis as Axis
+    from metalens.view.panels import Classes as Classes
+    from metalens.view.panels import Curves as Curves
+    from metalens.view.panels import Images as Images
+    from metalens.view.panels import Numbers as Numbers
+    from metalens.view.panels import Panel as Panel
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Axis": "panels",
+        "Classes": "panels",
+        "Curves": "panels",
+        "Images": "panels",
+        "Numbers": "panels",
+        "Panel": "panels",
+        "write": "page",
+    },
+)

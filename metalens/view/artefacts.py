@@ -1,0 +1,147 @@
+"""Panels of the artefacts of the optics core: library, lens, PSF stack; and of any other HDF5 artefact, plainly."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens import lens as lenses
+from metalens import library as libraries
+from metalens import psf
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, classes_of
+
+MOST_SAMPLES = 40_000_000  # float32 values of one figure: 160 MB before they are deflated
+
+
+def library_panels(path: Path) -> list[Panel]:
+    """t, r and their error bars over every parameter, with the stretches that resonances take."""
+    made = libraries.load(path)
+    axes = [
+        Axis("polarisation", list(made.polarization)),
+        Axis("angle", np.degrees(made.angle_rad).tolist(), "deg"),
+        Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+    ]
+    x, error = 1e3 * made.diameter_um, made.t_error
+    phase = np.unwrap(np.angle(made.t), axis=-1)
+    bands = [(1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()]
+    worst = 1e3 * error.max()
+    return [
+        Curves(
+            "Transmission of the pillar",
+            x,
+            "diameter / nm",
+            {"|t|": np.abs(made.t), "|r|": np.abs(made.r)},
+            "magnitude",
+            axes,
+            {"|t|": error, "|r|": error},
+            bands,
+            f"Bands: error bars of the solver, at most {worst:.2g}e-3. Shaded: resonances, to their half-width.",
+        ),
+        Curves(
+            "Phase of the pillar",
+            x,
+            "diameter / nm",
+            {"phase": phase / (2 * math.pi)},
+            "turns",
+            axes,
+            {"phase": np.arcsin(np.minimum(1, error / np.maximum(np.abs(made.t), 1e-12))) / (2 * math.pi)},
+            bands,
+        ),
+        Curves("Error bar of t", x, "diameter / nm", {"error bar": error}, "|t - exact| at most", axes, scale="log"),
+    ]
+
+
+def lens_panels(path: Path) -> list[Panel]:
+    """Every pillar, and what it does to the light."""
+    lens = lenses.load(path)
+    diameter = lens.diameters.diameter_um
+    index, sizes = classes_of(diameter)
+    return [
+        Classes(
+            "Pillars",
+            index,
+            1e3 * sizes,
+            lens.diameters.pitch_um,
+            "nm",
+            "Diameters. Drag to move, wheel or + and - to zoom: far away the mean over the sites of a pixel is shown, "
+            "near by every pillar in its size.",
+            {
+                "phase / turns": lens.proxy.phase_rad(sizes, lens.wavelength_um) / (2 * math.pi),
+                "|T|": lens.proxy.transmission(sizes, lens.wavelength_um),
+            },
+        ),
+        _section(lens.diameters.diameter_um, lens),
+    ]
+
+
+def _section(diameter: Array, lens: lenses.Lens) -> Curves:
+    """Phase and diameter along the middle row."""
+    middle = diameter[len(diameter) // 2]
+    held = middle > 0
+    phase = np.full(len(middle), np.nan)
+    phase[held] = lens.proxy.phase_rad(middle[held], lens.wavelength_um)
+    x = lens.diameters.x_um[held]
+    wrapped = (phase[held] / (2 * math.pi)) % 1
+    return Curves("Phase along the middle row", x, "x / um", {"phase modulo a turn": wrapped}, "turns")
+
+
+def psf_panels(path: Path) -> list[Panel]:
+    """PSFs with sliders over all that they depend on."""
+    stack = psf.load(path)
+    values = np.asarray(stack.intensity)
+    if values.size > MOST_SAMPLES:
+        values = values[..., :: math.ceil(values.size / MOST_SAMPLES), :, :]
+    names = [Axis("depth", (1e-3 * stack.depths_um[: values.shape[-3]]).tolist(), "mm")]
+    if values.ndim >= 4:
+        names.insert(0, Axis("field angle", [_angle(pair) for pair in stack.angles_rad]))
+    while values.ndim - 2 > len(names):
+        names.insert(0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))))
+    peak = float(values.max())
+    depth, energy = 1e-3 * stack.depths_um, np.asarray(stack.energy_um2)
+    lines = {"peak": values.max(axis=(-2, -1)) / peak, "light in the window": energy / energy.max()}
+    return [
+        Images(
+            "Point spread function",
+            values / peak,
+            names,
+            stack.step_um,
+            "of the highest peak",
+            f"Samples of {stack.step_um:g} um; stated relative error {stack.error:.1e} ({stack.reason}).",
+            optics=True,
+        ),
+        Curves("Over depth", depth[: values.shape[-3]], "depth / mm", lines, "of the largest", names[:-1]),
+    ]
+
+
+def _angle(pair: Array) -> str:
+    x, y = np.degrees(pair)
+    return f"{x:.3g}, {y:.3g} deg"
+
+
+def plain_panels(path: Path) -> list[Panel]:
+    """Any artefact: its arrays as images or curves, its attributes as a table."""
+    stored = store.load(path)
+    out: list[Panel] = []
+    for name, array in sorted(stored.arrays.items()):
+        if array.dtype.kind not in "fiu" or array.size == 0 or array.size > MOST_SAMPLES:
+            continue
+        if array.ndim >= 2 and min(array.shape[-2:]) >= 8:
+            axes = [Axis(f"axis {i}", list(range(n))) for i, n in enumerate(array.shape[:-2])]
+            out.append(Images(name, _finite(array), axes, 1.0, signed=bool(array.min() < 0)))
+        elif array.ndim == 1 and len(array) >= 8:
+            out.append(Curves(name, np.arange(len(array)), "index", {name: _finite(array)}, ""))
+    rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]
+    rows += [(name, f"{a.dtype} {tuple(a.shape)}") for name, a in sorted(stored.arrays.items())]
+    return [*out, Numbers("Content", ("name", "value"), rows)]
+
+
+def _finite(array: Array) -> Array:
+    return np.asarray(np.nan_to_num(np.asarray(array, float)))
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 200 else text[:197] + "..."

@@ -1,0 +1,116 @@
+"""What a page can show: images with sliders, curves with error bars, maps of classes, numbers. Data, no drawing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import StoreError
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A slider: its name, its values, and their unit."""
+
+    name: str
+    values: Sequence[float | str]
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Images:
+    """A stack of images, one slider an axis before (y, x).
+
+    values: (*axes, y, x) real; shown in single precision.
+    step_um: spacing of the samples; centre at (n-1)/2.
+    unit: of the values. signed: zero has a colour of its own (residuals). optics: MTF and encircled energy are shown.
+    """
+
+    title: str
+    values: Array
+    axes: Sequence[Axis]
+    step_um: float
+    unit: str = ""
+    caption: str = ""
+    signed: bool = False
+    optics: bool = False
+
+    def __post_init__(self) -> None:
+        counts = tuple(len(axis.values) for axis in self.axes)
+        if self.values.shape[:-2] != counts:
+            raise StoreError(f"{self.title}: sliders {counts} do not fit images of shape {self.values.shape}")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Curves:
+    """Curves over one axis, one slider for each further one.
+
+    x: (n,). lines: {name: (*axes, n)}; errors: {name of a line: (*axes, n)}, drawn as a band of ± that much.
+    bands: (start, stop) stretches of x that are left out.
+    """
+
+    title: str
+    x: Array
+    x_name: str
+    lines: Mapping[str, Array]
+    y_name: str
+    axes: Sequence[Axis] = ()
+    errors: Mapping[str, Array] = field(default_factory=dict)
+    bands: Sequence[tuple[float, float]] = ()
+    caption: str = ""
+    scale: Literal["linear", "log"] = "linear"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Classes:
+    """A map of classes on a lattice, every site present: averaged where many share a pixel of the screen.
+
+    index: (y, x) class of each site, 0 where there is nothing. sizes: (classes,) value of each, from 1.
+    columns: further values of each class, shown where the pointer is (dose, datatype).
+    marks: (x_um, y_um, text) places with something to say (broken rules).
+    """
+
+    title: str
+    index: Array
+    sizes: Array
+    pitch_um: float
+    unit: str
+    caption: str = ""
+    columns: Mapping[str, Sequence[Any] | Array] = field(default_factory=dict)
+    marks: Sequence[tuple[float, float, str]] = ()
+
+    def __post_init__(self) -> None:
+        if self.index.size and int(self.index.max()) > len(self.sizes):
+            raise StoreError(f"{self.title}: class {int(self.index.max())} of {len(self.sizes)}")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Numbers:
+    """A table; numbers are shown to four digits."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    caption: str = ""
+
+
+Panel = Images | Curves | Classes | Numbers
+
+
+def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:
+    """(index, sizes) of a map of few distinct positive values; 0 stays 0.
+
+    Where there are more than ``most`` distinct values they are put into ``most`` equal steps (a diameter map in
+    float64 has as many as it has sites; 65535 steps over 200 nm are 3 pm).
+    """
+    kinds = np.unique(values[values > 0])
+    if len(kinds) <= most:
+        index = np.where(values > 0, np.searchsorted(kinds, values) + 1, 0)
+    else:
+        low, high = float(kinds[0]), float(kinds[-1])
+        step = (high - low) / (most - 1)
+        index = np.where(values > 0, np.rint((values - low) / step).astype(np.int64) + 1, 0)
+        kinds = low + step * np.arange(most)
+    return index.astype(np.uint8 if len(kinds) < 256 else np.uint16), kinds

@@ -1,0 +1,165 @@
+"""Captures on disk: what is read, what is put right, what is refused and where."""
+
+import math
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from characterize.captures import capture
+from metalens.ground.errors import CaptureError
+
+RNG = np.random.default_rng(1)
+FRAMES = RNG.integers(0, 4096, (4, 12, 16)).astype(np.uint16)
+
+
+def folder(path, frames=FRAMES, stage=None, about="pixel_um = 3.0\nwavelength_um = 0.85\n"):
+    for i, frame in enumerate(frames):
+        tifffile.imwrite(path / f"frame_{i}.tif", frame)
+    rows = [f"frame_{i}.tif,{20 + 2 * i},0.5" for i in range(len(frames))]
+    (path / "stage.csv").write_text(stage or "file,depth_mm,angle_deg\n" + "\n".join(rows) + "\n")
+    (path / "capture.toml").write_text(about)
+    return path
+
+
+def test_folder_with_stage_and_description(tmp_path):
+    found = capture.load(folder(tmp_path))
+    assert np.array_equal(found.frames, FRAMES)
+    assert np.allclose(found.position_um, [20e3, 22e3, 24e3, 26e3])
+    assert np.allclose(found.angle_rad, [math.radians(0.5), 0])
+    assert (found.pixel_um, found.wavelength_um, found.bits) == (3.0, 0.85, 12)
+
+
+def test_stage_order_is_the_order_of_the_frames(tmp_path):
+    stage = "file,z_um\n" + "".join(f"frame_{i}.tif,{i}\n" for i in (2, 0, 3, 1))
+    found = capture.load(folder(tmp_path, stage=stage))
+    assert np.array_equal(found.frames, FRAMES[[2, 0, 3, 1]])
+    assert found.position_um.tolist() == [2, 0, 3, 1]
+
+
+def test_stack_png_and_hdf5_hold_the_same_frames(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES)
+    cv2.imwrite(str(tmp_path / "b.png"), FRAMES[1])
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["frames"] = FRAMES
+    assert np.array_equal(capture.load(tmp_path / "a.tif").frames, FRAMES)
+    assert np.array_equal(capture.load(tmp_path / "b.png").frames[0], FRAMES[1])
+    assert np.array_equal(capture.load(tmp_path / "c.h5").frames, FRAMES)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_counts_shifted_into_the_high_bits_are_shifted_back(tmp_path, bits):
+    counts = RNG.integers(0, 1 << bits, (3, 20, 20)).astype(np.uint16)
+    counts[0, 0, 0] = (1 << bits) - 1
+    tifffile.imwrite(tmp_path / "a.tif", counts << (16 - bits))
+    found = capture.load(tmp_path / "a.tif")
+    assert found.bits == bits
+    assert np.array_equal(found.frames, counts)
+    assert "shifted back" in found.corrections[0]
+
+
+def test_imagej_spacing_gives_the_positions(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, metadata={"spacing": 300.0, "unit": "nm", "axes": "ZYX"})
+    assert np.allclose(capture.load(tmp_path / "a.tif").position_um, [0, 0.3, 0.6, 0.9])
+
+
+def test_wrong_bit_shift_is_refused(tmp_path):
+    with pytest.raises(CaptureError, match="counts use 12 bits, the capture states 10"):
+        capture.load(folder(tmp_path, about="bits = 10\n"))
+
+
+def test_truncated_tiff_is_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES)
+    data = (tmp_path / "a.tif").read_bytes()
+    for keep in (len(data) // 2, 100, 4):
+        (tmp_path / "a.tif").write_bytes(data[:keep])
+        with pytest.raises(CaptureError, match="truncated"):
+            capture.load(tmp_path / "a.tif")
+
+
+def test_jpeg_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.jpg"), (FRAMES[0] // 16).astype(np.uint8))
+    with pytest.raises(CaptureError, match="lossy"):
+        capture.load(tmp_path / "a.jpg")
+
+
+def test_nan_is_refused_with_its_place(tmp_path):
+    frames = FRAMES.astype(np.float32)
+    frames[2, 3, 5] = np.nan
+    tifffile.imwrite(tmp_path / "a.tif", frames)
+    with pytest.raises(CaptureError, match="frame 2, row 3, column 5"):
+        capture.load(tmp_path / "a.tif")
+
+
+def test_missing_frame_is_refused_with_its_row(tmp_path):
+    folder(tmp_path)
+    (tmp_path / "frame_2.tif").unlink()
+    with pytest.raises(CaptureError, match="row 4: frame 'frame_2"):
+        capture.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        ("file,depht_um\nframe_0.tif,1\n", "did you mean 'depth_um'"),
+        ("file,depth_um\nframe_0.tif,one\n", "row 2: depth_um is 'one'"),
+        ("file,depth_um\nframe_0.tif,nan\n", "row 2: depth_um is nan"),
+        ("depth_um\n1\n", "no 'file'"),
+        ("file,depth_um\n", "no rows"),
+    ],
+)
+def test_stage_errors_name_the_row(tmp_path, stage, words):
+    with pytest.raises(CaptureError, match=words):
+        capture.load(folder(tmp_path, stage=stage))
+
+
+def test_colour_and_foreign_files_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
+    with pytest.raises(CaptureError, match="grey"):
+        capture.load(tmp_path / "a.png")
+    (tmp_path / "a.txt").write_text("no image")
+    with pytest.raises(CaptureError, match="need TIFF, PNG or HDF5"):
+        capture.load(tmp_path / "a.txt")
+    with pytest.raises(CaptureError, match="no such file"):
+        capture.load(tmp_path / "b.tif")
+
+
+def test_imagej_tags_tell_pixel_and_step(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 900, (5, 20, 31), dtype=np.uint16)
+    about = {"spacing": 0.25, "unit": "um", "axes": "ZYX"}
+    tifffile.imwrite(tmp_path / "a.tif", frames, imagej=True, resolution=(1 / 0.13, 1 / 0.13), metadata=about)
+    shots = capture.load(tmp_path / "a.tif")
+    assert np.allclose(shots.position_um, np.arange(5) * 0.25)
+    assert abs(shots.pixel_um - 0.13) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        '{"voxel_um": [0.3, 0.13, 0.13], "emission_nm": 520}',
+        '{"z_step_nm": 300, "pixel_nm": 130, "wavelength_um": 0.52}',
+    ],
+)
+def test_sizes_beside_a_file_or_in_a_folder_of_numbered_frames(tmp_path, words):
+    """Numbers count: z10 comes after z9; NAME.json beside a stack and capture.json in a folder say the same."""
+    frames = np.random.default_rng(0).integers(0, 250, (12, 9, 11), dtype=np.uint8)
+    folder = tmp_path / "planes"
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        tifffile.imwrite(folder / f"z{i}.tif", frame, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "stack.tif", frames, photometric="minisblack")
+    (folder / "capture.json").write_text(words)
+    (tmp_path / "stack.json").write_text(words)
+    for shots in (capture.load(folder), capture.load(tmp_path / "stack.tif")):
+        assert np.array_equal(shots.frames, frames)
+        assert np.allclose(shots.position_um, np.arange(12) * 0.3)
+        assert (round(shots.pixel_um, 9), round(shots.wavelength_um, 9)) == (0.13, 0.52)
+
+
+def test_several_channels_are_refused(tmp_path):
+    frames = np.zeros((4, 2, 9, 11), np.uint16)
+    tifffile.imwrite(tmp_path / "c.tif", frames, imagej=True, metadata={"axes": "ZCYX", "channels": 2})
+    with pytest.raises(CaptureError, match="2 channels"):
+        capture.load(tmp_path / "c.tif")

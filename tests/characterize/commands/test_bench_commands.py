@@ -1,0 +1,77 @@
+"""From a lens file to captures, and from captures to the as-built lens, on the command line."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+import characterize
+from characterize.inference import asbuilt
+from metalens import lens as lenses
+from metalens.cli import main
+from metalens.ground import store
+
+TRUTH = """
+depths_um = [400.0, 600.0, 1000.0]
+peak_e = 5000.0
+seed = 3
+dark_frames = 4
+flat_frames = 8
+[camera]
+pixel_um = 1.5
+pixels = 16
+[[parameter]]
+name = "bias_nm"
+value = 3.0
+[[parameter]]
+name = "crosstalk_px"
+value = 0.2
+[[parameter]]
+name = "background_e"
+value = 15.0
+"""
+
+
+@pytest.fixture
+def bench(tmp_path):
+    lenses.save(tmp_path / "lens.h5", b.lens())
+    (tmp_path / "truth.toml").write_text(TRUTH)
+    return tmp_path
+
+
+def shoot(bench, *more):
+    return main(
+        ["capture", str(bench / "lens.h5"), "--truth", str(bench / "truth.toml"), "-o", str(bench / "shots"), *more]
+    )
+
+
+def test_capture_then_fit(bench, capsys):
+    assert shoot(bench, "--quiet") == 0
+    shots = characterize.load(bench / "shots")
+    assert shots.frames.shape == (3, 16, 16)
+    assert shots.position_um.tolist() == [400, 600, 1000]
+    first = store.sha256(bench / "shots" / "frame_000.tif")
+    assert shoot(bench) == 2  # exists
+    assert shoot(bench, "--force", "--quiet") == 0
+    assert store.sha256(bench / "shots" / "frame_000.tif") == first
+    (bench / "told.toml").write_text('scan_um = 60.0\n[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n')
+    capsys.readouterr()
+    words = ["fit", str(bench / "shots"), "--design", str(bench / "lens.h5"), "--metrology", str(bench / "told.toml")]
+    assert main([*words, "-o", str(bench / "as.h5"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    value, sigma = found["parameters"]["bias_nm"]
+    assert abs(value - 3.0) < 4 * sigma
+    assert asbuilt.load(bench / "as.h5").trusted
+    assert (bench / "as.html").stat().st_size > 20000
+
+
+def test_bad_words_end_with_2_and_leave_nothing(bench):
+    assert main(["fit", str(bench / "none"), "--design", str(bench / "lens.h5"), "-o", str(bench / "a.h5")]) == 2
+    assert main(["fit", str(bench / "none"), "-o", str(bench / "a.h5")]) == 2
+    (bench / "truth.toml").write_text(TRUTH.replace("bias_nm", "bais_nm"))
+    assert shoot(bench) == 2
+    assert sorted(p.name for p in bench.iterdir()) == ["lens.h5", "truth.toml"]

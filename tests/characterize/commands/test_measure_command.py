@@ -1,0 +1,65 @@
+"""``metalens measure``: numbers of drawn spots and drawn pillars, in files that other tools read."""
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
+import test_sem
+
+from metalens.cli import main
+
+
+def spots(folder, sigma_um, pixel_um=0.9):
+    """Gaussian spots on a background, one a depth; D4 sigma is 4 sigma, FWHM 2.355 sigma, MTF50 0.1874 / sigma."""
+    folder.mkdir()
+    rng = np.random.default_rng(2)
+    axis = (np.arange(41) - 20) * pixel_um
+    lines = ["file,depth_um"]
+    for i, sigma in enumerate(sigma_um):
+        light = 9000 * np.exp(-((axis[None] - 0.7) ** 2 + (axis[:, None] + 0.4) ** 2) / 2 / sigma**2)
+        counts = np.rint(light + 120 + 2 * rng.standard_normal(light.shape)).astype(np.uint16)
+        tifffile.imwrite(folder / f"f{i}.tif", counts)
+        lines.append(f"f{i}.tif,{500 + 100 * i}")
+    (folder / "stage.csv").write_text("\n".join(lines) + "\n")
+    (folder / "capture.toml").write_text(f"pixel_um = {pixel_um}\nwavelength_um = 0.85\nbits = 16\n")
+
+
+def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
+    sigmas = (4.1, 3.2, 2.7, 3.0, 3.9)
+    spots(tmp_path / "shots", sigmas)
+    assert main(["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    with open(tmp_path / "out" / "frames.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, sigma in zip(rows, sigmas, strict=True):
+        wide = math.hypot(sigma, 0.9 / math.sqrt(12) * 0)  # drawn at the pixels' middles
+        assert float(row["fwhm_um"]) == pytest.approx(2.3548 * wide, rel=0.02)
+        assert float(row["mtf50_x_per_um"]) == pytest.approx(0.18739 / wide, rel=0.02)
+        assert float(row["centroid_x_um"]) == pytest.approx(0.7, abs=0.1)
+        assert float(row["centroid_y_um"]) == pytest.approx(-0.4, abs=0.1)
+        assert float(row["efficiency"]) != float(row["efficiency"])  # no reference: not known
+    told = json.loads((tmp_path / "out" / "measure.json").read_text())
+    assert 690 < told["best_depth_um"]["0.0"] < 760
+    assert (tmp_path / "out" / "measure.html").is_file()
+
+
+def test_a_micrograph_gives_every_pillar(tmp_path):
+    truth = np.random.default_rng(1).uniform(160, 280, (4, 4))
+    image = test_sem.render(truth, missing={(1, 2)})
+    counts = np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "sem.tif", counts)
+    arguments = ["measure", str(tmp_path / "sem.tif"), "-o", str(tmp_path / "out"), "--pixel-nm", "4.0", "--quiet"]
+    assert main(arguments) == 0
+    with open(tmp_path / "out" / "pillars.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["state"] for row in rows].count("missing") == 1
+    error = [float(r["diameter_nm"]) - t for r, t in zip(rows, truth.ravel(), strict=True) if r["state"] == "good"]
+    assert len(error) == 15
+    assert np.abs(np.mean(error)) < 1.2
+    assert main(arguments) == 2  # exists

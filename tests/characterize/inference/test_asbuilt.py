@@ -1,0 +1,217 @@
+"""The reduced model against the sum over every pillar, its derivatives, and the fit of a hidden lens."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+import characterize
+from characterize.inference import asbuilt
+from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.estimate import Options
+from characterize.model import made
+from characterize.model.forward import ForwardModel, Setting
+from characterize.model.parameters import NAMES, PARAMETERS, PLACE, Known, vector
+from characterize.model.pillars import Pillars
+from metalens import psf
+from metalens.ground.errors import CaptureError, ConfigError, FitError
+from metalens.made import sensitivity
+from metalens.psf.of_lens import View
+
+SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+USUAL = Options(scan_um=60.0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ForwardModel(b.lens(), SETTING, b.RESPONSE)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
+
+
+def against_all_pillars(model, **more):
+    x = vector(b.VALUES | more | {"background_e": 0.0, "background_x_e": 0.0})
+    found, want = model.images(x)[0], b.light(**more)
+    scale = (found * want).sum() / (found**2).sum()
+    return np.abs(scale * found - want).max() / want.max()
+
+
+def test_reduced_model_agrees_with_the_sum_over_every_pillar(model):
+    assert against_all_pillars(model) < 1e-3  # low-rank pillars 5e-4 in t, window operators 5e-4
+
+
+def test_tilt_and_source_beside_the_axis_agree_too(model):
+    assert against_all_pillars(model, tilt_x_deg=0.3, source_x_um=5.0, source_y_um=-3.0, pinhole_um=6.0) < 2e-3
+
+
+def test_low_rank_pillars_know_their_error():
+    pillars = Pillars(b.lens(), b.RESPONSE)
+    assert len(pillars.basis) < 16
+    assert pillars.error < 1e-3
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "bandwidth_nm"])
+def test_derivatives_match_finite_differences(model, name):
+    x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0})
+    h = 0.1 * PARAMETERS[PLACE[name]].scale  # images are in single precision
+    up, down = x.copy(), x.copy()
+    up[PLACE[name]] += h
+    down[PLACE[name]] -= h
+    want = (model.images(up)[0] - model.images(down)[0]) / (2 * h)
+    slope = model.images(x, [name])[1][0]
+    assert np.abs(slope - want).max() < 2e-2 * np.abs(want).max()  # operators of derivatives are cut at 3e-3 of all
+
+
+def test_a_point_source_has_a_slope_by_its_size(model):
+    """Light changes as the square of the size: no slope at 0. That of 0.3 pixels is taken, twice the chord to there."""
+    x = vector(b.VALUES)
+    slope = model.images(x, ["pinhole_um"])[1][0]
+    for i, depth in enumerate(b.DEPTHS):
+        size = 0.3 * 1.5 * depth * 1.004 / 112.0
+        chord = (model.images(vector(b.VALUES | {"pinhole_um": size}))[0] - model.images(x)[0])[i] / size
+        assert np.abs(slope[i] - 2 * chord).max() < 0.1 * np.abs(2 * chord).max()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_point_source_is_not_thrown_to_the_bound_of_its_size(seed):
+    """Without a slope at 0 a search jumps to 2 mm, and the size comes back with a sigma of 1e36."""
+    free = dataclasses.replace(USUAL, free=("pinhole_um",))
+    found = characterize.fit(b.capture(b.electrons(), seed=seed), b.lens(), free, response=b.RESPONSE)
+    i = found.names.index("pinhole_um")
+    assert found.trusted
+    assert found.value[i] < 4
+    assert 0.3 < found.sigma[i] < 10  # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
+
+
+def test_hidden_lens_is_found_within_its_intervals(fitted):
+    assert fitted.trusted
+    assert fitted.converged
+    assert 0.93 < fitted.chi2_per_dof < 1.07  # sqrt(2 / 1250) is 0.04
+    names = [n for n in fitted.names if n != "log_gain"]
+    z = [
+        (fitted.value[fitted.names.index(n)] - b.VALUES.get(n, 0.0)) / fitted.sigma[fitted.names.index(n)]
+        for n in names
+    ]
+    assert np.abs(z).max() < 4
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_predicted_frames_are_nearer_the_truth_than_the_noise(fitted):
+    want = b.electrons()
+    assert np.linalg.norm(fitted.predicted - want) < 0.02 * np.linalg.norm(want - 20)
+
+
+def test_degeneracies_are_named(fitted):
+    words = " ".join(fitted.degeneracies)
+    assert "bias_x_nm and decentre_x_um" in words
+    assert "wavelength_nm comes from prior knowledge" in words
+    assert fitted.identifiable
+
+
+def test_saved_result_comes_back(fitted, tmp_path):
+    asbuilt.save(tmp_path / "a.h5", fitted)
+    again = asbuilt.load(tmp_path / "a.h5")
+    assert again.names == fitted.names
+    assert np.array_equal(again.covariance, fitted.covariance)
+    assert again.degeneracies == fitted.degeneracies
+    assert np.array_equal(again.diameters.diameter_um, fitted.diameters.diameter_um)
+    assert again.samples(3, seed=1).shape == (3, len(fitted.names))
+    asbuilt.save(tmp_path / "b.h5", fitted)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
+    """The stored stack, through the pixels, is what the fit predicts; a draw of the posterior gives another one."""
+    fitted.save(tmp_path / "a.h5")
+    again = AsBuilt.load(tmp_path / "a.h5")
+    assert np.array_equal(again.psf.intensity, fitted.psf.intensity)
+    true = b.truth().vector()
+    want = psf.psf_stack(
+        *(f(made.pillars(b.lens(), b.RESPONSE, true)) for f in (np.angle, np.abs)),
+        pitch_um=0.4,
+        wavelength_um=0.85 + 0.4e-3,
+        sensor_distance_um=112.0,
+        depths_um=again.psf.depths_um,
+        window_um=24.0,
+        samples=again.psf.intensity.shape[-1],
+        offset_um=[b.VALUES[n] - fitted.value[fitted.names.index(n)] for n in ("decentre_x_um", "decentre_y_um")],
+    )
+    found = again.psf.intensity[0]
+    assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(want.intensity)  # intervals of the fit
+    view = View((600.0,), ((0.0, 0.0), (0.05, 0.0)), 24.0, 48)
+    draw = again.psf_stack(view, again.samples(1, seed=2)[0])
+    best = again.psf_stack(view)
+    assert draw.intensity.shape == (2, 1, 48, 48)
+    assert 1e-4 < np.linalg.norm(draw.intensity - best.intensity) / np.linalg.norm(best.intensity) < 0.05
+
+
+def test_samples_have_the_posterior_covariance(fitted):
+    draws = fitted.samples(20000, seed=0)
+    assert np.abs(np.cov(draws.T) - fitted.covariance).max() < 0.05 * np.diag(fitted.covariance).max()
+
+
+def test_as_built_lens_goes_through_the_psf_engine(fitted):
+    lens = fitted.lens()
+    grown = lens.diameters.diameter_um - b.lens().diameters.diameter_um
+    inside = b.lens().diameters.diameter_um > 0
+    assert abs(grown[inside].mean() * 1e3 - fitted.value[fitted.names.index("bias_nm")]) < 1.0
+    stack = psf.psf_stack(
+        lens.phase_rad(),
+        lens.transmission(),
+        pitch_um=0.4,
+        wavelength_um=lens.wavelength_um,
+        sensor_distance_um=lens.sensor_distance_um,
+        depths_um=[600.0],
+        window_um=24.0,
+        samples=48,
+    )
+    assert abs(stack.intensity.sum() - 1) < 1e-6
+
+
+def test_captures_of_another_lens_are_refused():
+    random = np.random.default_rng(0)
+    other = np.zeros((5, 16, 16))
+    for frame in other:
+        frame[tuple(random.integers(0, 16, (2, 30)))] = 3000.0
+    with pytest.raises(FitError, match="another lens"):
+        characterize.fit(b.capture(other + 20), b.lens(), USUAL, response=b.RESPONSE)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"pixel_um": np.nan}, "pixel_um is missing"),
+        ({"wavelength_um": np.nan}, "wavelength_um is missing"),
+        ({"position_um": np.full(5, np.nan)}, "source depths are missing"),
+    ],
+)
+def test_missing_numbers_are_refused(change, words):
+    shots = dataclasses.replace(b.capture(b.electrons()), **change)
+    with pytest.raises(CaptureError, match=words):
+        characterize.fit(shots, b.lens(), USUAL, response=b.RESPONSE)
+
+
+def test_unknown_parameters_name_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'height_nm'"):
+        Known("heigth_nm", 0.0)
+
+
+def test_effective_index_slopes_scale_as_a_waveguide():
+    found = sensitivity(b.lens())
+    d = np.array([0.12, 0.17, 0.22])
+    height, index, wall = found.at(d)
+    k = 2 * np.pi / 0.85
+    phase = b.lens().proxy.phase_rad(d, 0.85)
+    assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)  # phase = k n_eff h
+    assert (height.imag > k).all()  # guided: n_eff above that of air
+    assert (index.imag > 0).all()
+    assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light
+    assert not wall.any()  # straight walls: second order

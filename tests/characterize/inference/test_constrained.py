@@ -1,0 +1,57 @@
+"""Steps inside limits: against an independent solver, a closed form, and a fit that clipping cannot finish."""
+
+import numpy as np
+from scipy import optimize
+
+from characterize.inference import constrained, leastsquares
+from characterize.inference.constrained import Ball
+from characterize.inference.leastsquares import Data, Prior, Settings
+
+FREE = np.full(4, np.inf)
+
+
+def problem(seed=0, p=4):
+    random = np.random.default_rng(seed)
+    jacobian = random.standard_normal((30, p)) @ np.linalg.cholesky(np.full((p, p), 0.95) + 0.05 * np.eye(p)).T
+    return jacobian, random.standard_normal(30) * 3
+
+
+def test_bounded_step_is_that_of_an_independent_solver():
+    jacobian, target = problem()
+    low, high = np.full(4, -0.4), np.array([0.3, 0.2, 0.5, 0.1])
+    want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-12).x
+    free = np.linalg.lstsq(jacobian, target, rcond=None)[0]
+    found = constrained.step(
+        jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high, tolerance=1e-8
+    )
+    assert np.abs(found - want).max() < 1e-6
+    assert np.abs(np.clip(free, low, high) - want).max() > 0.05  # clipping the free minimum is something else
+
+
+def test_step_into_a_ball_of_equal_curvature_is_the_projection():
+    goal = np.array([3.0, 4.0, 0.5, 0.0])
+    ball = Ball(np.array([0, 1]), 1.0)
+    found = constrained.step(np.eye(4), -goal, np.zeros(4), low=-FREE, high=FREE, ball=ball, tolerance=1e-8)
+    assert np.abs(found - [0.6, 0.8, 0.5, 0.0]).max() < 1e-6
+    assert ball.inside(found)
+
+
+def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():
+    jacobian, target = problem(3)
+    shape = (1, 5, 6)
+    data = Data(target.reshape(shape), np.ones(shape, bool), np.zeros(shape, bool), np.ones(shape), np.full(shape, 1e9))
+
+    def model(x, wanted):
+        return (jacobian @ x).reshape(shape), jacobian.T.reshape(4, *shape) if wanted else None
+
+    low, high = np.full(4, -0.3), np.full(4, 0.3)
+    prior = Prior(np.zeros(4), FREE, low, high)
+    settings = Settings(huber=1e9, bounded=True, iterations=5)
+    found = leastsquares.fit(model, data, np.zeros(4), prior=prior, settings=settings).value
+    want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-12).x
+    assert np.abs(found - want).max() < 1e-3  # damping of 1e-3, then a fifth of it with every step
+
+
+def test_limits_that_leave_no_room_give_no_step():
+    found = constrained.step(np.eye(4), np.ones(4), np.zeros(4), low=np.zeros(4), high=np.zeros(4))
+    assert not found.any()

@@ -1,0 +1,113 @@
+"""Profiles and draws where the answer is a formula: a straight model, a bent one, and one with two lenses alike."""
+
+import numpy as np
+import pytest
+
+from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.posterior import REACH, Valley, draws, profile, shares
+
+NOISE = 0.7
+SHAPES = np.random.default_rng(0).standard_normal((2, 3, 11, 13))
+
+
+def data(images, seed=1):
+    """Noise of one size on noise-free images."""
+    noise = NOISE * np.random.default_rng(seed).standard_normal(images.shape)
+    everywhere = np.ones(images.shape, bool)
+    return Data(images + noise, everywhere, ~everywhere, np.full(images.shape, NOISE**2), np.full(images.shape, 1e12))
+
+
+def straight(x, jacobian):
+    return np.tensordot(x, SHAPES, 1), SHAPES if jacobian else None
+
+
+def bent(x, jacobian):
+    """The first parameter acts as x + x² / 4: its valley is a parabola only close to a mode."""
+    f = x[0] + 0.25 * x[0] ** 2
+    image = f * SHAPES[0] + x[1] * SHAPES[1]
+    return image, np.stack([(1 + 0.5 * x[0]) * SHAPES[0], SHAPES[1]]) if jacobian else None
+
+
+def double(x, jacobian):
+    image = x[0] ** 2 * SHAPES[0] + x[1] * SHAPES[1]
+    return image, np.stack([2 * x[0] * SHAPES[0], SHAPES[1]]) if jacobian else None
+
+
+def best(seen):
+    """Amplitudes of the two shapes by least squares, and their covariance."""
+    columns = SHAPES.reshape(2, -1).T
+    return np.linalg.lstsq(columns, seen.electrons.ravel(), rcond=None)[0], NOISE**2 * np.linalg.inv(
+        columns.T @ columns
+    )
+
+
+def test_a_straight_model_has_the_parabola_s_interval():
+    seen = data(straight(np.array([1.3, -0.4]), False)[0])
+    mode, covariance = best(seen)
+    valley = Valley(straight, seen, mode, Prior.none(mode))
+    found, better = profile(valley, 1)
+    reach = REACH * np.sqrt(covariance[1, 1])
+    assert better is None
+    assert found.parabolic
+    assert found.low == pytest.approx(mode[1] - reach, rel=1e-9)
+    assert found.high == pytest.approx(mode[1] + reach, rel=1e-9)
+
+
+def test_a_prior_narrows_the_interval_as_information_adds():
+    seen = data(straight(np.array([1.3, -0.4]), False)[0])
+    flat, covariance = best(seen)
+    wide = np.full(2, np.inf)
+    prior = Prior(np.array([0.0, -0.35]), np.array([np.inf, 0.03]), -wide, wide)
+    information = np.linalg.inv(covariance) + np.diag([0, 0.03**-2])
+    mode = np.linalg.solve(information, np.linalg.inv(covariance) @ flat + np.array([0, -0.35 / 0.03**2]))
+    found, _ = profile(Valley(straight, seen, mode, prior), 1)
+    assert (found.high - found.low) / 2 == pytest.approx(REACH * np.sqrt(np.linalg.inv(information)[1, 1]), rel=1e-6)
+
+
+def test_a_bent_valley_is_followed_to_its_ends():
+    """x + x²/4 is linear in the data: its ends are those of a parabola, and x follows by the root."""
+    seen = data(bent(np.array([-1.1, 0.8]), False)[0])
+    amplitude, covariance = best(seen)
+
+    def back(f):
+        return -2 + 2 * np.sqrt(1 + f)
+
+    mode = np.array([back(amplitude[0]), amplitude[1]])
+    found, better = profile(Valley(bent, seen, mode, Prior.none(mode)), 0)
+    reach = REACH * np.sqrt(covariance[0, 0])
+    ends = back(amplitude[0] - reach), back(amplitude[0] + reach)
+    assert better is None
+    assert found.low == pytest.approx(ends[0], abs=0.06 * (ends[1] - ends[0]))  # a step stops within 0.08 of the root
+    assert found.high == pytest.approx(ends[1], abs=0.06 * (ends[1] - ends[0]))
+    rise = np.interp(mode[0], found.value, found.rise)
+    assert rise < 0.3
+
+
+def test_draws_of_a_bent_valley_have_the_data_s_spread():
+    seen = data(bent(np.array([-1.1, 0.8]), False)[0])
+    amplitude, covariance = best(seen)
+    mode = np.array([-2 + 2 * np.sqrt(1 + amplitude[0]), amplitude[1]])
+    some = draws([Valley(bent, seen, mode, Prior.none(mode))], 400, seed=3)
+    f = some[:, 0] + 0.25 * some[:, 0] ** 2
+    assert f.mean() == pytest.approx(amplitude[0], abs=4 * np.sqrt(covariance[0, 0] / 400))
+    assert f.std() == pytest.approx(np.sqrt(covariance[0, 0]), rel=0.15)  # 400 draws: 3.5 % is one sigma
+
+
+def test_two_lenses_alike_are_drawn_alike():
+    seen = data(double(np.array([1.4, -0.6]), False)[0])
+    amplitude, _ = best(seen)
+    modes = [np.array([sign * np.sqrt(amplitude[0]), amplitude[1]]) for sign in (1, -1)]
+    valleys = [Valley(double, seen, mode, Prior.none(mode)) for mode in modes]
+    assert shares(valleys) == pytest.approx([0.5, 0.5], abs=1e-6)
+    some = draws(valleys, 200, seed=4)
+    assert 70 < (some[:, 0] > 0).sum() < 130  # binomial: 7 is one sigma
+
+
+def test_a_profile_that_falls_below_its_mode_says_where():
+    seen = data(bent(np.array([-1.1, 0.8]), False)[0])
+    amplitude, _ = best(seen)
+    wrong = np.array([-2 + 2 * np.sqrt(1 + amplitude[0]) + 0.35, amplitude[1]])
+    valley = Valley(bent, seen, wrong, Prior.none(wrong))
+    place, misfit = valley.descend(wrong)
+    assert misfit < valley.least - 5
+    assert place[0] + 0.25 * place[0] ** 2 == pytest.approx(amplitude[0], abs=0.02)

@@ -1,0 +1,96 @@
+"""Lattices of any kind and pillars with bright rims or dark tops, found and laid on a design that is known."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from characterize.measure import overlay, sem
+from metalens.ground.errors import CaptureError
+from metalens.lens import DiameterMap
+
+PIXEL, PITCH = 3.7, 310.0  # nm
+
+
+def picture(place_px, diameter_nm, shape, *, top=0.35, rim=1.0, gap=0.2, seed=0):
+    """Discs with a bright rim of 5 px and a top of its own, three samples a pixel side, blur and noise."""
+    over, reach = 3, 120
+    fine = np.full((shape[0] * over + 2 * reach, shape[1] * over + 2 * reach), gap)
+    for (row, column), size in zip(place_px, diameter_nm, strict=True):
+        middle = [int(round((p + 0.5) * over)) + reach for p in (row, column)]
+        if min(middle) < reach or middle[0] > fine.shape[0] - reach or middle[1] > fine.shape[1] - reach:
+            continue
+        part = fine[middle[0] - reach : middle[0] + reach, middle[1] - reach : middle[1] + reach]
+        y, x = ((np.arange(-reach, reach) + m - reach + 0.5) / over - 0.5 for m in middle)
+        r = np.hypot(x[None] - column, y[:, None] - row) - size / 2 / PIXEL
+        part[...] = np.where(r < 0, np.where(r > -5, rim, top), part)
+    image = fine[reach:-reach, reach:-reach].reshape(shape[0], over, shape[1], over).mean((1, 3))
+    noise = 0.04 * np.random.default_rng(seed).standard_normal(shape)
+    return 3000 * (ndimage.gaussian_filter(image, 1.2) + noise) + 500
+
+
+def lattice(turn_deg, angle_deg, ratio, shape, jitter=0.0, seed=0):
+    """Places of all sites in the picture for a lattice turned by ``turn_deg``, its vectors ``angle_deg`` apart."""
+    a = PITCH / PIXEL * np.array([np.sin(np.radians(turn_deg)), np.cos(np.radians(turn_deg))])
+    b = (
+        ratio
+        * PITCH
+        / PIXEL
+        * np.array([np.sin(np.radians(turn_deg + angle_deg)), np.cos(np.radians(turn_deg + angle_deg))])
+    )
+    index = np.mgrid[-12:13, -12:13].reshape(2, -1).T
+    place = np.array([11.3, 17.9]) + index[:, :1] * a + index[:, 1:] * b
+    keep = ((place > -60) & (place < np.array(shape) + 60)).all(1)
+    return place[keep]
+
+
+@pytest.mark.parametrize(
+    ("turn", "angle", "ratio", "kind", "top"),
+    [(7.0, 90.0, 1.0, "square", 0.35), (3.0, 60.0, 1.0, "hexagonal", 0.9), (0.0, 90.0, 1.3, "rectangular", 0.35)],
+)
+def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
+    shape = (330, 370)
+    place = lattice(turn, angle, ratio, shape)
+    truth = np.random.default_rng(5).uniform(140, 230, len(place))
+    found = sem.measure(picture(place, truth, shape, top=top), sem.Micrograph(PIXEL))
+    assert found.lattice.kind == kind
+    assert not (found.missing | found.collapsed).any()
+    seen = np.stack([found.row, found.column], 1)
+    apart = np.linalg.norm(seen[:, None] - place[None], axis=2)
+    assert apart.min(1).max() < 0.3  # pixels
+    error_px = (found.diameter_nm - truth[apart.argmin(1)]) / PIXEL
+    assert abs(error_px.mean()) < 0.6  # blur of 1.2 px moves the half level of a rim 5 px wide by less
+    assert error_px.std() < 0.25
+
+
+def test_a_picture_of_one_line_of_waves_is_refused():
+    waves = np.sin(np.arange(200) / 5)[None] + 0 * np.arange(160)[:, None]
+    with pytest.raises(CaptureError, match="no lattice"):
+        sem.measure(waves, sem.Micrograph(PIXEL))
+
+
+def drawn(rows=40, columns=44):
+    """Diameters that vary as those of a lens, asymmetric."""
+    y, x = np.mgrid[:rows, :columns]
+    return 185 + 40 * np.sin(0.013 * ((x - 9.3) ** 2 + 1.3 * (y - 31.7) ** 2)) + 1.1 * x
+
+
+def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
+    design, (row, column), n = drawn(), (17, 6), 6
+    rng = np.random.default_rng(3)
+    part = design[row : row + n, column : column + n]
+    made = part - 4.2 + 0.05 * (part - 185) + 0.7 * rng.standard_normal(part.shape)
+    made[2, 4] += 25.0  # one that went wrong
+    p = PITCH / PIXEL
+    place = (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) * p
+    side = int(n * p)
+    found = sem.measure(picture(place, made.ravel(), (side, side), top=0.9), sem.Micrograph(PIXEL, PITCH))
+    laid = overlay.overlay(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
+    assert laid.clearly
+    where = overlay.numbered(found, laid).site
+    assert where.min(0).tolist() == [row, column]
+    assert np.flatnonzero(laid.outlier).tolist() == [2 * n + 4]
+    assert np.allclose(laid.designed_nm, part.ravel())
+    for middle, bias, sigma, count in overlay.bias_table(laid, knots=3):
+        assert abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL  # edges of a blurred rim: as above
+        assert 0 < sigma < 1.5
+        assert count > 6

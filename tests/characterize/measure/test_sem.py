@@ -1,0 +1,114 @@
+"""Micrographs rendered with charging, noise and drift: diameters come back to a fraction of a pixel."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from characterize.measure import sem
+from characterize.measure.lattice import Lattice
+from metalens.ground.errors import CaptureError
+
+PIXEL, PITCH = 4.0, 400.0
+ABOUT = sem.Micrograph(PIXEL, PITCH)
+
+
+def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5):
+    """Anti-aliased discs with a brighter rim, blur, a shade, dark streaks, scan drift and shot noise."""
+    random = np.random.default_rng(seed)
+    n, p, over = len(diameters_nm), PITCH / PIXEL, 3
+    size = int(n * p)
+    wander = drift_px * np.sin(np.arange(size * over) / (size * over) * 5)  # of the scan, line by line
+    axis = np.arange(size * over) / over + 0.5 / over - 0.5
+    image = np.full((size * over, size * over), 0.25)
+    for j, i in np.ndindex(n, n):
+        if (j, i) in missing:
+            continue
+        cx, cy = (i + 0.5) * p + (0.35 * p if (j, i) in moved else 0), (j + 0.5) * p
+        rows = slice(int(j * p * over), int((j + 1) * p * over))
+        columns = slice(max(int((i - 0.1) * p * over), 0), int((i + 1.5) * p * over))
+        r = (
+            np.hypot(axis[None, columns] - wander[rows, None] - cx, axis[rows, None] - cy)
+            - diameters_nm[j, i] / 2 / PIXEL
+        )
+        disc = np.where(r < 0, 0.8 + 0.1 * np.exp(-((r + 2) ** 2) / 4), 0.25)
+        image[rows, columns] = np.where(r < 0, disc, image[rows, columns])
+    image = image.reshape(size, over, size, over).mean((1, 3))
+    image = ndimage.gaussian_filter(image, 1.0)
+    yy, xx = np.mgrid[:size, :size] / size
+    image = (
+        image
+        + 0.3 * xx * yy
+        + 0.1 * np.sin(5 * yy)
+        + 0.05 * ndimage.gaussian_filter1d(random.standard_normal(size), 8)[:, None]
+    )
+    return image + noise * 0.5 * random.standard_normal(image.shape)
+
+
+def test_bias_below_0_3_px_and_repeatability_below_0_1_px():
+    truth = np.random.default_rng(1).uniform(140, 300, (4, 4))
+    found = [sem.measure(render(truth, seed), ABOUT) for seed in range(4)]
+    runs = np.array([each.diameter_nm for each in found])
+    error_px = (runs - truth.ravel()) / PIXEL
+    assert not np.isnan(runs).any()
+    assert abs(error_px.mean()) < 0.3
+    assert error_px.std(0, ddof=1).mean() < 0.1
+    assert np.abs(error_px).max() < 1.0
+    told_px = np.array([each.sigma_nm for each in found]) / PIXEL
+    ratio = np.sqrt(error_px.var(0, ddof=1).mean() / (told_px**2).mean())
+    assert 0.5 < ratio < 1.3  # 48 degrees of freedom: 10 %; the bar takes four rays as one, which is on the safe side
+
+
+def test_missing_and_collapsed_pillars_are_named():
+    truth = np.full((4, 4), 200.0)
+    found = sem.measure(render(truth, missing={(1, 2), (3, 3)}, moved={(2, 0)}), ABOUT)
+    assert np.flatnonzero(found.missing).tolist() == [6, 15]
+    assert np.flatnonzero(found.collapsed).tolist() == [8]
+    assert np.isnan(found.diameter_nm[[6, 15, 8]]).all()
+    assert abs(found.mean_nm - 200) < 0.3 * PIXEL
+    assert found.three_sigma_nm < 3 * PIXEL
+
+
+def test_bias_becomes_prior_knowledge_of_the_fit():
+    truth = np.full((4, 4), 206.0)
+    known = sem.measure(render(truth), ABOUT).bias(200.0)
+    assert known.name == "bias_nm"
+    assert abs(known.value - 6) < 0.3 * PIXEL
+    assert 0 < known.sigma < 1
+
+
+def test_wrong_pitch_is_refused():
+    with pytest.raises(CaptureError, match="no lattice"):
+        sem.measure(render(np.full((4, 4), 200.0)), sem.Micrograph(PIXEL, 533.0))
+    with pytest.raises(CaptureError, match="6 or more pixels"):
+        sem.Micrograph(100.0, 400.0)
+
+
+def test_scale_bar_gives_the_pixel():
+    picture = np.full((200, 200), 90, np.uint8)
+    picture[190:193, 30:155] = 255
+    assert sem.scale_from_bar(picture, 500.0) == pytest.approx(4.0)
+    with pytest.raises(CaptureError, match="no scale bar"):
+        sem.scale_from_bar(np.eye(200), 500.0)
+
+
+def test_calibrated_edge_bias_comes_off_both_sides():
+    image = render(np.random.default_rng(4).uniform(160, 260, (4, 4)))
+    plain = sem.measure(image, ABOUT).diameter_nm
+    calibrated = sem.measure(image, sem.Micrograph(PIXEL, PITCH, edge_bias_nm=3.7)).diameter_nm
+    assert plain - calibrated == pytest.approx(np.full(16, 7.4), abs=1e-9)
+
+
+def test_summaries_of_the_diameters():
+    four = np.array([201.0, 202.0, np.nan, 204.0, 209.0])
+    zero, no = np.zeros(5), np.zeros(5, bool)
+    site = np.stack([np.arange(5), np.arange(5)[::-1]], axis=1)
+    where = (site, Lattice(np.zeros(2), np.array([0.0, 7.0]), np.array([6.0, 0.0])))
+    found = sem.Diameters(zero, zero, four, zero, no, no, *where)
+    assert found.mean_nm == pytest.approx(204.0)
+    assert found.three_sigma_nm == pytest.approx(3 * np.sqrt((9 + 4 + 0 + 25) / 4))
+    known = found.bias(np.array([200.0, 200.0, 200.0, 200.0, 200.0]))
+    assert known.value == pytest.approx(4.0)
+    assert known.sigma == pytest.approx(np.sqrt((9 + 4 + 0 + 25) / 3) / 2)
+    assert (
+        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where).bias(3.0).sigma == 0.05
+    )  # never surer than this

@@ -1,0 +1,179 @@
+"""Training on for the lens as built: what is refused and why, resume bit for bit, who is judged on what."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+import codesign
+from characterize.bench.bench import Truth
+from characterize.model.parameters import Known
+from codesign.adapt import reading
+from codesign.adapt import train as retraining
+from codesign.adapt.reading import Accuracy
+from codesign.adapt.train import Outcome, RetrainConfig
+from codesign.optics.built import MadeLens
+from metalens.ground.errors import ConfigError, FitError, TrainingError
+from metalens.lens.record import DiameterMap
+
+SHORT = RetrainConfig(steps=2, draws=2, judge=1, test_batches=1)
+TRUTH = Truth((3000.0,), parameter=tuple(Known(n, v) for n, v in m.TRUE.items()))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("retraining") / "run"
+    m.finished_run(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found():
+    return retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), SHORT, TRUTH)
+
+
+def _accuracy(error, n=50):
+    return Accuracy(torch.full((n, 3), error), torch.ones(n))
+
+
+def test_bars_of_a_gap_and_of_an_accuracy():
+    """Frames that both cases share: their common scatter takes no part in the bar of the gap."""
+    generator = torch.Generator().manual_seed(5)
+    shared = torch.rand(4000, 1, generator=generator) * 3
+    own = torch.randn(4000, 3, generator=generator) * torch.tensor([0.3, 0.6, 0.9])
+    better = Accuracy((shared + torch.tensor([1.0, 2.0, 6.0])).expand(4000, 3), torch.full((4000,), 0.75))
+    worse = Accuracy(better.error_mm + 0.21 + own, better.iou)
+    told = Outcome(better, better, worse, better, None)
+    assert told.gap_mm == pytest.approx(0.21, abs=4 * 0.374 / math.sqrt(4000))
+    # the mean of three axes scatters by sqrt(0.09 + 0.36 + 0.81) / 3 = 0.374
+    assert told.gap_sigma_mm == pytest.approx(0.374 / math.sqrt(4000), rel=0.05)
+    assert better.axial_mm - better.lateral_mm == pytest.approx(4.5, rel=1e-5)
+    assert better.slip_mm == pytest.approx(4.5, abs=0.05)
+    low, high = better.interval_mm()
+    assert high - low == pytest.approx(2 * 1.96 * 3 / math.sqrt(12) / math.sqrt(4000), rel=0.1)  # 1000 draws: 3 %
+    assert set(told.rows()) == {"designed", "nominal", "before", "after"}
+    assert told.rows()["after"]["iou"] == 0.75
+
+
+@pytest.mark.parametrize(("gap", "counted"), [(0.019, False), (0.021, True)])
+def test_a_gap_within_two_of_its_errors_is_no_gap(gap, counted):
+    scatter = torch.tensor([0.1, -0.1]).repeat(50)[:, None].expand(100, 3) * math.sqrt(99 / 100)  # bar of 0.01
+    nominal, before = Accuracy(torch.ones(100, 3), torch.ones(100)), Accuracy(1 + gap + scatter, torch.ones(100))
+    told = Outcome(nominal, nominal, before, nominal, None)
+    assert told.gap_sigma_mm == pytest.approx(0.01, rel=1e-5)
+    assert (told.recovered is not None) == counted
+
+
+def test_share_won_back_is_that_of_the_gap():
+    cases = [_accuracy(e) for e in (0.5, 0.4, 0.9, 0.45, 0.44)]
+    told = Outcome(*cases)
+    assert told.gap_mm == pytest.approx(0.5)
+    assert told.recovered == pytest.approx(0.9)
+    assert replace(told, before=_accuracy(0.4)).recovered is None
+    scattered = Accuracy(0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50))
+    assert replace(told, before=scattered).gap_mm > 0
+    assert replace(told, before=scattered).recovered is None  # a gap of 2.0 um, with a standard error of 2.4 um
+    assert list(told.rows()) == ["designed", "nominal", "before", "after", "known"]
+    assert list(replace(told, known=None).rows()) == ["designed", "nominal", "before", "after"]
+
+
+def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(200):
+        low, high = reading.bootstrap(rng.exponential(1.0, 200), draws=200)
+        hits += low <= 1.0 <= high
+    assert 0.88 <= hits / 200 <= 0.99  # 95 %, with the spread of 200 trials and the bootstrap's own bias
+
+
+def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(found):
+    assert found.known
+    assert len(found.drawn) == 2
+    true = MadeLens(m.small(), m.OPTICS).stack(TRUTH.vector())
+    assert torch.equal(found.judges[0].intensity, true.intensity)
+    blind = retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), SHORT)
+    assert not blind.known
+    assert not any(torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn)
+
+
+def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
+    source = retraining.load(folder)
+    whole = retraining.job(source, SHORT, found, "retrained")
+    list(retraining.train(whole, tmp_path / "whole", SHORT))
+    first = retraining.train(retraining.job(source, SHORT, found, "retrained"), tmp_path / "part", SHORT, every=1)
+    next(first), next(first)  # the checkpoint of step 1 is written
+    second = retraining.job(source, SHORT, found, "retrained")
+    list(retraining.train(second, tmp_path / "part", SHORT))
+    for a, b in zip(whole.model.net.state_dict().values(), second.model.net.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+    before = source.run.trainer.model.net.state_dict()
+    assert any(not torch.equal(before[n], v) for n, v in whole.model.net.state_dict().items())
+
+
+def test_only_weights_move(folder, found):
+    source = retraining.load(folder)
+    going = retraining.job(source, SHORT, found, "known")
+    list(going.run())
+    assert torch.equal(going.model.coefficients_rad, source.run.trainer.model.coefficients_rad)
+    assert torch.equal(going.model.log_pitch, source.run.trainer.model.log_pitch)
+
+
+def test_the_whole_story_in_one_call(folder):
+    told = codesign.retrain(folder, m.asbuilt(), config=SHORT, truth=TRUTH)
+    assert all(np.isfinite(v).all() for row in told.rows().values() for v in row.values())
+    assert told.known is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("result.json", "half-written run: result.json missing; finish it with"),
+        ("checkpoint.safetensors", "half-written run: checkpoint"),
+        ("lens.h5", "half-written run: lens.h5 missing"),
+    ],
+)
+def test_half_written_runs_are_named(folder, tmp_path, name, message):
+    for path in folder.iterdir():
+        if path.name != name:
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    with pytest.raises(TrainingError, match=message):
+        retraining.load(tmp_path)
+
+
+def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder, tmp_path):
+    with pytest.raises(TrainingError, match="is no run folder"):
+        retraining.load(tmp_path)
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "result.json").write_text((folder / "result.json").read_text()[:-9])
+    with pytest.raises(TrainingError, match="cut short or of another version"):
+        retraining.load(tmp_path)
+    with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are 2"):
+        retraining.load(folder, budget_mmacs=7.0)
+
+
+def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
+    d = m.small().diameters
+    other = np.where(d.diameter_um > 0, np.clip(d.diameter_um + 0.003, 0, 0.33), 0)
+    foreign = replace(m.small(), diameters=DiameterMap(other, d.pitch_um))
+    with pytest.raises(FitError, match=r"another lens: designed diameters differ by up to 3\.0 nm"):
+        retraining.check_lens(m.small(), m.asbuilt(made=foreign))
+    wider = replace(m.small(), diameters=DiameterMap(d.diameter_um[1:], d.pitch_um))
+    with pytest.raises(FitError, match="another lens"):
+        retraining.check_lens(m.small(), m.asbuilt(made=wider))
+    refused = m.asbuilt(problems=("chi2 is 3",))
+    with pytest.raises(FitError, match="refused by its own checks: chi2 is 3"):
+        retraining.check_lens(m.small(), refused)
+    retraining.check_lens(m.small(), refused, insist=True)
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="draws"):
+        RetrainConfig(draws=0)

@@ -1,0 +1,134 @@
+"""The error budget: entries of known changes, files, and refusals."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from codesign.budget import links as budget
+from codesign.budget import page as budget_page
+from codesign.budget import task
+from codesign.budget.links import Entry, Given
+from codesign.commands import budget as command_budget
+from codesign.optics.numerics import Aperture, Numerics, Window, kernels, psf_difference
+from metalens import design
+from metalens.cell.record import Cell, Index
+from metalens.design.profiles import Focus
+from metalens.ground.errors import ConfigError, LensError, StoreError
+from metalens.made import Printed, Spread, of_process
+from metalens.pillars.proxy import Proxy
+
+CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6))
+FOCUS = Focus(0.85, 2000.0, 20_000.0)
+
+
+@pytest.fixture(scope="module")
+def lens():
+    coefficients = np.polynomial.Chebyshev.interpolate(lambda d: 55 * d, 2, domain=[0.08, 0.21]).coef[None]
+    proxy = Proxy(coefficients, np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    wanted = design.phase_of(None, FOCUS, radius_um=40.0)
+    return design.make(wanted, FOCUS, aperture_um=80.0, cell=CELL, proxy=proxy, profile="hyperbolic")[0]
+
+
+def test_the_table_gives_the_phase_of_every_pillar(lens):
+    aperture = Aperture(lens)
+    phase, level = aperture.maps(aperture.designed())
+    built = lens.diameters.diameter_um > 0
+    turn = np.angle(np.exp(1j * (phase.numpy() - lens.phase_rad())))[built]
+    assert np.abs(turn).max() < 55 * aperture.step_um  # half a place of the table, in rad, and float32
+    assert (level.numpy()[~built] == 0).all()
+    assert aperture.share.sum() == pytest.approx(1)
+
+
+def test_a_bias_moves_every_pillar_along_its_curve(lens):
+    aperture = Aperture(lens)
+    built = lens.diameters.diameter_um > 0
+    middle = built & (lens.diameters.diameter_um > 0.09) & (lens.diameters.diameter_um < 0.2)
+    still, moved = (aperture.maps(aperture.designed(), bias_um=b)[0].numpy() for b in (None, 0.004))
+    change = np.angle(np.exp(1j * (moved - still)))[middle]
+    assert change == pytest.approx(55 * 0.004, abs=2 * 55 * aperture.step_um)
+
+
+def test_the_same_optics_do_not_differ_and_finer_ones_agree(lens):
+    aperture, window = Aperture(lens), Window(15e3, 30e3, 18.0)
+    maps = aperture.maps(aperture.designed())
+    found = [kernels(lens, maps, Numerics(n, 1, 1e-4, 1e-4), window) for n in (4, 8, 16)]
+    assert psf_difference(found[2], found[2], window) == 0
+    coarse, fine = (psf_difference(f, found[2], window) for f in found[:2])
+    assert fine < coarse / 2  # linear interpolation between depths: a quarter for twice the depths
+
+
+def test_rounding_to_nothing_changes_nothing(lens):
+    aperture = Aperture(lens)
+    table = aperture.designed()
+    fine, coarse = (np.abs(aperture.rounded(table, s) - table).max() for s in (1e-6, 5e-3))
+    assert fine < 1e-3
+    assert 0.05 < coarse < 55 * 2.6e-3  # half of 5 nm at 55 rad a um
+
+
+def test_a_common_phase_is_no_error():
+    share = np.array([0.25, 0.5, 0.25])
+    assert budget._spread_of(np.full(3, 2.0), share) == pytest.approx(0, abs=1e-12)
+    assert budget._spread_of(np.array([0.1, 0.0, -0.1]) + 3, share) == pytest.approx(0.1 * math.sqrt(0.5), rel=1e-3)
+
+
+def test_the_total_is_the_root_of_the_squares():
+    rows = [Entry("a", 3.0, math.nan, 3e-3, ""), Entry("b", math.nan, 1.0, 4e-3, "")]
+    total = budget._total(rows)
+    assert (total.phase_rad, total.psf, total.gaze_rad) == pytest.approx((3.0, 1.0, 5e-3))
+
+
+def test_a_network_without_error_costs_nothing(lens):
+    class Stub:
+        given = Given(slip_mm=(0.0, 0.0, 0.0))
+        setting = task.TaskSetting()
+
+    (entry,) = budget._network(Stub)
+    assert entry.gaze_rad < 1e-6
+    Stub.given = Given(slip_mm=(0.3, 0.3, 0.0))
+    (entry,) = budget._network(Stub)
+    # 0.376 mm rms on each axis, across an eye of 9.55 mm: 0.376 sqrt(2) / 9.55 rad, more where it looks aside
+    assert 0.04 < entry.gaze_rad < 0.12
+
+
+def test_files_come_back_as_they_were(tmp_path):
+    rows = [Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"), Entry("sensor noise", math.nan, math.nan, 1e-3, "bound")]
+    command_budget.save(tmp_path / "b.h5", rows, command_budget.store.Provenance(config="x = 1\n"))
+    assert [str(r) for r in command_budget.load(tmp_path / "b.h5")] == [str(r) for r in rows]
+    with pytest.raises(StoreError):
+        command_budget.load(tmp_path / "absent.h5")
+    assert "mask grid" in command_budget.text(rows)
+    budget_page.write(tmp_path / "b.html", [*rows, Entry("all links", 0.1, 0.2, 1e-3, "sum")])
+    assert "sensor noise" in (tmp_path / "b.html").read_text(encoding="utf-8")
+
+
+def test_spread_and_run_are_read_or_refused(tmp_path):
+    (tmp_path / "p.toml").write_text("[spread]\nbias_nm = 2.0\n[rules]\ndiameter_step_nm = 5\n")
+    assert of_process(tmp_path / "p.toml") == Printed(spread=Spread(bias_nm=2.0), diameter_step_nm=5.0)
+    (tmp_path / "q.toml").write_text("[spread]\nbais_nm = 2.0\n")
+    with pytest.raises(ConfigError, match="bias_nm"):
+        of_process(tmp_path / "q.toml")
+    with pytest.raises(ConfigError, match="no result"):
+        command_budget.slip_of(tmp_path)
+    (tmp_path / "result.json").write_text(json.dumps({"rows": [{"lateral_slip_mm": 0.2, "axial_slip_mm": 0.4}]}))
+    assert command_budget.slip_of(tmp_path) == (0.2, 0.2, 0.4)
+
+
+def test_a_budget_of_few_depths_is_refused():
+    with pytest.raises(LensError, match="depths"):
+        Numerics(depth_count=1)
+
+
+@pytest.mark.slow
+def test_the_whole_budget_of_a_small_lens(lens):
+    given = Given(Numerics(12, 1, 1e-3, 1e-2), mask=Printed(), draws=2)
+    rows = list(budget.entries(budget.bench(lens, given)))
+    found = {r.link: r for r in rows}
+    assert set(found) == {
+        "pillar solver and proxy", "local periodic approximation", "mask grid", "process spread", "propagation",
+        "depth sampling", "image kernels", "sensor noise", "all links",
+    }  # fmt: skip
+    assert all(r.gaze_rad >= 0 and r.method for r in rows)
+    # 2 nm of rounding: uniform within 1 nm, at 55 rad a um
+    assert found["mask grid"].phase_rad == pytest.approx(55e-3 / math.sqrt(3), rel=0.2)

@@ -1,0 +1,70 @@
+"""``metalens evaluate optics`` from lens files to tables, numbers and pictures; refusals leave nothing."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from metalens import cli, design, lens
+from metalens.cell.record import Cell, Index
+from metalens.design.profiles import Focus
+from metalens.pillars.proxy import Proxy
+
+IDEAL = Proxy(np.array([[0.0, 3 * math.pi]]), np.array([[1.0]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
+TOML = """[axial]
+depths_mm = [1.6, 2.6]
+count = 3
+angles_deg = [0.0, 5.0]
+binnings = [1, 2]
+window_um = 60.0
+[scenes]
+count = 3
+pixels = 64
+pitch_um = 9.0
+window_um = 72.0
+"""
+
+
+def made(path, focus_um, distance_um=600.0):
+    focus = Focus(0.85, distance_um, focus_um)
+    lens.save(path, design.make(design.phase_of(None, focus, radius_um=100.0), focus, aperture_um=200.0, cell=CELL,
+                                proxy=IDEAL)[0])  # fmt: skip
+
+
+def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
+    made(tmp_path / "a.h5", 2000.0)
+    made(tmp_path / "b.h5", 20000.0)
+    (tmp_path / "o.toml").write_text(TOML)
+    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml")]
+    assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 0
+    shown = capsys.readouterr().out
+    assert "paper: proposed" in shown
+    assert "95 % interval over the scenes" in shown
+    values = json.loads((tmp_path / "out" / "optics.json").read_text())
+    assert values["lenses"]["a"]["scene_ratios"]["gaze"] == [1.0, 1.0, 1.0]
+    assert np.shape(values["lenses"]["b"]["information_per_mm2"]) == (2, 2, 3)
+    energy = values["lenses"]["a"]["encircled_energy"][0]
+    assert max(energy) > max(values["lenses"]["b"]["encircled_energy"][0])  # b is focused far behind this range
+    for name in ("axial.png", "slices.png", "scenes.png", "report.html"):
+        assert (tmp_path / "out" / name).stat().st_size > 2000
+
+
+def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
+    made(tmp_path / "a.h5", 2000.0)
+    made(tmp_path / "b.h5", 2000.0, distance_um=700.0)
+    (tmp_path / "o.toml").write_text(TOML)
+    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml")]
+    assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 2
+    assert "sensor distance" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("bad", ["[scenes]\ncount = 0\n", "[axial]\ndepths_mm = [26.0, 16.0]\n"])
+def test_bad_settings_are_refused(tmp_path, capsys, bad):
+    made(tmp_path / "a.h5", 2000.0)
+    (tmp_path / "o.toml").write_text(bad)
+    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "-o", str(tmp_path / "out")]
+    assert cli.main(["evaluate", "optics", *words]) == 2
+    assert "need" in capsys.readouterr().err

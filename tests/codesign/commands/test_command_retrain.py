@@ -1,0 +1,72 @@
+"""``metalens retrain``: its files, what it overwrites, what a resume refuses."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from characterize.inference import asbuilt
+from layout.process import process
+from metalens import lens
+from metalens.cli import main
+
+TRUTH = "depths_um = [3000.0]\n" + "".join(f'[[parameter]]\nname = "{n}"\nvalue = {v}\n' for n, v in m.TRUE.items())
+SHORT = ["--steps", "2", "--draws", "2", "--judge", "1", "--test-batches", "1"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("command_retrain")
+    m.finished_run(path / "run")
+    asbuilt.save(path / "asbuilt.h5", m.asbuilt())
+    asbuilt.save(path / "refused.h5", m.asbuilt(problems=("chi2 is 3",)))
+    (path / "truth.toml").write_text(TRUTH)
+    return path
+
+
+def _retrain(folder, *words, record="asbuilt.h5", out="out"):
+    command = ["retrain", str(folder / "run"), "--asbuilt", str(folder / record), "-o", str(folder / out), *SHORT]
+    return main([*command, *words])
+
+
+def test_files_report_and_rules_of_overwriting(folder, capsys):
+    truth = ["--truth", str(folder / "truth.toml")]
+    assert _retrain(folder, "--json", *truth) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert set(told["cases"]) == {"designed", "nominal", "before", "after", "known"}
+    assert told["next_lens"][0]["name"] == "as made"
+    page = (folder / "out" / "report.html").read_text()
+    assert "The next mask" in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+    assert lens.load(folder / "out" / "lens_corrected.h5").profile.endswith("corrected")
+    assert process.load(folder / "out" / "bias.toml").bias.table_nm
+    kept = (folder / "out" / "retrained.safetensors").read_bytes()
+
+    assert _retrain(folder, *truth) == 2
+    assert "exists; give --force" in capsys.readouterr().err
+    assert _retrain(folder, *truth, "--resume", "--quiet") == 0  # everything is there: the same story again
+    assert (folder / "out" / "retrained.safetensors").read_bytes() == kept
+    assert _retrain(folder, *truth, "--resume", "--rate", "0.5") == 2
+    assert "settings.rate: 0.0015 -> 0.5" in capsys.readouterr().err
+
+
+def test_refusals_leave_nothing_behind(folder, capsys):
+    assert _retrain(folder, record="refused.h5", out="bad") == 2
+    assert "refused by its own checks" in capsys.readouterr().err
+    assert _retrain(folder, record="run/lens.h5", out="bad") == 2
+    assert "need 'asbuilt'" in capsys.readouterr().err
+    assert _retrain(folder, "--resume", out="bad") == 2
+    assert "no retraining to resume" in capsys.readouterr().err
+    assert not (folder / "bad").exists()
+
+
+def test_a_foreign_folder_is_not_overwritten_by_force(folder, capsys):
+    (folder / "thesis").mkdir()
+    (folder / "thesis" / "chapter.txt").write_text("years of work")
+    assert _retrain(folder, "--force", out="thesis") == 2
+    assert "not made by metalens" in capsys.readouterr().err
+    assert (folder / "thesis" / "chapter.txt").exists()

@@ -1,0 +1,88 @@
+"""Tables 1 and 3 on small lenses: pillars agree with the quick pupil model, intervals cover what they should."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.evaluate import optics as evaluate
+from codesign.evaluate.optics import Scenes, Setting
+from codesign.evaluate.tables import ratio
+from codesign.eye import dataset
+from metalens import design
+from metalens.cell.record import Cell, Index
+from metalens.design.profiles import DoubleHelix, Focus
+from metalens.image import pupil as pupils
+from metalens.image.information import axial_information
+from metalens.image.pupil import Pupil
+from metalens.pillars.proxy import Proxy
+
+RADIUS_UM = 150.0
+# pillars that give the phase of their diameter exactly: 3 turns over the domain, no loss
+IDEAL = Proxy(np.array([[0.0, 3 * math.pi]]), np.array([[1.0]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
+
+
+def _lens(focus_um, zones=0):
+    focus = Focus(0.85, 600.0, focus_um)
+    shape = DoubleHelix(zones=zones) if zones else None
+    phase = design.phase_of(shape, focus, radius_um=RADIUS_UM)
+    made, _ = design.make(phase, focus, aperture_um=2 * RADIUS_UM, cell=CELL, proxy=IDEAL)
+    return made
+
+
+def test_full_lens_agrees_with_the_pupil_model():
+    """Same honest information from pillars through the PSF engine as from the smooth pupil: two independent paths."""
+    setting = Setting(depths_mm=(1.6, 2.6), count=3, angles_deg=(0.0,), binnings=(1, 2), window_um=96.0)
+    got = evaluate.axial(_lens(2000.0), setting)
+    optics = Pupil(RADIUS_UM, 600.0, nodes=96)
+    depths = torch.tensor([1600.0, 2100.0, 2600.0], dtype=torch.float64)
+    flat = torch.zeros(96, 96, dtype=torch.float64)
+    near, far = (
+        pupils.psf(flat, optics, depths_um=d, focus_um=2000.0, sample_um=0.75, samples=128)
+        for d in (depths, depths + 200)
+    )
+    for k, pixel in enumerate((3.0, 6.0)):
+        want = axial_information(near, far, step_um=200.0, sample_um=0.75, pixel_um=pixel)
+        assert got.information[0, k].numpy() == pytest.approx(want.numpy(), rel=0.05)  # oblique rim, window edge
+    assert float(got.encircled.min()) > 0.5
+    assert float(got.encircled.max()) <= 1.0
+
+
+@pytest.mark.parametrize("size", [64, 65])
+def test_encircled_energy_is_that_of_the_best_circle(size):
+    """Half the light in a disc of 5 um anywhere, half as haze over the whole window: a circle of 6 um holds both."""
+    grid = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * 0.75
+    for x, y in ((0.0, 0.0), (9.0, -12.0)):
+        disc = (torch.hypot(grid - x, grid[:, None] - y) <= 5.0).double()
+        light = 0.5 * disc / disc.sum() + 0.5 / size**2
+        want = 0.5 + 0.5 * math.pi * 6.0**2 / (0.75 * size) ** 2
+        got = evaluate.most_encircled(light[None], 0.75, radius_um=6.0)
+        assert float(got) == pytest.approx(want, abs=2e-3)  # staircase of the circle on samples of 0.75 um
+
+
+def test_scene_energies_tell_lenses_apart():
+    states = dataset.states_at(torch.arange(2), 2)
+    lenses = [_lens(20e3), _lens(20e3, zones=3)]
+    plain, helix = evaluate.scene_energies(lenses, states, Scenes(pixels=64, pitch_um=24.0, window_um=96.0))
+    assert ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
+    assert not torch.allclose(helix.gaze, plain.gaze, rtol=1e-3)
+    assert bool((plain.separability > 0).all())
+    assert bool((plain.separability <= 2 * (plain.gaze + plain.slip) * (1 + 1e-6)).all())  # triangle inequality
+
+
+def test_bootstrap_interval_covers_the_true_ratio():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for k in range(100):
+        shared = rng.gamma(4.0, 1.0, 40)
+        a, b = (torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40)) for level in (1.5, 1.0))
+        _, low, high = ratio(a, b, draws=400, seed=k)
+        covered += low <= 1.5 <= high
+    assert 85 <= covered <= 100  # 95 asked; binomial sd 2.2, percentile bootstrap of 40 scenes a little short
+
+
+def test_nothing_to_evaluate_is_refused():
+    with pytest.raises(ValueError, match="at least one"):
+        evaluate.scene_energies([], dataset.states_at(torch.arange(1), 0))

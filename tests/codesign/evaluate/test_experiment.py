@@ -1,0 +1,151 @@
+"""The virtual experiment: geometry of stimuli and slippage, a regressor that is fitted honestly, and its command."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.adapt import train as retraining
+from codesign.evaluate import gaze_experiment as experiment
+from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentConfig, Trial
+from codesign.eye import population as eye
+from codesign.eye.population import Rig
+from codesign.gaze import personal, regressor
+from codesign.gaze.axis import pupil_of
+from metalens.cli import main
+from metalens.ground.errors import ConfigError, TrainingError
+
+SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("experiment")
+    m.finished_run(path / "run")
+    return path
+
+
+def _trial(config, subjects):
+    stimuli, slips = config.stimuli_deg, config.slips_mm
+    state, point = (g.ravel() for g in np.meshgrid(np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"))
+    one = [Trial(np.full(len(state), s), point, state, stimuli[point], slips[state]) for s in range(subjects)]
+    return Trial(*(np.concatenate([getattr(t, f) for t in one]) for f in Trial.__slots__))
+
+
+def test_the_paper_s_counts():
+    config = ExperimentConfig()
+    assert config.frames == 20 * 49 * 7 == 6860
+    assert np.ptp(config.stimuli_deg, axis=0).tolist() == [35.0, 25.0]
+    assert sorted(np.unique(np.diff(np.sort(config.slips_mm[:, 2])))) == [0.0, 2.5]
+    trial = _trial(config, 1)
+    assert trial.group(AXIAL).sum() == 5 * 49
+    assert trial.group(LATERAL).sum() == 3 * 49
+    assert (trial.group(AXIAL) & trial.group(LATERAL)).sum() == 49  # the origin
+
+
+def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
+    scenes = retraining.load(folder / "run").run.scenes(9)
+    states, trial = experiment.states_of(SMALL, 1, scenes)
+    assert np.allclose(states.slip_um.numpy() * 1e-3, trial.slip_mm)
+    assert np.ptp(states.trait("size").numpy()) == 0  # one subject
+    assert np.ptp(states.trait("pupil_radius_um").numpy()) > 0  # whose pupil moves
+    still = replace(states, mount_rad=states.mount_rad * 0)
+    _, visual = eye.directions(still, scenes.rig)
+    face = eye._face(scenes.rig, still)
+    across, down = ((visual * face[i]).sum(1).numpy() for i in (0, 1))
+    wanted = np.sin(np.radians(trial.stimulus_deg))
+    assert np.abs(across - wanted[:, 0]).max() < 0.03  # kappa of 5 degrees, added to first order
+    assert np.abs(down - wanted[:, 1]).max() < 0.03
+    other, _ = experiment.states_of(SMALL, 2, scenes)
+    assert float(other.trait("size")[0]) != float(states.trait("size")[0])
+
+
+def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (70, 5))
+
+    def target(v):
+        return np.stack([np.tanh(v[:, 0] + 0.5 * v[:, 2]), v[:, 1] * (1 + 0.3 * v[:, 4])], 1)
+
+    made = regressor.fit(x, target(x), penalty=1e-5)
+    new = rng.uniform(-0.8, 0.8, (200, 5))
+    assert np.abs(made(new) - target(new)).mean() < 0.02  # of a range of 2: two tanh terms and a product
+    inside, outside = rng.standard_normal((6, 3)), rng.standard_normal((4, 2))
+    slope = regressor._jacobian(inside, outside, x)
+    for k, (array, place) in enumerate(((inside, (2, 1)), (outside, (3, 0)))):
+        up, down = array.copy(), array.copy()
+        up[place] += 1e-6
+        down[place] -= 1e-6
+        pair = [(a, outside) if k == 0 else (inside, a) for a in (up, down)]
+        difference = (regressor._forward(*pair[0], x) - regressor._forward(*pair[1], x)).ravel() / 2e-6
+        column = np.ravel_multi_index(place, array.shape) + (inside.size if k else 0)
+        assert np.abs(slope[:, column] - difference).max() < 1e-8
+    with pytest.raises(TrainingError, match="2 points"):
+        regressor.fit(x[:2], target(x[:2]))
+
+
+def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_much():
+    """The mean eye, a sphere: the pupil's image moves with gaze and slip; only a slip that is read tells them apart."""
+    config, rig = ExperimentConfig(subjects=2), Rig()
+    trial = _trial(config, 2)
+    person = personal.fit(np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0)
+    s, c = np.sin(rig.elevation_rad), np.cos(rig.elevation_rad)
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
+    direction = torch.from_numpy(personal.direction(np.radians(trial.stimulus_deg)) @ axes)
+    pupil = pupil_of(direction, torch.from_numpy(-trial.slip_mm), person.mean).numpy()
+    for slip, low, high in ((trial.slip_mm, 0.0, 0.5), (0 * trial.slip_mm, 1.5, 20.0)):
+        predicted, judged = experiment.calibrated(pupil, slip, trial, config, rig=rig)
+        error = personal.angle_deg(predicted, trial.stimulus_deg)[judged]
+        assert low <= error.mean() < high
+    assert judged.mean() == pytest.approx(39 / 49)
+    assert all(len(np.unique(trial.stimulus[~judged & (trial.subject == s)])) == 10 for s in (0, 1))
+
+
+def test_spread_points_reach_the_corners():
+    grid = ExperimentConfig().stimuli_deg
+    chosen = experiment.spread(grid, 10, first=24)
+    assert len(set(chosen)) == 10
+    assert set(chosen[1:5]) == {0, 6, 42, 48}  # the middle first, then the corners
+    gaps = np.linalg.norm(grid[:, None] - grid[chosen], axis=2).min(1)
+    assert gaps.max() < 10.0  # of a field of 35 x 25 degrees
+
+
+@pytest.mark.parametrize("change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}])
+def test_impossible_experiments_are_refused(change):
+    with pytest.raises(ConfigError, match="subject"):
+        replace(SMALL, **change)
+
+
+def test_the_command_writes_numbers_and_figures_once(folder, capsys):
+    run, out = str(folder / "run"), folder / "out"
+    words = [
+        "evaluate",
+        "experiment",
+        run,
+        run,
+        "-o",
+        str(out),
+        "--subjects",
+        "2",
+        "--grid",
+        "4",
+        "3",
+        "--share",
+        "0.3",
+    ]
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [r["name"] for r in told["runs"]] == ["run 1", "run 2"]
+    assert all(r["ratio"] == 1.0 for r in told["ratios"])  # the same run twice, the same noise
+    assert {p.name for p in out.iterdir()} >= {"experiment.json", "samples.png", "ambiguity.png", "errors.png"}
+    assert main(words) == 2
+    assert "give --force" in capsys.readouterr().err
+    assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
+    assert "is no run folder" in capsys.readouterr().err

@@ -1,0 +1,125 @@
+"""The paper beside ours: transcription against the paper's own text, ratios, and what is said of what is missing."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.commands import paper as command_paper
+from codesign.evaluate import paper
+from codesign.evaluate.paper import Measured
+from metalens.cli import main
+from metalens.ground.errors import StoreError
+
+RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
+
+
+def test_every_number_stands_in_the_paper(shared):
+    text = "\n".join(path.read_text(encoding="utf-8") for path in (shared / "paper").glob("*.txt"))
+    numbers = set(re.findall(r"\d+\.\d+|\d+", text.replace(",", "")))
+    known = {float(n) for n in numbers}
+    for claim in paper.claims():
+        for number in re.findall(r"\d+\.\d+", claim.note):
+            assert float(number) in known, claim
+        if not claim.picture and claim.unit != "ratio":
+            assert claim.value in known, claim
+    for words in ("40%", "~50%", "7× fewer", "3× fewer"):
+        assert words in text.replace(r"\%", "%")
+
+
+def test_ratios_are_those_of_the_numbers_beside_them():
+    checked = 0
+    for claim in paper.claims():
+        found = RATIO.match(claim.note)
+        if claim.unit == "ratio" and found:
+            assert claim.value == pytest.approx(float(found[1]) / float(found[2]), abs=6e-4), claim
+            checked += 1
+    assert checked >= 15
+
+
+def test_all_of_the_paper_is_there_once():
+    places = {claim.place for claim in paper.claims()}
+    wanted = {"Table 1", "Table 2", "Table 3", "Fig. 5", "Fig. 7", "Fig. 8a", "Fig. 8b", "Fig. 10", "Fig. 11", "15 dB"}
+    assert wanted <= places
+    keys = [claim.key for claim in paper.claims()]
+    assert len(keys) == len(set(keys))
+
+
+def test_what_was_not_measured_says_how_to_and_what_was_has_a_ratio():
+    told = {line.claim.key: line for line in paper.lines({"iou/proposed": Measured(0.47, 0.4, 0.5, "here")})}
+    assert told["iou/proposed"].ratio == pytest.approx(0.5)
+    assert told["iou/proposed"].words()[3] == "0.47 [0.4, 0.5]"
+    missing = told["gaze_axial/ratio"].words()
+    assert missing[3] == "not measured"
+    assert missing[5].startswith("measure with: metalens evaluate experiment")
+
+
+def _experiment(path, axial):
+    row = {"mmacs": 2.0, "gaze_axial_deg": axial, "gaze_lateral_deg": 1.0, "slip_mm": 0.4, "iou": 0.9}
+    rows = [
+        {**row, "name": "proposed", "iou_interval": [0.8, 1.0]},
+        {**row, "name": "hyperbolic", "gaze_axial_deg": 2.0},
+    ]
+    ratio = {"quantity": "gaze_axial_deg", "against": "hyperbolic", "ratio": axial / 2, "interval": [0.1, 0.9]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    about = {"subjects": 3, "frames": 9, "seed": 0}
+    path.write_text(json.dumps({"first": "proposed", "settings": about, "runs": rows, "ratios": [ratio]}))
+
+
+def test_measurements_are_collected_from_their_files(tmp_path):
+    _experiment(tmp_path / "experiment" / "experiment.json", 1.0)
+    _experiment(tmp_path / "dim" / "experiment.json", 1.5)
+    found = command_paper.collect(tmp_path, {})
+    assert found["gaze_axial/ratio"].value == 0.5
+    assert found["iou/proposed"].low == 0.8
+    assert found["dim/proposed"].value == pytest.approx(1.5)
+    assert found["dim/hyperbolic"].value == pytest.approx(2.0 / 1.5)
+
+
+def test_equal_budgets_and_equal_accuracy_of_two_runs():
+    def rows(*pairs):
+        return [{"budget_mmacs": b, "mmacs": b, "axial_slip_mm": e} for b, e in pairs]
+
+    found = paper.of_runs({"proposed": rows((2.0, 0.5), (8.0, 0.3)), "hyperbolic": rows((2.0, 1.0), (8.0, 0.5))})
+    assert found["fig8a/error"].value == 0.5
+    assert found["fig8a/compute"].value == 0.25
+    assert paper.of_runs({"proposed": rows((2.0, 0.5))}) == {}
+
+
+def test_files_of_other_versions_are_named(tmp_path):
+    (tmp_path / "old.json").write_text('{"runs": []}')
+    with pytest.raises(StoreError, match="ratios, settings missing: made by another version"):
+        paper.of_experiment(tmp_path / "old.json")
+    (tmp_path / "cut.json").write_text('{"runs": [')
+    with pytest.raises(StoreError, match="not a JSON file"):
+        paper.of_optics(tmp_path / "cut.json")
+
+
+def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys):
+    words = ["evaluate", "paper", "-o", str(tmp_path / "out")]
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["lines"]) == len(paper.claims())
+    assert all(line["ours"] is None for line in told["lines"])
+    assert "not measured" in (tmp_path / "out" / "report.html").read_text()
+    assert main(words) == 2
+    assert "give --force" in capsys.readouterr().err
+    assert main([*words, str(tmp_path), "--force", "--no-measure"]) == 2
+    assert "no finished run" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_one_command_measures_and_compares(tmp_path, capsys):
+    for name in ("a", "b"):
+        m.finished_run(tmp_path / name)
+    words = ["evaluate", "paper", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(tmp_path / "out"), "--json"]
+    assert main([*words, "--subjects", "2", "--scenes", "2"]) == 0
+    told = {line["key"]: line for line in json.loads(capsys.readouterr().out)["lines"]}
+    assert told["gaze_axial/ratio"]["ours"]["value"] == 1.0  # the same run twice
+    assert told["scenes/slip/proposed"]["ours"]["value"] == pytest.approx(1.0)
+    assert told["picture/experiment/ambiguity.png"]["picture"]

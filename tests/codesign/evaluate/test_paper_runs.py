@@ -1,0 +1,93 @@
+"""Table 2 and Fig. 8b from finished runs: what each run counts as, ratios with a known answer, gaze of two networks."""
+
+import functools
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.commands import paper as command_paper
+from codesign.commands.paper import GAZE
+from codesign.evaluate import paper, paper_runs
+from codesign.train import run as runs
+from metalens.cli import main
+from metalens.ground.errors import TrainingError
+
+KEYS = ("population_floor_deg", "personal_deg", "personal_floor_deg", "anatomy_deg")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("paper_runs") / "run"
+    m.finished_run(path)
+    return path
+
+
+def _result(path, **entries):
+    path.mkdir(parents=True)
+    rows = [{"budget_mmacs": b, "mmacs": b, "axial_slip_mm": e} for b, e in entries.pop("rows", ((2.0, 1.0),))]
+    (path / "result.json").write_text(json.dumps({"rows": rows, **entries}))
+    return path
+
+
+def _other_network(path):
+    """A finished run of somebody else's network on the scenes of the small one."""
+    path.mkdir()
+    (path / "run.toml").write_text(m.TINY.replace('preset = "smoke"', 'preset = "smoke"\nnetwork = "nvgaze"'))
+    made = runs.start(runs.load(path / "run.toml"))
+    runs.save(path / "checkpoint.safetensors", made)
+    row = {"budget_mmacs": None, "mmacs": 1.5, "architecture": {}}
+    (path / "result.json").write_text(json.dumps({"rows": [row], "network": "nvgaze", "frozen": []}))
+    return path
+
+
+def test_compute_of_a_frozen_part_is_that_at_its_own_best_error():
+    ours = [{"mmacs": 2.0, "axial_slip_mm": 0.9}, {"mmacs": 6.0, "axial_slip_mm": 0.5}]
+    fixed = [{"mmacs": 4.0, "axial_slip_mm": 1.2}, {"mmacs": 14.0, "axial_slip_mm": 0.9}]
+    better = [{"mmacs": 9.0, "axial_slip_mm": 0.4}]
+    found = paper_runs.of_ablations(ours, {"optics": fixed, "pitch": better})
+    assert found["fig8b/optics"].value == 7.0  # 14 MMACs for 0.9 mm, which 2 MMACs of ours reach
+    assert "0.90 mm" in found["fig8b/optics"].conditions
+    assert "fig8b/pitch" not in found  # ours never gets there: no number is made up
+    assert {claim.key for claim in paper.claims()} >= {"fig8b/optics", "fig8b/pitch"}
+
+
+def test_runs_are_told_apart_by_what_they_wrote(tmp_path):
+    one = _result(tmp_path / "a", network="supernet", frozen=["optics"])
+    two = _result(tmp_path / "b", network="supernet", frozen=["pitch", "optics"])
+    three = _result(tmp_path / "c", network="nvgaze", frozen=["pitch"])
+    assert [part for part, _ in paper_runs.frozen_rows((one, two, three))] == ["optics"]
+    again = _result(tmp_path / "d", network="supernet", frozen=["optics"])
+    with pytest.raises(TrainingError, match="both have optics frozen; give one of them"):
+        list(paper_runs.frozen_rows((one, again)))
+    with pytest.raises(TrainingError, match="no finished run"):
+        paper_runs.kind_of(tmp_path)
+
+
+def test_networks_of_the_table_have_their_claims():
+    row = {"mmacs": 3.0, "personal_deg": 1.5, "people": 4, "seed": 5}
+    told = {"x": {"network": "supernet", "rows": [row, {**row, "personal_deg": 1.0}]}}
+    told |= {name: {"network": name, "rows": [row]} for name in paper_runs.TABLE_2}
+    found = paper_runs.of_gaze(told)
+    assert set(found) == {claim.key for claim in paper.claims() if claim.place == "Table 2"}
+    assert found["table2/proposed_efficient"].value == 1.5
+    assert found["table2/proposed_accurate"].value == 1.0
+
+
+def test_gaze_of_both_kinds_of_network_stands_in_the_table(folder, tmp_path, monkeypatch):
+    other, page = _other_network(tmp_path / "nvgaze"), tmp_path / "page"
+    monkeypatch.setattr(paper_runs, "gaze", functools.partial(paper_runs.gaze, people=3, each=20))
+    monkeypatch.setattr(command_paper, "_measure", lambda options, at: command_paper._measure_gaze(options, at / GAZE))
+    arguments = ["evaluate", "paper", str(folder), "--others", str(other), "-o", str(page), "--quiet"]
+    assert main(arguments) == 0
+    for entry in json.loads((page / GAZE).read_text()).values():
+        (row,) = entry["rows"]
+        assert all(0 < row[key] <= 180 for key in KEYS)
+        assert row["personal_floor_deg"] < row["personal_deg"]  # an untrained network knows less than the truth
+    told = json.loads((page / "paper.json").read_text())
+    measured = {line["key"] for line in told if line["place"] == "Table 2" and line["ours"]}
+    assert measured == {"table2/nvgaze", "table2/proposed_efficient", "table2/proposed_accurate"}

@@ -1,0 +1,145 @@
+"""The eye's geometry against closed forms: Listing's law, refraction at the cornea, projection, population limits."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.eye import landmarks, model
+from codesign.eye import population as eye
+from codesign.eye.population import POPULATION, Motion, Rig, States
+from codesign.eye.renderer import Camera
+from metalens.ground.errors import SceneError
+
+FRONTAL = Rig(elevation_rad=0.0, aim_um=(0.0, 0.0))
+
+
+def mean_states(n=1, **changes):
+    """The mean subject, looking straight ahead, nothing slipped."""
+    still = eye.draw(n, 0)
+    traits = torch.tensor([[t.mean for t in POPULATION.values()]] * n, dtype=torch.float64)
+    zero = torch.zeros(n, dtype=torch.float64)
+    pair, triple = torch.zeros(n, 2, dtype=torch.float64), torch.zeros(n, 3, dtype=torch.float64)
+    base = States(traits, still.textures, pair, zero, triple, pair, zero + 1, zero + 1)
+    return replace(base, **changes)
+
+
+def pack(states, rig=FRONTAL):
+    return eye.parameters(states, rig, pixel_rad=0.0045)
+
+
+def test_same_seed_same_states_and_limits_hold():
+    a, b = eye.draw(200, 7), eye.draw(200, 7)
+    assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in States.__slots__)
+    for name, trait in POPULATION.items():
+        values = a.trait(name)
+        assert float(values.min()) >= trait.low
+        assert float(values.max()) <= trait.high
+
+
+@pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.3, 0.0), (0.2, -0.3), (0.0, 1.2), (2.0, 1.0)])
+def test_listing_turns_by_the_shortest_way(gaze):
+    """Axes stay orthonormal, the axis makes the stated angle, and the rotation has no part about the primary axis."""
+    p = pack(mean_states(gaze_rad=torch.tensor([gaze], dtype=torch.float64)))[0]
+    axes = torch.stack([p[k : k + 3] for k in (model.IRIS_X, model.IRIS_Y, model.AXIS)])
+    face = torch.stack([p[k : k + 3] for k in (model.FACE_X, model.FACE_Y, model.FACE_Z)])
+    assert torch.allclose(axes @ axes.mT, torch.eye(3, dtype=torch.float64), atol=1e-12)
+    assert float(axes[2] @ face[2]) == pytest.approx(math.cos(math.hypot(*gaze)), abs=1e-12)
+    turn = face @ axes.mT  # rotation in face coordinates
+    assert float(turn[0, 1] - turn[1, 0]) == pytest.approx(0, abs=1e-12)
+
+
+def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
+    """Paraxial closed form for one surface: 1/s' = n/s - (n-1)/R, magnification n s' / s... seen on the axis."""
+    p = pack(mean_states())
+    radius = torch.tensor([[[10.0, 0.0]]], dtype=torch.float64)  # um: paraxial
+    tangent = float(landmarks.iris_to_camera(p, radius)[0, 0, 0])
+    s, n, r = 3600.0, 1.3375, 7800.0
+    virtual = 1 / (n / s - (n - 1) / r)
+    apex = 21000.0 - 3600.0
+    assert tangent * (apex + virtual) == pytest.approx(10.0 * n * virtual / s, rel=1e-4)
+    ray = torch.tensor([[0.0]], dtype=torch.float64)
+    q = p.mT[:, :, None]
+    dx, dy, dz = model.ray(ray, ray)
+    bank = torch.zeros(80, 256, 256, dtype=torch.float64)
+    _, depth, pupil = model.eye(q, bank, ray, ray, ray + 5e3, ray + 5e3, dx, dy, dz)
+    assert float(depth) == pytest.approx(apex + virtual, rel=1e-6)
+    assert float(pupil) == 1.0
+
+
+def test_refracted_rays_obey_snell_at_the_cornea():
+    p = pack(mean_states(gaze_rad=torch.tensor([[0.35, 0.2]], dtype=torch.float64)), Rig())
+    target = torch.tensor([[[1500.0, -700.0]]], dtype=torch.float64)
+    t = landmarks.iris_to_camera(p, target)[0, 0].numpy()
+    d = np.array([*t, 1.0]) / math.hypot(*t, 1.0)
+    value = p[0].numpy()
+    centre, axis = value[0:3], value[model.AXIS : model.AXIS + 3]
+    ball = centre + value[model.CORNEA_D] * axis
+    b = ball @ d
+    hit = (b - math.sqrt(b**2 - ball @ ball + value[model.CORNEA_R] ** 2)) * d
+    normal = (hit - ball) / value[model.CORNEA_R]
+    x, y = value[model.IRIS_X : model.IRIS_X + 3], value[model.IRIS_Y : model.IRIS_Y + 3]
+    point = centre + value[model.PUPIL_D] * axis + 1500.0 * x - 700.0 * y
+    inner = (point - hit) / np.linalg.norm(point - hit)
+    assert np.linalg.norm(np.cross(normal, d)) == pytest.approx(
+        1.3375 * np.linalg.norm(np.cross(normal, inner)), rel=1e-7
+    )
+    assert abs(np.linalg.det([normal, d, inner])) < 1e-9  # in one plane
+
+
+def test_slip_to_plus_x_moves_landmarks_by_the_pinhole_law():
+    still, moved = mean_states(), mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64))
+    camera = Camera()
+    a, b = (camera.position_px(landmarks.landmark_points(pack(s)), FRONTAL)[0] for s in (still, moved))
+    apex = landmarks.NAMES.index("corneal apex")
+    assert float(b[apex, 0] - a[apex, 0]) == pytest.approx(500 / (21000 - 3600) * 2000 / 9, rel=1e-9)
+    assert float((b - a)[:, 1].abs().max()) < 1e-9
+
+
+def test_visual_axis_is_kappa_from_the_optic_axis():
+    states = mean_states()
+    optic, visual = eye.directions(states, FRONTAL)
+    want = math.hypot(math.tan(math.radians(5)), math.tan(math.radians(1.5)))
+    assert float(torch.linalg.cross(optic, visual).norm() / (optic * visual).sum()) == pytest.approx(want, rel=1e-9)
+    assert float(visual[0, 0]) < 0  # towards the nose, at -x
+
+
+def test_gradient_of_the_parameters_is_exact():
+    states = eye.draw(3, 5)
+
+    def packed(gaze, slip):
+        p = pack(replace(states, gaze_rad=gaze, slip_um=slip), Rig())
+        return torch.cat([p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1)  # edge and exposure are held
+
+    held = states.gaze_rad.clone().requires_grad_(True), states.slip_um.clone().requires_grad_(True)
+    assert torch.autograd.gradcheck(packed, held, atol=1e-4, rtol=1e-5)
+
+
+def test_unusable_states_are_refused_by_name():
+    with pytest.raises(SceneError, match=r"slip_um of state 0"):
+        mean_states(slip_um=torch.tensor([[math.nan, 0, 0]], dtype=torch.float64))
+    with pytest.raises(SceneError, match="gaze_rad has shape"):
+        mean_states(gaze_rad=torch.zeros(1, 3, dtype=torch.float64))
+    with pytest.raises(SceneError, match="lamps"):
+        Rig(lamps_um=())
+
+
+def test_motion_ranges_hold():
+    drawn = eye.draw(500, 1, motion=Motion(slip_um=(1.0, 2.0, 3.0), scale=0.2))
+    assert (drawn.slip_um.abs().amax(0) <= torch.tensor([1.0, 2.0, 3.0])).all()
+    assert 0.8 <= float(drawn.scale.min()) < float(drawn.scale.max()) <= 1.2
+
+
+def test_a_parameter_that_is_left_out_or_filled_twice_is_refused():
+    """Parameters stand at the indices that the picture reads, whatever their order here."""
+    filled = {place: torch.full((3, 1), float(place)) for place in range(model.COUNT)}
+    row = eye._row(dict(reversed(filled.items())))
+    assert row[1].tolist() == list(range(model.COUNT))
+    with pytest.raises(SceneError, match="left out"):
+        eye._row({place: part for place, part in filled.items() if place != 41})
+    with pytest.raises(SceneError, match="filled twice"):
+        eye._row(filled | {model.CENTRE: torch.ones(3, 2)})
+    with pytest.raises(SceneError, match="picture reads"):
+        eye._row(filled | {model.COUNT: torch.ones(3)})

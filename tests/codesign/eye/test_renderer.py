@@ -1,0 +1,177 @@
+"""Frames against the float64 twin, derivatives against exact ones, labels against masks, states at the limits."""
+
+import math
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from codesign.eye import population as eye
+from codesign.eye import renderer
+from codesign.eye.population import POPULATION, Rig, States
+from codesign.eye.renderer import Camera
+
+SMALL = Camera(pixels=64, pitch_um=22.5)
+STATES = eye.draw(4, 5)
+
+
+def _p(states, camera=SMALL):
+    return eye.parameters(states, Rig(), pixel_rad=camera.pitch_um / 2000.0)
+
+
+def test_compiled_frames_agree_with_the_twin():
+    out = renderer.render(STATES, camera=SMALL)
+    light, cover, depth, pupil = renderer.twin(_p(STATES), Rig(), SMALL)
+    assert float((light - out.frames.radiance).abs().max()) < 1e-3  # float32 on edges a pixel wide
+    assert float((cover - out.frames.coverage).abs().max()) < 1e-3
+    assert float(((depth - out.frames.depth_um) * (cover > 0)).abs().max()) < 0.5  # um
+    assert float((pupil - out.pupil).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("pixels", [1, 13, 37])
+def test_frames_that_do_not_fill_the_tiles_agree_with_the_twin(pixels):
+    camera = Camera(pixels=pixels, pitch_um=1440 / pixels)
+    out = renderer.render(STATES, camera=camera)
+    light, cover, _, pupil = renderer.twin(_p(STATES, camera), Rig(), camera)
+    assert float((light - out.frames.radiance).abs().max()) < 1e-3
+    assert float((cover - out.frames.coverage).abs().max()) < 1e-3
+    assert float((pupil - out.pupil).abs().max()) < 1e-3
+    slopes = renderer.sensitivities(STATES, camera=camera).frames
+    assert float((slopes.radiance - out.frames.radiance).abs().max()) < 1e-3
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+def test_frames_do_not_depend_on_the_threads():
+    many = renderer.render(STATES, camera=SMALL).pinhole()
+    numba.set_num_threads(1)
+    one = renderer.render(STATES, camera=SMALL).pinhole()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert torch.equal(many, one)
+
+
+def test_compiled_derivatives_agree_with_exact_ones():
+    motions = ("gaze_y", "slip_z")
+    got = renderer.sensitivities(STATES, motions, camera=SMALL)
+    p, *along = renderer.parameter_tangents(STATES, motions, rig=Rig(), camera=SMALL)
+    for part, tangent in zip((got.first, got.second), along, strict=True):
+        _, want = torch.func.jvp(lambda q: renderer.twin(q, Rig(), SMALL)[:2], (p,), (tangent,))
+        assert float((part.radiance - want[0]).norm() / want[0].norm()) < 1e-3
+        assert float((part.coverage - want[1]).norm() / want[1].norm()) < 1e-3
+
+
+def test_twin_derivative_is_the_limit_of_differences_and_usual_steps_are_not():
+    """Differences at a step of half a degree are wrong by a fifth and more, since edges move by pixels."""
+    p, along, _ = renderer.parameter_tangents(STATES, ("gaze_x", "slip_z"), rig=Rig(), camera=SMALL)
+    _, exact = torch.func.jvp(lambda q: renderer.twin(q, Rig(), SMALL)[0], (p,), (along,))
+
+    def difference(step):
+        moved = replace(STATES, gaze_rad=STATES.gaze_rad + torch.tensor([step, 0.0]))
+        return (renderer.twin(_p(moved), Rig(), SMALL)[0] - renderer.twin(p, Rig(), SMALL)[0]) / step
+
+    def error(step):
+        return float((difference(step) - exact).norm() / exact.norm())
+
+    assert error(1e-7) < 1e-4
+    assert error(math.radians(0.5)) > 0.2
+
+
+def test_nothing_is_seen_behind_closed_lids():
+    shut = replace(STATES, aperture=torch.zeros(4, dtype=torch.float64))
+    out = renderer.render(shut, camera=SMALL)
+    assert float(out.pupil.max()) == 0
+    assert float(out.labels.visible.max()) == 0
+    assert torch.equal(out.labels.centroid_px, out.labels.pupil_px)
+    assert float(out.frames.coverage[:, 1].max()) < 1e-6
+
+
+def test_mask_is_centred_on_the_refracted_outline():
+    frontal = Rig(elevation_rad=0.0, aim_um=(500.0, 300.0))
+    wide = replace(
+        STATES, gaze_rad=torch.zeros(4, 2, dtype=torch.float64), slip_um=torch.zeros(4, 3, dtype=torch.float64)
+    )
+    labels = renderer.render(wide, rig=frontal, camera=Camera()).labels
+    assert float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4  # oblique refraction: under 0.4 px
+    assert float(labels.visible.min()) > 0.97
+
+
+def test_scale_changes_depth_and_labels_but_not_the_image():
+    double = replace(STATES, scale=torch.full((4,), 1.2, dtype=torch.float64))
+    a, b = renderer.render(STATES, camera=SMALL), renderer.render(double, camera=SMALL)
+    assert torch.equal(a.frames.radiance, b.frames.radiance)
+    assert torch.allclose(1.2 * a.frames.depth_um, b.frames.depth_um)
+    assert torch.allclose(1.2 * a.labels.pupil_um, b.labels.pupil_um)
+    assert torch.equal(a.labels.optic_axis, b.labels.optic_axis)
+
+
+def test_same_states_same_frames_alone_or_in_a_batch():
+    whole = renderer.render(STATES, camera=SMALL).pinhole()
+    alone = torch.cat([renderer.render(STATES[k : k + 1], camera=SMALL).pinhole() for k in range(4)])
+    assert torch.equal(whole, alone)
+
+
+def extremes(count, seed):
+    """States far beyond any population: every limit of the renderer is met."""
+    rng = np.random.default_rng(seed)
+    base = eye.draw(count, seed)
+    gaze = rng.choice([0, 0.1, math.pi / 2, math.pi, -math.pi / 2, 2.5], (count, 2)) * rng.choice(
+        [1, 1, 1.001], (count, 2)
+    )
+    slip = rng.choice([0.0, 1e3, -2e4, 5e4, -4e4, 1e6], (count, 3))
+    traits = base.traits.clone()
+    names = list(POPULATION)
+    traits[:, names.index("pupil_radius_um")] = torch.from_numpy(rng.choice([500.0, 4500.0, 1900.0], count))
+    traits[:, names.index("exposure")] = torch.from_numpy(rng.choice([0.0, 0.5, 1e4], count))
+    aperture = torch.from_numpy(rng.choice([0.0, 0.05, 1.0, 3.0], count))
+    return States(
+        traits, base.textures, torch.from_numpy(gaze), base.torsion_rad, torch.from_numpy(slip), 30 * base.mount_rad,
+        aperture, base.scale,
+    )  # fmt: skip
+
+
+def _fuzz(count):
+    camera = Camera(pixels=20, pitch_um=90.0)
+    for start in range(0, count, 500):
+        states = extremes(min(500, count - start), start)
+        out = renderer.render(states, camera=camera)
+        rates = renderer.sensitivities(states, camera=camera)
+        checked = [out.frames.radiance, out.frames.coverage, out.frames.depth_um, out.pupil]
+        checked += [getattr(out.labels, name) for name in renderer.Labels.__slots__]
+        checked += [f for part in (rates.first, rates.second) for f in (part.radiance, part.coverage, part.depth_um)]
+        assert all(bool(torch.isfinite(value).all()) for value in checked)
+
+
+def test_extreme_states_stay_finite():
+    _fuzz(2000)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_extreme_states_stay_finite():
+    _fuzz(100_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("eye out of frame", {"slip_um": [[3e4, 0.0, 0.0]] * 4}),
+        ("behind the camera", {"slip_um": [[0.0, 0.0, -6e4]] * 4}),
+        ("turned away", {"gaze_rad": [[2.8, 0.0]] * 4}),
+        ("grazing cornea", {"gaze_rad": [[1.3, 0.0]] * 4}),
+    ],
+)
+def test_hidden_pupils_have_empty_masks_or_thin_ones(name, change):
+    states = replace(STATES, **{k: torch.tensor(v, dtype=torch.float64) for k, v in change.items()})
+    out = renderer.render(states, camera=SMALL)
+    assert bool(torch.isfinite(out.pinhole()).all()), name
+    assert float(out.labels.visible.max()) < 0.9 or name == "grazing cornea"
+    if name in ("eye out of frame", "turned away"):
+        assert float(out.pupil.sum()) == 0
+
+
+def test_gradient_of_the_twin_is_finite_at_the_limits():
+    states = extremes(60, 3)
+    p = eye.parameters(states, Rig(), pixel_rad=0.045).requires_grad_(True)
+    light, *_ = renderer.twin(p, Rig(), Camera(pixels=12, pitch_um=150.0))
+    light.sum().backward()
+    assert bool(torch.isfinite(p.grad).all())

@@ -1,0 +1,80 @@
+"""Personal calibration: an eye off the mean is found from a few points, noise does not make it wild."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.eye import population as eye
+from codesign.eye.population import Rig
+from codesign.gaze import personal
+from codesign.gaze.axis import EyeGeometry, pupil_of
+from metalens.ground.errors import TrainingError
+
+RIG = Rig()
+GRID = np.stack([g.ravel() for g in np.meshgrid(np.linspace(-17, 17, 5), np.linspace(-12, 12, 5))], 1)
+
+
+def _person(slip_mm, *, beside=(0.6, -0.4, 0.5), larger=0.4, kappa_deg=(5.0, 1.5)):
+    """Pupils on the sensor and gaze of an eye that is a sphere off the mean, looking at every stimulus per slip."""
+    centre, radius = eye.mean_eye_um(RIG)
+    x, y, z = np.asarray(centre) * 1e-3 + beside
+    geometry = EyeGeometry((x, y, z), radius * 1e-3 + larger, RIG.sensor_distance_um * 1e-3)
+    gaze = np.tile(GRID, (len(slip_mm), 1))
+    face = personal.direction(np.radians(gaze + kappa_deg))
+    s, c = math.sin(RIG.elevation_rad), math.cos(RIG.elevation_rad)
+    direction = face @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
+    slips = np.repeat(slip_mm, len(GRID), 0)
+    pupil = pupil_of(torch.from_numpy(direction), torch.from_numpy(-slips), geometry).numpy()
+    return pupil, slips, gaze
+
+
+SLIPS = np.array([[0, 0, 0], [-2.5, 0, 0], [-5, 0, 0], [0, 0, -5], [0, 0, -2.5], [0, 0, 2.5], [0, 0, 5]], float)
+
+
+def _known(gaze, every):
+    return np.isin(np.unique(gaze, axis=0, return_inverse=True)[1].ravel() % every, 0)
+
+
+def test_face_angles_undo_the_tilt_of_the_camera():
+    s, c = math.sin(0.7), math.cos(0.7)
+    ahead = np.array([[0.0, -s, -c]])  # out of a face that the camera sees from 0.7 rad below
+    assert np.allclose(personal.face_angles(ahead, 0.7), 0, atol=1e-12)
+    turned = ahead * math.cos(0.2) + math.sin(0.2) * np.array([[1.0, 0.0, 0.0]])
+    assert np.allclose(personal.face_angles(turned, 0.7), [[math.degrees(0.2), 0.0]])
+
+
+def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
+    """Four parameters and kappa explain a spherical eye; what is left is the pull of the population: 0.1 degrees."""
+    pupil, slip, gaze = _person(SLIPS)
+    known = _known(gaze, 4)
+    person = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG)
+    error = personal.angle_deg(person(pupil[~known], slip[~known]), gaze[~known])
+    alone = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG, hidden=0)
+    assert known.sum() == 49
+    assert error.mean() < 0.15
+    assert personal.angle_deg(alone.sphere(pupil, slip), gaze).mean() < 0.25
+    assert np.abs(alone.own[4:6] + np.array([5.0, 1.5])).max() < 1.5  # kappa trades with the centre to first order
+
+
+def test_noisy_slippage_makes_the_regressor_careful():
+    """0.3 mm of slippage on a sphere of 10 mm is 1.7 degrees a frame: no calibration may end far above that."""
+    rng = np.random.default_rng(0)
+    pupil, slip, gaze = _person(SLIPS[:1])
+    read = slip + 0.3 * rng.standard_normal(slip.shape)
+    known = _known(gaze, 3)
+    person = personal.fit(pupil[known], read[known], gaze[known], rig=RIG)
+    assert personal.angle_deg(person(pupil[~known], read[~known]), gaze[~known]).mean() < 4.0
+
+
+def test_angles_between_directions():
+    zero = np.zeros((3, 2))
+    assert np.allclose(personal.angle_deg(zero, np.array([[3.0, 0.0], [0.0, -4.0], [0.0, 0.0]])), [3.0, 4.0, 0.0])
+    one, other = np.array([[10.0, 20.0]]), np.array([[12.0, 20.0]])
+    assert personal.angle_deg(one, other)[0] == pytest.approx(2 * np.cos(np.radians(20.0)), rel=1e-3)
+
+
+def test_two_points_are_refused():
+    with pytest.raises(TrainingError, match="2 points"):
+        personal.fit(np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2)), rig=RIG)

@@ -1,0 +1,70 @@
+"""The cost model equals counted forward passes, published counts, and its own finite differences."""
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from codesign.network import cost
+from codesign.network.architecture import Space, largest, sample, smallest
+from codesign.network.supernet import Supernet
+from metalens.ground.errors import ConfigError
+
+
+def _counted(net, architecture, size):
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        net(torch.zeros(1, 1, size, size), architecture)
+    return counter.get_total_flops() // 2
+
+
+def test_count_equals_a_counted_forward_pass_for_200_subnets():
+    net, generator = Supernet(), np.random.default_rng(0)
+    net.eval()
+    for _ in range(200):
+        architecture = sample(net.space, generator)
+        size = int(generator.integers(54, 120))
+        scaled = round(size * architecture.resolution)
+        assert int(cost.network(net.space, architecture).at(scaled)) == _counted(net, architecture, size)
+
+
+def test_published_counts_of_mobilenet_v3():
+    assert cost.mobilenet_v3("large") / 1e6 == pytest.approx(216.6, abs=0.05)
+    assert cost.mobilenet_v3("small") / 1e6 == pytest.approx(56.5, abs=0.05)
+
+
+@pytest.mark.parametrize("size", [16.0, 63.5, 64.0, 127.25, 400.0])
+def test_continuous_count_has_the_gradient_of_its_finite_difference(size):
+    space = Space()
+    at = torch.tensor(size, dtype=torch.float64, requires_grad=True)
+    value = cost.macs_of_size(space, largest(space), at)
+    value.backward()
+    step = 1e-6
+    ahead, behind = (float(cost.macs_of_size(space, largest(space), size + s)) for s in (step, -step))
+    # at an integer the curvature jumps: the difference is off by that times the step, 1e-4 of the mean slope
+    mean_slope = 2 * float(value.detach()) / size
+    assert float(at.grad) == pytest.approx((ahead - behind) / (2 * step), rel=1e-4, abs=1e-4 * mean_slope)
+    if size == round(size):
+        assert float(value.detach()) == float(cost.network(space, largest(space)).at(int(size)))
+
+
+def test_the_gradient_in_the_pitch_is_that_of_its_finite_difference():
+    pitch = torch.tensor(5.31, dtype=torch.float64, requires_grad=True)
+    cost.macs(largest(Space()), pitch, window_um=1152.0).backward()
+    ahead, behind = (float(cost.macs(largest(Space()), 5.31 + s, window_um=1152.0)) for s in (1e-6, -1e-6))
+    assert float(pitch.grad) == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
+
+
+@pytest.mark.parametrize("low", [64, 100, 217])
+def test_more_pixels_never_cost_less(low):
+    sizes = np.linspace(low, low + 3, 61)
+    counts = np.array([float(cost.macs_of_size(Space(), smallest(Space()), s)) for s in sizes])
+    assert (np.diff(counts) >= -1e-6 * counts[0]).all()
+
+
+def test_cost_falls_with_pitch_and_impossible_pitch_is_refused():
+    space = Space()
+    sizes = [cost.input_size(1200.0, pitch, 1.0) for pitch in (3.0, 6.0, 12.0)]
+    counts = [float(cost.macs_of_size(space, smallest(space), s)) for s in sizes]
+    assert counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.9
+    with pytest.raises(ConfigError, match=r"leaves 12\.0 pixels"):
+        cost.input_size(1200.0, 100.0, 1.0)

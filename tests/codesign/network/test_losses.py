@@ -1,0 +1,94 @@
+"""Losses: closed values at the ends, finite on empty masks, gradients by finite differences."""
+
+import pytest
+import torch
+
+from codesign.network import losses
+
+
+def _mask(batch=2):
+    mask = torch.zeros(batch, 16, 16, dtype=torch.float64)
+    mask[:, 4:9, 6:12] = 1
+    return mask
+
+
+def test_dice_is_zero_for_the_right_mask_and_nearly_one_for_its_complement():
+    mask = _mask()
+    assert float(losses.dice(200 * (mask - 0.5), mask)) < 1e-12
+    wrong = float(losses.dice(-200 * (mask - 0.5), mask))
+    assert wrong == pytest.approx(1 - 1 / (16 * 16 + 1), abs=1e-9)  # no overlap: only the smoothing is left
+
+
+def test_all_blink_batch_is_finite_with_finite_gradient():
+    logits = torch.zeros(3, 16, 16, requires_grad=True)
+    loss = losses.segmentation(logits, torch.zeros(3, 16, 16))
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert torch.isfinite(logits.grad).all()
+    assert float(losses.overlap(torch.full((3, 16, 16), -9.0), torch.zeros(3, 16, 16)).min()) == 1
+
+
+def test_gradients_agree_with_finite_differences():
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(2, 8, 8, generator=generator, dtype=torch.float64, requires_grad=True)
+    slip = torch.randn(2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    truth = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    mask = _mask()
+    assert torch.autograd.gradcheck(lambda a: losses.segmentation(a, mask), (logits,))
+    assert torch.autograd.gradcheck(lambda s: losses.slip(s, truth, scale), (slip,))
+
+
+def test_budget_acts_only_beyond_it():
+    macs = torch.tensor(90.0, requires_grad=True)
+    losses.over_budget(macs, 100.0).backward()
+    assert float(macs.grad) == 0
+    assert float(losses.over_budget(torch.tensor(150.0), 100.0)) == pytest.approx(0.5)
+
+
+def test_overlap_of_half_a_mask():
+    mask = torch.zeros(1, 8, 8)
+    mask[:, :4] = 1
+    logits = torch.full((1, 8, 8), -1.0)
+    logits[:, :2] = 1
+    assert float(losses.overlap(logits, mask)[0]) == pytest.approx(0.5)
+
+
+def test_slip_is_counted_in_units_of_its_scale():
+    """Off by 0.1 and 0.5 units: half the square over the knee below it, straight beyond; no scale is 1."""
+    truth, scale = torch.tensor([[0.8, -2.1, 3.3]]), torch.tensor([0.4, 0.7, 3.0])
+    predicted = truth / scale + torch.tensor([[0.1, 0.0, -0.5]])
+    want = (0.1**2 / 2 / 0.3 + (0.5 - 0.3 / 2)) / 3
+    assert float(losses.slip(predicted, truth, scale)) == pytest.approx(want, rel=1e-5)
+
+
+def test_place_is_the_distance_from_the_centroid_of_each_mask():
+    mask = torch.zeros(2, 10, 20)
+    mask[0, 2:4, 5:9] = 0.5  # centroid: x (7 / 20 - 1/2) = -0.15, y (3 / 10 - 1/2) = -0.2
+    centre = torch.tensor([[-0.15 + 0.1, -0.2 - 0.002], [0.3, 0.3]])  # the second is empty: it takes no part
+    want = ((0.1 / 0.02 - 0.15) + (0.1**2 / 2 / 0.3)) / 2
+    assert float(losses.place(centre, mask)) == pytest.approx(want, rel=1e-4)
+    mask[1, 9, 19] = 0.75  # one covered pixel is a mask: x = 19.5 / 20 - 1/2, y = 9.5 / 10 - 1/2
+    both = want + ((0.475 - 0.3) / 0.02 - 0.15 + (0.45 - 0.3) / 0.02 - 0.15) / 2
+    assert float(losses.place(centre, mask)) == pytest.approx(both / 2, rel=1e-4)
+
+
+def test_task_adds_mask_and_twice_the_slip():
+    from codesign.network.supernet import Prediction
+
+    generator = torch.Generator().manual_seed(3)
+    logits, slip = torch.randn(2, 8, 8, generator=generator), torch.randn(2, 3, generator=generator)
+    mask, truth, scale = _mask().float(), torch.tensor([[0.3, -0.9, 2.0]] * 2), torch.tensor([0.4, 0.7, 3.0])
+    kinds = {"mask_logits": logits, "slip": slip}
+    names = Prediction.__dataclass_fields__ if hasattr(Prediction, "__dataclass_fields__") else Prediction._fields
+    found = Prediction(**{n: kinds.get(n, torch.zeros(2, 2)) for n in names})
+    bce = torch.nn.functional.binary_cross_entropy_with_logits(logits, losses.resized(mask, logits))
+    want = losses.dice(logits, losses.resized(mask, logits)) + bce + 2 * losses.slip(slip, truth, scale)
+    assert float(losses.task(found, mask, truth, scale)) == pytest.approx(float(want), rel=1e-6)
+
+
+def test_dice_of_a_half_covered_mask_in_closed_form():
+    logits = torch.full((1, 4, 6), 0.0, dtype=torch.float64)  # one half everywhere
+    mask = torch.zeros(1, 4, 6, dtype=torch.float64)
+    mask[0, :, :2] = 1
+    assert float(losses.dice(logits, mask, smooth=3.0)) == pytest.approx(1 - (2 * 4 + 3) / (12 + 8 + 3), rel=1e-12)

@@ -1,0 +1,129 @@
+"""Weight sharing by slices, calibration of batch statistics, and subnets that equal their supernet."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from codesign.network import architecture as arch
+from codesign.network.subnet import Subnet
+from codesign.network.supernet import Supernet, recalibrate, soft_argmax
+from metalens.ground.errors import ConfigError, TrainingError
+
+SPACE = arch.Space()
+
+
+@pytest.fixture(scope="module")
+def net():
+    torch.manual_seed(0)
+    return Supernet(SPACE)
+
+
+def _frames(count=2, size=64):
+    return torch.randn(count, 1, size, size, generator=torch.Generator().manual_seed(1))
+
+
+def test_every_sampled_architecture_runs_and_gives_all_outputs(net):
+    generator = np.random.default_rng(0)
+    for _ in range(6):
+        found = net.train()(_frames(), arch.sample(SPACE, generator))
+        assert found.slip.shape == (2, 3)
+        assert found.centre.shape == (2, 2)
+        for value in (found.mask_logits, found.centre, found.slip):
+            assert torch.isfinite(value).all()
+
+
+def test_a_subnet_equals_its_slice_of_the_supernet(net):
+    chosen = arch.sample(SPACE, np.random.default_rng(3))
+    recalibrate(net, chosen, [_frames(), _frames(4)])
+    with torch.no_grad():
+        whole, cut = net(_frames(), chosen), Subnet(net, chosen)(_frames())
+    for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
+        assert torch.equal(a, b)
+    assert sum(p.numel() for p in Subnet(net, chosen).parameters()) < sum(p.numel() for p in net.parameters())
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning")
+def test_torchscript_export_gives_equal_outputs(net):
+    chosen = arch.smallest(SPACE)
+    recalibrate(net, chosen, [_frames(size=96)])
+    cut = Subnet(net, chosen)
+    with torch.no_grad():
+        traced = torch.jit.trace(cut, _frames(size=96))
+        for a, b in zip(cut(_frames(3, 96)), traced(_frames(3, 96)), strict=True):
+            assert torch.allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("resolution", [1.0, 0.6])
+def test_onnx_export_gives_equal_outputs(net, tmp_path, resolution):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
+    recalibrate(net, chosen, [_frames(size=100)])
+    cut = Subnet(net, chosen)
+    cut.export_onnx(tmp_path / "n.onnx", size=100)
+    found = onnxruntime.InferenceSession(tmp_path / "n.onnx").run(None, {"frames": _frames(1, 100).numpy()})
+    with torch.no_grad():
+        for a, b in zip(cut(_frames(1, 100)), found, strict=True):
+            assert np.abs(a.numpy() - b).max() < 1e-4  # float32 through 40 layers in another order
+
+
+def test_recalibration_gives_the_mean_of_the_batches_whatever_came_before(net):
+    chosen = arch.largest(SPACE)
+    batches = [_frames(4), 2 * _frames(4) + 1]
+    recalibrate(net, chosen, batches)
+    first = net.stem.norm.mean.clone()
+    recalibrate(net, arch.smallest(SPACE), [_frames()])
+    recalibrate(net, chosen, batches[::-1])
+    assert torch.allclose(net.stem.norm.mean, first, atol=1e-6)
+
+
+def test_recalibration_without_frames_is_refused(net):
+    with pytest.raises(TrainingError, match="at least one batch"):
+        recalibrate(net, arch.smallest(SPACE), [])
+
+
+def test_training_one_slice_leaves_the_rest_without_gradient(net):
+    net.zero_grad()
+    net.train()(_frames(), arch.smallest(SPACE)).slip.sum().backward()
+    block = net.stages[0][0]
+    hidden = arch.blocks(SPACE, arch.smallest(SPACE))[0][0].hidden
+    assert float(block.expand.weight.grad[hidden:].abs().max()) == 0
+    assert float(block.expand.weight.grad[:hidden].abs().max()) > 0
+    rim = block.depthwise.weight.grad.clone()
+    rim[..., 2:5, 2:5] = 0
+    assert float(rim.abs().max()) == 0
+
+
+def test_soft_argmax_finds_the_centre_of_a_disc_and_survives_an_empty_mask():
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    logits = (5 - torch.hypot(x - 44.5, y - 9.5)).mul(4)[None].requires_grad_()
+    centre = soft_argmax(logits)
+    assert centre[0].tolist() == pytest.approx([45 / 60 - 0.5, 10 / 40 - 0.5], abs=2e-3)
+    empty = torch.full((1, 8, 8), -50.0, requires_grad=True)
+    soft_argmax(empty).sum().backward()
+    assert soft_argmax(empty).abs().max() == 0
+    assert torch.isfinite(empty.grad).all()
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000))
+def test_mutation_stays_in_the_space_and_changes_the_network(seed):
+    generator = np.random.default_rng(seed)
+    parent = arch.sample(SPACE, generator)
+    child = arch.check(SPACE, arch.mutate(SPACE, parent, generator))
+    assert arch.active(SPACE, child) != arch.active(SPACE, parent)
+    chain = list(arch.walk(arch.blocks(SPACE, child)))
+    assert all(a.outputs == b.inputs for a, b in itertools.pairwise(chain))
+
+
+def test_a_foreign_architecture_is_refused_by_name():
+    odd = dataclasses.replace(arch.smallest(SPACE), kernels=(4, *arch.smallest(SPACE).kernels[1:]))
+    with pytest.raises(ConfigError, match=r"kernels\[0\] is 4"):
+        arch.check(SPACE, odd)
+    with pytest.raises(ConfigError, match="resolution is 2"):
+        arch.check(SPACE, dataclasses.replace(arch.smallest(SPACE), resolution=2.0))

@@ -1,0 +1,88 @@
+"""PSFs of made lenses on training's samples: against the sum over every pillar, with all symmetries broken."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from characterize.model import made
+from characterize.model.parameters import PLACE, vector
+from codesign.optics import built
+from codesign.optics import stack as optics
+from codesign.optics.stack import Stack
+from metalens import psf
+from metalens.made import sensitivity
+
+X = vector(m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e": 9.0})
+
+
+def _engine(x, settings):
+    """The same PSFs from every pillar, integrated over samples whose light is low-passed to their grid."""
+    lens, known = m.small(), built.of_lens(x)
+    t = made.pillars(lens, sensitivity(lens), known)
+    samples, window = 8 * 15, 45.0
+    found = psf.psf_stack(
+        np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85, depths_um=settings.depths_um.numpy(),
+        sensor_distance_um=300.0 + float(known[PLACE["distance_um"]]), window_um=window, samples=samples,
+        tolerance=1e-4,
+    )  # fmt: skip
+    edge = window / (2 * settings.sample_um)
+    m_ = np.arange(1, int(edge + 0.5) + 1)
+    kept = np.clip(edge - m_ + 0.5, 0, 1) * np.sinc(m_ / window * settings.sample_um)
+    place = (np.arange(11) - 5) * settings.sample_um
+    fine = (np.arange(samples) - (samples - 1) / 2) * window / samples
+    waves = np.cos(2 * np.pi * m_ / window * (place[:, None] - fine)[..., None])
+    rows = settings.sample_um / window * (1 + 2 * (waves * kept).sum(-1))
+    light = found.energy_um2 / (float((lens.diameters.diameter_um > 0).sum()) * 0.16)
+    return Stack(torch.as_tensor(rows @ (found.intensity * light[:, None, None]) @ rows.T), settings.depths_um)
+
+
+@pytest.mark.parametrize("x", [vector(), X], ids=["design", "made"])
+def test_psfs_agree_with_the_sum_over_every_pillar(x):
+    got, want = built.MadeLens(m.small(), m.OPTICS).stack(x), _engine(x, m.OPTICS)
+    assert built.psf_error(got, want) < 6e-3  # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
+    assert (
+        got.intensity.sum((1, 2)) / want.intensity.sum((1, 2)) - 1
+    ).abs().max() < 0.02  # half a pitch at the rim is 1.3 % of the light
+    far = built.MadeLens(m.small(), m.OPTICS).stack()
+    assert x is not X or built.psf_error(far, want) > 0.05  # the errors of this lens are far above the tolerance
+
+
+def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
+    """Phase grows with the diameter: a lens thicker at +x delays the light there and bends it to +x."""
+    settings = dataclasses.replace(m.OPTICS, window_samples=15)
+    light = built.MadeLens(m.small(), settings).stack(vector({"bias_x_nm": 10.0})).intensity.double()
+    axis = (torch.arange(15, dtype=torch.float64) - 7) * 3.0
+    x, y = ((light.sum(d) * axis).sum(1) / light.sum((1, 2)) for d in (1, 2))
+    slope = 3 * np.pi * 2 / 0.24 * 10e-3 / 2  # rad at the rim: phase is 3 turns over 0.24 um of diameter ...
+    expected = slope / 60.0 / (2 * np.pi / 0.85) * 300.0
+    assert abs(y).max() < 0.02
+    assert x.min() > 0.3 * expected > 0
+
+
+def test_only_what_the_lens_keeps_enters():
+    bench = vector({"stage_zero_um": 300.0, "wavelength_nm": 2.0, "crosstalk_px": 1.0, "log_gain": 3.0})
+    made_lens = built.MadeLens(m.small(), m.OPTICS)
+    assert torch.equal(made_lens.stack(bench).intensity, made_lens.stack().intensity)
+
+
+def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
+    draws = np.array(list(built.posterior(m.asbuilt(sigma=0.5), 400, seed=3)))
+    again = np.array(list(built.posterior(m.asbuilt(sigma=0.5), 400, seed=3)))
+    assert np.array_equal(draws, again)
+    bias = draws[:, PLACE["bias_nm"]]
+    assert abs(bias.mean() - 6.0) < 4 * 0.5 / 20
+    assert abs(bias.std() - 0.5) < 4 * 0.5 / np.sqrt(800)
+
+
+def test_the_design_matches_the_smooth_lens_of_training():
+    """Pillars against the phase they were made for: two ways to the same samples."""
+    got = built.MadeLens(m.small(), m.OPTICS).stack()
+    want = optics.stack(m.OPTICS, torch.zeros(0))
+    assert built.psf_error(got, want) < 0.25  # the grids of both windows cut the band at different harmonics

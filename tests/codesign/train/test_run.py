@@ -1,0 +1,203 @@
+"""A whole run at the smallest size: presets, stop and resume bit for bit, search within budgets, refusals by name."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from codesign.commands import codesign as command_codesign
+from codesign.train import run
+from codesign.train.finish import finish, finished
+from metalens.ground.errors import ConfigError, TrainingError
+
+TINY = """
+preset = "smoke"
+checkpoint_every = 1
+validation_batches = 1
+test_batches = 1
+[scenes]
+pixels = 48
+pool = 6
+[inner]
+steps = 2
+batch = 2
+[inner.optics]
+rate = 0.02
+start = 0.0
+end = 0.9
+[search]
+population = 2
+tournament = 1
+rounds = 3
+[run]
+budgets_mmacs = [2.0]
+[optics]
+aperture_mm = 0.3
+sensor_distance_mm = 1.0
+depth_count = 4
+window_samples = 9
+"""
+
+
+@pytest.fixture
+def settings(tmp_path):
+    (tmp_path / "run.toml").write_text(TINY)
+    return run.load(tmp_path / "run.toml")
+
+
+def _end(going, path):
+    list(run.train(going, path))
+    list(run.search(going, path))
+    return finish(going)
+
+
+def test_preset_fills_what_the_file_leaves_out(settings):
+    assert settings.scenes.pixels == 48  # from the file
+    assert settings.scenes.margin == 8  # from the preset
+    assert settings.inner.weights.rate == 4e-3  # default
+
+
+@pytest.mark.parametrize("name", ["smoke", "laptop", "paper"])
+def test_every_preset_is_a_valid_run_whose_psfs_fit_its_margin(tmp_path, name):
+    (tmp_path / "run.toml").write_text(f'preset = "{name}"')
+    found = run.load(tmp_path / "run.toml")
+    assert found.preset == name
+    assert found.scenes.margin >= found.optics.window_samples // 2
+    side = found.scenes.pixels + 2 * found.scenes.margin
+    assert found.scenes.pool * side**2 * 3 < 4e9  # bytes of the pool
+
+
+def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(settings, tmp_path):
+    whole = run.start(settings)
+    rows = _end(whole, tmp_path / "whole")
+
+    first = run.start(settings)
+    steps = run.train(first, tmp_path / "part")
+    next(steps), next(steps)
+    second = run.resume(tmp_path / "part", settings)
+    assert second.trainer.step == 1  # the checkpoint of the second step is written after the record is taken
+    list(run.train(second, tmp_path / "part"))
+    births = run.search(second, tmp_path / "part")
+    next(births), next(births)
+    third = run.resume(tmp_path / "part", settings)
+    assert _end(third, tmp_path / "part") == rows
+    for a, b in zip(
+        whole.trainer.model.net.state_dict().values(), third.trainer.model.net.state_dict().values(), strict=True
+    ):
+        assert torch.equal(a, b)
+    assert torch.equal(run.coefficients(whole), run.coefficients(third))
+    assert float(run.coefficients(whole).abs().max()) > 0
+    assert all(c.macs <= 2e6 for s in whole.searches for c in s.history)
+
+
+def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
+    going = run.start(settings)
+    run.save(tmp_path / "c", going)
+    (tmp_path / "other.toml").write_text(TINY.replace("steps = 2", "steps = 4"))
+    with pytest.raises(TrainingError, match=r"inner\.steps: 2 -> 4"):
+        run.resume(tmp_path / "c", run.load(tmp_path / "other.toml"))
+    with pytest.raises(TrainingError, match="0 of 1 searches"):
+        finish(going)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('preset = "laptp"', r"preset is 'laptp'; did you mean 'laptop'\?"),
+        ("[run]\npitch_um = 500.0", "pixels of a"),
+        ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
+        ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
+        ("[scenes]\npool = 3", "need a pool of a batch or more"),
+        ("[run]\nfrozen = ['lens']", "frozen"),
+        ("network = 'resnet'", "network"),
+        ("[optics.spread]\nfocus_um = -1.0", "standard deviations of 0 or more"),
+        ("[optics.spread]\ncorrelation = [1.0, 0.2]", "correlation has 2 entries, need k x k"),
+    ],
+)
+def test_bad_configs_are_refused_by_name(tmp_path, change, message):
+    (tmp_path / "run.toml").write_text(change + "\n")
+    with pytest.raises(ConfigError, match=message):
+        run.load(tmp_path / "run.toml")
+
+
+def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
+    with pytest.raises(TrainingError, match="below the smallest network"):
+        run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+
+
+def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
+    going = run.start(replace(settings, run=replace(settings.run, frozen=("optics", "architecture"))))
+    rows = _end(going, tmp_path / "c")
+    assert not run.coefficients(going).any()
+    assert [len(s.history) for s in going.searches] == [1]
+    assert len(set(rows[0]["architecture"]["kernels"])) == 1
+    assert rows[0]["mmacs"] <= 2.0
+
+
+@pytest.mark.parametrize("network", ["nvgaze", "popovic", "de2gaze"])
+def test_baselines_run_from_the_same_config(settings, tmp_path, network):
+    going = run.start(replace(settings, network=network))
+    (row,) = _end(going, tmp_path / "c")
+    assert row["budget_mmacs"] is None
+    assert row["mmacs"] > 0.5
+    assert (row["iou"] is None) == (network == "nvgaze")
+    again = run.resume(tmp_path / "c", replace(settings, network=network))
+    assert finish(again) == [row]
+
+
+def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tmp_path):
+    tuned = replace(settings, run=replace(settings.run, finetune_steps=2), ambiguity_pairs=2)
+    going = run.start(tuned)
+    rows = _end(going, tmp_path / "c")
+    plain = finish(run.resume(tmp_path / "c", tuned))
+    assert plain == rows
+    assert {"ambiguous_axial_slip_mm", "depth_response_mm_per_mm"} <= set(rows[0])
+    before = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
+    row, made = finished(going)[0]
+    assert row == rows[0]
+    assert torch.equal(made.coefficients_rad, going.trainer.model.coefficients_rad)
+    assert not torch.equal(made.net.stem.weight, before["stem.weight"])
+
+
+def test_a_log_line_cut_by_a_kill_is_dropped(settings, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    going = run.start(settings)
+    next(run.train(going, folder / "unused"))
+    run.save(folder / command_codesign.CHECKPOINT, going)
+    lines = [json.dumps({"kind": "step", "step": s}) for s in (1, 2, 3)]
+    (folder / command_codesign.LOG).write_text("\n".join(lines)[:-5])
+    command_codesign._resume(folder, settings)
+    assert (folder / command_codesign.LOG).read_text() == lines[0] + "\n"
+
+
+@pytest.mark.slow
+def test_killed_after_any_step_or_birth_the_command_ends_in_the_same_bytes(tmp_path):
+    (tmp_path / "run.toml").write_text(TINY)
+
+    def start(folder, *words):
+        command = [sys.executable, "-m", "metalens", "codesign", "run.toml", "-o", folder, *words]
+        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+
+    def end(child):
+        child.communicate()
+        return child.returncode
+
+    def begin():
+        resumable = (tmp_path / "killed.unfinished" / command_codesign.CHECKPOINT).exists()
+        return start("killed", "--resume" if resumable else "--force")
+
+    assert end(start("whole")) == 0
+    for lines in (0, 1, 1, 2):  # what it says before it is killed: nothing, a step, the other step, births
+        child = begin()
+        assert all(child.stdout.readline() for _ in range(lines))
+        os.kill(child.pid, signal.SIGKILL)
+        assert end(child) == -signal.SIGKILL
+    assert end(begin()) == 0
+    for name in ("result.json", "log.jsonl", "checkpoint.safetensors", "lens.h5", "subnet_2.safetensors"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes(), name

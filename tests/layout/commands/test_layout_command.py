@@ -1,0 +1,163 @@
+"""``metalens layout`` from lens file to mask: what it writes, what it refuses, and how it ends."""
+
+import json
+
+import numpy as np
+import pytest
+
+import layout
+from layout.files import dxf
+from layout.process.process import Rules
+from layout.rules import check as drc
+from layout.rules import markers
+from layout.shapes import polygon
+from metalens import cli, lens
+from metalens.cell.record import Cell
+from metalens.ground.errors import ProcessError
+from metalens.lens.record import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
+
+
+@pytest.fixture(scope="module")
+def lens_file(tmp_path_factory):
+    """A small round lens of random diameters."""
+    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    axis = np.arange(60) - 29.5
+    d = np.random.default_rng(0).uniform(0.1, 0.3, (60, 60))
+    d[axis**2 + axis[:, None] ** 2 > 900] = 0
+    path = tmp_path_factory.mktemp("lens") / "lens.h5"
+    lens.save(path, Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"))
+    return path
+
+
+def run(*words):
+    return cli.main(["layout", *map(str, words)])
+
+
+def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
+    target = tmp_path / "mask"
+    assert run(lens_file, "-o", target, "--dxf", "--oasis", "--gds", "--stl", "--window.size-um", 6) == 0
+    assert "reads back as planned" in capsys.readouterr().out
+    names = {path.name for path in target.iterdir()}
+    assert {"mask.oas", "mask.gds", "mask.dxf", "mask.lyp", "mask.lyrdb", "report.html", "pillars.stl"} <= names
+    assert {"die.png", "pillars.png", "diameters.png", "margins.png", "process.toml", "layout.json"} <= names
+    values = json.loads((target / "layout.json").read_text())
+    assert values["ok"]
+    planned = np.count_nonzero(lens.load(lens_file).diameters.diameter_um)
+    for content in (layout.read_oasis(target / "mask.oas"), layout.read_gdsii(target / "mask.gds")):
+        assert sum(content.counts("LENS").values()) == planned
+    page = (target / "report.html").read_text()
+    assert "violations" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_same_input_gives_the_same_masks(lens_file, tmp_path):
+    for name in ("a", "b"):
+        assert run(lens_file, "-o", tmp_path / name, "--quiet") == 0
+    for name in ("mask.oas", "mask.gds", "mask.lyp", "mask.lyrdb", "process.toml", "die.png"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_broken_rule_ends_with_one_and_is_marked(lens_file, tmp_path, capsys):
+    process = tmp_path / "process.toml"
+    process.write_text("[rules]\nminimum_gap_nm = 130\n[exposure]\ncorrect = false\n")
+    target = tmp_path / "mask"
+    assert run(lens_file, "--process", process, "-o", target, "--oasis", "--json") == 1
+    values = json.loads(capsys.readouterr().out)
+    assert not values["ok"]
+    assert values["violations"]["gap"] > 0
+    rdb = pytest.importorskip("klayout.rdb")
+    database = rdb.ReportDatabase()
+    database.load(str(target / "mask.lyrdb"))
+    shown = sum(1 for _ in database.each_item())
+    assert shown == min(values["violations"]["gap"], 500)
+    assert {c.name() for c in database.each_category() if c.num_items()} == {"gap"}
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("[rules]\ngrid_mn = 1\n", "grid_nm"),
+        ("[rules]\ngrid_nm = 5\ndiameter_step_nm = 2\n", "coarser"),
+        ("[die]\nmargin_um = 20\n", "margin_um"),
+        ("[die]\nlabel = 'ÄÖ'\n", "font"),
+    ],
+)
+def test_bad_processes_end_with_two_and_write_nothing(lens_file, tmp_path, capsys, text, match):
+    process = tmp_path / "process.toml"
+    process.write_text(text)
+    assert run(lens_file, "--process", process, "-o", tmp_path / "mask") == 2
+    assert match in capsys.readouterr().err
+    assert not (tmp_path / "mask").exists()
+
+
+def test_bad_targets_and_lenses_end_with_two(lens_file, tmp_path, capsys):
+    assert run(tmp_path / "none.h5", "-o", tmp_path / "mask") == 2
+    assert run(lens_file, "-o", tmp_path / "no" / "mask") == 2
+    (tmp_path / "file").write_text("x")
+    assert run(lens_file, "-o", tmp_path / "file", "--force") == 2
+    assert run(lens_file, "-o", tmp_path / "mask", "--name", "A B") == 2
+    capsys.readouterr()
+    assert not (tmp_path / "mask").exists()
+
+
+def test_an_existing_mask_stays_without_force_and_stale_files_go_with_it(lens_file, tmp_path, capsys):
+    target = tmp_path / "mask"
+    assert run(lens_file, "-o", target, "--quiet") == 0
+    before = (target / "mask.oas").read_bytes()
+    assert run(lens_file, "-o", target, "--quiet") == 2
+    assert (target / "mask.oas").read_bytes() == before
+    assert run(lens_file, "-o", target, "--quiet", "--force", "--oasis", "--circles") == 0
+    assert not (target / "mask.gds").exists()
+    assert (target / "mask.oas").read_bytes() != before
+    capsys.readouterr()
+
+
+def test_dxf_of_a_window_reads_in_klayout(plan, tmp_path):
+    db = pytest.importorskip("klayout.db")
+    window = dxf.Window(-2.0, 1.0, 4.0)
+    count = layout.write_dxf(plan, tmp_path / "m.dxf", window=window)
+    inside = [
+        (x, y, k)
+        for k, x, y in dxf.sites_in(plan, plan.lattices[0], window)
+        if abs(x + 2000) < 2001 and abs(y - 1000) < 2001
+    ]
+    assert count == len(inside) > 0
+    read = db.Layout()
+    options = db.LoadLayoutOptions()
+    options.dxf_dbu = 0.001
+    options.dxf_polyline_mode = 3  # closed polylines are polygons
+    read.read(str(tmp_path / "m.dxf"), options)
+    layer = next(i for i in read.layer_indexes() if read.get_info(i).name == "PILLAR")
+    region = db.Region(read.top_cell().begin_shapes_rec(layer))
+    assert region.count() == count
+    area = sum(polygon.twice_area(plan.classes[k - 1].outline) for _, _, k in inside) / 2
+    assert region.area() == area
+
+
+def test_dxf_beyond_its_limit_is_refused(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(dxf, "MOST_PILLARS", 3)
+    with pytest.raises(ProcessError, match="take at most 3"):
+        layout.write_dxf(plan, tmp_path / "m.dxf", window=dxf.Window(0, 0, 50))
+    assert not list(tmp_path.iterdir())
+
+
+def test_layer_properties_name_every_layer(plan, tmp_path):
+    markers.write_lyp(plan, tmp_path / "m.lyp")
+    text = (tmp_path / "m.lyp").read_text()
+    for source, name in (("1/0@1", "pillar"), ("3/0@1", "marks")):
+        assert f"<source>{source}</source>" in text
+        assert f"<name>{name}</name>" in text
+
+
+def test_markers_stand_where_the_violations_are(make_plan, tmp_path):
+    rdb = pytest.importorskip("klayout.rdb")
+    plan = make_plan(np.array([[7, 7]], np.uint8))
+    found = drc.check(plan, Rules(minimum_gap_nm=300, minimum_feature_nm=1))
+    markers.write_lyrdb(plan, found, tmp_path / "m.lyrdb")
+    database = rdb.ReportDatabase()
+    database.load(str(tmp_path / "m.lyrdb"))
+    (item,) = database.each_item()
+    box = next(v.box() for v in item.each_value() if v.is_box())
+    violation = found.violations[0]
+    assert [round(1000 * v) for v in (box.left, box.bottom, box.right, box.top)] == list(violation.box)

@@ -1,0 +1,307 @@
+"""From diameters to the plan of a mask: quantisation, bias, doses, die features; impossible input is refused."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import layout
+from layout.dose import exposure
+from layout.mask import build, cells, die, font
+from layout.process.process import Die, Exposure, Layers, Process, Rules
+from layout.shapes import polygon
+from metalens.ground.errors import LensError, ProcessError
+from metalens.lens.record import DiameterMap
+from metalens.made import Bias
+
+PLAIN = Process(exposure=Exposure(correct=False))
+
+
+def disc_map(n=41, pitch=0.4, seed=0):
+    """A round lens of random diameters, without symmetry."""
+    axis = np.arange(n) - (n - 1) / 2
+    d = np.random.default_rng(seed).uniform(0.1, 0.3, (n, n))
+    d[axis**2 + axis[:, None] ** 2 > (n / 2) ** 2] = 0
+    return DiameterMap(d, pitch)
+
+
+@given(step=st.integers(1, 10), seed=st.integers(0, 99))
+def test_drawn_diameters_are_within_half_a_step(step, seed):
+    source = disc_map(15, seed=seed)
+    found = cells.quantise(source, Process(rules=Rules(diameter_step_nm=step)))
+    there = source.diameter_um > 0
+    assert np.array_equal(found.classes > 0, there)
+    drawn = found.diameters_nm[found.classes[there].astype(int) - 1]
+    wanted = Process().written_diameter_nm(source.diameter_um[there] * 1e3)
+    assert np.abs(drawn - wanted).max() <= step / 2 + 1 / 16  # the table of designed diameters has 1/16 nm
+    assert np.array_equal(np.bincount(found.classes.ravel())[1:], found.counts)
+
+
+def test_bias_is_taken_off():
+    process = Process(bias=Bias(table_nm=((50.0, -10.0), (400.0, -10.0))))
+    one = cells.quantise(DiameterMap(np.array([[0.2]]), 0.4), Process())
+    other = cells.quantise(DiameterMap(np.array([[0.2]]), 0.4), process)
+    assert other.diameters_nm[0] - one.diameters_nm[0] == 10
+
+
+def test_a_pillar_at_the_rim_is_drawn_wider_where_isolated_ones_come_out_thin():
+    process = Process(bias=Bias(isolated_nm=-10.0))
+    drawn = cells.drawn_steps(DiameterMap(np.full((31, 31), 0.2), 0.4), process)
+    assert drawn[0, 0] > drawn[15, 15]
+    assert drawn[15, 15] == cells.drawn_steps(DiameterMap(np.array([[0.2]]), 0.4), Process())[0, 0]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -0.1, 0.4, 0.5])
+def test_impossible_diameters_are_refused_with_row_and_column(bad):
+    d = np.full((5, 7), 0.2)
+    d[3, 4] = bad
+    with pytest.raises(LensError, match="row 3, column 4"):
+        layout.plan(DiameterMap(d, 0.4), PLAIN)
+
+
+def test_a_bias_that_makes_pillars_touch_is_refused_with_row_and_column():
+    d = np.full((5, 7), 0.2)
+    d[2, 6] = 0.39
+    process = Process(bias=Bias(table_nm=((50.0, -30.0), (400.0, -30.0))))
+    with pytest.raises(ProcessError, match="row 2, column 6"):
+        layout.plan(DiameterMap(d, 0.4), process)
+
+
+def test_a_pillar_that_vanishes_is_refused():
+    d = np.full((3, 3), 0.2)
+    d[1, 2] = 0.0004
+    with pytest.raises(ProcessError, match="row 1, column 2"):
+        layout.plan(DiameterMap(d, 0.4), PLAIN)
+
+
+def test_an_empty_lens_is_refused():
+    with pytest.raises(LensError, match="no pillar"):
+        layout.plan(DiameterMap(np.zeros((4, 4)), 0.4), PLAIN)
+
+
+def test_a_pitch_off_the_grid_is_refused():
+    with pytest.raises(ProcessError, match="no multiple of the grid"):
+        layout.plan(disc_map(pitch=0.4005), PLAIN)
+    with pytest.raises(ProcessError, match="no multiple of the grid"):
+        layout.plan(disc_map(pitch=0.402), Process(rules=Rules(grid_nm=5, diameter_step_nm=10)))
+
+
+def test_coordinates_beyond_32_bit_are_refused():
+    rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
+    with pytest.raises(ProcessError, match="32 bits"):
+        build.stream(lambda a, b: np.zeros((b - a, 2)), PLAIN, shape=(rows, 2), pitch_um=0.4, range_um=(0.1, 0.3))
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 10])
+def test_the_axis_of_the_lens_is_the_origin_and_coordinates_are_those_of_the_lens(n):
+    d = np.zeros((n, n))
+    d[0, n - 1] = 0.2
+    plan = layout.plan(DiameterMap(d, 0.4), PLAIN, furnished=False)
+    lattice = plan.lattices[0]
+    half = (n - 1) * 200
+    assert (lattice.x0, lattice.y0) == (-half, half)
+    assert lattice.whole()[n - 1, n - 1] == 1  # the map's first row, at negative y, is the lowest of the mask
+    assert plan.axis == (0, 0)
+
+
+def test_an_even_lens_on_an_odd_pitch_lies_half_a_step_off_and_says_so():
+    plan = layout.plan(disc_map(10, pitch=0.401), PLAIN, furnished=False)
+    assert plan.axis == (-0.5, 0.5)
+    assert isinstance(plan.lattices[0].x0, int)
+
+
+def test_a_coarse_grid_holds_for_everything():
+    process = Process(rules=Rules(grid_nm=5, diameter_step_nm=10), exposure=Exposure(correct=False))
+    plan = layout.plan(disc_map(31), process)
+    assert plan.grid == 5
+    assert layout.check(plan, process.rules).counts["off-grid"] == 0
+
+
+def test_streamed_rows_give_the_plan_of_the_whole_map():
+    source = disc_map(61)
+    for process in (PLAIN, Process(bias=Bias(isolated_nm=-4.0, range_um=0.8), exposure=Exposure(correct=False))):
+        whole = layout.plan(source, process, furnished=False)
+        streamed = build.stream(
+            lambda a, b: source.diameter_um[a:b],
+            process,
+            shape=source.diameter_um.shape,
+            pitch_um=0.4,
+            range_um=(0.1, 0.3),
+        )
+        sizes = [np.array([0, *(c.diameter_units for c in plan.classes)]) for plan in (whole, streamed)]
+        first = sizes[0][whole.lattices[0].whole()]
+        blocks = np.concatenate([sizes[1][block] for _, block in streamed.lattices[0].blocks(7)])
+        assert np.array_equal(first, blocks)
+
+
+def test_streamed_diameters_outside_the_range_are_refused():
+    plan = build.stream(lambda a, b: np.full((b - a, 4), 0.35), PLAIN, shape=(9, 4), pitch_um=0.4, range_um=(0.1, 0.3))
+    with pytest.raises(ProcessError, match="widen range_um"):
+        plan.lattices[0].source(0, 3)
+
+
+BEAM = {"alpha_um": 0.012, "beta_um": 27.0, "eta": 0.65}
+
+
+def test_without_a_point_exposure_the_lens_has_one_datatype_and_one_dose():
+    for process in (Process(), Process(exposure=Exposure(**BEAM, correct=False))):
+        made = build.prepare(disc_map(61), process)
+        assert made.dose is None
+        lens = [c for c in made.plan.classes if c.name[0] == "D"]
+        assert {c.layer for c in lens} == {(1, 0)}
+        assert made.plan.doses[1, 0] == 1.0
+
+
+def test_doses_become_named_datatypes_and_every_shape_has_one():
+    made = build.prepare(disc_map(61), Process(exposure=Exposure(**BEAM, tolerance=0.02)))
+    assert made.dose is not None
+    assert made.dose.worst < 0.02
+    drawn = {c.layer for c in made.plan.classes} | {layer for f in made.plan.figures for layer in f.polygons}
+    assert drawn - set(made.plan.doses) == {(10, 0)}
+    for c in made.plan.classes:
+        assert made.plan.doses[c.layer] == c.dose
+        assert made.plan.layer_names[c.layer].endswith(f"dose_{c.dose:.4f}")
+    assert len({c.layer for c in made.plan.classes if c.layer[0] == 1}) > 1
+
+
+def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
+    """Pillars of lens, dose test and witness cells, and a mark: the direct sum over all of them, at some edges."""
+    settings = Exposure(**BEAM, tolerance=0.01)
+    plan = build.prepare(disc_map(41), Process(exposure=settings)).plan
+    point = exposure.point_exposure(settings)
+    centres, wide, dose, goal = [], [], [], []
+    for lattice in plan.lattices:
+        rows, columns = np.nonzero(lattice.whole())
+        centres.append(np.stack([lattice.x0 + columns * 400, lattice.y0 - rows * 400], -1) * 1e-3)
+        kinds = [plan.classes[k - 1] for k in lattice.whole()[rows, columns]]
+        wide += [c.diameter_nm * 1e-3 for c in kinds]
+        dose += [c.dose for c in kinds]
+        goal += [c.goal for c in kinds]
+    centres, wide, dose, goal = np.concatenate(centres), np.array(wide), np.array(dose), np.array(goal)
+    which = np.linspace(0, len(wide) - 1, 24).astype(int)
+    beside = [f.polygons.items() for f in plan.figures if f.name in ("MARKS", "LABEL")]
+    shapes = [(p, plan.doses[layer]) for items in beside for layer, ps in items for p in ps]
+    edges = exposure.at_edges(centres, wide, dose, point, which=which, rim_points=8)
+    box = np.array([[*p.min(0), *p.max(0)] for p, _ in shapes]) * 1e-3
+    level = np.array([dose for _, dose in shapes])
+    area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
+    for n, index in enumerate(which):  # marks and label: small beside the width of the beam that reaches this far
+        away = np.hypot(*(((box[:, :2] + box[:, 2:]) / 2 - centres[index]).T))
+        edges[n] += (level * area * point.density(away)).sum()
+    assert abs(edges / (0.5 * goal[which]) - 1).max() < 0.01 + 2e-3
+    assert set(np.round(goal[which], 2)) >= {0.8, 1.0, 1.2}
+
+
+def test_a_negative_tone_draws_what_is_left_of_the_square():
+    process = Process(tone="negative", exposure=Exposure(correct=False))
+    plan = layout.plan(disc_map(21), process, furnished=False)
+    for made in plan.classes:
+        drawn = sum(polygon.twice_area(half) for half in made.polygons)
+        assert abs(drawn) == 2 * 400**2 - polygon.twice_area(made.outline)
+    db = pytest.importorskip("klayout.db")
+    made = plan.classes[0]
+    shapes = [
+        db.Region(db.Polygon([db.Point(*map(int, p)) for p in shape])) for shape in (*made.polygons, made.outline)
+    ]
+    assert (shapes[0] & shapes[1]).is_empty()
+    assert ((shapes[0] + shapes[1]) & shapes[2]).is_empty()
+    assert ((shapes[0] + shapes[1] + shapes[2]) ^ db.Region(db.Box(-200, -200, 200, 200))).is_empty()
+
+
+def test_a_negative_tone_clears_the_sites_without_pillar():
+    source, process = disc_map(21), Process(tone="negative")
+    plan = layout.plan(source, process, furnished=False)
+    clear = next(f for f in plan.figures if f.name == "CLEAR").polygons[process.layers.pillar]
+    area = sum(polygon.twice_area(p) for p in clear) / 2
+    assert area == 400**2 * np.count_nonzero(source.diameter_um == 0)
+    sites = plan.lattices[0]
+    for row, column in np.argwhere(sites.whole() > 0):
+        x, y = sites.x0 + column * 400, sites.y0 - row * 400
+        assert not any(p[0, 0] < x < p[1, 0] and p[0, 1] < y < p[2, 1] for p in clear)
+
+
+def test_the_die_holds_everything_within_its_street_and_apart():
+    process = Process(exposure=Exposure(correct=False))
+    plan = layout.plan(disc_map(101), process, name="LENS_7")
+    names = {figure.name for figure in plan.figures} | {lattice.name for lattice in plan.lattices}
+    assert names == {"APERTURE", "MARKS", "LABEL", "OUTLINE", "LENS", "DOSETEST", "WITNESS"}
+    assert layout.check(plan, process.rules).ok
+    outline = next(f for f in plan.figures if f.name == "OUTLINE").polygons[process.layers.outline][0]
+    edge = outline.max() - 1000 * process.die.street_um
+    for figure in plan.figures:
+        if figure.name != "OUTLINE":
+            assert max(np.abs(p).max() for ps in figure.polygons.values() for p in ps) <= edge
+    doses = {c.dose for c in plan.classes if c.layer[0] == process.layers.dose[0]}
+    assert doses == set(die.DOSES)
+
+
+def test_the_aperture_opens_the_lens_and_the_test_structures():
+    plan = layout.plan(disc_map(101), PLAIN)
+    openings = next(f for f in plan.figures if f.name == "APERTURE").polygons[PLAIN.layers.aperture]
+    radius = 1000 * (disc_map(101).radius_um + 0.2)
+    assert polygon.twice_area(openings[0]) / 2 == pytest.approx(math.pi * radius**2, rel=1e-4)
+    for lattice in plan.lattices[1:]:
+        corners = (lattice.x0, lattice.y0), (lattice.x0 + (lattice.columns - 1) * lattice.pitch, lattice.y0)
+        assert any(
+            all(p[:, 0].min() < x < p[:, 0].max() and p[:, 1].min() < y < p[:, 1].max() for x, y in corners)
+            for p in openings[1:]
+        )
+
+
+@given(radius=st.floats(1e3, 5e6), grid=st.sampled_from([1, 5]))
+def test_the_aperture_disc_keeps_its_area_and_fits_gdsii(radius, grid):
+    shape = die.disc(radius, (0.0, 0.0), grid)
+    assert len(shape) <= 8000
+    assert (shape % grid == 0).all()
+    # rounding moves each vertex by at most 0.71 grid steps, its edge by as much: 1.5 g / R of the area
+    assert polygon.twice_area(shape) / 2 == pytest.approx(math.pi * radius**2, rel=1.5 * grid / radius + 1e-9)
+
+
+def test_a_die_without_room_is_refused_with_what_it_needs():
+    with pytest.raises(ProcessError, match=r"\d+ um are needed"):
+        layout.plan(disc_map(101), dataclasses.replace(PLAIN, die=Die(margin_um=60)))
+
+
+def test_the_orientation_mark_is_like_none_of_its_images():
+    mark = die._letter_f(0, 0, 10)
+    db = pytest.importorskip("klayout.db")
+    shape = db.Region(db.Polygon([db.Point(*map(int, p)) for p in mark]))
+    for turn in range(1, 8):
+        other = shape.transformed(db.Trans(turn % 4, turn >= 4, 0, 0))
+        moved = other.moved(shape.bbox().left - other.bbox().left, shape.bbox().bottom - other.bbox().bottom)
+        assert not (moved ^ shape).is_empty()
+
+
+def test_letters_are_upright_and_unknown_ones_are_refused():
+    shapes = font.text("L", x=0, y=0, square=10)
+    heights = {(int(s[:, 0].min()), int(s[:, 0].max())) for s in shapes if s[:, 1].min() == 0}
+    assert heights == {(0, 50)}  # the foot of an L is at the bottom
+    assert max(int(s[:, 1].max()) for s in shapes) == 70
+    with pytest.raises(ProcessError, match="font"):
+        font.text("Ä", x=0, y=0, square=10)
+
+
+def test_dose_test_layers_keep_clear_of_the_others():
+    layers = Layers(marks=(5, 3))  # the dose array uses 5/0 to 5/8
+    with pytest.raises(ProcessError, match="5/3"):
+        layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=layers))
+
+
+def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independent_reader_sees_them(tmp_path):
+    """One pillar right of the axis and one at positive y, read back by KLayout: neither axis is mirrored."""
+    db = pytest.importorskip("klayout.db")
+    d = np.zeros((21, 21))
+    d[10, 15], d[18, 10] = 0.20, 0.30  # (x, y) = (+2.0, 0) and (0, +3.2) um
+    mask = layout.plan(DiameterMap(d, 0.4), PLAIN, furnished=False)
+    for write, name in ((layout.write_oasis, "m.oas"), (layout.write_gdsii, "m.gds")):
+        write(mask, tmp_path / name)
+        read = db.Layout()
+        read.read(str(tmp_path / name))
+        region = db.Region(read.top_cell().begin_shapes_rec(read.layer(1, 0)))
+        found = {(round(p.bbox().center().x), round(p.bbox().center().y)): p.bbox().width() for p in region.each()}
+        assert found.keys() == {(2000, 0), (0, 3200)}
+        assert found[2000, 0] == pytest.approx(200, abs=4)
+        assert found[0, 3200] == pytest.approx(300, abs=4)

@@ -1,0 +1,34 @@
+"""Limits that a process puts on a design: what they let through, the mask draws within the rules."""
+
+import numpy as np
+import pytest
+
+import layout
+from layout.process import process
+from layout.process.limits import printable
+from metalens.ground.errors import ProcessError
+from metalens.lens.record import DiameterMap
+
+COARSE = "[rules]\nminimum_feature_nm = 100\nminimum_gap_nm = 90\ngrid_nm = 5\ndiameter_step_nm = 5\n"
+BIASED = COARSE + "[bias]\ntable_nm = [[80, -6.0], [200, 3.0], [340, 1.0]]\n[etch]\nsidewall_deg = 0.8\n"
+
+
+@pytest.mark.parametrize("text", [COARSE, BIASED])
+def test_designs_at_the_limits_are_drawn_within_the_rules(tmp_path, text):
+    path = tmp_path / "process.toml"
+    path.write_text(text)
+    least, gap = printable(path, pitch_um=0.4, height_um=0.7)
+    rules = process.load(path)
+    sizes = np.random.default_rng(1).uniform(least, 400 - gap, (30, 30)) * 1e-3
+    sizes[0, :3] = np.array([least, 400 - gap, 400 - gap]) * 1e-3
+    found = layout.check(layout.plan(DiameterMap(sizes, 0.4), rules, furnished=False), rules.rules)
+    assert found.ok, found.summary
+    assert found.minimum_gap_nm < 90 + 10  # and they give away no more than a step or two
+    assert found.minimum_feature_nm < 100 + 10
+
+
+def test_a_process_that_prints_nothing_on_this_pitch_is_refused(tmp_path):
+    path = tmp_path / "process.toml"
+    path.write_text(COARSE)
+    with pytest.raises(ProcessError, match="widen the pitch"):
+        printable(path, pitch_um=0.18, height_um=0.7)

@@ -1,0 +1,120 @@
+"""Rules on masks made elsewhere: no disagreement with KLayout on what both can express."""
+
+import json
+
+import numpy as np
+import pytest
+
+from layout.commands.check import read
+from layout.process.process import Rules
+from layout.rules import foreign
+from metalens import cli
+
+db = pytest.importorskip("klayout.db")
+
+
+def turned_pillars(path, count=900, seed=3):
+    """Rectangles and hexagons at jittered places and any angle, some too near, some too thin; no two overlap."""
+    rng = np.random.default_rng(seed)
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    boxes = []
+    for n in range(count):
+        x, y = np.array(divmod(n, 30)) * 372 + rng.uniform(-35, 35, 2)
+        wide, long = rng.uniform(75, 190), rng.uniform(180, 300)
+        if n % 3:
+            corners = np.array([[-long, -wide], [long, -wide], [long, wide], [-long, wide]]) / 2
+        else:
+            angle = np.arange(6) * np.pi / 3
+            corners = wide / 1.5 * np.column_stack([np.cos(angle), np.sin(angle)])
+        turn = rng.uniform(0, np.pi)
+        c, s = np.cos(turn), np.sin(turn)
+        points = np.rint(corners @ [[c, s], [-s, c]] + (x, y)).astype(int)
+        shape = db.Polygon([db.Point(*map(int, p)) for p in points])
+        top.shapes(layer).insert(shape)
+        boxes.append(shape)
+    made.write(str(path))
+    return made, boxes
+
+
+def pairs_of_klayout(shapes, gap):
+    """Pairs of shapes that KLayout finds nearer than ``gap``, as boxes around both."""
+    found = set()
+    regions = [db.Region(s) for s in shapes]
+    for i, a in enumerate(shapes):
+        for j in range(i + 1, len(shapes)):
+            b = shapes[j]
+            if (
+                a.bbox().enlarged(gap, gap).touches(b.bbox())
+                and regions[i].separation_check(regions[j], gap, False, db.Region.Euclidian).count()
+            ):
+                both = a.bbox() + b.bbox()
+                found.add((both.left, both.bottom, both.right, both.top))
+    return found
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+def test_turned_convex_pillars_anywhere_agree_with_klayout(tmp_path, suffix):
+    path = tmp_path / f"m.{suffix}"
+    _, shapes = turned_pillars(path)
+    touching = sum(
+        1 for i, a in enumerate(shapes) for b in shapes[i + 1 : i + 40] if a.bbox().touches(b.bbox()) and a.touches(b)
+    )
+    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=1))
+    assert report.pillars == len(shapes)
+    own = {v.box for v in report.violations if v.rule == "gap" and " to " in v.text}
+    theirs = pairs_of_klayout(shapes, 70)
+    assert touching == 0 or own <= theirs
+    assert own == theirs or touching
+    assert len(own) > 10
+
+
+def marks(path, arm=20, notch=45):
+    """A cross with one thin arm, a U with a narrow notch, and two abutting pieces of one bar."""
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(3, 0)
+    cross = [(0, 0), (0, -3000), (arm, -3000), (arm, 0), (3000, 0), (3000, 500), (500, 500), (500, 3000), (0, 3000)]
+    u = [
+        (8000, 0),
+        (9000, 0),
+        (9000, 900),
+        (8500 + notch, 900),
+        (8500 + notch, 200),
+        (8500, 200),
+        (8500, 900),
+        (8000, 900),
+    ]
+    for points in (cross, u):
+        top.shapes(layer).insert(db.Polygon([db.Point(*p) for p in points]))
+    top.shapes(layer).insert(db.Box(12000, 0, 12030, 400))
+    top.shapes(layer).insert(db.Box(12030, 0, 12400, 400))
+    made.write(str(path))
+    return db.Region(top.begin_shapes_rec(layer)).merged()
+
+
+def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, capsys):
+    path = tmp_path / "m.gds"
+    region = marks(path)
+    process = tmp_path / "p.toml"
+    process.write_text("[rules]\nminimum_feature_nm = 80\nminimum_gap_nm = 70\n")
+    assert (
+        cli.main(["check", str(path), "--process", str(process), "--json", "--output", str(tmp_path / "m.lyrdb")]) == 1
+    )
+    values = json.loads(capsys.readouterr().out)
+    found = values["violations"]
+    assert found["feature"] == region.width_check(80, False, db.Region.Euclidian).count() == 1
+    assert found["gap"] == region.notch_check(70, False, db.Region.Euclidian).count() == 1
+    assert values["minimum_feature_nm"] == 20
+    assert values["minimum_gap_nm"] == 45
+    rdb = pytest.importorskip("klayout.rdb")
+    database = rdb.ReportDatabase()
+    database.load(str(tmp_path / "m.lyrdb"))
+    assert database.num_items() == 2
+
+
+def test_sound_marks_pass_and_a_missing_file_is_refused(tmp_path, capsys):
+    marks(tmp_path / "m.oas", arm=90, notch=80)
+    assert cli.main(["check", str(tmp_path / "m.oas")]) == 0
+    assert "keeps the design rules" in capsys.readouterr().out
+    assert cli.main(["check", str(tmp_path / "none.oas")]) == 2
+    assert "no such file" in capsys.readouterr().err

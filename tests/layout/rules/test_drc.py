@@ -1,0 +1,251 @@
+"""The check against closed forms, brute force and KLayout, on patches with seeded violations."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import layout
+from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, pillar_classes
+from layout.process.process import Rules, Zone
+from layout.rules import check as drc
+from layout.rules.report import DrcReport
+from layout.shapes import convex, polygon
+
+LOOSE = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
+
+
+def plan_of(diameters, classes, *, pitch=400, vertices=16):
+    made = pillar_classes(np.array(diameters), layer=(1, 0), grid=1, unit_nm=1.0, vertices=vertices, shape="round")
+    lattice = Lattice.of("LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000)
+    return MaskPlan("TOP", made, (lattice,))
+
+
+def sites(plan):
+    """(x, y, class) of every pillar."""
+    lattice = plan.lattices[0]
+    for row, column in np.argwhere(lattice.whole() > 0).tolist():
+        yield lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.pitch, int(lattice.whole()[row, column])
+
+
+def seeded(size, seeds, seed=0):
+    """A patch of well separated pillars with some that are too wide or too thin."""
+    rng = np.random.default_rng(seed)
+    classes = rng.integers(1, 16, (size, size))
+    rows, columns = rng.integers(0, size, (2, seeds))
+    classes[rows, columns] = rng.integers(16, 21, seeds)
+    classes[rng.integers(0, size, seeds // 4), rng.integers(0, size, seeds // 4)] = 21
+    return plan_of([*range(100, 295, 13), 330, 350, 370, 390, 395, 60], classes)
+
+
+def klayout_findings(plan, rules):
+    """(boxes of pairs that are too close, sites that are too thin) by KLayout."""
+    db = pytest.importorskip("klayout.db")
+    region, boxes = db.Region(), {}
+    for x, y, k in sites(plan):
+        shape = db.Polygon([db.Point(x + int(a), y + int(b)) for a, b in plan.classes[k - 1].outline])
+        region.insert(shape)
+        boxes[x, y] = shape.bbox()
+    region.merged_semantics = False
+    pitch = plan.lattices[0].pitch
+
+    def site(edge):
+        middle = ((edge.p1.x + edge.p2.x) / 2, (edge.p1.y + edge.p2.y) / 2)
+        return round((middle[0] + 3000) / pitch) * pitch - 3000, round((middle[1] - 2000) / pitch) * pitch + 2000
+
+    close = set()
+    for pair in region.space_check(int(rules.minimum_gap_nm), False, db.Region.Euclidian).each():
+        both = boxes[site(pair.first)] + boxes[site(pair.second)]
+        close.add((both.left, both.bottom, both.right, both.top))
+    # opposite edges only: edges at an angle measure chords of the round pillar, not its width
+    check = region.width_check(int(rules.minimum_feature_nm), False, db.Region.Euclidian, 10)
+    thin = {site(p.first) for p in check.each()}
+    return close, thin
+
+
+def agree(size, seeds, seed):
+    plan, rules = seeded(size, seeds, seed), Rules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1)
+    found = layout.check(plan, rules)
+    close, thin = klayout_findings(plan, rules)
+    assert {v.box for v in found.violations if v.rule == "gap"} == close
+    assert {v.centre for v in found.violations if v.rule == "feature"} == thin
+    assert (found.counts["gap"], found.counts["feature"]) == (len(close), len(thin))
+    assert close
+    assert thin
+    assert not found.ok
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_no_disagreement_with_klayout_on_a_patch_with_seeded_violations(seed):
+    agree(60, 40, seed)
+
+
+@pytest.mark.slow
+def test_no_disagreement_with_klayout_on_240000_pillars():
+    agree(490, 110, 7)
+
+
+@given(st.lists(st.lists(st.integers(0, 6), min_size=5, max_size=5), min_size=2, max_size=6))
+def test_gap_is_the_least_of_all_pairs_by_brute_force(rows):
+    plan = plan_of([100, 180, 240, 300, 350, 390], rows)
+    found = drc.check(plan, LOOSE)
+    gaps = [
+        convex.gap(plan.classes[k - 1].outline, plan.classes[m - 1].outline, u - x, v - y)
+        for (x, y, k), (u, v, m) in itertools.combinations(sites(plan), 2)
+        if abs(u - x) <= 400 and abs(v - y) <= 400
+    ]
+    assert found.pillars == np.count_nonzero(rows)
+    if gaps:
+        assert found.minimum_gap_nm == pytest.approx(min(gaps), abs=1e-9)
+    else:
+        assert math.isinf(found.minimum_gap_nm)
+
+
+def test_gap_of_two_neighbours_is_pitch_less_their_flats():
+    plan = plan_of([200, 300], [[1, 2]])
+    flats = [made.outline[:, 0].max() for made in plan.classes]
+    assert drc.check(plan, LOOSE).minimum_gap_nm == 400 - flats[0] - flats[1]
+
+
+def test_overlap_and_touch_are_found_with_their_place():
+    found = drc.check(plan_of([420], [[1, 1, 0, 1]]), LOOSE)
+    assert found.counts["overlap"] == 1
+    (violation,) = found.violations
+    assert violation.centre == (-2800, 2000)
+    square = np.array([[-200, -200], [200, -200], [200, 200], [-200, 200]])
+    touching = MaskPlan(
+        "T",
+        (PillarClass("A", 450.0, 450, (1, 0), square),),
+        (Lattice.of("L", np.ones((1, 2), np.uint8), pitch=400, x0=0, y0=0),),
+    )
+    assert drc.check(touching, LOOSE).minimum_gap_nm == 0
+    assert not drc.check(touching, LOOSE).ok
+
+
+def test_a_rule_as_wide_as_two_pitches_looks_at_second_neighbours():
+    plan = plan_of([100], [[1, 0, 1]], pitch=200)
+    assert drc.check(plan, Rules(minimum_gap_nm=310, minimum_feature_nm=1, maximum_density=1)).counts["gap"] == 1
+    assert drc.check(plan, Rules(minimum_gap_nm=290, minimum_feature_nm=1, maximum_density=1)).ok
+
+
+def test_off_grid_vertices_and_sites_are_found():
+    plan = plan_of([200], [[1]])
+    assert drc.check(plan, LOOSE).counts["off-grid"] == 0
+    coarse = plan.replace(grid=7)
+    assert drc.check(coarse, LOOSE).counts["off-grid"] == 2
+
+
+def test_density_is_the_share_of_the_window():
+    plan = plan_of([300], np.ones((60, 60)))
+    found = drc.check(plan, Rules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8))
+    share = polygon.twice_area(plan.classes[0].outline) / 2 / 400**2
+    assert found.maximum_density == pytest.approx(share, rel=1e-12)
+    assert found.counts["density"] > 0
+    assert drc.check(plan, Rules(minimum_feature_nm=1, maximum_density=0.45)).ok
+
+
+@given(x=st.floats(-3.5, 1), y=st.floats(-2, 2.5), w=st.floats(0.01, 2), h=st.floats(0.01, 2))
+def test_exclusion_zones_agree_with_klayout(x, y, w, h):
+    db = pytest.importorskip("klayout.db")
+    zone = Zone(round(x, 3), round(y, 3), max(round(w, 3), 0.001), max(round(h, 3), 0.001))
+    plan = plan_of([120, 260], np.indices((9, 9)).sum(0) % 3)
+    box = db.Region(
+        db.Box(
+            *(round(v * 1e3) for v in (zone.x_um, zone.y_um)),
+            *(round(v * 1e3) for v in (zone.x_um + zone.width_um, zone.y_um + zone.height_um)),
+        )
+    )
+    inside = 0
+    for px, py, k in sites(plan):
+        shape = db.Region(db.Polygon([db.Point(px + int(a), py + int(b)) for a, b in plan.classes[k - 1].outline]))
+        # overlap of exact areas: scaled up, so that no cut is rounded away
+        inside += not (shape.transformed(db.ICplxTrans(1000)) & box.transformed(db.ICplxTrans(1000))).is_empty()
+    rules = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, exclusion=(zone,))
+    assert drc.check(plan, rules).counts["exclusion"] == inside
+
+
+def test_structures_that_meet_are_found(make_plan):
+    plan = make_plan()
+    again = plan.lattices[0]
+    other = Lattice.of("OTHER", np.ones((2, 2), np.uint8), pitch=400, x0=again.x0 + 300, y0=again.y0)
+    found = drc.check(plan.replace(lattices=(again, other)), LOOSE)
+    assert found.counts["structures"] == 1
+
+
+def test_row_blocks_give_the_same_report(monkeypatch):
+    plan, rules = seeded(60, 40), Rules(minimum_gap_nm=70, minimum_feature_nm=80)
+    whole = drc.check(plan, rules)
+    monkeypatch.setattr(drc, "_BLOCK_SITES", 60 * 7)
+    blocks = drc.check(plan, rules)
+    assert blocks.counts == whole.counts
+    assert {v.box for v in blocks.violations} == {v.box for v in whole.violations}
+
+
+def test_width_of_a_regular_polygon_and_of_a_triangle():
+    octagon = polygon.pillar(1000, vertices=8).points
+    assert convex.width(octagon) == pytest.approx(
+        min(2 * octagon[:, 0].max(), abs(octagon @ (1, 1)).max() * math.sqrt(2))
+    )
+    assert convex.width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(12 / 5)  # height on the hypotenuse
+
+
+def test_summary_says_what_was_found():
+    report = drc.check(plan_of([200, 380], [[1, 2, 2]]), Rules(minimum_gap_nm=70))
+    assert isinstance(report, DrcReport)
+    assert "gap" in report.summary
+    assert "3 pillars" in report.summary
+
+
+def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
+    plan = make_plan()
+    cross = np.array([[0, 0], [4000, 0], [4000, 300], [320, 300], [320, 4000], [300, 4000], [300, 300], [0, 300]])
+    slot = np.array([[0, 0], [900, 0], [900, 900], [535, 900], [535, 200], [500, 200], [500, 900], [0, 900]])
+    figures = tuple(Figure("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)}) for shape in (cross, slot))
+    rules = Rules(minimum_feature_nm=80, minimum_gap_nm=70, maximum_density=1)
+    before = drc.check(plan, rules)
+    thin, narrow = (drc.check(plan.replace(figures=(figure,)), rules) for figure in figures)
+    assert thin.counts["feature"] == before.counts["feature"] + 1
+    assert thin.minimum_feature_nm == 20
+    assert narrow.counts["gap"] == before.counts["gap"] + 1
+    assert narrow.minimum_gap_nm == 35
+
+
+def test_feet_that_nearly_meet_are_found():
+    plan = plan_of([200, 260], [[1, 2, 0], [0, 1, 1]])
+    feet = np.array([241.0, 305.0])
+    found = drc.check(plan, LOOSE, foot_nm=feet)
+    assert found.minimum_foot_gap_nm == pytest.approx(400 - (241 + 305) / 2)
+    assert found.counts["foot"] == 0
+    tight = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, minimum_foot_gap_nm=150)
+    assert drc.check(plan, tight, foot_nm=feet).counts["foot"] == 2  # both pairs of unlike pillars, in x and in y
+
+
+@pytest.mark.parametrize(("pitch", "reach"), [(400, 390.0), (400, 401.0), (350, 1060.0), (300, 1500.0)])
+def test_every_neighbour_within_reach_is_visited_once(pitch, reach):
+    """By brute force over all steps: one of each opposite pair, the left ones of the rows above included."""
+    steps = {tuple(s) for s in drc._offsets(pitch, reach).tolist()}
+    near = {
+        (i, j)
+        for i in range(-7, 8)
+        for j in range(-7, 8)
+        if (i, j) != (0, 0) and (max(abs(i), abs(j)) == 1 or math.hypot(i, j) * pitch < reach)
+    }
+    assert steps | {(-i, -j) for i, j in steps} == near
+    assert not steps & {(-i, -j) for i, j in steps}
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_a_gap_across_either_diagonal_is_found(corner):
+    """Two pillars 20 nm apart across one diagonal of the lattice, nothing else: sqrt 2 · 400 - 546 = 19.7 nm."""
+    classes = np.zeros((4, 5), int)
+    row, column = 1, 2
+    classes[row + corner[0], column + corner[1]] = 1
+    classes[row + 1 - corner[0], column + 1 - corner[1]] = 1
+    found = layout.check(
+        plan_of([546], classes, vertices=32), Rules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1)
+    )
+    assert found.counts["gap"] == 1
+    assert found.minimum_gap_nm == pytest.approx(math.sqrt(2) * 400 - 546, abs=2.5)  # grid, and vertices 0.3 nm out

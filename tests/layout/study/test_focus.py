@@ -1,0 +1,91 @@
+"""The reduced sum over pillars against the plain Rayleigh-Sommerfeld sum, with every symmetry broken."""
+
+import numpy as np
+import pytest
+
+from layout.study import focus
+from layout.study.focus import Window
+from metalens.cell.record import Cell
+from metalens.ground.errors import PropagationError
+from metalens.lens.record import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
+
+RNG = np.random.default_rng(4)
+PROXY = Proxy(np.array([[3.0, 2.8, 0.3]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+
+
+def random_lens(ny=90, nx=121, distance_um=150.0, source_um=900.0):
+    diameter = np.where(RNG.random((ny, nx)) < 0.9, RNG.uniform(0.1, 0.3, (ny, nx)), 0)
+    return Lens(DiameterMap(diameter, 0.4), Cell(0.4), PROXY, 0.85, distance_um, source_um, "random")
+
+
+def amplitude(lens):
+    return lens.transmission() * np.exp(1j * lens.phase_rad())
+
+
+def window_of(lens, depths):
+    return Window(np.linspace(-3, 9, 4), np.linspace(-7, 2, 3), lens.sensor_distance_um, 0.85, np.array(depths))
+
+
+def test_the_reduced_sum_is_the_plain_sum_at_all_depths_and_for_a_collimated_beam():
+    lens = random_lens()
+    where = window_of(lens, [600.0, 900.0, 1500.0, np.inf])
+    exact = focus.direct(lens, amplitude(lens), where)
+    ready = focus.prepare(lens, where)
+    fast = ready.light(ready.project(amplitude(lens)[None].astype(np.complex64)))[0]
+    assert abs(fast - exact).max() < 3e-6 * abs(exact).max()  # float32 sums of 1e4 terms
+
+
+def test_blocks_add_up_to_the_whole():
+    lens = random_lens()
+    ready = focus.prepare(lens, window_of(lens, [900.0]))
+    t = amplitude(lens)[None]
+    whole = ready.project(t)
+    parts = [((slice(0, 40), slice(0, 121))), (slice(40, 90), slice(0, 50)), (slice(40, 90), slice(50, 121))]
+    total = sum(ready.project(t[:, rows, columns], rows, columns) for rows, columns in parts)
+    assert abs(total - whole).max() < 1e-5 * abs(whole).max()
+
+
+def test_shifted_pillars_send_their_light_from_where_they_are():
+    lens = random_lens()
+    where = window_of(lens, [900.0])
+    ones = np.ones(lens.diameters.diameter_um.shape)
+    exact = focus.direct(lens, amplitude(lens), where, shift_um=(0.05 * ones, -0.03 * ones))
+    ready = focus.prepare(lens, where)
+    fast = ready.light(ready.project(amplitude(lens)[None]), (0.05, -0.03))[0]
+    assert abs(fast - exact).max() < 3e-6 * abs(exact).max()
+
+
+def test_light_tilted_to_plus_x_and_plus_y_arrives_there():
+    lens = random_lens(91, 91, distance_um=200.0, source_um=np.inf)
+    x, y = lens.diameters.x_um, lens.diameters.y_um[:, None]
+    r = np.sqrt((x - 5) ** 2 + (y - 3) ** 2 + 200**2)
+    aimed = np.exp(-2j * np.pi / 0.85 * r)
+    where = Window(np.arange(-8, 9.0), np.arange(-8, 9.0), 200.0, 0.85, np.array([np.inf]))
+    ready = focus.prepare(lens, where)
+    psf = abs(ready.light(ready.project(aimed[None]))[0, 0]) ** 2
+    row, column = np.unravel_index(psf.argmax(), psf.shape)
+    assert (where.x_um[column], where.y_um[row]) == (5, 3)
+
+
+def test_the_usual_window_holds_the_geometric_blur():
+    lens = random_lens(91, 91)
+    where = focus.window(lens, depths_um=np.array([600.0, 900.0]))
+    blur = lens.diameters.radius_um * 150 * (1 / 600 - 1 / 900)
+    assert where.x_um[-1] > blur
+    assert where.x_um[1] - where.x_um[0] <= 0.85 * 150 / (4 * lens.diameters.radius_um) + 1e-12
+    assert (where.x_um == -where.x_um[::-1]).all()
+
+
+def test_a_window_without_extent_is_refused():
+    lens = random_lens()
+    with pytest.raises(PropagationError, match="2 samples"):
+        focus.prepare(lens, Window(np.zeros(1), np.zeros(3), 150.0, 0.85, np.array([900.0])))
+
+
+@pytest.mark.parametrize(("x0", "y0"), [(0.0, 0.0), (0.31, -0.44), (0.5, 0.5)])
+def test_the_peak_between_samples_of_an_airy_spot_is_found(x0, y0):
+    # the spot of a square aperture, sinc^2 sinc^2, at its Nyquist step of half a diffraction width
+    axis = np.arange(-20, 21) * 0.5
+    spot = np.sinc(axis - x0 / 2) ** 2 * np.sinc(axis[:, None] - y0 / 2) ** 2
+    assert focus.peak(spot) == pytest.approx(1, abs=1.5e-3)  # cut at 10 widths: tails of 1e-3

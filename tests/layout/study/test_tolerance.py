@@ -1,0 +1,203 @@
+"""Tolerance: the reduced model against the plain sum with every pillar changed, limits, and the tolerant choice."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from layout.mask import fields
+from layout.process.process import Process, WriteField
+from layout.study import focus, tolerance, tolerant
+from layout.study import page as study_page
+from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.spread_model import missed, reduce
+from metalens import modal
+from metalens.cell.record import Cell, Index
+from metalens.ground.errors import ProcessError
+from metalens.ground.report import Figure, Table
+from metalens.lens.record import DiameterMap, Lens
+from metalens.made import DRAWN, Spread, draws, transmission
+from metalens.pillars.proxy import Proxy
+
+PROXY = Proxy(np.array([[4.6, 4.2, 0.5, 0.3]]), np.array([[0.9, 0.02, 0.04]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+DIAMETERS = np.linspace(0.1, 0.3, 9)
+SENS = Sensitivities(
+    DIAMETERS,
+    np.array([8j + 30j * (DIAMETERS - 0.1) - 1.0, 0.3j + 25j * (DIAMETERS - 0.1), 0.2 + 5j * (DIAMETERS - 0.2)]),
+    0.01,
+)
+
+
+def hyperbolic(n=161, distance_um=150.0, source_um=1500.0):
+    x = (np.arange(n) - (n - 1) / 2) * 0.4
+    r = np.hypot(x, x[:, None])
+    path = np.sqrt(r**2 + distance_um**2) + np.sqrt(r**2 + source_um**2)
+    table = np.arange(0.1, 0.3, 0.002)
+    phase = PROXY.phase_rad(table, 0.85)
+    table, phase = table[phase < phase[0] + 2 * np.pi], phase[phase < phase[0] + 2 * np.pi]
+    wanted = np.remainder(-2 * np.pi / 0.85 * path - phase[0], 2 * np.pi)
+    diameter = table[np.clip(np.searchsorted(phase - phase[0], wanted), 0, len(table) - 1)]
+    diameters = DiameterMap(np.where(r < n * 0.2, diameter, 0), 0.4)
+    return Lens(diameters, Cell(0.4), PROXY, 0.85, distance_um, source_um, "hyperbolic")
+
+
+def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one():
+    lens = hyperbolic()
+    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0, 1200.0]))
+    model = reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=0)
+    lenses = draws(Spread(), 4, seed=9)
+    fast = model.focus.light(model.drawn([each.state() for each in lenses]))
+    x, y = (axis / lens.diameters.radius_um for axis in (lens.diameters.x_um, lens.diameters.y_um[:, None]))
+    for draw, light in zip(lenses, fast, strict=True):
+        d, a = lens.diameters.diameter_um, draw.amounts
+        along = x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
+        bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (x**2 + y**2 - 0.5)
+        made = np.where(d > 0, d + bias_nm * 1e-3, 0.2)
+        height, index, wall = SENS.at(made)
+        change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
+        t = transmission(PROXY, SENS, made, 0.85, np.zeros(3)) * np.exp(change)
+        exact = focus.direct(lens, np.where(d > 0, t, 0), where)
+        assert abs(light - exact).max() < 2e-3 * abs(exact).max()
+    assert missed(model, lenses) < 2e-3
+    assert len(model.basis) <= 12
+
+
+def test_no_spread_leaves_the_lens_as_it_is():
+    still = Process(spread=Spread.only())
+    report = tolerance.analyse(hyperbolic(), still, sens=SENS, depths_um=(1200.0,), draws=10)
+    assert report.draws.strehl == pytest.approx(np.ones(10), abs=1e-5)
+    assert report.draws.psf_change == pytest.approx(np.zeros(10), abs=1e-5)
+    assert all(effect.phase_rad < 1e-12 for effect in report.effects)
+
+
+def test_effects_and_bands_of_a_lens():
+    report = tolerance.analyse(hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3)
+    assert [effect.cause for effect in report.effects] == list(DRAWN)
+    again = tolerance.analyse(hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3)
+    assert (report.draws.strehl == again.draws.strehl).all()
+    low, middle, high = report.band("information")
+    assert low.shape == (2,)
+    assert (low < middle).all()
+    assert (middle < high).all()
+    # a phase spread s costs exp(-s^2) of the peak; height changes phase and, by its real part, the level
+    height = report.effects[list(DRAWN).index("height_nm")]
+    assert height.strehl == pytest.approx(1 - np.exp(-(height.phase_rad**2) - 2 * 1.0 * 0.007), abs=0.004)
+    assert report.error < 2e-3
+    assert 0.4 < report.nominal.efficiency[0] < 1
+
+
+def test_the_effect_of_a_bias_on_the_phase_is_the_slope_of_the_proxy():
+    lens = hyperbolic()
+    small = Process(spread=dataclasses.replace(Spread(), bias_nm=0.1))
+    report = tolerance.analyse(lens, small, sens=SENS, depths_um=(1200.0,), draws=10)
+    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    slope = PROXY.dphase_ddiameter(d, 0.85)
+    assert report.effects[0].phase_rad == pytest.approx(1e-4 * slope.std(), rel=0.02)
+
+
+def test_axial_information_is_equation_11_of_the_direct_psf():
+    lens = hyperbolic()
+    report = tolerance.analyse(lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10)
+    where = dataclasses.replace(report.window, depths_um=np.array([1200.0, 1400.0]))
+    t = lens.transmission() * np.exp(1j * lens.phase_rad())
+    few = dataclasses.replace(where, x_um=where.x_um[::2], y_um=where.y_um[::2])
+    psf = abs(focus.direct(lens, t, few)) ** 2
+    ready = focus.prepare(lens, where)
+    fast = abs(ready.light(ready.project(t[None]))[0]) ** 2
+    assert abs(fast[:, ::2, ::2] - psf).max() < 1e-4 * psf.max()
+    unit = fast / fast.sum((1, 2), keepdims=True)
+    want = ((unit[1] - unit[0]) ** 2).sum() / tolerance.DEPTH_STEP_UM**2
+    assert report.nominal.information[0, 0] == pytest.approx(want, rel=2e-3)
+
+
+def test_beyond_the_domain_the_phase_goes_on_straight():
+    d = np.array([0.3, 0.31, 0.32])
+    phase = np.unwrap(np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(3))))
+    assert np.diff(phase) == pytest.approx(0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9)
+
+
+def test_sensitivities_of_a_film_of_air_are_its_optical_path():
+    # pillars of the index of what is between them do not exist: t = exp(ik n h) up to a constant
+    film = Cell(0.3, pillar="air", substrate="air")
+    narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
+    lens = dataclasses.replace(hyperbolic(), cell=film, proxy=narrow)
+    found = sensitivities(lens, count=5)
+    assert found.rates[0] == pytest.approx(np.full(5, 2j * np.pi / 0.85), abs=1e-6)
+    assert found.rates[2] == pytest.approx(np.zeros(5), abs=1e-6)
+    # an index change counts by the area of the pillar, to first order in the contrast (and no coupling)
+    share = np.pi / 4 * found.diameter_um**2 / 0.3**2
+    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.7 * share, rel=0.03)
+
+
+def test_too_few_draws_are_refused():
+    with pytest.raises(ProcessError, match="10 or more"):
+        tolerance.analyse(hyperbolic(), Process(), sens=SENS, draws=5)
+
+
+def test_the_tolerant_choice_keeps_the_phase_and_lowers_the_spread():
+    lens = hyperbolic()
+    result = tolerant.choose(lens, Process(), tolerance_rad=0.1, loss=0.05)
+    d, made = lens.diameters.diameter_um, result.lens.diameters.diameter_um
+    here = d > 0
+    assert ((made > 0) == here).all()
+    away = np.angle(np.exp(1j * (PROXY.phase_rad(made[here], 0.85) - PROXY.phase_rad(d[here], 0.85))))
+    assert abs(away).max() < 0.1 + 2 * np.pi / 2048
+    assert result.after < 0.95 * result.before
+    assert result.moved > 0.02
+    assert result.transmission > result.transmission_before - 0.05
+
+
+def test_the_tolerant_choice_loses_less_to_a_bias():
+    lens = hyperbolic()
+    result = tolerant.choose(lens, Process(), tolerance_rad=0.1)
+    only_bias = Process(spread=Spread.only(bias_nm=8.0))
+    lost = [
+        tolerance.analyse(each, only_bias, sens=SENS, depths_um=(1200.0,), draws=10).effects[0].phase_rad
+        for each in (lens, result.lens)
+    ]
+    assert lost[1] < 0.9 * lost[0]
+
+
+def test_chosen_diameters_are_printable():
+    result = tolerant.choose(hyperbolic(), Process())
+    made = result.lens.diameters.diameter_um
+    sizes = np.unique(made[made > 0]) * 1e3
+    assert np.allclose(sizes % 2, 0, atol=1e-6) or np.allclose(2 - sizes % 2, 0, atol=1e-6)
+    assert sizes.min() >= 100
+    assert sizes.max() <= 400 - 70
+
+
+@pytest.mark.parametrize("bad", [0.0, 4.0, -1.0])
+def test_an_impossible_phase_tolerance_is_refused(bad):
+    with pytest.raises(ProcessError, match="between 0 and pi"):
+        tolerant.choose(hyperbolic(41), Process(), tolerance_rad=bad)
+
+
+def test_the_report_sections_say_what_was_found():
+    lens = hyperbolic(101)
+    process = Process(write_field=WriteField(size_um=20.0))
+    made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
+    assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
+    tables = [item for section in made for item in section.items if isinstance(item, Table)]
+    assert [row[0] for row in tables[1].rows] == list(DRAWN)
+    assert all(
+        np.isfinite(value) for table in tables for row in table.rows for value in row if isinstance(value, float)
+    )
+    pictures = [item for section in made for item in section.items if isinstance(item, Figure)]
+    assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
+
+
+def test_sensitivities_agree_with_an_independent_solver():
+    cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
+    narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
+    found = sensitivities(dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3)
+
+    def rate(low, high, step):
+        less, more = (modal.solve(each, 0.13, 0.85, tolerance=1e-4).t for each in (low, high))
+        return np.log(more / less) / (2 * step)
+
+    height = rate(dataclasses.replace(cell, height_um=0.69), dataclasses.replace(cell, height_um=0.71), 0.01)
+    index = rate(dataclasses.replace(cell, pillar=Index(3.58)), dataclasses.replace(cell, pillar=Index(3.62)), 0.02)
+    assert abs(found.rates[0, 1] / height - 1) < 0.03  # truncation of the plane waves: 1 to 2 % here
+    assert abs(found.rates[1, 1] / index - 1) < 0.05
+    assert 2 * np.pi / 0.85 < found.rates[0, 1].imag < 2 * np.pi / 0.85 * 3.6  # between air and bulk

@@ -1,0 +1,268 @@
+"""Materials: published values, smoothness of the interpolation, refusals that name line and range."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from metalens import materials
+from metalens.cell.record import Blend, Index
+from metalens.ground.errors import MaterialError
+
+
+@pytest.mark.parametrize(("wavelength_um", "want"), [(0.4861327, 1.46313), (0.5875618, 1.45846), (0.6562725, 1.45637)])
+def test_fused_silica_at_the_fraunhofer_lines(wavelength_um, want):
+    assert abs(materials.index("SiO2", wavelength_um) - want) < 5.1e-6  # catalogue values, five decimals
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength_um", "want"),
+    [("a-Si", 0.8266, 3.86 + 0.0812j), ("a-Si", 1.033, 3.61), ("Si", 0.85, 3.641 + 3.6120e-3j), ("air", 0.85, 1)],
+)
+def test_rows_of_the_sources_come_back(name, wavelength_um, want):
+    assert abs(materials.index(name, wavelength_um) - want) < 1e-12
+
+
+@given(st.sampled_from(["a-Si", "Si"]), st.floats(0.32, 1.44))
+def test_between_rows_the_table_is_a_straight_line(name, wavelength_um):
+    w, n, k = materials.material(name).table
+    want = np.interp(wavelength_um, w, n) + 1j * np.interp(wavelength_um, w, k)
+    assert abs(materials.index(name, wavelength_um) - want) < 1e-12
+    row = w[np.argmin(np.abs(w - wavelength_um))]
+    chord = (materials.index(name, row) - materials.index(name, wavelength_um)) / (row - wavelength_um or 1)
+    rate = materials.slope(name, wavelength_um)
+    assert row == wavelength_um or abs(chord - rate) < 1e-12 / abs(row - wavelength_um) + 1e-12 * abs(rate)
+
+
+@given(st.floats(0.22, 3.7))
+def test_slope_of_the_sellmeier_formula(wavelength_um):
+    step = 1e-5
+    rise = materials.index("SiO2", wavelength_um + step) - materials.index("SiO2", wavelength_um - step)
+    rate = materials.slope("SiO2", wavelength_um)
+    assert abs(rise / (2 * step) - rate) < 1e-4 * abs(rate) + 1e-9  # third derivative / 6 step^2, and rounding
+
+
+@given(st.floats(0.31, 2.066))
+def test_absorption_is_never_negative(wavelength_um):
+    assert materials.index("a-Si", wavelength_um).imag >= 0
+
+
+def test_plain_numbers_hold_at_every_wavelength():
+    assert materials.index(Index(3.6, 0.1), 0.85) == 3.6 + 0.1j
+    assert materials.slope(Index(3.6, 0.1), 0.85) == 0
+
+
+@pytest.mark.parametrize(("name", "wavelength_um"), [("a-Si", 2.07), ("Si", 0.2499), ("SiO2", 3.8)])
+def test_outside_the_range_is_refused_and_the_range_is_named(name, wavelength_um):
+    low, high = materials.material(name).range_um
+    with pytest.raises(MaterialError, match=rf"{name} at .*from {low} to {high} um"):
+        materials.index(name, wavelength_um)
+
+
+@pytest.mark.parametrize("wavelength_um", [0.0, -1.0, math.nan, math.inf])
+def test_a_wavelength_that_is_no_length_is_refused(wavelength_um):
+    with pytest.raises(MaterialError, match="need a finite length above 0"):
+        materials.index("air", wavelength_um)
+
+
+def test_a_misspelt_name_gets_the_nearest_one():
+    with pytest.raises(MaterialError, match="did you mean 'SiO2'"):
+        materials.index("SiO3", 0.85)
+
+
+def test_own_table_with_shuffled_columns_and_comments(tmp_path: Path):
+    file = tmp_path / "mine.csv"
+    file.write_text("# run 7, ellipsometer\nk, n, wavelength_um\n0.1,3.5,0.8\n\n0.0,3.3,0.9\n")
+    assert materials.index(str(file), 0.8) == 3.5 + 0.1j
+    assert materials.material(str(file)).source == "run 7, ellipsometer"
+    file.write_text("wavelength_um,n,k\n0.8,2,0\n0.9,2,0\n")
+    assert abs(materials.index(str(file), 0.85) - 2) < 1e-15  # a file that changed is read again
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        ("wavelength_um,k\n0.8,3\n", "line 1: no column n"),
+        ("lambda,n\n0.8,3\n", "line 1: no column wavelength_um"),
+        ("wavelength_um,n,k\n0.8,3,0\n", "1 rows"),
+        ("wavelength_um,n,k\n0.8,3,0\n0.9,x,0\n", "line 3: .* not numbers"),
+        ("wavelength_um,n,k\n# c\n0.8,3,0\n0.9,3\n", "line 4: 2 fields"),
+        ("wavelength_um,n,k\n0.8,3,0\n0.7,3,0\n", "line 3: wavelength 0.7 um follows 0.8"),
+        ("wavelength_um,n,k\n0.8,3,0\n0.9,3,-1e-3\n", "line 3: .*k >= 0"),
+        ("wavelength_um,n,k\n0.8,nan,0\n0.9,3,0\n", "line 2: .*finite"),
+    ],
+)
+def test_a_bad_table_is_refused_with_its_line(tmp_path: Path, text, message):
+    file = tmp_path / "bad.csv"
+    file.write_text(text)
+    with pytest.raises(MaterialError, match=message):
+        materials.index(str(file), 0.85)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.2, 20.0), st.floats(1e-3, 10.0), st.floats(0.0, 20.0)),
+        min_size=2,
+        max_size=20,
+        unique_by=lambda row: row[0],
+    )
+)
+def test_any_table_comes_back_at_its_rows_and_never_leaves_them_in_between(tmp_path_factory, rows):
+    rows = sorted(rows)
+    file = tmp_path_factory.mktemp("nk") / "any.csv"
+    file.write_text("wavelength_um,n,k\n" + "".join(f"{w!r},{n!r},{k!r}\n" for w, n, k in rows))
+    record = materials.read_csv(file)
+    assert record.range_um == (rows[0][0], rows[-1][0])
+    for w, n, k in rows:
+        assert abs(materials.index(record, w) - complex(n, k)) < 1e-12 * (n + k)
+    middle = materials.index(record, (rows[0][0] + rows[1][0]) / 2)
+    assert min(rows[0][2], rows[1][2]) * (1 - 1e-12) <= middle.imag <= max(rows[0][2], rows[1][2]) * (1 + 1e-12)
+
+
+def test_missing_and_binary_files_are_refused(tmp_path: Path):
+    with pytest.raises(MaterialError, match="no such file"):
+        materials.index(str(tmp_path / "none.csv"), 0.85)
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(MaterialError, match="not a readable text file"):
+        materials.index(str(tmp_path / "b.csv"), 0.85)
+
+
+FORMULAS = [  # by hand at 0.6328 um, from the database's description of each formula
+    (1, "0.1 0.7 0.09 0.4 9.0", lambda w: (1.1 + 0.7 * w**2 / (w**2 - 0.0081) + 0.4 * w**2 / (w**2 - 81)) ** 0.5),
+    (2, "0.1 0.7 0.09", lambda w: (1.1 + 0.7 * w**2 / (w**2 - 0.09)) ** 0.5),
+    (3, "2.2 0.01 2 0.02 -2", lambda w: (2.2 + 0.01 * w**2 + 0.02 / w**2) ** 0.5),
+    (
+        4,
+        "2.1 0.03 0 0.2 2 0.01 2 0.3 1 -0.01 2",
+        lambda w: (2.1 + 0.03 / (w**2 - 0.04) + 0.01 * w**2 / (w**2 - 0.3) - 0.01 * w**2) ** 0.5,
+    ),
+    (5, "1.5 0.004 -2 0.0002 -4", lambda w: 1.5 + 0.004 / w**2 + 0.0002 / w**4),
+    (6, "0.0 0.05 230 0.002 57", lambda w: 1 + 0.05 / (230 - w**-2) + 0.002 / (57 - w**-2)),
+    (
+        7,
+        "3.4 0.15 -0.02 -0.001 0.0002 0.00003",
+        lambda w: (
+            3.4 + 0.15 / (w**2 - 0.028) - 0.02 / (w**2 - 0.028) ** 2 - 0.001 * w**2 + 0.0002 * w**4 + 0.00003 * w**6
+        ),
+    ),
+    (
+        8,
+        "0.3 0.05 0.03 -0.002",
+        lambda w: (
+            (
+                (1 + 2 * (0.3 + 0.05 * w**2 / (w**2 - 0.03) - 0.002 * w**2))
+                / (1 - (0.3 + 0.05 * w**2 / (w**2 - 0.03) - 0.002 * w**2))
+            )
+            ** 0.5
+        ),
+    ),
+    (
+        9,
+        "2.5 0.01 0.02 0.003 1.5 0.9",
+        lambda w: (2.5 + 0.01 / (w**2 - 0.02) + 0.003 * (w - 1.5) / ((w - 1.5) ** 2 + 0.9)) ** 0.5,
+    ),
+]
+
+
+@pytest.mark.parametrize(("number", "coefficients", "plain"), FORMULAS, ids=[f"formula {f[0]}" for f in FORMULAS])
+def test_every_formula_of_the_database_and_its_slope(tmp_path: Path, number, coefficients, plain):
+    page = tmp_path / "page.yml"
+    page.write_text(
+        f"REFERENCES: |\n    A. <i>B</i>\nDATA:\n  - type: formula {number}\n    wavelength_range: 0.4 0.9\n"
+        f"    coefficients: {coefficients}\n"
+    )
+    w, step = 0.6328, 1e-5
+    assert abs(materials.index(str(page), w) - plain(w)) < 1e-13
+    rise = (plain(w + step) - plain(w - step)) / (2 * step)
+    assert abs(materials.slope(str(page), w) - rise) < 1e-7 * (1 + abs(rise))  # third derivative / 6 step²
+    assert materials.material(str(page)).source == "A. B"
+    with pytest.raises(MaterialError, match=r"from 0.4 to 0.9 um"):
+        materials.index(str(page), 0.95)
+
+
+def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
+    page = tmp_path / "page.yaml"
+    page.write_text(
+        "DATA:\n  - type: formula 5\n    wavelength_range: 0.3 2.0\n    coefficients: 1.5 0.01 -2\n"
+        "  - type: tabulated k\n    data: |\n        0.9 3e-3\n        0.5 1e-3\n"
+    )
+    assert abs(materials.index(str(page), 0.6) - (1.5 + 0.01 / 0.36 + 1.5e-3j)) < 1e-15  # rows in any order
+    assert materials.material(str(page)).range_um == (0.5, 0.9)
+
+
+@pytest.mark.parametrize("name", materials.NAMES)
+def test_every_shipped_material_says_its_source_and_is_a_material(name):
+    record = materials.material(name)
+    low, high = record.range_um
+    for share in (0.01, 0.37, 0.83):
+        n = materials.index(name, low + share * (min(high, 20.0) - low))
+        assert n.real > 0
+        assert n.imag >= 0
+    assert len(record.source) > 15
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength_um", "want", "off"),
+    [
+        ("sapphire", 0.5893, 1.7682, 2e-4),  # handbooks: no = 1.768, ne = 1.760 at the sodium line
+        ("sapphire-e", 0.5893, 1.7600, 2e-4),
+        ("N-BK7", 0.5875618, 1.51680, 1e-5),  # catalogue nd
+        ("MgF2", 0.5893, 1.3777, 1e-4),
+        ("CaF2", 0.5893, 1.43384, 5e-5),
+        ("PMMA", 0.5893, 1.4914, 2e-3),  # samples differ by that much
+    ],
+)
+def test_shipped_materials_against_handbook_values(name, wavelength_um, want, off):
+    assert abs(materials.index(name, wavelength_um).real - want) < off
+
+
+@pytest.mark.parametrize(
+    ("name", "want"), [("tio2", "TiO2"), ("Sapphire", "sapphire"), ("hfo2", "HfO2"), ("gan", "GaN")]
+)
+def test_another_case_is_the_same_material(name, want):
+    with pytest.raises(MaterialError, match=f"did you mean '{want}'"):
+        materials.index(name, 0.6)
+
+
+def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
+    file = tmp_path / "n.csv"
+    file.write_text("wavelength_nm,n\n800,2.0\n900,2.2\n")
+    assert abs(materials.index(str(file), 0.85) - 2.1) < 1e-12
+    file = tmp_path / "stacked.csv"
+    file.write_text("wl,n\n0.8,2.0\n0.9,2.2\n\nwl,k\n0.8,0.02\n0.9,0.04\n")
+    assert abs(materials.index(str(file), 0.85) - (2.1 + 0.03j)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("just text", "no list DATA"),
+        ("DATA:\n  - type: formula 12\n    wavelength_range: 0.4 0.9\n    coefficients: 1 2 3\n", "formula 1 to 9"),
+        ("DATA:\n  - type: formula 1\n    wavelength_range: 0.4 0.9\n    coefficients: 1 x 3\n", "not numbers"),
+        ("DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5\n", "row 1"),
+        ("DATA: [", "not YAML"),
+        ("DATA:\n  - type: tabulated k\n    data: |\n        0.5 0.1\n        0.6 0.1\n", "neither a formula"),
+    ],
+)
+def test_a_bad_page_is_refused(tmp_path: Path, text, message):
+    file = tmp_path / "bad.yml"
+    file.write_text(text)
+    with pytest.raises(MaterialError, match=message):
+        materials.index(str(file), 0.55)
+
+
+def test_blends_and_offsets():
+    """Bruggeman's equation holds for what comes out; ends of the share are the materials themselves."""
+    a, b = materials.index("TiO2", 0.6) ** 2, materials.index("SiO2", 0.6) ** 2
+    e = materials.index(Blend("TiO2", "SiO2", 0.3), 0.6) ** 2
+    assert abs(0.7 * (a - e) / (a + 2 * e) + 0.3 * (b - e) / (b + 2 * e)) < 1e-12
+    assert abs(materials.index(Blend("TiO2", "SiO2", 1.0), 0.6) ** 2 - b) < 1e-12
+    shifted = materials.index(Blend("TiO2", n_offset=-0.07, k_offset=0.002), 0.6)
+    assert abs(shifted - (materials.index("TiO2", 0.6) - 0.07 + 0.002j)) < 1e-15
+    step, blend = 1e-5, Blend("N-BK7", "PMMA", 0.4)
+    rise = (materials.index(blend, 0.6 + step) - materials.index(blend, 0.6 - step)) / (2 * step)
+    assert abs(materials.slope(blend, 0.6) - rise) < 1e-6

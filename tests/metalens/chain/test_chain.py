@@ -1,0 +1,98 @@
+"""The chain from one file: which stages it asks for, its settings laid out, its module drawn."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from metalens.chain import module_view
+from metalens.chain import stages as chain
+from metalens.chain.stages import ChainFiles
+from metalens.commands import demo
+from metalens.commands.design import Design
+from metalens.ground import config
+from metalens.ground.errors import ConfigError
+
+
+def _verbs(files):
+    return [stage.words[0] for stage in chain.stages(files)]
+
+
+def test_the_shipped_chain_runs_from_cell_to_retrained_network():
+    assert _verbs(chain.shipped()) == [
+        "library", "design", "psf", "layout", "codesign", "capture", "fit", "retrain",
+    ]  # fmt: skip
+    assert {w for s in chain.stages(chain.shipped()) for w in s.words if w.endswith("lens.h5")} == {
+        "lens.h5", "run/lens.h5",
+    }  # fmt: skip
+    names = [demo._name(stage) for stage in chain.stages(chain.shipped())]
+    assert len(set(names)) == len(names)
+
+
+def test_a_stage_without_its_file_is_left_out(tmp_path):
+    for name in ("c", "d", "p", "r"):
+        (tmp_path / f"{name}.toml").write_text("")
+    text = 'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n'
+    (tmp_path / "chain.toml").write_text(text)
+    assert _verbs(chain.load(tmp_path / "chain.toml")) == ["library", "design", "psf", "layout"]
+    (tmp_path / "chain.toml").write_text(text + 'run = "r.toml"\npsf = "p.toml"\n')
+    stages = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    (tmp_path / "chain.toml").write_text(text + 'bench_design = "d.toml"\nbench_truth = "r.toml"\n')
+    own = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    assert [s.words[0] for s in own[-3:]] == ["design", "capture", "fit"]
+    assert "bench_lens.h5" in own[-1].words
+    assert stages[-1].words[0] == "codesign"
+    assert "--config" in stages[2].words
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('cell = "c.toml"\n', "missing key"),
+        ('cell = "absent.toml"\ndesign = "c.toml"\nprocess = "c.toml"\n', "no such file"),
+        (
+            'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_design = "c.toml"\n',
+            "belongs to a bench_truth",
+        ),
+        ('cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_truth = "c.toml"\n', "no lens to measure"),
+        ('cell = "c.toml"\ndesin = "c.toml"\n', "did you mean 'design'"),
+    ],
+)
+def test_incomplete_chains_are_refused(tmp_path, text, message):
+    (tmp_path / "c.toml").write_text("")
+    (tmp_path / "chain.toml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        chain.load(tmp_path / "chain.toml")
+
+
+def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_path):
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.mkdir()
+    target.mkdir()
+    (source / "my.toml").write_text('profile = "cubic"\naperture_mm = 1.0\n[cubic]\nstrength_rad = 5.0\n')
+    for name in ("c", "p"):
+        (source / f"{name}.toml").write_text(f"# {name}\n")
+    files = chain.lay_out(target, ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")), source, aperture_mm=0.25)
+    assert files == ChainFiles(Path("cell.toml"), Path("design.toml"), Path("process.toml"))
+    made = config.load(target / "design.toml", Design)
+    assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (0.25, "cubic", 5.0)
+
+
+def test_the_shipped_settings_are_laid_out(tmp_path):
+    chain.lay_out(tmp_path, chain.shipped(), None, aperture_mm=0.25)
+    assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
+    assert config.load(tmp_path / "design.toml", Design).aperture_mm == 0.25
+    assert (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")
+
+
+def test_the_drawn_module_needs_nothing_from_outside_and_grows_with_the_lens():
+    small, large = (module_view.view(aperture_mm=a, sensor_distance_mm=2.0).html for a in (0.5, 3.0))
+    assert not re.search(r"(?:src|href)=|https?:", small)
+    parts = [json.loads(re.search(r"const parts = (\[.*?\]);\n", html)[1]) for html in (small, large)]
+    names = [p["name"] for p in parts[0] if p["name"]]
+    assert names == ["NIR filter", "substrate", "metalens", "mount", "sensor", "flex"]
+    widths = [max(x for part in p for face in part["faces"] for x, _, _ in face) for p in parts]
+    assert widths[1] > widths[0] + 0.9
+    bottom = min(z for part in parts[0] for face in part["faces"] for _, _, z in face)
+    assert bottom == pytest.approx(-2.7)  # 2 mm of air, 0.5 mm sensor, 0.2 mm flex

@@ -1,0 +1,147 @@
+"""``metalens library`` and ``metalens study``: what they write, what they refuse, and how they end."""
+
+import json
+
+import numpy as np
+import pytest
+
+from metalens import library
+from metalens.cli import main
+from metalens.commands.library import CellFile
+from metalens.ground import config
+from metalens.pillars.record import DEFAULT_CELL
+
+QUICK = """
+[cell]
+pitch_um = 0.30
+height_um = 0.7
+pillar = { n = 3.6, k = 0.0 }
+[sweep]
+samples = 120
+tolerance = 1e-2
+"""
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A function that writes a config and runs the command on it."""
+
+    def run(text, *words):
+        path = tmp_path / "cell.toml"
+        path.write_text(text)
+        return main(["library", str(path), "-o", str(tmp_path / "library.h5"), *words])
+
+    return run
+
+
+def files(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_library_with_proxy_and_figure(cell, tmp_path, capsys):
+    assert cell(QUICK, "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["turns"] >= 1
+    assert values["max_error"] <= 1e-2
+    assert values["max_phase_error_rad"] <= 1e-3
+    assert files(tmp_path) == ["cell.toml", "library.h5", "library.png"]
+    made = library.load(tmp_path / "library.h5")
+    assert made.proxy is not None
+    assert made.provenance.inputs.keys() == {"cell.toml"}
+    assert np.isfinite(made.proxy.phase_rad(np.array([0.1, 0.2]), 0.85)).all()
+    before = (tmp_path / "library.h5").read_bytes()
+    assert cell(QUICK) == 2
+    assert "give --force" in capsys.readouterr().err
+    assert cell(QUICK, "--force", "--quiet") == 0
+    assert capsys.readouterr().out == ""
+    assert (tmp_path / "library.h5").read_bytes() == before  # same input, same bytes
+
+
+def test_the_table_of_speed_and_error(cell, capsys):
+    assert cell(QUICK) == 0
+    shown = capsys.readouterr().out
+    assert "solves (modal" in shown
+    assert "24 coefficients" in shown
+    assert "cut at" in shown
+
+
+def test_a_material_table_is_named_in_the_provenance(cell, tmp_path):
+    table = tmp_path / "film.csv"
+    table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.59,0\n")
+    assert cell(QUICK.replace("{ n = 3.6, k = 0.0 }", f'"{table}"'), "--quiet") == 0
+    assert library.load(tmp_path / "library.h5").provenance.inputs.keys() == {"cell.toml", "film.csv"}
+
+
+def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
+    assert cell(QUICK.replace("height_um = 0.7", "height_um = 0.3")) == 1
+    assert "a lens needs 1" in capsys.readouterr().out
+    assert (tmp_path / "library.h5").exists()  # the result is there to look at
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("pitch_um", "pich_um", "did you mean 'pitch_um'"),
+        ("samples", "sampels", "did you mean 'samples'"),
+        ("[sweep]", "[swep]", "did you mean 'sweep'"),
+        ("pitch_um = 0.30", "pitch_um = 0.60", "(-1, 0) in the substrate"),
+        ("pitch_um = 0.30", "pitch_um = -1.0", "need a finite length above 0"),
+        ("pitch_um = 0.30", "pitch_um = inf", "pitch_um is inf, need a finite number"),
+        ("pitch_um = 0.30", "pitch_um = nan", "pitch_um is nan"),
+        ("pitch_um = 0.30", 'pitch_um = "wide"', "need float"),
+        ("{ n = 3.6, k = 0.0 }", '"a-Sj"', "did you mean 'a-Si'"),
+        ("{ n = 3.6, k = 0.0 }", "{ n = -3.6 }", "need finite n > 0"),
+        ("{ n = 3.6, k = 0.0 }", '"none.csv"', "none.csv: no such file"),
+        ("tolerance = 1e-2", "wavelengths_um = [50.0]", "its source holds from"),
+        ("tolerance = 1e-2", "diameters_um = [0.1, 0.3]", "pillars touch"),
+        ("tolerance = 1e-2", "diameters_um = [0.1]", "need 2"),
+        ("tolerance = 1e-2", "tolerance = 0.0", "need 1e-8 to 0.1"),
+        ("tolerance = 1e-2", "tolerance = ", "not valid TOML"),
+    ],
+)
+def test_bad_input_ends_with_2_and_writes_nothing(cell, tmp_path, capsys, old, new, words):
+    assert old in QUICK
+    assert cell(QUICK.replace(old, new)) == 2
+    assert words in capsys.readouterr().err
+    assert files(tmp_path) == ["cell.toml"]
+
+
+def test_missing_config_and_folder(tmp_path, capsys):
+    assert main(["library", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml: no such file" in capsys.readouterr().err
+    (tmp_path / "cell.toml").write_text(QUICK)
+    assert main(["library", str(tmp_path / "cell.toml"), "-o", str(tmp_path / "no" / "l.h5")]) == 2
+    assert "does not exist" in capsys.readouterr().err
+
+
+def test_the_example_is_the_default_cell(request):
+    example = request.config.rootpath / "examples" / "cell.toml"
+    assert config.load(example, CellFile).cell == DEFAULT_CELL
+    assert config.loads("", CellFile).sweep == config.load(example, CellFile).sweep
+
+
+STUDY = """
+pitches_um = [0.30]
+heights_um = [0.7]
+wavelengths_um = [0.85]
+tolerance = 2e-2
+"""
+
+
+def test_study(tmp_path, capsys):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    out = tmp_path / "study"
+    assert main(["study", str(path), "-o", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["pitch_um"] == 0.3
+    assert files(out) == ["README.md", "cell_study.json", "cell_study.png", "manifest.json"]
+    assert main(["study", str(path), "-o", str(out)]) == 2
+    assert "give --force" in capsys.readouterr().err
+    path.write_text(STUDY.replace("0.7", "0.2"))
+    assert main(["study", str(path), "-o", str(out), "--force"]) == 1
+    path.write_text(STUDY.replace("pitches", "pitchs"))
+    assert main(["study", str(path), "-o", str(out), "--force"]) == 2
+    assert "did you mean 'pitches_um'" in capsys.readouterr().err
+    path.write_text(STUDY)
+    assert main(["study", str(path), "-o", str(tmp_path / "no" / "study")]) == 2
+    assert "does not exist" in capsys.readouterr().err

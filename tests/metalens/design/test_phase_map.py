@@ -1,0 +1,160 @@
+"""Phase maps of other programs: every format gives the same phase, the right way up, or a refusal that says why."""
+
+import contextlib
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from metalens.design import phase_map
+from metalens.design.profiles import PhaseMap
+from metalens.ground.errors import ConfigError, LensError
+
+STEP = 2.0
+X = (np.arange(24) - 11.5) * STEP
+Y = (np.arange(20) - 9.5) * STEP
+PHASE = 0.02 * X + 0.05 * Y[:, None] + 0.001 * X * Y[:, None]  # no symmetry: a turned or mirrored axis shows
+
+
+def zemax_text(phase, *, step_mm=STEP * 1e-3, unit=0, dec=(0.0, 0.0), nodata=()):
+    """What OpticStudio reads: the point of least x and largest (upward) y first; our row 0 is the top."""
+    lines = [f"{phase.shape[1]} {phase.shape[0]} {step_mm:.17g} {step_mm:.17g} {unit} {dec[0]:.17g} {dec[1]:.17g}"]
+    for i, value in enumerate(phase.ravel()):
+        lines.append(f"{value:.17g} 0 0 0 {int(i in nodata)}")
+    return "\n".join(lines) + "\n"
+
+
+def write(folder, kind):
+    path = folder / f"map.{kind.split('-')[0]}"
+    if kind == "npy":
+        np.save(path, PHASE)
+    elif kind == "csv":
+        np.savetxt(path, PHASE, delimiter=",", fmt="%.17g")
+    elif kind == "csv-semicolon":
+        text = "\n".join(";".join(f"{v:.17g}" for v in row) for row in PHASE)
+        path.write_text("\ufeff" + text, encoding="utf-8")  # Excel starts with a byte-order mark
+    elif kind == "txt":
+        np.savetxt(path, PHASE, fmt="%.17g")
+    elif kind == "mat":
+        savemat(path, {"phi": PHASE, "note": "text", "scale": 3.0})
+    elif kind == "mat-73":
+        with h5py.File(path, "w") as file:
+            file["phi"] = PHASE.T  # MATLAB keeps columns first
+    else:
+        path.write_text(zemax_text(PHASE))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "csv", "csv-semicolon", "txt", "mat", "mat-73", "dat"])
+def test_every_format_gives_the_same_samples(tmp_path, kind):
+    path = write(tmp_path, kind)
+    samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))
+    assert samples.phase_rad == pytest.approx(PHASE, abs=1e-15)
+    assert samples.step_um == pytest.approx((STEP, STEP))
+    x, y = np.array([-7.3, 0.0, 12.1]), np.array([-15.2, 3.3])
+    got = phase_map.interpolate(samples, x, y)
+    want = 0.02 * x + 0.05 * y[:, None] + 0.001 * x * y[:, None]
+    assert got == pytest.approx(want, abs=2e-4)  # phasors turn by 0.15 rad a step: error of the chord 0.15³/60
+
+
+def test_zemax_units_and_decentre(tmp_path):
+    for unit, um in enumerate((1e3, 1e4, 25.4e3, 1e6)):
+        (tmp_path / "g.dat").write_text(zemax_text(PHASE, step_mm=STEP / um, unit=unit, dec=(4 / um, 6 / um)))
+        samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
+        assert samples.step_um == pytest.approx((STEP, STEP), rel=1e-12)
+        assert samples.centre_um == pytest.approx((4.0, -6.0), rel=1e-9)  # up in the file is -y here
+        shifted = phase_map.interpolate(samples, np.array([4 + X[5]]), np.array([Y[3] - 6]))
+        assert shifted[0, 0] == pytest.approx(PHASE[3, 5], abs=1e-9)
+
+
+def test_points_without_data_matter_inside_the_aperture_alone(tmp_path):
+    (tmp_path / "g.dat").write_text(zemax_text(PHASE, nodata={0, 1, 24}))  # the upper left corner
+    samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
+    assert np.isnan(samples.phase_rad).sum() == 3
+    x = np.linspace(-17, 17, 30)
+    assert np.isfinite(phase_map.interpolate(samples, x, x, radius_um=10.0)[10:20, 10:20]).all()
+    with pytest.raises(LensError, match="no data near row 0"):
+        phase_map.interpolate(samples, x - 5, x - 2, radius_um=60.0)
+
+
+def test_conjugate_turns_the_sign(tmp_path):
+    path = write(tmp_path, "npy")
+    assert phase_map.read(PhaseMap(path, STEP, conjugate=True)).phase_rad == pytest.approx(-PHASE)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.dat", b"", "empty"),
+        ("a.dat", b"3 3 0.1 0.1\n", "need nx ny delx"),
+        ("a.dat", b"3 3 0.1 0.1 7 0 0\n", "unitflag 0 to 3"),
+        ("a.dat", b"2 2 0.1 0.1 0 0 0\n0 0 0 0\n", "1 points for a grid of 2 x 2"),
+        ("a.dat", b"2 2 0.1 0.1 0 0 0\n0\n0\nnan\n0\n", "line 4: phase is nan"),
+        ("a.dat", b"2 2 0.1 0.1 0 0 0\n0\n0\nabc\n0\n", "line 4 is 'abc'"),
+        ("a.dat", b"\xff\xfe\x00\x01", "binary"),
+        ("a.csv", b"1,2\n3,x\n", "not a phase map"),
+        ("a.csv", b"1,2\n3\n", "not a phase map"),
+        ("a.npy", b"\x93NUMPY", "not a phase map"),
+        ("a.mat", b"MATLAB 5.0 MAT-file", "not a MATLAB file"),
+    ],
+)
+def test_broken_files_are_refused_by_name(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    pitch = None if name.endswith("dat") else 1.0
+    with pytest.raises(LensError, match=message) as refusal:
+        phase_map.read(PhaseMap(tmp_path / name, pitch))
+    assert name in str(refusal.value)
+
+
+def test_settings_that_do_not_fit_the_file_are_refused(tmp_path):
+    path = write(tmp_path, "npy")
+    with pytest.raises(LensError, match="give pitch_um"):
+        phase_map.read(PhaseMap(path))
+    with pytest.raises(LensError, match=r"is for \.mat files"):
+        phase_map.read(PhaseMap(path, 1.0, variable="phi"))
+    with pytest.raises(LensError, match="leave pitch_um out"):
+        phase_map.read(PhaseMap(write(tmp_path, "dat"), 3.0))
+    with pytest.raises(ConfigError, match="pitch_um"):
+        PhaseMap(path, -1.0)
+
+
+def test_a_matrix_is_chosen_by_name_where_there_are_several(tmp_path):
+    savemat(tmp_path / "m.mat", {"phi": PHASE, "other": PHASE + 1})
+    with pytest.raises(LensError, match=r"2 matrices \(other, phi\)"):
+        phase_map.read(PhaseMap(tmp_path / "m.mat", STEP))
+    with pytest.raises(LensError, match="did you mean 'phi'"):
+        phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="ph"))
+    assert phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="phi")).phase_rad == pytest.approx(PHASE)
+
+
+def test_every_flipped_bit_of_a_header_is_refused_or_read(tmp_path):
+    """numpy reads the header as Python text: what that raises must not come through."""
+    path = write(tmp_path, "npy")
+    whole = path.read_bytes()
+    for bit in range(8 * 128):
+        broken = bytearray(whole)
+        broken[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(broken)
+        with contextlib.suppress(LensError):
+            assert phase_map.read(PhaseMap(path, STEP)).phase_rad.ndim == 2
+
+
+@settings(max_examples=200)
+@given(kind=st.sampled_from(["npy", "csv", "txt", "mat", "mat-73", "dat"]), data=st.data())
+def test_damaged_files_are_refused_or_read(tmp_path_factory, kind, data):
+    """Truncated or with a flipped bit: a typed refusal or a map, never another exception."""
+    path = write(tmp_path_factory.mktemp("fuzz"), kind)
+    whole = bytearray(path.read_bytes())
+    if data.draw(st.booleans(), label="truncate"):
+        whole = whole[: data.draw(st.integers(0, len(whole) - 1), label="length")]
+    else:
+        whole[data.draw(st.integers(0, len(whole) - 1), label="byte")] ^= 1 << data.draw(st.integers(0, 7), label="bit")
+    path.write_bytes(bytes(whole))
+    try:
+        samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))
+    except LensError:
+        return
+    assert samples.phase_rad.ndim == 2

@@ -1,0 +1,80 @@
+"""Pillars as the image sees them: against the PSFs summed over every pillar, and their gradient against differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.cell import Cell, Index
+from metalens.design import Focus, profiles
+from metalens.field import Grid, Layers, Optics, PillarWave, Window, imager, psfs
+from metalens.field.patches import relative
+from metalens.image import integrate
+from metalens.lens import DiameterMap, Lens
+from metalens.pillars import Proxy
+from metalens.psf import View, from_lens
+
+PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15
+PROXY = Proxy(np.array([[6.0, 3.2 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def lens():
+    x = (np.arange(251) - 125) * PITCH
+    focus = Focus(0.85, DISTANCE, FOCUS)
+    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus) - 0.2, 2 * math.pi)
+    wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))  # into the range of the proxy
+    diameter = 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi)
+    diameter = np.where(np.hypot(x, x[:, None]) <= 50.0, diameter, 0.0)
+    cell = Cell(pitch_um=PITCH, pillar=Index(3.6), substrate=Index(1.45))
+    return Lens(DiameterMap(diameter, PITCH), cell, PROXY, 0.85, DISTANCE, FOCUS, "hyperbolic")
+
+
+@pytest.mark.parametrize("angle", [0.0, 9.0])
+def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
+    """Both twice averaged over squares of a sample; apart: cells of 2.5 um, rim, light folded back (1 % each)."""
+    tilt, fine = (math.radians(angle), math.radians(-0.4 * angle)), 9
+    wide = SAMPLES + 4
+    made = from_lens(lens, View((4000.0,), (tilt,), wide * STEP, wide * fine), tolerance=1e-4)
+    light = torch.as_tensor(made.intensity[0, 0] * made.energy_um2[0, 0]).double() / (math.pi * 50.0**2)
+    box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
+    smooth = torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0]
+    want = integrate(smooth, STEP / fine, pitch_um=STEP)[2:-2, 2:-2]
+    at = torch.tensor([[DISTANCE * math.tan(t) for t in tilt]], dtype=torch.float64)
+    optics = Optics(PillarWave(lens), Layers(), DISTANCE)
+    got = psfs(optics, at, depths_um=torch.tensor([4e3]), wavelength_um=0.85, window=Window(SAMPLES, STEP))[0, 0]
+    assert float(relative(got.double(), want)) < 3e-2
+    assert float(got.sum() / want.sum()) == pytest.approx(1, abs=2.5e-2)
+
+
+def test_the_gradient_to_a_pillar_is_that_of_differences(lens):
+    diameter = torch.from_numpy(lens.diameters.diameter_um).clone()
+    diameter = torch.where(diameter > 0, diameter.clamp(0.082, 0.318), 0.0)
+    at, window = torch.tensor([[12.0, -7.0]], dtype=torch.float64), Window(9, STEP)
+    weight = torch.linspace(0.3, 1.9, 81).reshape(9, 9)
+    step = torch.zeros_like(diameter)
+    step[60:110, 90:120] = (diameter[60:110, 90:120] > 0) * 1e-3  # a patch beside the axis grows by 1 nm
+
+    def score(d):
+        optics = Optics(PillarWave(lens, diameter_um=d), Layers(), DISTANCE)
+        light = psfs(optics, at, depths_um=torch.tensor([4e3]), wavelength_um=0.85, window=window)[0, 0]
+        return (light * weight).double().sum()
+
+    leaf = diameter.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(score(leaf), leaf)
+    with torch.no_grad():
+        wide = 0.5 * (score(diameter + step) - score(diameter - step))
+    assert float((slope * step).sum()) == pytest.approx(float(wide), rel=2e-2)  # float32
+
+
+def test_other_orders_are_weak_and_sum_to_less_than_the_light(lens):
+    shares = PillarWave(lens).orders(0.85, (-1, 0, 1, 2))
+    assert 0.76 < shares[1] < 0.87  # |t|² of 0.87² to 0.93²
+    assert 0 < sum(v for m, v in shares.items() if m != 1) < 0.05
+
+
+def test_an_imager_of_a_lens_file_carries_its_stray_light(lens):
+    made = imager(lens, Grid((8, 8), STEP, (3e3, 6e3), window=SAMPLES), tolerance=5e-2)
+    assert made.stray is not None
+    assert set(made.stray.shares) == {-1, 0, 2, 3}

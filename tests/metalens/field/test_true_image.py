@@ -1,0 +1,156 @@
+"""The image engine against every scene point with its own PSF; invariants, gradients and refusals."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.cell import Film, Index
+from metalens.design import Focus
+from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, node_psfs, psfs, with_psfs
+from metalens.field.patches import relative
+from metalens.ground.errors import PropagationError, SceneError
+from metalens.image import Frames
+from metalens.psf import Nodes
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from referees.true_image import Referee
+
+DISTANCE, RADIUS, FOCUS, STEP, WINDOW = 240.0, 50.0, 6000.0, 4.8, 15
+WAVES = Nodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
+GRID = Grid((9, 7), STEP, (3000.0, 9000.0), margin=WINDOW // 2, window=WINDOW)
+MIDDLE = (math.radians(9.0), math.radians(-4.0))
+
+
+REFEREE = Referee(radius=RADIUS, distance=DISTANCE, focus=FOCUS, design_wavelength=0.85, fine=0.6, count=256)
+
+
+def _depths():
+    rows, columns = (n + 2 * GRID.margin for n in GRID.samples)
+    down, across = np.linspace(0, 1, rows)[:, None], np.linspace(0, 1, columns)
+    return 1 / (1 / 3000 + (1 / 9000 - 1 / 3000) * (0.1 + 0.5 * down + 0.3 * across))
+
+
+def _texture():
+    """1/f texture of mean 1 on image and margin."""
+    draw = np.random.default_rng(5)
+    rows, columns = (n + 2 * GRID.margin for n in GRID.samples)
+    f = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.fftfreq(columns)) + 0.5 / rows
+    rough = np.fft.ifft2(np.fft.fft2(draw.standard_normal((rows, columns))) / f).real
+    return np.clip(1 + 0.4 * (rough - rough.mean()) / rough.std(), 0.05, None)
+
+
+def _frames(light, depth):
+    one = torch.from_numpy(np.stack([np.zeros_like(light), light])[None])
+    cover = torch.from_numpy(np.stack([np.zeros_like(light), np.ones_like(light)])[None])
+    return Frames(one, cover, torch.from_numpy(np.stack([depth, depth])[None]))
+
+
+@pytest.fixture(scope="module")
+def optics():
+    return imager(SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS), GRID, spectrum=WAVES, field=MIDDLE, tolerance=1e-2)
+
+
+def _error(optics, light):
+    got = optics(_frames(light, _depths()))[0].numpy()
+    middle = DISTANCE * math.tan(MIDDLE[0]), DISTANCE * math.tan(MIDDLE[1])
+    waves = list(zip(WAVES.wavelengths_um, WAVES.weights, strict=True))
+    want = REFEREE.image(light, _depths(), step=STEP, window=WINDOW, waves=waves, middle=middle)
+    m = GRID.margin
+    want = want[m:-m, m:-m]
+    return np.linalg.norm(got - want) / np.linalg.norm(want)
+
+
+def test_the_image_of_a_texture_errs_by_no_more_than_it_says(optics):
+    assert optics.error < 1.2e-2
+    assert (
+        _error(optics, _texture()) < optics.error
+    )  # 8 kinds of error, none of them the referee's: its rounding is 1e-12
+
+
+def test_single_bright_points_lie_where_and_are_as_bright_as_the_referee_has_them(optics):
+    """Points hold more of the high frequencies than a texture: twice the stated error, and place to 1 / 50 sample."""
+    light = np.zeros_like(_depths())
+    light[9, 11], light[14, 8] = 7.3, 2.1
+    assert _error(optics, light) < 2.5 * optics.error
+
+
+def test_films_behind_the_lens_are_in_the_image():
+    """Glass of 0.5 of the way, index 1.5, moves focus by 40 um of 240: without it the image is another one."""
+    layers = Layers(behind=(Film(Index(1.5), 0.25 * DISTANCE),))
+    window = Window(WINDOW, STEP)
+    wave = SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS)
+    place, depth = (31.0, -22.0), 5000.0
+    at = torch.tensor([place], dtype=torch.float64)
+    got, bare = (
+        psfs(Optics(wave, films, DISTANCE), at, depths_um=torch.tensor([depth]), wavelength_um=0.85, window=window)[
+            0, 0
+        ]
+        for films in (layers, Layers())
+    )
+    about = {
+        "radius": RADIUS,
+        "distance": DISTANCE,
+        "focus": FOCUS,
+        "design_wavelength": 0.85,
+        "fine": 0.6,
+        "count": 256,
+    }
+    glass = Referee(films=((1.5, 0.25 * DISTANCE),), **about)
+    want = torch.from_numpy(glass.sampled(glass.intensity(place, depth, 0.85), STEP, WINDOW).copy())
+    scaled = got.double() * (want.sum() / got.sum())
+    assert float(relative(scaled, want)) < 6e-3  # rim and fold, as in air
+    assert float(got.sum() / want.sum()) == pytest.approx(0.96, abs=4e-3)  # 4 % of one face at normal incidence
+    assert float(relative(bare.double(), want)) > 0.02
+
+
+def test_films_thicker_than_the_gap_are_refused():
+    layers = Layers(behind=(Film(Index(1.5), 300.0),))
+    with pytest.raises(PropagationError, match="300 um in the 240 um from lens to sensor"):
+        layers.after(DISTANCE, 0.85)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, 1.0])
+def test_tolerances_that_mean_nothing_are_refused(tolerance):
+    with pytest.raises(SceneError, match="tolerance"):
+        imager(SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS), GRID, spectrum=WAVES, tolerance=tolerance)
+
+
+def test_frames_of_another_size_are_refused(optics):
+    with pytest.raises(SceneError, match="samples, need"):
+        optics(_frames(np.ones((9, 7)), np.full((9, 7), 4e3)))
+
+
+def test_compiled_and_differentiable_paths_give_one_image(optics):
+    single = _frames(_texture().astype(np.float32), _depths().astype(np.float32))
+    quick = optics(single)
+    slow = optics(Frames(single.radiance.clone().requires_grad_(), single.coverage, single.depth_um))
+    assert slow.requires_grad
+    assert float((quick - slow.detach()).norm() / quick.norm()) < 1e-5  # single precision
+
+
+def test_the_gradient_to_the_phase_is_that_of_differences():
+    """Coma-like added phase: d image power / d strength through nodes, kernels and patches; asymmetric on purpose."""
+
+    def power(strength):
+        def added(x, y):
+            return strength * (x / RADIUS) * ((x / RADIUS) ** 2 + (y / RADIUS) ** 2 - 0.3) + 0.2 * y / RADIUS
+
+        wave = SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS, added)
+        optics = Optics(wave, Layers(), DISTANCE)
+        return with_psfs(base, *node_psfs(optics, base.plan))(frames).double().square().sum()
+
+    wave = SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS, lambda x, y: 0.7 * x / RADIUS)
+    base = imager(wave, Grid((5, 6), STEP, (3e3, 6e3), window=9), spectrum=WAVES, tolerance=5e-2)
+    rows, columns = 5, 6
+    light = np.random.default_rng(2).random((rows, columns))
+    frames = _frames(light, np.full((rows, columns), 4.1e3))
+    strength = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)
+    power(strength).backward()
+    step = 0.02
+    with torch.no_grad():
+        slope = (power(strength + step) - power(strength - step)) / (2 * step)
+    assert float(strength.grad) == pytest.approx(float(slope), rel=5e-3)  # 1e-7 of float32 over a step of 0.02

@@ -1,0 +1,91 @@
+"""Configs: unknown keys name the nearest, wrong values name their place, and records survive the round trip."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from metalens.cell.record import Cell, Film, Index
+from metalens.ground import config
+from metalens.ground.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Inner:
+    width_um: float
+    name: str = "x"
+
+
+@dataclass(frozen=True)
+class Outer:
+    pitch_um: float
+    mode: Literal["fast", "small"] = "fast"
+    inner: Inner = Inner(1.0)
+    steps: tuple[int, ...] = ()
+    pair: tuple[float, float] = (0.0, 1.0)
+    file: Path | None = None
+    films: tuple[Inner, ...] = ()
+
+    def __post_init__(self):
+        if self.pitch_um <= 0:
+            raise ValueError(f"pitch_um = {self.pitch_um}: need above 0")
+
+
+def test_nested_tables_lists_and_defaults():
+    text = 'pitch_um = 1\nsteps = [1, 2]\nfile = "a.h5"\n[inner]\nwidth_um = 2\n[[films]]\nwidth_um = 3\nname = "f"\n'
+    found = config.loads(text, Outer)
+    assert found == Outer(1.0, inner=Inner(2.0), steps=(1, 2), file=Path("a.h5"), films=(Inner(3.0, "f"),))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("pich_um = 1", r"unknown key 'pich_um'; did you mean 'pitch_um'\?"),
+        ("pitch_um = 1\n[inner]\nwidht_um = 2", r"unknown key 'inner\.widht_um'; did you mean 'width_um'\?"),
+        ("", "missing key 'pitch_um'"),
+        ('pitch_um = "wide"', r"pitch_um is 'wide' \(str\), need float"),
+        ("pitch_um = true", r"pitch_um is True \(bool\), need float"),
+        ("pitch_um = nan", "pitch_um is nan"),
+        ("pitch_um = -1", "need above 0"),
+        ('pitch_um = 1\nmode = "smal"', r"mode is 'smal'; did you mean 'small'\?"),
+        ("pitch_um = 1\nsteps = [1, 2.5]", r"steps\[1\] is 2.5"),
+        ("pitch_um = 1\npair = [1.0]", "pair has 1 entries, need 2"),
+        ("pitch_um = 1\ninner = 3", "need a table"),
+        ("pitch_um = = 1", "not valid TOML"),
+    ],
+)
+def test_bad_config_is_refused_by_name(text, message):
+    with pytest.raises(ConfigError, match=message):
+        config.loads(text, Outer)
+
+
+def test_missing_file_and_binary_file_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        config.load(tmp_path / "absent.toml", Outer)
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not a text file"):
+        config.load(tmp_path / "b.toml", Outer)
+
+
+def test_a_material_is_a_name_or_plain_numbers():
+    cell = config.loads('pitch_um = 0.4\npillar = {n = 3.6, k = 0.01}\nsubstrate = "SiO2"\n', Cell)
+    assert cell.pillar == Index(3.6, 0.01)
+    assert cell.substrate == "SiO2"
+
+
+@given(
+    st.builds(
+        Cell,
+        pitch_um=st.floats(0.01, 10),
+        height_um=st.floats(0, 5),
+        pillar=st.builds(Index, st.floats(0.1, 5), st.floats(0, 3)),
+        substrate=st.sampled_from(["SiO2", 'a "quoted" name', "back\\slash"]),
+        sidewall_rad=st.floats(-0.7, 0.7),
+        under=st.lists(st.builds(Film, st.sampled_from(["Si", "air"]), st.floats(0, 2)), max_size=2).map(tuple),
+    )
+)
+def test_a_record_written_as_toml_reads_back_the_same(cell):
+    assert config.loads(config.dumps(cell), Cell) == cell

@@ -1,0 +1,59 @@
+"""The report page: self-contained, escaped, pictures and tables in place."""
+
+import re
+
+import numpy as np
+import pytest
+
+from metalens.ground import report
+from metalens.ground.report import Figure, KeyFigure, Markup, Section, Table
+
+
+@pytest.fixture
+def page(tmp_path):
+    figure, axes = report.canvas()
+    axes.plot([0, 1], [0, 1])
+    picture = Figure(report.png(figure), "A line <b>rising</b>")
+    table = Table(("name", "value"), (("t", 0.123456), ("<script>", 3)), "numbers")
+    sections = [
+        Section("One & two", "First paragraph.\n\nSecond <i>paragraph</i>.", (picture, table)),
+        Section("View", items=(Markup("<svg id='view'></svg>"),)),
+        Section("End"),
+    ]
+    keys = [
+        KeyFigure("pillars", "8,721,433"),
+        KeyFigure("checked", "yes", good=True),
+        KeyFigure("left", "1", good=False),
+    ]
+    report.write(tmp_path / "report.html", "A lens", sections, lead="Lead.", key_figures=keys)
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_page_works_offline(page):
+    assert not re.search(r"(?:src|href)=[\"'](?!data:|#)", page)
+    assert "@import" not in page
+    assert page.count("data:image/png;base64,") == 1
+
+
+def test_text_is_escaped_and_markup_is_not(page):
+    assert "A line &lt;b&gt;rising&lt;/b&gt;" in page
+    assert "<script>" not in page
+    assert "<svg id='view'></svg>" in page
+
+
+def test_paragraphs_tables_keys_and_contents_are_there(page):
+    assert page.count("<p>") == 3
+    assert "<td>0.1235</td>" in page
+    assert 'class="key good"' in page
+    assert 'class="key bad"' in page
+    assert 'href="#s3"' in page
+    assert 'name="viewport"' in page
+
+
+def test_same_drawing_gives_the_same_bytes():
+    def draw():
+        figure, axes = report.canvas()
+        axes.imshow(np.eye(5))
+        return report.png(figure)
+
+    assert draw() == draw()

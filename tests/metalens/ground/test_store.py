@@ -1,0 +1,149 @@
+"""Artefact files: whole or not at all, same input same bytes, refused by name when foreign."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from metalens.ground import store
+from metalens.ground.errors import StoreError
+
+ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "group/b": np.arange(40_000), "names": np.array(["x", "µm"])}
+
+
+def test_round_trip_keeps_arrays_attributes_and_provenance(tmp_path):
+    made = store.Provenance(config="x = 1\n", inputs={"cell.toml": "ab" * 32}, seed=7)
+    store.save(tmp_path / "f.h5", "lens", ARRAYS, attributes={"pitch_um": 0.4, "n": 3}, provenance=made)
+    back = store.load(tmp_path / "f.h5", "lens")
+    np.testing.assert_array_equal(back.arrays["a"], ARRAYS["a"])
+    np.testing.assert_array_equal(back.arrays["group/b"], ARRAYS["group/b"])
+    assert [n.decode() for n in back.arrays["names"]] == ["x", "µm"]
+    assert back.attributes == {"pitch_um": 0.4, "n": 3}
+    assert (back.provenance.config, dict(back.provenance.inputs), back.provenance.seed) == (
+        made.config,
+        dict(made.inputs),
+        7,
+    )
+    assert back.provenance.versions["numpy"] == np.__version__
+
+
+@settings(max_examples=25)
+@given(hnp.arrays(st.sampled_from([np.float32, np.int64, np.complex128]), hnp.array_shapes(min_dims=0, max_dims=3)))
+def test_any_array_comes_back_bit_for_bit(tmp_path_factory, array):
+    path = tmp_path_factory.mktemp("s") / "f.h5"
+    store.save(path, "psf", {"x": array})
+    back = store.load(path, "psf").arrays["x"]
+    assert back.dtype == array.dtype
+    assert back.tobytes() == array.tobytes()
+
+
+def test_same_input_gives_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        store.save(tmp_path / name, "lens", ARRAYS, attributes={"b": 1.0, "a": 2.0})
+    assert store.sha256(tmp_path / "one") == store.sha256(tmp_path / "two")
+
+
+def test_wrong_kind_names_what_was_found_and_what_is_needed(tmp_path):
+    store.save(tmp_path / "f.h5", "psf", ARRAYS)
+    with pytest.raises(StoreError, match=r"holds 'psf' version 1, need 'lens' version 1"):
+        store.load(tmp_path / "f.h5", "lens")
+
+
+def test_wrong_version_is_refused(tmp_path):
+    store.save(tmp_path / "f.h5", "lens", ARRAYS, version=2)
+    with pytest.raises(StoreError, match="version 2, need 'lens' version 1"):
+        store.load(tmp_path / "f.h5", "lens")
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(StoreError, match="no such file"):
+        store.load(tmp_path / "absent.h5", "lens")
+
+
+def test_foreign_hdf5_is_refused(tmp_path):
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(StoreError, match="not made by this toolchain"):
+        store.load(tmp_path / "f.h5")
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.3, 0.7, 0.999])
+def test_truncated_file_is_refused(tmp_path, fraction):
+    path = tmp_path / "f.h5"
+    store.save(path, "lens", ARRAYS)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * fraction)])
+    with pytest.raises(StoreError, match="truncated or"):
+        store.load(path, "lens")
+
+
+def test_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "f.txt"
+    path.write_text("old")
+
+    def fail():
+        with store.replacing(path) as part:
+            part.write_text("half")
+            raise RuntimeError("cut")
+
+    with pytest.raises(RuntimeError, match="cut"):
+        fail()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["f.txt"]
+
+
+def test_unwritable_target_is_an_oserror(tmp_path):
+    with pytest.raises(OSError, match="absent"):
+        store.save(tmp_path / "absent" / "f.h5", "lens", ARRAYS)
+
+
+def test_disk_full_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "f.h5"
+    store.save(path, "lens", ARRAYS)
+    before = path.read_bytes()
+    script = textwrap.dedent(f"""
+        import resource, signal
+        import numpy as np
+        from metalens.ground import store
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+        try:
+            store.save({str(path)!r}, "lens", {{"x": np.random.default_rng(0).random(10**6)}})
+        except OSError:
+            print("refused")
+    """)
+    child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert child.stdout.strip() == "refused", child.stderr[-500:]
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["f.h5"]
+
+
+def test_terminated_while_writing_leaves_the_old_file_whole(tmp_path):
+    path = tmp_path / "f.h5"
+    store.save(path, "lens", ARRAYS)
+    before = path.read_bytes()
+    script = textwrap.dedent(f"""
+        import numpy as np, sys, signal
+        from metalens.ground import store
+        arrays = {{"x": np.random.default_rng(0).random((4000, 4000))}}
+        print("ready", flush=True)
+        while True:
+            with store.replacing({str(path)!r}) as part:
+                part.write_bytes(arrays["x"].tobytes())
+                while True:
+                    pass
+    """)
+    child = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+    child.stdout.readline()
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    assert path.read_bytes() == before
+    store.load(path, "lens")

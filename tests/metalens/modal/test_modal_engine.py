@@ -1,0 +1,321 @@
+"""The modal engine against closed forms, invariants, its own two forms, and the slower methods."""
+
+import math
+
+import numpy as np
+import pytest
+
+from metalens import modal, rcwa
+from metalens.cell.record import Cell, Film, Index
+from metalens.ground.errors import CellError
+from metalens.modal.assembly import assemble
+from metalens.modal.engine import case_of, evaluate, geometric_mean
+from metalens.modal.homogeneous import modes
+from metalens.modal.ladder import RUNGS
+from metalens.modal.mesh import X0, X1, MeshPlan, build
+from metalens.modal.shapes import plain, rim, square
+from metalens.modal.spaces import space
+
+WAVELENGTH = 0.85
+PLAN = MeshPlan(3, 3, 3, (0.7, 1.3))
+COARSE = RUNGS[0].choice(0.5).plan
+
+
+def cell(height=0.7, n=3.6, k=0.0, pitch=0.4, substrate=1.4525, cover=1.0, between=1.0):
+    return Cell(pitch, height, Index(n, k), Index(substrate), Index(cover), Index(between))
+
+
+def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):
+    """Power-normalised t of a slab between half-spaces at normal incidence (Airy)."""
+    r1, r2 = (below - n) / (below + n), (n - above) / (n + above)
+    t12 = 2 * np.sqrt(below * n) / (below + n) * 2 * np.sqrt(n * above) / (n + above)
+    phase = np.exp(2j * np.pi * n * height / wavelength)
+    return t12 * phase / (1 + r1 * r2 * phase**2)
+
+
+# --- elements -------------------------------------------------------------------------------------------------
+
+
+def test_slopes_are_orthonormal_and_integrate_to_the_values():
+    for line in (plain(5, 12), rim(4, 28, (0.7, 1.3), False), rim(4, 28, (0.7, 1.3), True)):
+        gram = (line.slope * line.weight) @ line.slope.T
+        assert np.abs(gram - np.eye(line.degree)).max() < 1e-11
+        # partial integration: bubbles vanish at both ends, so their mean times 1 is minus <s, slope>
+        mean = line.value[2:] @ line.weight
+        assert np.abs(mean + line.slope[1:] @ (line.weight * line.point)).max() < 1e-12
+
+
+def test_rim_rule_integrates_fractional_powers():
+    line = rim(3, 28, (0.7,), False)
+    for power in (-0.6, -0.3, 0.7, 1.4, 2.0):
+        assert abs((line.weight * line.point**power).sum() - 1 / (power + 1)) < 1e-12
+
+
+def test_curl_of_gradient_vanishes():
+    basis = square(rim(3, 20, (0.7,), True), plain(4, 9))
+    assert np.abs(basis.curl @ basis.gradient).max() == 0
+
+
+@pytest.mark.parametrize("rho", [0.025, 0.5, 0.975])
+def test_areas_of_disc_and_cell(rho):
+    geometry = assemble(rho, PLAN)
+    # constants are the sum of the vertex functions: those that the gradient sends to zero together
+    _, _, right = np.linalg.svd(geometry.gradient)
+    one = right[-1] / right[-1][np.argmax(np.abs(right[-1]))]
+    assert abs(one @ geometry.cell.scalar @ one - 1) < 1e-10
+    assert abs(one @ geometry.disc.scalar @ one / (math.pi * rho**2 / 4) - 1) < 1e-10
+
+
+def test_every_edge_is_shared_with_one_direction():
+    mesh = build(PLAN)
+    keys = {pair for patch in mesh.patches for pair in zip(patch.vector.ravel(), patch.vector.ravel(), strict=True)}
+    assert len(keys) == len(mesh.vector_wall)
+    walls = (mesh.vector_wall & (X0 | X1)) != 0
+    assert 0 < walls.sum() < len(walls) / 2
+
+
+def test_matrix_rates_against_central_differences():
+    from metalens.modal.assembly import integrate
+
+    mesh, rho, step = build(PLAN), 0.5, 1e-5
+    rate = integrate(mesh, rho, rate=True)
+    plus, minus = integrate(mesh, rho + step), integrate(mesh, rho - step)
+    for got, high, low in zip(rate, plus, minus, strict=True):
+        for name in ("mass", "curl", "scalar"):
+            want = (getattr(high, name) - getattr(low, name)) / (2 * step)
+            # differences of order step² = 1e-10 of the matrix, rounding 1e-16 / step; a mapped core has no rate at all
+            scale = np.abs(getattr(high, name)).max()
+            assert np.abs(getattr(got, name) - want).max() < 1e-7 * scale
+
+
+@pytest.mark.parametrize("half_phase", [None, 0.3, 1.2])
+def test_empty_cell_has_plane_waves_as_modes(half_phase):
+    basis = modes(space(assemble(0.5, PLAN), electric=True, half_phase_rad=half_phase))
+    along = range(1, 5) if half_phase is None else [half_phase / math.pi + m for m in range(-4, 4)]
+    exact = np.array(sorted(m**2 + n**2 for m in along for n in range(1, 5)))[:3]
+    got = basis.tm[:3] / math.pi**2
+    assert np.abs(got / exact - 1).max() < 4e-2  # smooth waves on 5 cubic elements
+    assert (got > exact * (1 - 1e-12)).all()  # Rayleigh-Ritz: from above
+
+
+def test_plane_waves_converge_exponentially_with_the_degree():
+    errors = []
+    for degree in (3, 4, 5):
+        plan = MeshPlan(degree, degree, degree, (0.7,))
+        basis = modes(space(assemble(0.5, plan), electric=False, half_phase_rad=0.3))
+        errors.append(abs(basis.tm[0] - 0.09) / 0.09)
+    assert errors[1] < errors[0] / 5
+    assert errors[2] < errors[1] / 5
+
+
+# --- solutions with a known answer ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-9, 0.01, 0.7, 5.0, 50.0])
+def test_pillar_of_air_is_a_film_of_air(height):
+    got = modal.solve(cell(height, n=1.0), 0.2, WAVELENGTH)
+    assert abs(got.t - film(1.0, height)) < 1e-10 + 1e-10 * height  # q to 1e-11, times k0 h
+    assert got.converged
+
+
+@pytest.mark.parametrize(("n", "k"), [(2.0, 0.0), (3.6, 0.1), (3.6, 3.0)])
+def test_homogeneous_layer_of_any_permittivity(n, k):
+    layer = Cell(0.4, 0.7, Index(n, k), Index(1.4525), Index(1.0), Index(n, k))
+    assert abs(modal.solve(layer, 0.2, WAVELENGTH).t - film(n + 1j * k, 0.7)) < 1e-10
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+def test_oblique_homogeneous_layer_is_fresnel(polarization):
+    angle = math.radians(20)
+    layer = cell(0.7, n=2.0, between=2.0)
+    k0, kx = 2 * math.pi / WAVELENGTH, 2 * math.pi / WAVELENGTH * math.sin(angle)
+    kz = [np.sqrt((k0 * n) ** 2 - kx**2 + 0j) for n in (1.4525, 2.0, 1.0)]
+    y = [k / n**2 if polarization == "p" else k for k, n in zip(kz, (1.4525, 2.0, 1.0), strict=True)]
+    r1, r2 = (y[0] - y[1]) / (y[0] + y[1]), (y[1] - y[2]) / (y[1] + y[2])
+    t12 = 4 * np.sqrt(y[0] * y[1]) / (y[0] + y[1]) * np.sqrt(y[1] * y[2]) / (y[1] + y[2])
+    phase = np.exp(1j * kz[1] * 0.7)
+    want = t12 * phase / (1 + r1 * r2 * phase**2)
+    got = modal.solve(layer, 0.2, WAVELENGTH, angle_rad=angle, polarization=polarization, tolerance=1e-3)
+    assert abs(got.t - want) < got.t_error
+    assert got.t_error < 1e-3
+
+
+@pytest.mark.parametrize("diameter", [0.01, 0.1, 0.1937, 0.302, 0.39])
+def test_lossless_energy_and_reciprocity(diameter):
+    case = case_of(cell(), diameter, WAVELENGTH, 0.0, 0.0, "x")
+    solution = evaluate(case, COARSE)
+    s = solution.matrix
+    assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
+    assert abs(s[0, 1] - s[1, 0]) < 1e-12
+    assert abs(solution.energy - 1) < 1e-12
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+def test_lossless_energy_and_reciprocity_oblique(polarization):
+    solution = evaluate(case_of(cell(), 0.272, WAVELENGTH, math.radians(5), 0.0, polarization), COARSE)
+    s = solution.matrix
+    assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
+    assert abs(s[0, 1] - s[1, 0]) < 1e-12
+
+
+def test_reciprocity_with_absorption():
+    s = evaluate(case_of(cell(k=0.1), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    assert abs(s[0, 1] - s[1, 0]) < 1e-12
+    assert np.linalg.norm(s, 2) < 1
+
+
+def test_swap_of_sides_turns_the_scattering_matrix_round():
+    there = evaluate(case_of(cell(), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    back = evaluate(case_of(cell(substrate=1.0, cover=1.4525), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    assert np.abs(back - there[::-1, ::-1]).max() < 1e-11
+
+
+def test_scaling_all_lengths_changes_nothing():
+    one = modal.solve(cell(), 0.2, WAVELENGTH).t
+    two = modal.solve(cell(1.4, pitch=0.8), 0.4, 2 * WAVELENGTH).t
+    assert abs(one - two) < 1e-11
+
+
+def test_polarisations_are_equal_at_normal_incidence():
+    answers = {
+        modal.solve(cell(), 0.2, WAVELENGTH, polarization=p, azimuth_rad=a).t for p in "xysp" for a in (0.0, 1.0)
+    }
+    assert len(answers) == 1
+
+
+def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
+    rng = np.random.default_rng(2)
+    a = np.linalg.qr(rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2)))[0]
+    u, v = a @ a.T, a @ np.diag(np.exp(1j * np.array([0.02, -0.05]))) @ a.T
+    mean = geometric_mean(u, v)
+    assert np.abs(mean.conj().T @ mean - np.eye(2)).max() < 1e-14
+    assert np.abs(mean - a @ np.diag(np.exp(0.5j * np.array([0.02, -0.05]))) @ a.T).max() < 1e-14
+    assert np.abs(mean - mean.T).max() < 1e-14
+
+
+# --- hard cases ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height", [50.0, 1000.0])
+def test_hard_tall_pillars_stay_unitary(height):
+    s = evaluate(case_of(cell(height), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-10
+
+
+def test_hard_touching_pillars_on_a_mesh_of_their_own():
+    """Elements that shrink towards the point of contact, up to a gap of 4 pm; RCWA takes the touching ones as they are.
+
+    t still moves by 7e-3 over the last two decades of the gap.
+    """
+    touching = rcwa.solve(cell(), 0.4, WAVELENGTH, harmonics=11)
+    plan = MeshPlan(3, 4, 3, (0.7, 1.45), sectors=(0.15, 1.0))
+    near, nearer = (evaluate(case_of(cell(), 0.4 * (1 - gap), WAVELENGTH, 0.0, 0.0, "x"), plan) for gap in (1e-4, 1e-5))
+    for solution in (near, nearer):
+        s = solution.matrix
+        assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
+        assert abs(s[1, 0] - touching.t) < touching.t_error < 4e-2
+    assert abs(near.matrix[1, 0] - nearer.matrix[1, 0]) < 1e-2
+
+
+@pytest.mark.parametrize("short", [1e-4, 1e-8, 0.0])
+def test_hard_substrate_order_at_cutoff(short):
+    got = modal.solve(cell(), 0.2, 0.4 * 1.4525 / (1 - short))
+    assert np.isfinite([got.t, got.r]).all()
+    assert abs(got.energy - 1) < 1e-9  # rounding times the admittance of an order at its cutoff, 1e8
+
+
+def test_hard_pitch_equals_wavelength():
+    got = modal.solve(cell(), 0.2, 0.4)
+    assert np.isfinite([got.t, got.r]).all()
+    assert abs(got.energy - 1) < 1e-9  # as above
+    assert abs(got.t) ** 2 + abs(got.r) ** 2 < 1
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+def test_hard_tiny_angles_join_normal_incidence(polarization):
+    case = [case_of(cell(), 0.2, WAVELENGTH, a, 0.0, polarization) for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)]
+    t = [evaluate(c, COARSE).matrix[1, 0] for c in case]
+    assert t[1] == t[0] == t[2]
+    assert abs(t[3] - t[0]) < 1e-7
+    assert abs(t[4] - t[0]) < 1e-4  # t is even in the angle: 20 theta² at most here
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+def test_hard_grazing(polarization):
+    case = case_of(cell(), 0.2, WAVELENGTH, math.radians(89), 0.0, polarization)
+    solution = evaluate(case, COARSE)
+    assert np.isfinite(solution.matrix).all()
+    assert abs(solution.energy - 1) < 1e-12
+
+
+def test_angle_and_azimuth_have_the_symmetry_of_the_square():
+    one = modal.solve(cell(), 0.2, WAVELENGTH, angle_rad=0.2, polarization="p", tolerance=1e-2).t
+    two = modal.solve(cell(), 0.2, WAVELENGTH, angle_rad=-0.2, polarization="p", tolerance=1e-2).t
+    three = modal.solve(
+        cell(), 0.2, WAVELENGTH, angle_rad=0.2, azimuth_rad=math.pi / 2, polarization="y", tolerance=1e-2
+    ).t
+    assert one == two == three
+
+
+def test_hard_float32_numbers_are_taken_in_double_precision():
+    diameter, wavelength = np.float32(0.2), np.float32(0.85)
+    single = modal.solve(cell(), diameter, wavelength, tolerance=1e-2)
+    double = modal.solve(cell(), float(diameter), float(wavelength), tolerance=1e-2)
+    assert single == double
+
+
+def test_table_is_made_of_single_solves():
+    calls = []
+    table = modal.solve_many(
+        cell(),
+        [0.1, 0.2],
+        [0.84, 0.85],
+        angles_rad=[0.0, 0.2],
+        polarizations=("s", "p"),
+        tolerance=1e-2,
+        progress=calls.append,
+    )
+    assert table.t.shape == (2, 2, 2, 2)
+    assert sum(calls) == table.t.size
+    one = modal.solve(cell(), 0.2, 0.84, angle_rad=0.2, polarization="p", tolerance=1e-2)
+    assert table.t[1, 1, 0, 1] == one.t
+    assert table.t_error[1, 1, 0, 1] == one.t_error
+    assert (table.t[0, 0] == table.t[1, 0]).all()
+    assert (table.t_error <= 1e-2).all()
+    assert table.converged.all()
+
+
+# --- refusals ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"diameter_um": 0.4}, "rcwa"),
+        ({"diameter_um": 0.0}, "diameter_um"),
+        ({"diameter_um": math.nan}, "diameter_um"),
+        ({"wavelength_um": -1.0}, "wavelength_um"),
+        ({"angle_rad": 2.0}, "angle_rad"),
+        ({"angle_rad": math.nan}, "angle_rad"),
+        ({"angle_rad": 0.1, "azimuth_rad": math.inf}, "azimuth_rad"),
+        ({"angle_rad": 0.1, "azimuth_rad": 0.3}, "rcwa"),
+        ({"polarization": "z"}, "polarization"),
+        ({"tolerance": 0.0}, "tolerance"),
+    ],
+)
+def test_bad_numbers_are_refused(change, word):
+    with pytest.raises(CellError, match=word):
+        modal.solve(**({"cell": cell(), "diameter_um": 0.2, "wavelength_um": 0.85} | change))
+
+
+@pytest.mark.parametrize(
+    "shape", [{"sidewall_rad": 0.02}, {"under": (Film("SiO2", 0.1),)}, {"over": (Film("SiO2", 0.1),)}]
+)
+def test_films_and_tilted_walls_are_refused_by_name(shape):
+    with pytest.raises(CellError, match="rcwa"):
+        modal.solve(Cell(0.4, **shape), 0.2, 0.85)
+
+
+def test_absorbing_half_space_is_refused():
+    with pytest.raises(CellError, match="absorbs"):
+        modal.solve(Cell(0.4, 0.7, Index(3.6), Index(1.45, 0.1)), 0.2, 0.85)

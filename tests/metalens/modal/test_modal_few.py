@@ -1,0 +1,127 @@
+"""Few modes and a matrix root against all modes of the layer: the same scattering matrix, for a part of the work."""
+
+import numpy as np
+import pytest
+
+from metalens.cell.record import Cell, Index
+from metalens.modal.assembly import assemble
+from metalens.modal.dense import below, definite_inverse, eigen_pairs
+from metalens.modal.engine import case_of, evaluate
+from metalens.modal.few_modes import few_modes, root
+from metalens.modal.homogeneous import modes
+from metalens.modal.ladder import RUNGS
+from metalens.modal.layer import Medium, electric_modes, magnetic_modes
+from metalens.modal.match import few_scattering, half_space, scattering
+from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
+from metalens.modal.spaces import space
+
+COARSE = RUNGS[0].choice(0.5).plan
+CASES = [(0.08, 0.0, "x"), (0.302, 0.0, "x"), (0.2, 0.2, "p"), (0.272, 0.0873, "p"), (0.2, 0.2, "s")]
+
+
+def cell(height=0.7, n=3.6, k=0.0):
+    return Cell(0.4, height, Index(n, k), Index(1.4525), Index(1.0), Index(1.0))
+
+
+def both(case, *, magnetic, weak):
+    """Scattering matrices from all modes and from few (None where they are not few)."""
+    electric = bool(case.bloch) and case.p == magnetic
+    symmetry_class = space(assemble(case.rho, COARSE), electric=electric, half_phase_rad=case.bloch or None)
+    b, medium = modes(symmetry_class), Medium(case.k0, case.disc, case.around)
+    halves = [half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above)]
+    full = scattering((magnetic_modes if magnetic else electric_modes)(b, medium), case.height, *halves).matrix
+    pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
+    found = few_modes(pencil, case.height, weak=weak)
+    if found is None:
+        return full, None
+    sign = np.array([[-1, 1], [1, -1]]) if magnetic else 1  # the dual unknown reflects with the other sign
+    return full, sign * few_scattering(pencil, found, case.height, *halves).matrix
+
+
+@pytest.mark.parametrize("magnetic", [False, True])
+@pytest.mark.parametrize(("diameter", "angle", "polarization"), CASES)
+def test_few_modes_give_the_matrix_of_all(diameter, angle, polarization, magnetic):
+    case = case_of(cell(), diameter, 0.85, angle, 0.0, polarization)
+    sharp = 25 if diameter == 0.272 else 1  # a relative 1e-12 of the dark mode's wavenumber is 1e-8 of t
+    for weak, within in ((1e-12, 2e-9 * sharp), (1e-7, 1e-6)):
+        full, few = both(case, magnetic=magnetic, weak=weak)
+        assert np.abs(few - full).max() < within
+        assert np.abs(few.conj().T @ few - np.eye(2)).max() < 1e-12  # whatever was left out
+        assert abs(few[0, 1] - few[1, 0]) < 1e-12
+
+
+def test_thin_layer_keeps_all_modes():
+    case = case_of(cell(height=0.001), 0.2, 0.85, 0.0, 0.0, "x")
+    assert both(case, magnetic=False, weak=1e-12)[1] is None
+    assert abs(evaluate(case, COARSE).matrix[1, 0]) > 0.9
+
+
+@pytest.mark.parametrize("height", [50.0, 1000.0])
+def test_hard_tall_pillar_conserves_energy(height):
+    case = case_of(cell(height=height), 0.2, 0.85, 0.0, 0.0, "x")
+    matrix = evaluate(case, COARSE, weak=RUNGS[0].weak).matrix
+    assert np.abs(matrix.conj().T @ matrix - np.eye(2)).max() < 1e-11
+
+
+def test_absorbing_and_metallic_layers_take_all_modes():
+    assert not lossless(Medium(1.0, 3.6**2 + 0.1j, 1.0))
+    assert not lossless(Medium(1.0, -4.0, 1.0))
+    assert lossless(Medium(1.0, 3.6**2, 1.0))
+
+
+def test_dense_algebra_does_what_it_says():
+    random = np.random.default_rng(1)
+    left, right = random.normal(size=(2, 20, 20))
+    definite, symmetric = left @ left.T + np.eye(20), right + right.T
+    lower = np.linalg.cholesky(definite)
+    assert np.abs(lower @ below(lower, right) - right).max() < 1e-12
+    assert np.abs(lower.T @ below(lower, right, transposed=True) - right).max() < 1e-12
+    inverse = definite_inverse(definite)
+    assert np.abs(inverse @ definite - np.eye(20)).max() < 1e-11
+    assert (inverse == inverse.T).all()
+    value, vectors = eigen_pairs(symmetric, definite)
+    assert np.abs(symmetric @ vectors - definite @ vectors * value).max() < 1e-11
+    assert np.abs(vectors.T @ definite @ vectors - np.eye(20)).max() < 1e-11
+    with pytest.raises(np.linalg.LinAlgError):
+        eigen_pairs(definite, symmetric)
+
+
+def test_root_of_a_matrix_near_a_diagonal():
+    random = np.random.default_rng(3)
+    n = 24
+    signs = np.where(np.arange(n) < 12, 1.0, -1.0)
+    level = np.geomspace(50, 1e5, n)[random.permutation(n)]
+    rest = random.normal(size=(n, n)) * np.sqrt(level)
+    square = np.diag(level) + signs[:, None] * (rest + rest.T) / 4
+    found = root(square, signs, 30.0, 1e-13)
+    assert np.abs(found @ found - square).max() < 1e-11 * level.max()
+    assert (np.linalg.eigvals(found).real > 0).all()
+    assert np.abs(signs[:, None] * found - (signs[:, None] * found).T).max() < 1e-11 * np.sqrt(level.max())
+
+
+def test_root_refuses_what_is_far_from_a_diagonal():
+    square = np.array([[1.0, 50.0], [-50.0, 1.0]])
+    assert root(square, np.array([1.0, -1.0]), 1.0, 1e-12) is None
+
+
+@pytest.mark.parametrize("half_phase", [None, 0.05, 0.3, 1.3])
+@pytest.mark.parametrize("rho", [0.1, 0.5, 0.9])
+def test_quick_homogeneous_modes_are_the_homogeneous_modes(half_phase, rho):
+    for electric in (True, False):
+        symmetry_class = space(assemble(rho, COARSE), electric=electric, half_phase_rad=half_phase)
+        slow, quick = modes(symmetry_class, careful=True), modes(symmetry_class, quick=True)
+        assert np.abs(slow.tm / quick.tm - 1).max() < 1e-6
+        assert np.abs(slow.te - quick.te).max() < 3e-8 * slow.te.max()
+        gram = quick.vector.T @ symmetry_class.cell.mass @ quick.vector
+        assert np.abs(gram - np.eye(quick.size)).max() < 1e-6
+        direct = quick.vector.T @ symmetry_class.disc.mass @ quick.vector
+        assert np.abs(direct - quick.disc_mass).max() < 1e-6
+
+
+def test_a_rung_leaves_out_less_than_a_hundredth_of_its_estimate():
+    case = case_of(cell(), 0.2, 0.85, 0.0, 0.0, "x")
+    for rung in RUNGS[:2]:
+        plan = rung.choice(case.rho).plan
+        quick, exact = evaluate(case, plan, weak=rung.weak), evaluate(case, plan)
+        error = rung.error(exact, case.rho)
+        assert np.abs(quick.matrix - exact.matrix).max() < 1e-2 * error

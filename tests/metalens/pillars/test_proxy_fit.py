@@ -1,0 +1,178 @@
+"""Proxy fits on synthetic libraries whose phase and |t| are known functions."""
+
+import math
+
+import numpy as np
+import pytest
+
+from metalens import library, proxy
+from metalens.cell.record import Cell, Index
+from metalens.ground.errors import DomainError
+from metalens.pillars import fit as proxy_fit
+from metalens.pillars import stretch as smooth
+from metalens.pillars.fit import Wanted
+from metalens.pillars.record import PillarLibrary, Sweep
+
+CELL = Cell(0.30, 0.7, Index(3.6))
+TURN = 2 * math.pi
+
+
+def phase_of(d, wavelength, angle):
+    """1.3 turns from 60 to 220 nm with a bend, chromatic and tilted."""
+    x = (d / 0.22) ** 2
+    return 1.3 * TURN * (x + 0.05 * np.sin(5 * x)) * (0.85 / wavelength) ** 2 * (1 + 0.2 * np.sin(angle) ** 2)
+
+
+def level_of(d, wavelength, angle):
+    return 0.93 + 0.0699999 * np.cos(40 * d + wavelength) - 0.1 * np.sin(angle) ** 2
+
+
+def synthetic(waves=(0.85,), angles=(0.0,), resonances=(), factor=None, samples=161) -> PillarLibrary:
+    d = np.linspace(0.06, 0.22, samples)
+    w, a = np.array(waves)[None, :, None], np.radians(angles)[:, None, None]
+    t = level_of(d, w, a) * np.exp(1j * phase_of(d, w, a))
+    t = t if factor is None else t * factor(d)
+    t = np.stack([t]) if angles == (0.0,) else np.stack([t, t])
+    return PillarLibrary(
+        cell=CELL,
+        sweep=Sweep(waves, angles),
+        polarization=("x",) if angles == (0.0,) else ("s", "p"),
+        angle_rad=np.radians(angles),
+        wavelength_um=np.array(waves),
+        diameter_um=d,
+        t=t,
+        r=0 * t,
+        t_error=np.full(t.shape, 1e-4),
+        energy=np.abs(t) ** 2,
+        resonances=np.array(resonances, float).reshape(-1, 5),
+        engine="modal",
+        solves=30,
+    )
+
+
+def errors(made, waves, angles, count=500):
+    """Largest deviation of phase (modulo a turn) and |T| from the known functions, at random places."""
+    rng = np.random.default_rng(3)
+    d = rng.uniform(*made.domain_um, count)
+    phase, level = 0.0, 0.0
+    for wavelength in waves:
+        for angle in angles:
+            off = made.phase_rad(d, wavelength, angle) - phase_of(d, wavelength, angle)
+            phase = max(phase, np.abs(off - TURN * np.round(off.mean() / TURN)).max())
+            level = max(level, np.abs(made.transmission(d, wavelength, angle) - level_of(d, wavelength, angle)).max())
+    return phase, level
+
+
+def test_the_stated_error_holds_where_the_fit_never_looked():
+    made = proxy.fit(synthetic())
+    phase, level = errors(made, (0.85,), (0.0,))
+    assert phase <= 1.05 * made.max_phase_error_rad  # the polynomial turns between samples by 1/400 of a wave
+    assert level <= 1.05 * made.max_transmission_error
+    assert made.max_phase_error_rad <= 1e-3
+    assert made.max_transmission_error <= 1e-3
+    assert made.phase_coefficients.size + made.transmission_coefficients.size <= 24
+
+
+def test_more_coefficients_leave_less_error():
+    table = proxy_fit.fit(synthetic()).table
+    assert [trial.coefficients for trial in table] == sorted(trial.coefficients for trial in table)
+    assert table[-1].phase_error_rad < 1e-2 * table[0].phase_error_rad
+
+
+def test_wavelengths_and_angles_between_those_of_the_library():
+    waves, angles = (0.83, 0.84, 0.85, 0.86, 0.87), (0.0, 10.0, 20.0)
+    made = proxy.fit(synthetic(waves, angles, samples=81))
+    assert made.phase_coefficients.ndim == 3
+    phase, level = errors(made, (0.8312, 0.853, 0.8666), np.radians([0.0, 7.3, 19.0]))
+    assert phase < 2e-3
+    assert level < 2e-3
+
+
+def test_transmission_stays_below_one_where_the_light_all_passes():
+    made = proxy.fit(synthetic(factor=lambda d: 1 / (0.93 + 0.07 * np.cos(40 * d + 0.85))))
+    for dtype in (np.float32, np.float64):
+        d = np.linspace(*made.domain_um, 100_001).astype(dtype)
+        assert made.transmission(d, 0.85).max() <= 1
+    assert made.max_transmission_error < 1e-3
+
+
+def blaschke(centre, width):
+    """The factor that a lossless resonance at ``centre`` puts on t: a zero and a pole across the real axis."""
+    return lambda d: (d - centre - 0.5j * width) / (d - centre + 1j * width)
+
+
+def test_a_resonance_cuts_the_domain_and_says_so():
+    resonant = synthetic(resonances=[(0, 0.0, 0.85, 0.2, 0.001)], factor=blaschke(0.2, 0.001))
+    made = proxy_fit.fit(resonant)
+    assert made.proxy.domain_um[1] < 0.2
+    assert any("resonance at 0.2000 um, half-width 1 nm (0.85 um)" in note for note in made.notes)
+    assert made.turns < 1.15
+
+
+def test_the_longer_side_of_a_resonance_is_kept():
+    early = synthetic(resonances=[(0, 0.0, 0.85, 0.08, 0.0005)])
+    assert proxy.fit(early).domain_um[0] > 0.08
+
+
+def test_dark_entries_cut_the_domain():
+    made = proxy_fit.fit(synthetic(factor=lambda d: np.where(d > 0.19, 0.5, 1.0)))
+    assert made.proxy.domain_um[1] <= 0.19
+    assert any("|t| falls to" in note for note in made.notes)
+
+
+def test_falling_phase_cuts_the_domain():
+    made = proxy_fit.fit(synthetic(factor=lambda d: np.exp(-100j * np.maximum(d - 0.18, 0) / 0.5)))
+    assert made.proxy.monotone(0.85)
+
+
+def test_resonances_everywhere_are_refused():
+    dense = [(0, 0.0, 0.85, c, 0.004) for c in np.arange(0.06, 0.22, 0.01)]
+    with pytest.raises(DomainError, match=r"no 12 diameters in a row .* choose another pitch"):
+        proxy_fit.fit(synthetic(resonances=dense))
+
+
+def test_within_narrows_the_domain():
+    made = proxy.fit(synthetic(), Wanted(within_um=(0.1, 0.2)))
+    assert made.domain_um[0] >= 0.1 - 1e-9
+    assert made.domain_um[1] <= 0.2 + 1e-9
+
+
+def test_few_coefficients_shorten_the_domain_but_not_below_a_turn():
+    made = proxy_fit.fit(synthetic(), Wanted(coefficients=8, phase_tolerance_rad=1e-4, transmission_tolerance=1e-4))
+    assert made.turns >= 1
+    assert made.proxy.phase_coefficients.size > 4
+
+
+def test_polarisations_are_averaged_and_their_spread_is_told():
+    both = synthetic(angles=(0.0, 10.0))
+    shifted = both.t.copy()
+    shifted[1] *= np.exp(0.02j)
+    made = proxy_fit.fit(PillarLibrary(**{n: getattr(both, n) for n in PillarLibrary.__slots__} | {"t": shifted}))
+    assert made.polarization_spread == pytest.approx(0.01, rel=0.1)
+
+
+def test_phase_is_continuous_over_wavelength_and_angle():
+    waves, angles = (0.83, 0.85, 0.87), (0.0, 20.0)
+    stretch = smooth.stretch(synthetic(waves, angles), least_transmission=0.7, least_half_width_um=0.005)
+    d, w, a = stretch.diameter_um, np.array(waves)[None, :, None], np.radians(angles)[:, None, None]
+    off = stretch.phase - phase_of(d, w, a)
+    assert np.abs(off - off[0, 0, 0]).max() < 1e-9
+
+
+def test_default_cell_meets_its_numbers():
+    made = library.sweep(library.DEFAULT_CELL, Sweep(tolerance=5e-3))
+    fitted = proxy_fit.fit(made)
+    p = fitted.proxy
+    assert p.phase_coefficients.size + p.transmission_coefficients.size <= 24
+    assert p.max_phase_error_rad <= 1e-3
+    assert p.max_transmission_error <= 1e-3
+    assert p.monotone(0.85)
+    assert p.coverage_rad(0.85, within_um=(0.08, p.domain_um[1])) >= TURN  # printable pillars cover a full turn
+
+
+def test_a_candidate_that_turns_negative_between_entries_is_passed_over():
+    # entries so few that high degrees swing between them: those fits are no proxies, the next shorter domain may be
+    made = synthetic(factor=lambda d: 1 - 0.85 * np.exp(-(((d - 0.2) / 0.002) ** 2)), samples=60)
+    with pytest.raises(DomainError, match="sweep with more samples") as refused:
+        proxy_fit.fit(made, Wanted(least_transmission=0.05))
+    assert "fit it again" not in str(refused.value)  # what the proxy says of its coefficients is no advice to a user

@@ -1,0 +1,95 @@
+"""Workers: what comes back is what was computed, refusals keep their class, a death is an error with its cause."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from metalens import rcwa
+from metalens.cell.record import Cell, Index
+from metalens.ground import executor
+from metalens.ground.errors import MaterialError, WorkerError
+from metalens.pillars import workers
+from metalens.pillars.engines import Light
+
+CELL = Cell(0.30, 0.7, Index(3.6))
+TASK = workers.points_task(CELL, Light(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa")
+
+
+def test_what_comes_back_is_what_was_computed():
+    ((index, result),) = workers.run([TASK])
+    assert index == 0
+    exact = [rcwa.solve(CELL, d, 0.85, tolerance=5e-2) for d in (0.1, 0.15)]
+    assert result["diameter_um"] == [0.1, 0.15]
+    for (re, im), response in zip(result["t"], exact, strict=True):
+        assert complex(re, im) == pytest.approx(response.t, abs=1e-12)  # another number of BLAS threads
+    assert result["error"] == pytest.approx([response.t_error for response in exact], rel=1e-6)
+
+
+def test_the_same_bits_from_any_number_of_workers():
+    tasks = [workers.points_task(CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa") for i in range(5)]
+    found = dict(workers.run(tasks, processes=2))
+    assert sorted(found) == [0, 1, 2, 3, 4]
+    assert [found[i]["diameter_um"][0] for i in range(5)] == [0.05 + 0.02 * i for i in range(5)]
+    assert found == dict(workers.run(tasks, processes=1))
+
+
+def test_refusals_keep_their_class():
+    unknown = workers.points_task(Cell(0.3, 0.7, "a-Sj"), Light(0.85), [0.1], tolerance=0.1, engine="rcwa")
+    with pytest.raises(MaterialError, match="did you mean 'a-Si'"):
+        list(workers.run([TASK, unknown]))
+
+
+def test_a_worker_that_dies_is_told_with_its_cause():
+    with pytest.raises(WorkerError, match=r"ended early.*SIGKILL"):
+        list(executor.run(signal.raise_signal, [signal.SIGKILL]))
+
+
+def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(tmp_path):
+    """Files that bear the names of modules lie where the command runs; the caller's script has no main guard."""
+    for name in ("queue", "scipy", "subprocess", "json", "multiprocessing"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').write(__name__)\nprint('hi')\n")
+    (tmp_path / "there").mkdir()
+    script = tmp_path / "there" / "script.py"
+    script.write_text(
+        textwrap.dedent("""
+            import os, sys
+            from metalens.ground import executor
+            print(dict(executor.run(os.path.basename, ["a/b", "c/d"], processes=2)))
+            print(dict(executor.run(print, ["stray"], processes=1)))
+        """)
+    )
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == ["{0: 'b', 1: 'd'}", "{0: None}"], done.stderr
+    assert "stray" in done.stderr
+    words = [sys.executable, "-m", "metalens", "library", "cell.toml"]
+    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert told.returncode == 2
+    assert "no such file" in told.stderr
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path)
+    ) as cluster:
+        tasks = [
+            workers.points_task(CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa") for i in range(6)
+        ]
+        found = {}
+        with executor.on(cluster.scheduler_address):
+            for index, result in workers.run(tasks):
+                if not found:
+                    os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+                found[index] = result
+    assert found == dict(workers.run(tasks))
+
+
+def test_no_cluster_at_the_address_is_told():
+    pytest.importorskip("distributed")
+    with pytest.raises(WorkerError, match="no dask scheduler at"), executor.on("tcp://127.0.0.1:9"):
+        list(executor.run(abs, [1]))

@@ -1,0 +1,325 @@
+"""The PSF record: normalisation, angles, wavelengths, files, pixels, metrics; answers in closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from metalens import propagate, psf
+from metalens.ground.errors import PropagationError, StoreError
+from metalens.psf import metrics as psf_metrics
+from metalens.psf import spectrum
+
+K = 2 * np.pi / 0.85
+GEOMETRY = dict(pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=120.0, depths_um=[1000.0, 1600.0])
+WINDOW = dict(window_um=16.0, samples=20)
+
+
+def focus(n=64, source=1300.0, distance=120.0, wavelength=0.85):
+    x = (np.arange(n) - (n - 1) / 2) * 0.4
+    r2 = x**2 + x[:, None] ** 2
+    path = r2 / (np.sqrt(r2 + distance**2) + distance) + r2 / (np.sqrt(r2 + source**2) + source)
+    return -2 * np.pi / wavelength * path, (r2 <= x[-1] ** 2).astype(float)
+
+
+def gaussian_stack(widths, step=0.5, n=81):
+    """Gaussian PSFs of given standard deviations along depth."""
+    x = (np.arange(n) - (n - 1) / 2) * step
+    r2 = x**2 + x[:, None] ** 2
+    light = np.stack([np.exp(-r2 / (2 * w * w)) for w in widths])
+    base = psf.psf_stack(*focus(16), **GEOMETRY, **WINDOW)
+    depths = np.linspace(16e3, 18e3, len(widths))
+    light /= light.sum((1, 2), keepdims=True)
+    ones = np.ones(len(widths))
+    return dataclasses.replace(base, intensity=light, energy_um2=ones, depths_um=depths, step_um=step)
+
+
+def test_each_psf_has_sum_one_and_its_energy_beside_it():
+    phase, level = focus()
+    stack = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW)
+    power = np.abs(propagate.exact(phase, level, **GEOMETRY, **WINDOW)) ** 2
+    assert stack.intensity.sum((1, 2)) == pytest.approx(1, abs=1e-12)
+    assert stack.energy_um2 == pytest.approx(power.sum((1, 2)) * 0.8**2, rel=1e-4)
+    assert stack.intensity.dtype == np.float64
+
+
+def test_angles_make_an_axis_and_equal_single_angles():
+    phase, level = focus()
+    several = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=[[0.1, 0.0], [0.0, -0.2]])
+    assert several.intensity.shape == (2, 2, 20, 20)
+    assert several.angles_rad == pytest.approx(np.array([[0.1, 0.0], [0.0, -0.2]]))
+    assert several.centres_um[1] == pytest.approx([0, 120 * np.tan(-0.2)])
+    one = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=(0.0, -0.2))
+    assert np.array_equal(several.intensity[1], one.intensity)
+
+
+def test_field_along_x_and_y_are_transposed():
+    phase, level = focus()
+    along_x, along_y = (
+        psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=a).intensity for a in ((0.3, 0), (0, 0.3))
+    )
+    assert np.abs(along_x - along_y.swapaxes(1, 2)).max() < 1e-4 * along_x.max()
+
+
+def test_wavelengths_add_incoherently_with_their_weights():
+    phase, level = focus()
+    waves, weights = [0.84, 0.86], [1.0, 3.0]
+    other = GEOMETRY | dict(wavelength_um=waves)
+    both = psf.psf_stack(np.stack([phase, phase]), level, **other, **WINDOW, weights=weights, tolerance=1e-6)
+    want = 0
+    for wave, weight in zip(waves, (0.25, 0.75), strict=True):
+        one = psf.psf_stack(phase, level, **GEOMETRY | dict(wavelength_um=wave), **WINDOW, tolerance=1e-6)
+        want = want + weight * one.intensity * one.energy_um2[:, None, None]
+    want /= want.sum((1, 2), keepdims=True)
+    assert np.abs(both.intensity - want).max() < 1e-8
+    with pytest.raises(PropagationError, match="weight"):
+        psf.psf_stack(np.stack([phase, phase]), level, **other, **WINDOW, weights=[1.0])
+    with pytest.raises(PropagationError, match="wavelength, y, x"):
+        psf.psf_stack(phase, level, **other, **WINDOW)
+
+
+def test_torch_in_torch_out_and_dtype_follows():
+    phase, level = (torch.tensor(m, dtype=torch.float32) for m in focus())
+    stack = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW)
+    assert isinstance(stack.intensity, torch.Tensor)
+    assert stack.intensity.dtype == torch.float32
+    with pytest.raises(PropagationError, match="float32 or float64"):
+        psf.psf_stack(torch.zeros(4, 4, dtype=torch.int32), level, **GEOMETRY, **WINDOW)
+
+
+def test_file_round_trip_and_same_bytes(tmp_path):
+    stack = psf.psf_stack(*focus(), **GEOMETRY, **WINDOW)
+    for name in ("a.h5", "b.h5"):
+        psf.save(tmp_path / name, stack)
+    back = psf.load(tmp_path / "a.h5")
+    assert np.array_equal(back.intensity, stack.intensity)
+    assert (back.reason, back.error, back.step_um) == (stack.reason, stack.error, stack.step_um)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+    (tmp_path / "a.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:500])
+    with pytest.raises(StoreError):
+        psf.load(tmp_path / "a.h5")
+
+
+@settings(max_examples=15)
+@given(pitch=st.floats(1.0, 7.0), bins=st.integers(1, 3))
+def test_pixels_keep_all_light(pitch, bins):
+    stack = gaussian_stack([2.0, 3.0])
+    seen = psf.on_pixels(stack, pitch_um=pitch, bins=bins)
+    assert seen.step_um == pytest.approx(pitch * bins)
+    assert seen.intensity.sum((1, 2)) == pytest.approx(1, abs=1e-12)
+    assert seen.energy_um2 == pytest.approx(1, abs=1e-6)
+
+
+def test_binning_twice_equals_pixels_twice_as_wide():
+    stack = gaussian_stack([2.0], n=80)
+    fine = psf.on_pixels(stack, pitch_um=2.5).intensity
+    wide = psf.on_pixels(stack, pitch_um=2.5, bins=2).intensity
+    assert np.abs(fine.reshape(1, 8, 2, 8, 2).sum((2, 4)) - wide).max() < 1e-12
+    with pytest.raises(PropagationError, match="bins"):
+        psf.on_pixels(stack, pitch_um=0.1)
+
+
+def test_pixels_are_differentiable_in_pitch():
+    stack = gaussian_stack([2.0])
+    pitch = torch.tensor(3.13, dtype=torch.float64, requires_grad=True)
+
+    def score(p):
+        seen = psf.on_pixels(stack, pitch_um=p, count=9).intensity
+        return (torch.as_tensor(seen) ** 2).sum()
+
+    score(pitch).backward()
+    want = (score(3.13 + 1e-6) - score(3.13 - 1e-6)) / 2e-6
+    assert pitch.grad.item() == pytest.approx(want.item(), rel=1e-5)
+
+
+def test_metrics_of_gaussians_are_closed_forms():
+    stack = gaussian_stack([2.0, 3.0])
+    f = np.linspace(0, 0.2, 9)
+    for depth, width in enumerate((2.0, 3.0)):
+        want = np.exp(-2 * (np.pi * width * f) ** 2)
+        assert psf_metrics.mtf(stack, frequencies_per_um=f)[depth, 0] == pytest.approx(want, abs=1e-9)
+        inside = psf_metrics.encircled(stack, radii_um=np.array([2.0, 4.0]))[depth]
+        assert inside == pytest.approx(1 - np.exp(-np.array([4.0, 16.0]) / (2 * width**2)), abs=5e-3)
+        assert psf_metrics.width_um(stack)[depth] == pytest.approx(4 * width, rel=1e-6)
+
+
+def test_axial_information_under_each_named_normalisation():
+    """Gaussians of width w: Σ PSF² = dx²/(4πw²) and the overlap of w and v is dx²/(2π(w² + v²))."""
+    w, v, dx, dz = 2.0, 2.4, 0.5, 2.0
+    stack = gaussian_stack([w, v], step=dx)
+    own, cross = [dx**2 / (4 * np.pi * a * a) for a in (w, v)], dx**2 / (2 * np.pi * (w * w + v * v))
+    depth, by_sum = psf_metrics.axial_information(stack, normalisation="sum")
+    assert depth == pytest.approx([17e3])
+    assert by_sum == pytest.approx([(own[0] + own[1] - 2 * cross) / dz**2], rel=1e-8)
+    by_l2 = psf_metrics.information_by_name(stack)["l2"]
+    assert by_l2 == pytest.approx([(2 - 2 * cross / np.sqrt(own[0] * own[1])) / dz**2], rel=1e-8)
+    brighter = dataclasses.replace(stack, energy_um2=np.array([2.0, 2.0]))
+    assert psf_metrics.axial_information(brighter, normalisation="none")[1] == pytest.approx(4 * by_sum)
+    with pytest.raises(PropagationError, match="two different"):
+        psf_metrics.axial_information(dataclasses.replace(stack, depths_um=np.array([1.0, 1.0])), normalisation="sum")
+
+
+@pytest.mark.parametrize("tolerance", [3e-2, 3e-3])
+def test_depth_samples_allow_linear_mixture(tolerance):
+    phase, level = focus(96)
+    depths = psf.depth_samples(800.0, 2500.0, radius_um=19.0, wavelength_um=0.85, tolerance=tolerance, most_um=1e9)
+    middle = 2 / (1 / depths[1:] + 1 / depths[:-1])
+    at, between = (psf.psf_stack(phase, level, **GEOMETRY | dict(depths_um=z), **WINDOW) for z in (depths, middle))
+    mixed = (at.intensity[1:] + at.intensity[:-1]) / 2
+    error = np.linalg.norm(mixed - between.intensity, axis=(1, 2)) / np.linalg.norm(between.intensity, axis=(1, 2))
+    assert error.max() <= tolerance
+    assert error.max() > tolerance / 20  # not much finer than needed
+    assert np.diff(psf.depth_samples(16e3, 26e3, radius_um=1.0, wavelength_um=0.85, tolerance=1.0)).max() <= 500
+
+
+def test_gauss_rule_is_exact_for_polynomials_under_the_weight():
+    """Eigenvalues and first components are rounded to eps times the matrix and its size, and a moment of order n moves
+    by n times that: of a span of the line, to the power n."""
+    um, share = spectrum.weight(spectrum.Source(850.0, 30.0))
+    assert share.sum() == pytest.approx(1)
+    reach = np.abs(um - 0.85).max()
+    for count in (1, 2, 5):
+        x, w = spectrum.gauss(um, share, count)
+        for power in range(2 * count):
+            budget = 1e-14 * count * max(power, 1) * max(1.0, 0.85 / reach) * reach**power
+            found, want = ((v * (t - 0.85) ** power).sum() for t, v in ((x, w), (um, share)))
+            assert found == pytest.approx(want, rel=0, abs=budget)
+        assert (w > 0).all()
+
+
+def test_diode_line_has_its_peak_and_width():
+    um, share = spectrum.weight(spectrum.Source(850.0, 30.0, silicon_um=1e6))  # thick silicon: flat response times λ
+    line = share / um
+    half = um[line >= line.max() / 2]
+    assert (half[0] + half[-1]) / 2 == pytest.approx(0.85, abs=3e-4)
+    assert half[-1] - half[0] == pytest.approx(0.03, abs=6e-4)
+    thin = spectrum.weight(spectrum.Source(850.0, 30.0))[1]
+    assert (thin * um).sum() < (share * um).sum()  # thin silicon sees less of the red side
+
+
+def test_as_many_wavelengths_as_the_tolerance_needs():
+    source = spectrum.Source(850.0, 30.0)
+    few, more = (spectrum.nodes(source, path_um=10.0, tolerance=t) for t in (1e-2, 1e-5))
+    assert len(few.weights) < len(more.weights)
+    um, share = spectrum.weight(source)
+    for found, tolerance in ((few, 1e-2), (more, 1e-5)):
+        for path in (0.0, 3.3, 10.0):
+            want = np.exp(2j * np.pi * path / um) @ share
+            assert abs(np.exp(2j * np.pi * path / found.wavelengths_um) @ found.weights - want) <= tolerance
+    with pytest.raises(PropagationError, match="wavelengths needed"):
+        spectrum.nodes(source, path_um=3000.0, tolerance=1e-6)
+
+
+def test_polychromatic_psf_converges_with_the_nodes():
+    phase, level = focus(96, wavelength=0.85)
+    path = spectrum.path_span(19.0, 120.0, 1000.0)
+    results = []
+    for tolerance in (1e-2, 1e-3, 1e-7):
+        found = spectrum.nodes(spectrum.Source(), path_um=path, tolerance=tolerance)
+        maps = np.stack([phase] * len(found.weights))
+        other = GEOMETRY | dict(wavelength_um=found.wavelengths_um.tolist())
+        results.append(
+            psf.psf_stack(maps, level, **other, **WINDOW, weights=found.weights.tolist(), tolerance=1e-7).intensity
+        )
+    errors = [np.linalg.norm(r - results[-1]) / np.linalg.norm(results[-1]) for r in results[:2]]
+    assert errors[0] < 1e-2
+    assert errors[1] < 1e-3
+
+
+def test_thin_silicon_sees_what_its_absorption_leaves():
+    """17 um of silicon at 800 and 900 nm, half-width either side of the peak: 850 and 306 per cm (Green 2008)."""
+    um, share = spectrum.weight(spectrum.Source(850.0, 100.0, silicon_um=17.0))
+    blue, red = (float(np.interp(w, um, share)) for w in (0.8, 0.9))
+    seen = [w * (1 - np.exp(-a * 17e-4)) for w, a in ((0.8, 850.0), (0.9, 306.0))]
+    assert blue / red == pytest.approx(seen[0] / seen[1], rel=0.04)  # tables of silicon differ by 3 %
+    middle = float(np.interp(0.85, um, share)) / (0.85 * (1 - np.exp(-535.0 * 17e-4)))
+    assert blue / seen[0] / middle == pytest.approx(0.5, rel=0.04)  # full width at half maximum
+
+
+def test_path_from_axis_to_rim_adds_both_sides():
+    """In a Pythagorean triangle each: 300, 400, 500 behind the lens, 300, 1250, sqrt(1652500) before it."""
+    assert spectrum.path_span(300.0, 400.0, np.inf) == pytest.approx(100.0)
+    assert spectrum.path_span(300.0, 400.0, 1250.0) == pytest.approx(100.0 + np.sqrt(1652500.0) - 1250.0)
+
+
+def test_error_of_the_nodes_is_the_worst_over_the_paths():
+    source = spectrum.Source(850.0, 42.0)
+    um, share = spectrum.weight(source)
+    found = spectrum.nodes(source, path_um=17.0, tolerance=3e-3)
+    paths = np.linspace(0, 17.0, 400)[:, None]
+    worst = np.abs(
+        np.exp(2j * np.pi * paths / found.wavelengths_um) @ found.weights - np.exp(2j * np.pi * paths / um) @ share
+    )
+    assert found.error == pytest.approx(worst.max(), rel=0.02)  # the largest is at the longest path, or near
+    fewer = spectrum.gauss(um, share, len(found.weights) - 1)
+    missed = np.exp(2j * np.pi * paths / fewer[0]) @ fewer[1] - np.exp(2j * np.pi * paths / um) @ share
+    assert np.abs(missed).max() > 3e-3  # no wavelength more than needed
+
+
+def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
+    from types import SimpleNamespace
+
+    from metalens.psf.of_lens import pillar_maps
+
+    class Tilted:
+        max_angle_rad, domain_um = 0.5, (0.1, 0.3)
+
+        def phase_rad(self, d, wavelength_um, tilt):
+            return 40 * d * tilt / wavelength_um
+
+        def transmission(self, d, wavelength_um, tilt):
+            return d * 3 - tilt
+
+    sizes = np.array([[0.1, 0.0], [0.3, 0.22]])
+    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=sizes), proxy=Tilted())
+    phase, level = pillar_maps(lens, 0.94, (0.17, -0.31))
+    direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
+    tilt = np.arccos(1 / np.linalg.norm(direction))
+    want = np.where(sizes > 0, 40 * sizes * tilt / 0.94, 0)
+    assert np.exp(1j * phase) == pytest.approx(np.exp(1j * want), abs=1e-12)
+    assert np.abs(phase).max() <= np.pi
+    assert level == pytest.approx(np.where(sizes > 0, sizes * 3 - tilt, 0), abs=1e-12)
+    Tilted.max_angle_rad = 0.0  # a library of normal incidence alone
+    assert pillar_maps(lens, 0.94, (0.17, -0.31))[1] == pytest.approx(sizes * 3, abs=1e-12)
+
+
+def test_depths_are_even_in_their_inverse_and_no_closer_than_needed():
+    from metalens.psf.of_lens import depth_samples
+
+    near, far, radius, wavelength, tolerance = 9e3, 31e3, 270.0, 0.94, 0.013
+    found = depth_samples(near, far, radius_um=radius, wavelength_um=wavelength, tolerance=tolerance, most_um=1e9)
+    assert (found[0], found[-1]) == pytest.approx((near, far))
+    steps = -np.diff(1 / found)
+    assert steps == pytest.approx(np.full(len(steps), steps[0]), rel=1e-9)
+    phase = np.pi * radius**2 / wavelength * steps[0]
+    assert phase**2 / 24 <= tolerance < (phase * len(steps) / (len(steps) - 1)) ** 2 / 24
+    close = depth_samples(near, far, radius_um=radius, wavelength_um=wavelength, tolerance=tolerance, most_um=700.0)
+    assert 550 < np.diff(close).max() <= 700
+
+
+def test_metrics_of_an_oblong_spot_off_the_middle():
+    """Gaussian of 2.1 by 1.3 um about (1.5, -2.3): each axis has its own number, radii count from the centroid."""
+    stack = gaussian_stack([2.0, 2.0], step=0.4, n=81)
+    x = stack.x_um
+    light = np.exp(-((x - 1.5) ** 2) / (2 * 2.1**2) - (x[:, None] + 2.3) ** 2 / (2 * 1.3**2))
+    light = np.stack([light, light[::-1]]) / light.sum()
+    stack = dataclasses.replace(stack, intensity=light, energy_um2=np.array([3.0, 7.0]))
+    assert np.array(psf_metrics.centroid(stack)) == pytest.approx(np.array([[1.5, 1.5], [-2.3, 2.3]]), abs=1e-6)
+    assert psf_metrics.width_um(stack) == pytest.approx(np.full(2, 4 * np.sqrt((2.1**2 + 1.3**2) / 2)), rel=1e-6)
+    f = np.array([0.03, 0.11])
+    found = psf_metrics.mtf(stack, frequencies_per_um=f)
+    want = [np.exp(-2 * (np.pi * s * f) ** 2) for s in (2.1, 1.3)]
+    assert found == pytest.approx(np.array([want, want]), abs=1e-7)
+    angle = (np.arange(360) + 0.5) * np.pi / 180
+    narrow = (np.cos(angle) / 2.1) ** 2 + (np.sin(angle) / 1.3) ** 2
+    inside = (((1 - np.exp(-narrow * 2.7**2 / 2)) / narrow).mean()) / (2.1 * 1.3)
+    for share, whole in ((True, 1.0), (False, np.array([3.0, 7.0]))):
+        got = psf_metrics.encircled(stack, radii_um=np.array([2.7]), of_window=share)[:, 0]
+        assert got == pytest.approx(inside * whole, rel=0.01)  # samples cut by the rim
+    depth, plain = psf_metrics.axial_information(stack, normalisation="none")
+    step_mm = np.diff(stack.depths_um)[0] * 1e-3
+    assert depth == pytest.approx([stack.depths_um.mean()])
+    assert plain == pytest.approx([((7 * light[1] - 3 * light[0]) ** 2).sum() / step_mm**2])

@@ -1,0 +1,121 @@
+"""Cells of any shape against the modal method, against themselves turned, and against conservation laws."""
+
+import math
+
+import numpy as np
+import pytest
+
+from metalens import modal, rcwa
+from metalens.cell import Cell, Film, Index, Lattice, Layer
+from metalens.cell.orders import check_subwavelength
+from metalens.cell.shapes import Circle, Ellipse, Polygon, Rectangle, RegularPolygon
+from metalens.ground.errors import CellError
+
+ABOUT = {"height_um": 0.5, "pillar": Index(2.6), "substrate": Index(1.45), "cover": Index(1.0), "between": Index(1.1)}
+TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.3), (0.0, 0.6)))
+WAVE = 0.633
+RECTANGULAR = Lattice("rectangular", 1.0)  # a square that takes the general way
+
+
+def swap(t):
+    """The same response with x and y exchanged."""
+    return t[::-1, ::-1]
+
+
+def test_round_pillar_by_the_general_way_agrees_with_the_modal_method():
+    want = modal.solve(Cell(0.35, **ABOUT), 0.2, WAVE, tolerance=1e-4)
+    got = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, harmonics=10)
+    for found, exact in ((got.t, want.t), (got.r, want.r)):
+        assert np.abs(found - exact * np.eye(2)).max() < got.t_error + want.t_error
+    assert got.t_error < 2e-2
+
+
+@pytest.mark.parametrize(("polarization", "place"), [("s", 0), ("p", 1)])
+def test_oblique_light_agrees_with_the_modal_method(polarization, place):
+    want = modal.solve(Cell(0.35, **ABOUT), 0.2, WAVE, angle_rad=0.2, polarization=polarization, tolerance=1e-3)
+    got = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, angle_rad=0.2, harmonics=8)
+    assert abs(got.t[place, place] - want.t) < got.t_error + want.t_error
+    assert abs(got.r[place, place] - want.r) < got.t_error + want.t_error
+
+
+def test_many_sides_are_a_circle_of_equal_area():
+    swell = math.sqrt(2 * math.pi / 48 / math.sin(2 * math.pi / 48))
+    circle = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, harmonics=6)
+    polygon = rcwa.jones(Cell(0.35, **ABOUT, shape=RegularPolygon(48)), 0.2 * swell, WAVE, harmonics=6)
+    assert np.abs(circle.t - polygon.t).max() < 1e-3  # of second order in the 1.3 % by which corners stand out
+
+
+@pytest.mark.parametrize("shape", [Rectangle(0.5), Ellipse(0.6), TRIANGLE], ids=lambda s: s.kind)
+def test_a_quarter_turn_exchanges_x_and_y(shape):
+    """Every shape meets another set of mirrors when it is turned."""
+    turned = type(shape)(*((shape.corners,) if shape is TRIANGLE else (shape.ratio,)), math.pi / 2)
+    first = rcwa.jones(Cell(0.35, **ABOUT, shape=shape), 0.25, WAVE, harmonics=5)
+    second = rcwa.jones(Cell(0.35, **ABOUT, shape=turned), 0.25, WAVE, harmonics=5)
+    assert np.abs(second.t - swap(first.t)).max() < 1e-9
+    assert np.abs(second.r - swap(first.r)).max() < 1e-9
+    assert np.abs(first.t[0, 0] - first.t[1, 1]) > 1e-2  # they do differ
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.11])
+@pytest.mark.parametrize("shape", [Rectangle(0.5, 0.4), Polygon(TRIANGLE.corners, 0.3)], ids=lambda s: s.kind)
+def test_lossless_cells_keep_the_power_whatever_their_symmetry(shape, angle_rad):
+    cell = Cell(0.35, **ABOUT, shape=shape, over=(Film(Index(1.3), 0.05),))
+    got = rcwa.jones(cell, 0.25, WAVE, angle_rad=angle_rad, azimuth_rad=0.7, harmonics=4)
+    assert np.abs(got.energy - 1).max() < 1e-10
+    assert abs(got.t[0, 1]) > 1e-3
+
+
+def test_geometric_phase_turns_by_twice_the_angle():
+    """Circular light keeps exp(2 i angle) of a turned rectangle on a lattice that hardly matters."""
+
+    def flipped(angle_rad):
+        got = rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.45, angle_rad)), 0.2, WAVE, harmonics=6)
+        return np.array([1, 1j]) @ got.t @ np.array([1, 1j]) / 2
+
+    turn = np.angle(flipped(0.3) / flipped(0.0))
+    assert abs(turn - 0.6) < 0.1  # truncation at 6 orders, and the square lattice does not turn along
+
+
+def test_hexagonal_lattice_has_no_preferred_direction_for_round_pillars():
+    got = rcwa.jones(Cell(0.38, **ABOUT, lattice=Lattice("hexagonal")), 0.2, WAVE, harmonics=9)
+    assert abs(got.t[0, 0] - got.t[1, 1]) < got.t_error
+    assert abs(got.t[0, 1]) < 1e-12
+    empty = rcwa.jones(
+        Cell(0.38, **(ABOUT | {"pillar": Index(1.1)}), lattice=Lattice("hexagonal")), 0.2, WAVE, harmonics=3
+    )
+    film = rcwa.solve(Cell(0.38, **ABOUT), 0.0, WAVE)
+    assert abs(empty.t[0, 0] - film.t) < 1e-12
+
+
+def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
+    whole = rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=5)
+    cut = Cell(0.35, **ABOUT, shape=Rectangle(0.5), layers=(Layer(0.2), Layer(0.3)))
+    assert np.abs(rcwa.jones(cut, 0.25, WAVE, harmonics=5).t - whole.t).max() < 1e-10
+    same = Cell(0.35, **ABOUT, shape=Rectangle(0.5), layers=(Layer(0.5, grow_um=-0.02, coat_um=0.01, coat=Index(2.6)),))
+    assert (
+        np.abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
+    )  # normals of the inner wall differ
+
+
+def test_a_hole_is_the_pillar_with_materials_exchanged():
+    hole = Cell(0.35, **ABOUT, shape=Circle(hole=True))
+    swapped = Cell(0.35, **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}), lattice=RECTANGULAR)
+    one, other = (rcwa.jones(c, 0.2, WAVE, harmonics=5) for c in (hole, swapped))
+    assert np.abs(one.t - other.t).max() < 1e-12
+
+
+def test_solve_gives_the_diagonal_and_refuses_what_touches():
+    cell = Cell(0.35, **ABOUT, shape=Rectangle(0.5))
+    got = rcwa.jones(cell, 0.25, WAVE, harmonics=5)
+    for polarization, place in (("x", 0), ("y", 1), ("p", 0), ("s", 1)):
+        assert rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t == got.t[place, place]
+    with pytest.raises(CellError, match="touches its neighbour"):
+        rcwa.solve(cell, 0.36, WAVE)
+
+
+def test_orders_of_the_hexagonal_lattice():
+    """The first one appears at pitch = 2 wavelength / (sqrt(3) n)."""
+    edge = 2 * WAVE / math.sqrt(3) / 1.45
+    check_subwavelength(Cell(edge * 0.999, **ABOUT, lattice=Lattice("hexagonal")), WAVE)
+    with pytest.raises(CellError, match=f"need pitch_um < {edge:.6g}"):
+        check_subwavelength(Cell(edge * 1.001, **ABOUT, lattice=Lattice("hexagonal")), WAVE)

@@ -1,0 +1,142 @@
+"""Pages to explore artefacts: nothing is lost on the way into the page, nothing leads out of it, a browser shows it."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import zlib
+
+import numpy as np
+import pytest
+
+from metalens import lens, psf
+from metalens.cell import Cell, Index
+from metalens.commands import view
+from metalens.design import make
+from metalens.ground.errors import StoreError
+from metalens.profiles import Focus
+from metalens.proxy import Proxy
+from metalens.view import Axis, Classes, Curves, Images, Numbers, artefacts, page
+from metalens.view.panels import classes_of
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def _unpacked(entry):
+    kinds = {"Float32Array": "<f4", "Uint8Array": "u1", "Uint16Array": "<u2"}
+    raw = zlib.decompress(base64.b64decode(entry["data"]))
+    return np.frombuffer(raw, kinds[entry["type"]]).reshape(entry["shape"])
+
+
+def _content(text):
+    inside = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    return json.loads(inside.group(1))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A lens without symmetry and its PSFs."""
+    folder = tmp_path_factory.mktemp("view")
+    coefficients = np.polynomial.Chebyshev.interpolate(lambda d: 55 * d, 2, domain=[0.08, 0.21]).coef[None]
+    proxy = Proxy(coefficients, np.array([[0.83]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    focus = Focus(0.85, 60.0, 900.0)
+    made, _ = make(
+        lambda x, y: 1.7e-2 * x**3 + 0.4 * y[:, None] - 0.031 * (x**2 + y[:, None] ** 2),
+        focus,
+        aperture_um=17.0,
+        cell=Cell(pitch_um=0.30, pillar=Index(3.6)),
+        proxy=proxy,
+    )
+    lens.save(folder / "lens.h5", made)
+    seen = psf.View((700.0, 900.0, 1400.0), ((0.0, 0.0), (0.07, -0.03)), 14.0, 28)
+    psf.save(folder / "psf.h5", psf.from_lens(made, seen, tolerance=1e-3))
+    return folder
+
+
+def test_every_pillar_is_in_the_page(folder):
+    design = lens.load(folder / "lens.h5")
+    panel = _content(page.html("lens", artefacts.lens_panels(folder / "lens.h5")))["panels"][0]
+    index, sizes = _unpacked(panel["index"]), np.array([0.0, *panel["sizes"]])
+    # sizes have six digits: half of the last one is 5e-4 nm
+    assert np.abs(sizes[index] - 1e3 * design.diameters.diameter_um).max() < 5.1e-4
+    assert panel["pitch"] == 0.3
+    picked = tuple(np.argwhere(index > 0)[37])
+    turns = design.phase_rad()[picked] / (2 * np.pi)
+    assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(turns, rel=1e-5)
+
+
+def test_psfs_keep_their_axes(folder):
+    stack = psf.load(folder / "psf.h5")
+    panel = _content(page.html("psf", artefacts.psf_panels(folder / "psf.h5")))["panels"][0]
+    values = _unpacked(panel["values"])
+    assert values.shape == (2, 3, 28, 28)
+    assert [axis["name"] for axis in panel["axes"]] == ["field angle", "depth"]
+    assert panel["axes"][1]["values"] == [0.7, 0.9, 1.4]
+    scaled = stack.intensity / stack.intensity.max()
+    assert np.abs(values - scaled).max() < 1e-7  # float32
+    assert panel["step"] == 0.5
+
+
+def test_nothing_in_a_page_leads_out_of_it(folder):
+    text = page.html("a & b </script><script>alert(1)</script>", artefacts.psf_panels(folder / "psf.h5"))
+    outside = set(re.findall(r"(?:src|href)\s*=\s*[\"']?(?!data:|#)[^\s\"'>]+|@import|fetch\(|XMLHttpRequest", text))
+    assert not outside
+    assert _content(text)["title"] == "a & b </script><script>alert(1)</script>"
+    assert "<script>alert" not in text
+
+
+def test_few_sizes_are_kept_as_they_are_and_many_in_equal_steps():
+    map_um = np.array([[0.0, 0.17, 0.11], [0.17, 0.13, 0.0]])
+    index, sizes = classes_of(map_um)
+    assert index.dtype == np.uint8
+    assert index.tolist() == [[0, 3, 1], [3, 2, 0]]
+    assert sizes.tolist() == [0.11, 0.13, 0.17]
+    many = np.random.default_rng(3).uniform(0.08, 0.21, (40, 50))
+    many[3, 7] = 0
+    index, sizes = classes_of(many, most=300)
+    assert index[3, 7] == 0
+    held = many > 0
+    assert np.abs(sizes[index[held] - 1] - many[held]).max() <= 0.5001 * 0.13 / 299  # half a step
+
+
+def test_figures_that_do_not_fit_are_refused():
+    with pytest.raises(StoreError, match=r"sliders \(3,\) do not fit"):
+        Images("psf", np.zeros((2, 4, 4)), [Axis("depth", [1, 2, 3])], 1.0)
+    with pytest.raises(StoreError, match="class 5 of 2"):
+        Classes("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
+
+
+def test_the_command_writes_a_page_once(folder, tmp_path):
+    target = tmp_path / "out.html"
+    assert view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
+    assert _content(target.read_text(encoding="utf-8"))["about"]["made with"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser to show the page in: install chromium")
+@pytest.mark.parametrize("what", ["lens", "psf", "all"])
+def test_a_browser_shows_every_figure(what, folder, tmp_path):
+    if what == "all":
+        x = np.linspace(1, 3, 17)
+        panels = [
+            Curves("line", x, "x", {"y": x**2}, "y", errors={"y": 0.1 * x}, bands=[(1.5, 1.7)]),
+            Classes(
+                "map", np.array([[0, 1], [2, 1]], np.uint8), np.array([90.0, 130.0]), 0.3, "nm", marks=[(0, 0, "m")]
+            ),
+            Numbers("table", ("a", "b"), [(1.25, "text"), (float("nan"), "x")]),
+        ]
+    else:
+        panels = getattr(artefacts, f"{what}_panels")(folder / f"{what}.h5")
+    path = tmp_path / "page.html"
+    page.write(path, what, panels, about={"settings": "x = 1"})
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+    words += ["--virtual-time-budget=20000", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()]
+    done = subprocess.run([BROWSER, *words], capture_output=True, text=True, check=False)
+    assert 'data-ready="true"' in done.stdout
+    assert 'class="failed"' not in done.stdout
+    assert done.stdout.count("<section") == len(panels)
+    assert done.stdout.count("<canvas") >= sum(not isinstance(p, Numbers) for p in panels)
+    if what == "psf":  # the number under the cross is that of the file
+        stack = psf.load(folder / "psf.h5").intensity
+        shown = float(re.search(r"x 0.25 µm, y 0.25 µm: ([0-9.e-]+) of", done.stdout).group(1))
+        assert shown == pytest.approx(float(stack[0, 0, 14, 14] / stack.max()), rel=1e-3)  # four digits are shown

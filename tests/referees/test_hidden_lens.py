@@ -1,0 +1,103 @@
+"""The fit judged by a bench that shares nothing with it: its intervals, and what it says of errors unknown to it."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import hidden_lens as hidden
+import pillar_bench as bench
+import pillar_table
+
+import characterize
+from characterize.inference.estimate import Options
+from characterize.model import slopes
+from metalens import modal
+from metalens.ground.errors import CaptureError, FitError
+from metalens.pillars.record import DEFAULT_CELL
+
+USUAL = Options(scan_um=60.0)
+
+
+@pytest.fixture(scope="module")
+def response():
+    return slopes(hidden.lens())
+
+
+def test_the_table_is_what_the_solver_says_between_its_entries():
+    for diameter, height, wave in ((0.1337, 0.691, 0.8512), (0.1891, 0.7073, 0.8483)):
+        cell = dataclasses.replace(DEFAULT_CELL, height_um=height)
+        want = modal.solve(cell, diameter, wave, tolerance=1e-4).t
+        assert (
+            abs(pillar_table.load().at(diameter, height, wave) - want) < 3e-3
+        )  # quartic over the height, 1e-3 of bars
+
+
+def test_the_convolution_is_the_sum_over_all_pillars():
+    lens, session = hidden.lens(12.0, 40.0, 200.0), hidden.session(4, depths_um=(200.0,))
+    x, y, d, light, fields = bench._pillars(lens, session, np.random.default_rng(0))
+    k, z = 2 * np.pi / 0.85, 211.0
+    path = bench._source_path(session.faults, x - 3.1, y + 1.7, z)
+    lit = bench._transmission(lens, session, d, 0.85) * light * np.exp(1j * k * (path - path.min())) / z
+    found = bench._intensity(lit, [bench._kernel(lens, session, lit.shape, k, (0.0, 0.0))], fields)
+    middle, at = (len(found) - 1) / 2, (len(found) // 2 + 7, len(found) // 2 - 4)
+    X = (at[1] - middle) * lens.diameters.pitch_um + session.of("decentre_x_um")
+    Y = (at[0] - middle) * lens.diameters.pitch_um + session.of("decentre_y_um")
+    distance = lens.sensor_distance_um + session.of("distance_um")
+    r = np.sqrt((X - x) ** 2 + (Y - y) ** 2 + distance**2)
+    field = (lit * np.exp(1j * k * (r - distance)) * distance / (2 * np.pi * r * r) * (1 / r - 1j * k)).sum()
+    assert abs(field) ** 2 == pytest.approx(found[at], rel=1e-10)
+
+
+def test_a_plate_of_glass_bends_by_snell():
+    """Fermat: the path through the plate is the least over all places where the ray could enter it."""
+    glass = bench.Faults(glass_um=100.0)
+    rho, z = 37.3, 411.0
+    enter = np.linspace(0, rho, 200001)  # on the plate's far side, the plate lying on the lens
+    want = (np.hypot(enter, z - 100.0) + 1.51 * np.hypot(rho - enter, 100.0)).min()
+    assert bench._source_path(glass, np.array(rho), np.array(0.0), z) == pytest.approx(want, abs=1e-7)
+
+
+def test_one_frame_cannot_fix_twenty_parameters():
+    seen = bench.shoot(hidden.lens(), hidden.session(1, depths_um=(590.0,)))
+    with pytest.raises(CaptureError, match="one frame for"):
+        characterize.fit(seen.capture, hidden.lens(), USUAL)
+
+
+def test_depths_in_millimetres_are_called_so():
+    seen = bench.shoot(hidden.lens(), hidden.session(1))
+    short = dataclasses.replace(seen.capture, position_um=seen.capture.position_um / 1e3)
+    with pytest.raises(CaptureError, match="look like mm"):
+        characterize.fit(short, hidden.lens(), USUAL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_hidden_lens_lies_within_its_intervals(response, seed):
+    """19 intervals of 95 %: three that miss have a probability of 7 % together, four of 1.5 %."""
+    session = hidden.session(seed)
+    seen = bench.shoot(hidden.lens(), session)
+    found = characterize.fit(seen.capture, hidden.lens(), USUAL, response=response)
+    missed = []
+    for name in hidden.TRUTHS:
+        low, high = found.interval(name)
+        if not low <= session.of(name) <= high:
+            missed.append(name)
+    assert len(missed) < 4, missed
+    assert len(found.verdicts) == 2
+
+
+@pytest.mark.slow
+def test_a_ghost_is_refused_or_spoken_of(response):
+    """The other faults have their rows in ``benchmarks.characterize_referee``: not all are found."""
+    session = bench.with_faults(hidden.session(0), ghost=0.08)
+    seen = bench.shoot(hidden.lens(), session)
+    try:
+        found = characterize.fit(seen.capture, hidden.lens(), USUAL, response=response)
+    except FitError:
+        return
+    words = " ".join(found.cautions)
+    assert "residuals" in words or "left out" in words or "fitted too" in words or "phase" in words

@@ -1,0 +1,71 @@
+"""Every scene point through its own PSF, summed in float64: judges the image engine and shares no code with it.
+
+The aperture on a fine lattice, each point's spherical wave, the lens phase by its formula, angular spectrum to the
+sensor (through films: the phase of each plane wave in each film), |U|² added; at the end the box of a
+scene's sample and that of a sensor's. One full transform a point: for images of some hundred points.
+"""
+
+import numpy as np
+
+
+class Referee:
+    """lens: radius, sensor distance, focus of the source, all um; films behind as (index, thickness), air the rest."""
+
+    def __init__(self, *, radius, distance, focus, design_wavelength, films=(), fine=0.4, count=384, extra=None):
+        self.radius, self.distance, self.focus, self.films = radius, distance, focus, films
+        self.k0, self.fine, self.count, self.extra = 2 * np.pi / design_wavelength, fine, count, extra
+        axis = (np.arange(count) - count // 2) * fine
+        self.x, self.y = np.meshgrid(axis, axis)
+        self.open = self._coverage()
+
+    def _coverage(self):
+        """Share of each fine cell inside the aperture, by 5 x 5 points."""
+        off = (np.arange(5) - 2) / 5 * self.fine
+        return np.mean([np.hypot(self.x + a, self.y + b) <= self.radius for a in off for b in off], axis=0)
+
+    def lens_phase(self):
+        r2 = self.x**2 + self.y**2
+        phase = -self.k0 * (np.sqrt(r2 + self.distance**2) + np.sqrt(r2 + self.focus**2))
+        return phase if self.extra is None else phase + self.extra(self.x, self.y)
+
+    def intensity(self, place, depth, wavelength):
+        """|U|² on the fine lattice about `place` (x, y on the sensor) for a source seen in the direction of `place`."""
+        k = 2 * np.pi / wavelength
+        reduced = self.distance - sum(t * (1 - 1 / n) for n, t in self.films)
+        tx, ty = place[0] / reduced, place[1] / reduced
+        source = np.sqrt((self.x + tx * depth) ** 2 + (self.y + ty * depth) ** 2 + depth**2)
+        wave = self.open * np.exp(1j * (k * source + self.lens_phase()))
+        f = np.fft.fftfreq(self.count, self.fine)
+        fx, fy = np.meshgrid(f, f)
+        p2 = wavelength**2 * (fx**2 + fy**2)
+        air = self.distance - sum(t for _, t in self.films)
+        path = air * np.sqrt(np.maximum(1 - p2, 0)) + sum(t * np.sqrt(np.maximum(n**2 - p2, 0)) for n, t in self.films)
+        move = np.exp(1j * k * path + 2j * np.pi * (fx * place[0] + fy * place[1])) * (p2 < 1)
+        out = np.fft.ifft2(np.fft.fft2(np.fft.ifftshift(wave)) * move)
+        # the wave reaches the sensor of a lattice that wraps: the caller keeps the window well inside
+        return np.abs(np.fft.fftshift(out)) ** 2 / self.open.sum()
+
+    def sampled(self, fine, step, window):
+        """(window, window) light on samples about the middle of the lattice, from a square source as large as they."""
+        f = np.fft.fftfreq(self.count, self.fine)
+        keep = np.sinc(f * step) ** 2
+        smooth = np.fft.ifft2(np.fft.fft2(fine) * keep[:, None] * keep).real * (step / self.fine) ** 2
+        every = round(step / self.fine)
+        first = self.count // 2 - (window // 2) * every
+        return smooth[first : first + window * every : every, first : first + window * every : every]
+
+    def image(self, light, depth, *, step, window, waves, middle=(0.0, 0.0)):
+        """(y, x) irradiance of point sources on the samples: every one with its own PSF, cos⁴ and wavelengths."""
+        rows, columns = light.shape
+        half = window // 2
+        out = np.zeros((rows + 2 * half, columns + 2 * half))
+        reduced = self.distance - sum(t * (1 - 1 / n) for n, t in self.films)
+        for i in range(rows):
+            for j in range(columns):
+                if light[i, j] == 0:
+                    continue
+                place = middle[0] + (j - (columns - 1) / 2) * step, middle[1] + (i - (rows - 1) / 2) * step
+                psf = sum(w * self.sampled(self.intensity(place, depth[i, j], c), step, window) for c, w in waves)
+                fall = 1 / (1 + (place[0] ** 2 + place[1] ** 2) / reduced**2) ** 2
+                out[i : i + window, j : j + window] += light[i, j] * fall * psf
+        return out[half : half + rows, half : half + columns]
