@@ -204,7 +204,7 @@ def _scratch(target: Path) -> Iterator[Path]:
     try:
         yield scratch
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        _recover(scratch, target)
 
 
 def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Terms) -> None:
@@ -290,6 +290,7 @@ def _recover(scratch: Path, target: Path) -> None:
         for path in (new if done else old).iterdir():
             if not target.with_name(path.name).exists():
                 path.rename(target.with_name(path.name))
+    ready.unlink(missing_ok=True)  # first: what a kill leaves of the rest is scratch and nothing more
     shutil.rmtree(scratch, ignore_errors=True)
 
 
