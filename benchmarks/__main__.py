@@ -1,4 +1,4 @@
-"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables and keep them in benchmarks/results.
+"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables, keep them in benchmarks/results and in the README.
 
 Without a topic all are run but those that take a quarter of an hour or need an extra package (``LONG``).
 """
@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import benchmarks
-from benchmarks import Row
+from benchmarks import Row, figures
 
 LONG = ("hardness", "hard_cells", "limits", "plan", "scene_referee")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
@@ -33,6 +33,7 @@ def main(words: list[str]) -> None:
         result = {"machine": about, "rows": [asdict(row) for row in rows]}
         name = f"{topic}_peers.json" if peers else f"{topic}.json"
         (folder / "results" / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    figures.write()
 
 
 def table(rows: list[Row]) -> str:

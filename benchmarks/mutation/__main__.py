@@ -22,15 +22,15 @@ REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # {"path: was ->
 SECONDS = ROOT / "build" / "mutants" / "seconds.json"  # of each test file, as measured before the first mutant
 
 
-def drawn(count: int, seed: int, only: str) -> list[rules.Mutant]:
-    """``count`` mutants: a third from lines that make error bars, modules in turn, rules in turn within each."""
+def drawn(count: int, seed: int, only: str, bars: float) -> list[rules.Mutant]:
+    """``count`` mutants, the share ``bars`` of them from lines that make error bars; modules and rules in turn."""
     generator, pools = random.Random(seed), {}
     for package in PACKAGES[:-1]:
         for path in sorted((ROOT / package).rglob("*.py")):
             if rules.numeric(path.relative_to(ROOT)) and path.relative_to(ROOT).as_posix().startswith(only):
                 pools[path] = rules.mutants(ROOT, path)
     chosen: list[rules.Mutant] = []
-    for bar, share in ((True, count // 3), (False, count - count // 3)):
+    for bar, share in ((True, round(bars * count)), (False, count - round(bars * count))):
         by_rule = {path: _shuffled([m for m in pool if m.bar is bar], generator) for path, pool in pools.items()}
         order = [path for path, pool in by_rule.items() if pool]
         generator.shuffle(order)
@@ -115,12 +115,13 @@ def main(words: list[str]) -> int:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="modules whose path starts so")
+    parser.add_argument("--bars", type=float, default=1 / 3, help="share drawn from lines that make error bars")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of related tests for one mutant")
     parser.add_argument("--trust", action="store_true", help="do not run the tests without a mutant first")
     parser.add_argument("--again", action="store_true", help="judge the survivors of the kept result once more")
     asked = parser.parse_args(words)
-    chosen = _survivors() if asked.again else drawn(asked.count, asked.seed, asked.only)
+    chosen = _survivors() if asked.again else drawn(asked.count, asked.seed, asked.only, asked.bars)
     load_libraries()
     with contextlib.ExitStack() as stack:
         trees = [str(stack.enter_context(copy_of(ROOT))) for _ in range(asked.jobs)]
