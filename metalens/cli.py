@@ -88,6 +88,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return SUCCESS
     if words[0] not in VERBS:
         return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
+    _prepare()
+    return _guarded(words, debug=debug)
+
+
+def _prepare() -> None:
+    """What a command needs of the process that it runs in."""
     for name in ("SIGTERM", "SIGHUP"):  # a lost terminal ends a command as Ctrl-C does, unless under nohup
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
@@ -96,6 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # where they spin as long as they do by default; alone it is a tenth slower so.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     _numba_cache()
+
+
+def _guarded(words: list[str], *, debug: bool) -> int:
+    """Run the command; its exit status, with one line for whatever stopped it."""
     told = lock.COMMAND.set(" ".join(words))
     try:
         if debug:

@@ -37,6 +37,20 @@ MODULES = {
     for path in (ROOT / package).rglob("*.py")
 }
 MOST_MODULES = 16  # of a folder
+MOST_LINES, MOST_LINES_OF_A_FUNCTION = 350, 40  # the latter without decorators and docstring
+LONGER = {  # {module or module:function: lines}: may only shrink; what is short enough by now is struck off
+    "characterize.model.forward": 367,
+    "characterize.model.forward:_group_light": 42,
+    "characterize.inference.estimate:_result": 42,
+    "codesign.adapt.train": 402,
+    "codesign.eye.lanes:dual": 56,
+    "metalens.ground.transaction": 358,
+    "metalens.modal.engine": 362,
+    "metalens.modal.engine:case_of": 49,
+    "metalens.propagate.nodes": 397,
+    "metalens.rcwa.any_shape:_waves": 41,
+    "metalens.rcwa.any_shape:jones": 41,
+}
 TABLES = {"metalens.cli"}  # names the verbs of every package: the one place that knows them all
 
 
@@ -125,6 +139,55 @@ def test_no_string_names_a_module_of_a_package_above():
 def test_no_folder_is_crowded():
     counts = collections.Counter(_folder(m) for m, path in MODULES.items() if path.name != "__init__.py")
     assert not {folder: count for folder, count in counts.items() if count > MOST_MODULES}
+
+
+def _length(node):
+    first = node.body[0]
+    told = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
+    return node.end_lineno - node.lineno + 1 - (first.end_lineno - first.lineno + 1 if told else 0)
+
+
+def _lengths():
+    """{module or module:function: lines} of all that is longer than a screen or a module may be."""
+    for module, path in MODULES.items():
+        lines = len(path.read_text(encoding="utf-8").splitlines())
+        if lines > MOST_LINES:
+            yield module, lines
+        for node in ast.walk(_tree(module)):
+            if isinstance(node, ast.FunctionDef) and _length(node) > MOST_LINES_OF_A_FUNCTION:
+                yield f"{module}:{node.name}", _length(node)
+
+
+def test_modules_and_functions_stay_short():
+    found = dict(_lengths())
+    assert not {name: lines for name, lines in found.items() if lines > LONGER.get(name, 0)}
+    assert not LONGER.keys() - found.keys(), "short enough by now: strike them off the list"
+
+
+def test_every_room_is_drawn_on_the_plan_and_says_what_it_is():
+    plan = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    for folder in {_folder(module) for module in MODULES}:
+        name = folder.rpartition(".")[2]
+        assert re.fullmatch(r"[a-z]+(_[a-z]+)?", name), f"{folder}: one plain word, or two"
+        assert re.search(rf"\b{name}\b", plan), f"{folder} is not in ARCHITECTURE.md"
+        assert ast.get_docstring(_tree(folder)), f"{folder}/__init__.py does not say what the folder is"
+
+
+def _public(tree, names):
+    """Public functions, classes and their methods; ``forward`` is documented by its class."""
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            yield f"{names}.{node.name}", node
+            if isinstance(node, ast.ClassDef):
+                yield from ((n, m) for n, m in _public(node, f"{names}.{node.name}") if m.name != "forward")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_is_public_is_documented(package):
+    modules = [module for module in MODULES if module.split(".")[0] == package]
+    assert not [module for module in modules if not ast.get_docstring(_tree(module))]
+    public = [pair for module in modules for pair in _public(_tree(module), module)]
+    assert not [name for name, node in public if not ast.get_docstring(node)]
 
 
 def test_what_crosses_folders_is_public():

@@ -1,5 +1,6 @@
 """Pages of ``metalens measure``: frames with their numbers, and a micrograph with every pillar drawn on it."""
 
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -8,37 +9,42 @@ from characterize.measure import frames, overlay, sem
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
+COLUMNS = {  # of a frame's record, and as the page has them
+    "name": "frame",
+    "depth_um": "depth / um",
+    "angle_deg": "angle / deg",
+    "spot.fwhm_um": "width at half maximum / um",
+    "spot.ee80_um": "radius of 80 % of the light / um",
+    "mtf50_x_per_um": "MTF at one half, x / (1/um)",
+    "mtf50_y_per_um": "MTF at one half, y / (1/um)",
+    "strehl": "Strehl ratio",
+    "efficiency": "focusing efficiency",
+}
+
 
 def frames_page(path: Path, found: frames.Quality) -> None:
     """Every frame with its numbers, and encircled energy over the radius."""
-    from characterize.measure import metrics
-
-    head = (
-        "frame",
-        "depth / um",
-        "angle / deg",
-        "FWHM / um",
-        "EE80 / um",
-        "MTF50 x",
-        "MTF50 y",
-        "Strehl",
-        "efficiency",
-    )
-    rows = [
-        (
-            row.name,
-            row.depth_um,
-            row.angle_deg,
-            row.spot.fwhm_um,
-            row.spot.ee80_um,
-            row.mtf50_x_per_um,
-            row.mtf50_y_per_um,
-            row.strehl,
-            row.efficiency,
-        )
-        for row in found.frames
+    rows = [tuple(attrgetter(name)(row) for name in COLUMNS) for row in found.frames]
+    sections = [
+        report.Section("Frames", "", [report.Table(tuple(COLUMNS.values()), rows)]),
+        report.Section("Curves", "", [report.Figure(_curves(found), "One line a frame.", wide=True)]),
     ]
+    fields = list(found.best_depth_um.items())
+    if fields:
+        head = ("angle / deg", "depth of the sharpest frame / um")
+        sections.append(report.Section("Field curvature", "", [report.Table(head, fields)]))
+    if found.distortion:
+        table = report.Table(("angle / deg", "distortion"), [(a, f"{d:+.3%}") for a, d in found.distortion.items()])
+        sections.append(report.Section("Distortion", "", [table]))
+    sections.append(report.Section("Put right or assumed on the way", "\n\n".join(found.notes)))
+    report.write(path, "Image quality of the captures", sections)
+
+
+def _curves(found: frames.Quality) -> bytes:
+    """Modulation over frequency and encircled energy over the radius."""
     from matplotlib.figure import Figure
+
+    from characterize.measure import metrics
 
     figure = Figure(figsize=(7, 3))
     mtf, energy = figure.subplots(1, 2)
@@ -52,18 +58,7 @@ def frames_page(path: Path, found: frames.Quality) -> None:
     mtf.set_ylabel("modulation along x")
     energy.set_xlabel("radius / um")
     energy.set_ylabel("share of the light")
-    sections = [
-        report.Section("Frames", "", [report.Table(head, rows)]),
-        report.Section("Curves", "", [report.Figure(report.png(figure), "One line a frame.", wide=True)]),
-    ]
-    fields = [(angle, depth) for angle, depth in found.best_depth_um.items()]
-    if fields:
-        sections.append(report.Section("Field curvature", "", [report.Table(("angle / deg", "sharpest / um"), fields)]))
-    if found.distortion:
-        table = report.Table(("angle / deg", "distortion"), [(a, f"{d:+.3%}") for a, d in found.distortion.items()])
-        sections.append(report.Section("Distortion", "", [table]))
-    sections.append(report.Section("Put right or assumed on the way", "\n\n".join(found.notes)))
-    report.write(path, "Image quality of the captures", sections)
+    return report.png(figure)
 
 
 def micrograph_page(

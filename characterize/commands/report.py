@@ -54,12 +54,6 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
     pictures = {"frames": _every_frame(result), "parameters": _intervals(result)}
     for name, picture in pictures.items():
         store.write_bytes(path.with_name(f"{path.stem}_{name}.png"), picture)
-    low_high = [result.interval(name) for name in result.names]
-    rows = [
-        (name, float(v), float(s), f"{low:.4g} to {high:.4g}", PARAMETERS[PLACE[name]].meaning)
-        for name, v, s, (low, high) in zip(result.names, result.value, result.sigma, low_high, strict=True)
-    ]
-    head = ("parameter", "value", "1 sigma", "95 % interval", "meaning")
     seen = (
         "One column a frame. Square root of the light above background, one scale down each column; the residual runs "
         "from -5 (blue) to 5 sigma (red): noise alone looks like even speckle, structure is what the model leaves over."
@@ -71,9 +65,7 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
     sections = [
         report.Section("What is known", "\n\n".join(result.verdicts)),
         report.Section("Frames", result.reason + ".", [report.Figure(pictures["frames"], seen, wide=True)]),
-        report.Section(
-            "Parameters", "", [report.Figure(pictures["parameters"], bars, wide=True), report.Table(head, rows)]
-        ),
+        report.Section("Parameters", "", [report.Figure(pictures["parameters"], bars, wide=True), _parameters(result)]),
         report.Section("What goes together", "", [correlated]),
         report.Section("What the frames fix", "\n\n".join(result.identifiable)),
         report.Section(
@@ -85,6 +77,15 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
         sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
     lead = "The lens that was really made, from what the bench saw: how it differs from the design, and how surely."
     report.write(path, "The lens as built", sections, lead=lead, key_figures=keys)
+
+
+def _parameters(result: AsBuilt) -> report.Table:
+    low_high = [result.interval(name) for name in result.names]
+    rows = [
+        (name, float(v), float(s), f"{low:.4g} to {high:.4g}", PARAMETERS[PLACE[name]].meaning)
+        for name, v, s, (low, high) in zip(result.names, result.value, result.sigma, low_high, strict=True)
+    ]
+    return report.Table(("parameter", "value", "1 sigma", "95 % interval", "meaning"), rows)
 
 
 def scale(name: str) -> float:

@@ -135,54 +135,54 @@ def _write(folder: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> 
     store.write_text(folder / JSON, json.dumps(values, indent=1) + "\n")
 
 
+COLUMNS = {  # of the page's table: what the numbers are called in the result, and on paper
+    "name": "run",
+    "mmacs": "million MACs a frame",
+    "gaze_axial_deg": "gaze error under axial slip / deg",
+    "gaze_lateral_deg": "under lateral slip / deg",
+    "gaze_told_slip_deg": "axial, slip told / deg",
+    "slip_mm": "slip error / mm",
+    "slip_axial_mm": "its axial part / mm",
+    "slip_lateral_mm": "its lateral part / mm",
+    "iou": "overlap of pupil masks",
+}
+CAPTIONS = {
+    "errors.png": "Mean gaze error at every stimulus: area of the markers (paper Fig. 11).",
+    "ambiguity.png": "Pupil centres under slippage (paper Fig. 10): one place, many gazes.",
+    "samples.png": "Eyes by slippage state, pupil as it is (green) and as read (red) (paper Fig. 9).",
+}
+
+
 def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
-    names = (
-        "gaze_axial_deg",
-        "gaze_lateral_deg",
-        "gaze_told_slip_deg",
-        "slip_mm",
-        "slip_axial_mm",
-        "slip_lateral_mm",
-        "iou",
-    )
-    head = (
-        "run",
-        "MMACs",
-        "gaze, axial / deg",
-        "gaze, lateral / deg",
-        "gaze, slip told / deg",
-        "slip / mm",
-        "axial / mm",
-        "lateral / mm",
-        "IoU",
-    )
-    rows = [(r["name"], r["mmacs"], *(r[n] for n in names)) for r in values["runs"]]
+    rows = [tuple(run[name] for name in COLUMNS) for run in values["runs"]]
+    tables = [report.Table(tuple(COLUMNS.values()), rows, digits=3)]
     ratios = [
-        (r["quantity"].replace("_", " "), r["against"], r["ratio"], f"{r['interval'][0]:.2f} to {r['interval'][1]:.2f}")
+        (
+            COLUMNS.get(r["quantity"], r["quantity"]).split(" / ")[0],
+            r["against"],
+            r["ratio"],
+            "{:.2f} to {:.2f}".format(*r["interval"]),
+        )
         for r in values["ratios"]
     ]
-    about = values["settings"]
-    text = (
+    if ratios:
+        head = ("error", "against", f"ratio of {values['first']}", "95 % interval")
+        tables.append(report.Table(head, ratios, digits=3))
+    figures = [report.Figure(pictures[name], caption, wide=True) for name, caption in CAPTIONS.items()]
+    keys = [
+        report.KeyFigure(f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°")
+        for r in values["runs"]
+    ]
+    sections = [report.Section("Numbers", _told(values["settings"]), tables), report.Section("Figures", "", figures)]
+    report.write(path, "Virtual experiment", sections, key_figures=keys)
+
+
+def _told(about: dict[str, Any]) -> str:
+    """How the numbers were made."""
+    return (
         f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each subject's eye (sphere "
         f"and regressor of one hidden layer) is fitted to {about['share']:.0%} of the stimuli, "
         f"{PLACED[about['points']]}, and judged on the rest; subjects "
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
         "error under axial slip is that of the pupil alone. Intervals are over subjects."
     )
-    tables: list[Any] = [report.Table(head, rows, digits=3)]
-    if ratios:
-        tables.append(
-            report.Table(("error", "against", f"ratio of {values['first']}", "95 % interval"), ratios, digits=3)
-        )
-    captions = {
-        "errors.png": "Mean gaze error at every stimulus: area of the markers (paper Fig. 11).",
-        "ambiguity.png": "Pupil centres under slippage (paper Fig. 10): one place, many gazes.",
-        "samples.png": "Eyes by slippage state, pupil as it is (green) and as read (red) (paper Fig. 9).",
-    }
-    figures = [report.Figure(pictures[n], caption, wide=True) for n, caption in captions.items()]
-    keys = [
-        report.KeyFigure(f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°")
-        for r in values["runs"]
-    ]
-    sections = [report.Section("Numbers", text, tables), report.Section("Figures", "", figures)]
-    report.write(path, "Virtual experiment", sections, key_figures=keys)

@@ -148,7 +148,11 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
             ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
         ),
     )
-    yield Stage(
+    yield _mask()
+
+
+def _mask() -> Stage:
+    return Stage(
         "Mask",
         "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
         "witness cells; checked against the design rules, written, read back and compared.",

@@ -1,7 +1,7 @@
 """A phase profile made of pillars: every site takes the diameter whose proxy phase is the wanted one."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -116,17 +116,9 @@ def make(
     count = int(aperture_um / cell.pitch_um) if math.isfinite(aperture_um) else 0
     if count < 1:
         raise LensError(f"empty aperture: {aperture_um} um holds no cell of pitch {cell.pitch_um} um")
-    axis = (np.arange(count) - (count - 1) / 2) * cell.pitch_um
-    reach = aperture_um / 2 - cell.pitch_um / 2 if count > 1 else 0.0
-    diameter = np.zeros((count, count), np.float32)
-    sums = _Sums()
-    block = max(1, _BLOCK_SITES // count)
-    for start in range(0, count, block):
-        rows = slice(start, start + block)
-        inside = axis[rows, None] ** 2 + axis**2 <= reach**2 * (1 + 1e-12)
-        wanted = phase(axis, axis[rows])[inside]
-        made = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within, gap=gap)
-        diameter[rows][inside] = made
+    diameter, sums = np.zeros((count, count), np.float32), _Sums()
+    for rows, inside, wanted in _wanted(phase, count, aperture_um, cell.pitch_um):
+        diameter[rows][inside] = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within, gap=gap)
         sums.add(wanted, diameter[rows][inside].astype(float), proxy, focus.wavelength_um)
     lens = Lens(
         diameters=DiameterMap(diameter, cell.pitch_um),
@@ -141,6 +133,17 @@ def make(
     return lens, sums.quality(
         focus, aperture_um / 2, proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
     )
+
+
+def _wanted(phase: PhaseOf, count: int, aperture_um: float, pitch_um: float) -> Iterator[tuple[slice, Array, Array]]:
+    """Blocks of rows: which of their sites lie inside the aperture, and the phase wanted there."""
+    axis = (np.arange(count) - (count - 1) / 2) * pitch_um
+    reach = aperture_um / 2 - pitch_um / 2 if count > 1 else 0.0
+    block = max(1, _BLOCK_SITES // count)
+    for start in range(0, count, block):
+        rows = slice(start, start + block)
+        inside = axis[rows, None] ** 2 + axis**2 <= reach**2 * (1 + 1e-12)
+        yield rows, inside, phase(axis, axis[rows])[inside]
 
 
 def printable(

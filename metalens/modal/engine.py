@@ -69,6 +69,7 @@ class Solution:
 
 @lru_cache(maxsize=4)
 def geometry(rho: float, plan: MeshPlan) -> Geometry:
+    """Matrices of a disc ``rho`` pitches wide on a mesh, kept for the next call."""
     return assemble(rho, plan)
 
 

@@ -39,10 +39,12 @@ class Basis:
 
     @property
     def vector(self) -> np.ndarray:
+        """The modes on the vector space, made when first asked for."""
         return self.make_vector()
 
     @property
     def size(self) -> int:
+        """Count of the modes."""
         return len(self.te) + len(self.tm)
 
 

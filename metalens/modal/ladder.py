@@ -68,16 +68,24 @@ class Measured(Protocol):
     """What a solution tells of its own error; see ``engine.Solution``."""
 
     @property
-    def spread(self) -> float: ...
+    def spread(self) -> float:
+        """Half the difference of both forms."""
+        ...
 
     @property
-    def drift(self) -> float: ...
+    def drift(self) -> float:
+        """How far the answer moves for a relative error of one in the transverse wavenumbers squared."""
+        ...
 
     @property
-    def grazing(self) -> float: ...
+    def grazing(self) -> float:
+        """How far exact cutoffs of the orders near grazing move the answer."""
+        ...
 
     @property
-    def bloch(self) -> float: ...
+    def bloch(self) -> float:
+        """Half Bloch phase in rad, 0 at normal incidence."""
+        ...
 
 
 NARROW, GAP = 0.9, 2.5  # from this diameter in pitches, the safety factor times this

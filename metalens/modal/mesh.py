@@ -83,6 +83,7 @@ class Numbering:
         self.scalar_wall: list[int] = []
 
     def wall(self, vertex: Vertex) -> int:
+        """Walls of the quarter cell that a vertex lies on, as bits."""
         kind, i, j = vertex
         if kind == "core":
             return (X0 if i == 0 else 0) | (Y0 if j == 0 else 0)
@@ -93,12 +94,14 @@ class Numbering:
         return (start if j == 0 else 0) | (end if last else 0)
 
     def vector(self, wall: int, *key: object) -> int:
+        """Number of the vector function ``key``; a key seen for the first time takes the next one."""
         if key not in self.vectors:
             self.vectors[key] = len(self.vectors)
             self.vector_wall.append(wall)
         return self.vectors[key]
 
     def scalar(self, wall: int, *key: object) -> int:
+        """Number of the scalar function ``key``; a key seen for the first time takes the next one."""
         if key not in self.scalars:
             self.scalars[key] = len(self.scalars)
             self.scalar_wall.append(wall)
@@ -133,6 +136,7 @@ class Numbering:
 
 
 def core_vertex(i: int, j: int, n: int) -> Vertex:
+    """Name of the corner (i, j) of a core of n by n elements; those on its rim are named as the rings name them."""
     if i == n and j == n:
         return ("diagonal", 0, 0)
     if i == n:
@@ -141,6 +145,7 @@ def core_vertex(i: int, j: int, n: int) -> Vertex:
 
 
 def ring_vertex(side: str, ring: int, j: int, n: int) -> Vertex:
+    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above); both sides share the diagonal."""
     return ("diagonal", ring, 0) if j == n else (side, ring, j)
 
 

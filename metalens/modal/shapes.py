@@ -33,6 +33,7 @@ class Interval:
 
     @property
     def degree(self) -> int:
+        """Highest degree of the polynomials."""
         return len(self.slope)
 
 

@@ -42,10 +42,12 @@ class Selection:
 
     @property
     def size(self) -> int:
+        """Count of the unknowns."""
         return 2 * self.inside + self.start + self.end if self.periodic else self.inside
 
     @property
     def periodic(self) -> bool:
+        """Whether a Bloch phase ties the ends of the cell together."""
         return len(self.order) > self.inside
 
 

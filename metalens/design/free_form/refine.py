@@ -22,8 +22,6 @@ def refine(
 
     Best feasible point of ``settings.refine`` evaluations (Svanberg 2002); the start where none is better.
     """
-    import nlopt
-
     start = controls.detach().numpy().ravel()
     known: dict[bytes, tuple[float, np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
     best = (math.inf, start)
@@ -56,13 +54,26 @@ def refine(
         if gradient.size:
             gradient[:] = found[3]
 
-    count = len(evaluate(start)[2])
+    _climb(start, value, constraint, constraints=len(evaluate(start)[2]), evaluations=settings.refine)
+    return torch.from_numpy(best[1]).reshape(controls.shape)
+
+
+def _climb(
+    start: np.ndarray[Any, Any],
+    value: Callable[..., float],
+    constraint: Callable[..., None],
+    *,
+    constraints: int,
+    evaluations: int,
+) -> None:
+    """Let NLopt call ``value`` and ``constraint`` within REACH_RAD of the start; who calls keeps the best point."""
+    import nlopt
+
     solver = nlopt.opt(nlopt.LD_MMA, start.size)
     solver.set_min_objective(value)
-    solver.add_inequality_mconstraint(constraint, np.full(count, 1e-4))
+    solver.add_inequality_mconstraint(constraint, np.full(constraints, 1e-4))
     solver.set_lower_bounds(start - REACH_RAD)
     solver.set_upper_bounds(start + REACH_RAD)
-    solver.set_maxeval(settings.refine)
+    solver.set_maxeval(evaluations)
     with contextlib.suppress(nlopt.RoundoffLimited):  # the best point so far is kept
         solver.optimize(start)
-    return torch.from_numpy(best[1]).reshape(controls.shape)
