@@ -11,7 +11,7 @@ import numpy as np
 
 from layout.certify import certify
 from layout.commands.job import Job, Options
-from layout.files import doses, verify
+from layout.files import MaskContent, doses, verify
 from layout.files import write as write_dxf
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
@@ -27,7 +27,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 from metalens.lens import Lens
 
-MOST_CERTIFIED = 20_000_000  # pillars whose exposure is simulated: some 200 bytes each
+MOST_CERTIFIED = 10_000_000  # pillars whose places are kept when a file is read back, and whose exposure is simulated
+_MOST_READ = 2**40
 
 
 def run(options: Options) -> int:
@@ -47,7 +48,7 @@ def run(options: Options) -> int:
 def _prepare(options: Options) -> Job:
     seconds: dict[str, float] = {}
     with _timed(seconds, "read"):
-        source = lenses.load(options.lens)
+        source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
     with _timed(seconds, "classes and dose"):
         made = build.prepare(source, rules, name=options.name, with_doses=options.dose)
@@ -101,9 +102,9 @@ def _write_solids(job: Job, target: Path) -> None:
     job.written |= {path.name: path.stat().st_size for path in made}
 
 
-def _read_back(job: Job, path: Path, read: Callable[[Path], Any]) -> None:
+def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
     with _timed(job.seconds, f"read back {path.suffix[1:]}"):
-        content = read(path)
+        content = read(path, limit=_MOST_READ, keep=MOST_CERTIFIED)
         job.compared[path.name] = verify.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)

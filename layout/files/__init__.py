@@ -12,10 +12,13 @@ if TYPE_CHECKING:
     from layout.files.content import NOTHING as NOTHING
     from layout.files.content import QUARTERS as QUARTERS
     from layout.files.content import CellContent as CellContent
+    from layout.files.content import Gathered as Gathered
     from layout.files.content import MaskContent as MaskContent
     from layout.files.content import Placed as Placed
     from layout.files.content import Turn as Turn
+    from layout.files.content import forget as forget
     from layout.files.content import mapped as mapped
+    from layout.files.digest import Sums as Sums
     from layout.files.dxf import Window as Window
     from layout.files.dxf import sites_in as sites_in
     from layout.files.dxf import write as write
@@ -29,15 +32,18 @@ __getattr__, __dir__, __all__ = attach(
     {
         "CellContent": "content",
         "FARTHEST": "read_loops",
+        "Gathered": "content",
         "MaskContent": "content",
         "NOTHING": "content",
         "Placed": "content",
         "QUARTERS": "content",
+        "Sums": "digest",
         "Turn": "content",
         "Window": "dxf",
         "deltas": "read_loops",
         "doses": "",
         "flat": "",
+        "forget": "content",
         "mapped": "content",
         "paths": "",
         "placements": "read_loops",

@@ -1,6 +1,7 @@
 """What a mask file holds, as it was read: cells, their polygons, circles and placements."""
 
 import math
+import mmap
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from layout.files.digest import Digest, Sums
 from layout.process import LayerNumber
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
@@ -64,13 +66,28 @@ NOTHING = Placed((), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, n
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CellContent:
-    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n, 3) of x, y, radius}."""
+    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n, 3) of x, y, radius}.
+
+    sums: where the cell has more placements than are kept, their sums, one for each of ``placed.children``; ``placed``
+    then holds none.
+    """
 
     name: str
     polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
     circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
     placed: Placed = NOTHING
     texts: int = 0
+    sums: Sums | None = None
+
+    def kept(self) -> Placed:
+        """The placements.
+
+        Raises:
+            MaskFileError: only their sums were kept.
+        """
+        if self.sums is not None:
+            raise MaskFileError(f"cell {self.name!r}: of its placements only the sums were kept; read all of them")
+        return self.placed
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -126,10 +143,10 @@ class MaskContent:
     def _walk(self, name: str, x: int, y: int, turn: Turn, above: tuple[str, ...]) -> Iterator[Placed]:
         if name in above or len(above) > _DEEPEST:
             raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
-        placed = self._cell(name).placed
+        placed = self._cell(name).kept()
         if not len(placed.child):
             return
-        deep = np.array([bool(len(self._cell(child).placed.child)) for child in placed.children], bool)
+        deep = np.array([bool(len(self._cell(child).kept().child)) for child in placed.children], bool)
         px, py = (_within(v, name) for v in _moved(placed, turn, x, y))
         turns = placed.turns if turn == QUARTERS[0] else tuple(turn.after(inner) for inner in placed.turns)
         if not deep.any():
@@ -170,4 +187,39 @@ def mapped(path: str | Path) -> Array:
     """
     if not os.stat(path).st_size:
         raise MaskFileError(f"{path}: byte 0: empty file, need a mask")
-    return np.asarray(np.memmap(path, np.uint8, mode="r"))
+    with open(path, "rb") as file:
+        return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+
+
+def forget(data: Array, end: int) -> None:
+    """Give back the memory of the bytes before ``end`` of a mapped file; they are read again if they are looked at."""
+    base: object = data.base
+    if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") and end >= mmap.PAGESIZE:
+        base.madvise(mmap.MADV_DONTNEED, 0, end // mmap.PAGESIZE * mmap.PAGESIZE)
+
+
+@dataclass(eq=False, slots=True)
+class Gathered:
+    """Placements of a cell while it is read: kept up to a number (None: all), beyond it only their sums.
+
+    parts: (child, x, y, turn) of what is kept; child as the reader numbers it.
+    """
+
+    keep: int | None = None
+    parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
+    count: int = 0
+    digest: Digest | None = None
+
+    def add(self, child: Array, x: Array, y: Array, turn: Array) -> None:
+        """Take in some more."""
+        self.count += len(child)
+        if self.digest is None:
+            self.parts.append((child, x, y, turn))
+            if self.keep is None or self.count <= self.keep:
+                return
+            self.digest = Digest()
+            for part in self.parts:
+                self.digest.take(*part)
+            self.parts = []
+            return
+        self.digest.take(child, x, y, turn)

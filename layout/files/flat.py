@@ -66,7 +66,7 @@ def _cells(
     if name in above or len(above) > _DEEPEST:
         raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
     yield name, np.array([at[0]]), np.array([at[1]]), turn
-    placed = content.cells[name].placed
+    placed = content.cells[name].kept()
     if not len(placed.child):
         return
     px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
@@ -78,7 +78,7 @@ def _cells(
     kinds, first = np.unique(key[order], return_index=True)
     for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
         child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])
-        if child in content.cells and not len(content.cells[child].placed.child):
+        if child in content.cells and not len(content.cells[child].kept().child):
             yield child, px[some], py[some], inner
         else:
             for i in some.tolist():

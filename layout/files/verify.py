@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.files.content import QUARTERS, CellContent, MaskContent
+from layout.files.digest import Digest, Sums
 from layout.mask import Lattice, MaskPlan, PillarClass
 from metalens.ground.arrays import Array
 
@@ -48,7 +49,12 @@ def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
     found += _compare_top(plan, content.cells[plan.name])
     pillars = 0
     for lattice in plan.lattices:
-        count, wrong = _compare_lattice(plan, lattice, content)
+        sums = content.cells[lattice.name].sums
+        count, wrong = (
+            _compare_lattice(plan, lattice, content)
+            if sums is None
+            else _compare_sums(plan, lattice, content.cells[lattice.name].placed.children, sums)
+        )
         pillars, found = pillars + count, found + wrong
     return Comparison(pillars, tuple(found))
 
@@ -103,6 +109,38 @@ def _compare_lattice(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> 
             read[row, column] = lookup[placed.child[part]]
         count += len(placed.child)
     return count, _differences(lattice, read, count)
+
+
+def _compare_sums(plan: MaskPlan, lattice: Lattice, children: tuple[str, ...], read: Sums) -> tuple[int, list[str]]:
+    """As :func:`_compare_lattice`, where of each class only sums over its places were kept."""
+    digest = Digest()
+    for first, block in lattice.blocks(max(1, _CHUNK // lattice.columns)):
+        digest.sites(block, lattice.x0, lattice.y0 - first * lattice.pitch, lattice.pitch)
+    wanted = digest.of(np.arange(len(plan.classes) + 1))
+    number = {made.name: k for k, made in enumerate(plan.classes, 1)}
+    count, wrong = int(read.count.sum()), []
+    strange = [name for name in children if name not in number]
+    if strange:
+        wrong.append(f"{lattice.name} places {', '.join(strange[:5])}, which are no classes of the plan")
+    row = {name: n for n, name in enumerate(children)}
+    for name, k in number.items():
+        n = row.get(name)
+        found = (0, 0, 0, 0, 0) if n is None else tuple(int(v[n]) for v in read)
+        planned = tuple(int(v[k]) for v in wanted)
+        if found != planned:
+            wrong.append(f"{lattice.name}: class {name}: {_unlike(planned, found)}")
+    return count, wrong
+
+
+def _unlike(planned: tuple[int, ...], found: tuple[int, ...]) -> str:
+    """What differs between (count, x, y, turned, hash) of a class, in words."""
+    (n, x, y, _, _), (m, u, v, turned, _) = planned, found
+    if turned:
+        return f"{turned} pillars are turned"
+    if abs(n - m) == 1:
+        sign, what = (1, "one pillar is missing") if n > m else (-1, "one pillar too many")
+        return f"{what}, at ({sign * (x - u)}, {sign * (y - v)})"
+    return f"{m} pillars, planned {n}" if n != m else f"{n} pillars, not all at their places"
 
 
 def _differences(lattice: Lattice, read: Array, count: int) -> list[str]:

@@ -1,11 +1,26 @@
 """GDSII reader: every record is checked; what is wrong is named with its byte offset."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from layout.files import FARTHEST, NOTHING, QUARTERS, CellContent, MaskContent, Placed, Turn, mapped, paths, sref_run
+from layout.files import (
+    FARTHEST,
+    NOTHING,
+    QUARTERS,
+    CellContent,
+    Gathered,
+    MaskContent,
+    Placed,
+    Sums,
+    Turn,
+    forget,
+    mapped,
+    paths,
+    sref_run,
+)
 from layout.gdsii import bytes as gds
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
@@ -19,53 +34,56 @@ LIMIT = 2**29
 class _Batch:
     """Placements of the structure that is being read."""
 
+    held: Gathered
     names: dict[bytes, int] = field(default_factory=dict)
-    child: list[Array] = field(default_factory=list)
-    x: list[Array] = field(default_factory=list)
-    y: list[Array] = field(default_factory=list)
-    turn: list[Array] = field(default_factory=list)
     turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
 
     def add(self, child: Array, x: Array, y: Array, turn: Turn) -> None:
-        self.child.append(child.astype(np.int32))
-        self.x.append(x.astype(np.int32))
-        self.y.append(y.astype(np.int32))
         number = self.turns.setdefault(turn, len(self.turns))
-        self.turn.append(np.full(len(child), number, np.uint8 if number < 256 else np.int32))
+        turned = np.full(len(child), number, np.uint8 if number < 256 else np.int32)
+        self.held.add(child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned)
 
     def number(self, name: bytes) -> int:
         return self.names.setdefault(name, len(self.names))
 
+    def sums(self) -> Sums | None:
+        return None if self.held.digest is None else self.held.digest.of(np.arange(len(self.names)))
+
     def placed(self) -> Placed:
-        if not self.child:
+        if not self.held.count:
             return NOTHING
-        child, x, y, turn = (np.concatenate(part) for part in (self.child, self.x, self.y, self.turn))
-        return Placed(tuple(name.decode("ascii") for name in self.names), child, x, y, turn, tuple(self.turns))
+        names = tuple(name.decode("ascii") for name in self.names)
+        if self.held.digest is not None:
+            return dataclasses.replace(NOTHING, children=names)
+        child, x, y, turn = (np.concatenate(part) for part in zip(*self.held.parts, strict=True))
+        return Placed(names, child, x, y, turn, tuple(self.turns))
 
 
-def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
+def read(path: str | Path, *, limit: int = LIMIT, keep: int | None = None) -> MaskContent:
     """Read a GDSII file.
 
     Args:
         limit: most placements, arrays of references taken apart, that are read.
+        keep: most placements of one structure that are kept; of more only the sums are (:mod:`layout.files.digest`),
+            in bounded memory. None: all are kept.
 
     Raises:
         MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    return parse(mapped(path), limit=limit, where=str(path))
+    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(data: Array, *, limit: int = LIMIT, where: str = "data") -> MaskContent:
+def parse(data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data") -> MaskContent:
     """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them in errors."""
-    return _Reader(where, data, limit).library()
+    return _Reader(where, data, limit, keep).library()
 
 
 class _Reader:
     """A cursor over the records."""
 
-    def __init__(self, path: str, data: Array, limit: int) -> None:
-        self.path, self.data, self.at, self.limit = path, data, 0, limit
+    def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
+        self.path, self.data, self.at, self.limit, self.keep = path, data, 0, limit, keep
         self.begin = 0  # of the latest record
 
     def fail(self, text: str, at: int | None = None) -> MaskFileError:
@@ -120,13 +138,13 @@ class _Reader:
 
     def structure(self) -> CellContent:
         name = self.name(self.next(gds.STRNAME)[1]).decode("ascii")
-        batch, texts = _Batch(), 0
+        batch, texts = _Batch(Gathered(self.keep)), 0
         polygons: dict[tuple[int, int], list[Array]] = {}
         while True:
             self.references(batch)
             kind, _ = self.next(*_SHAPES, gds.ENDSTR)
             if kind == gds.ENDSTR:
-                return CellContent(name, polygons, {}, batch.placed(), texts)
+                return CellContent(name, polygons, {}, batch.placed(), texts, batch.sums())
             if kind in (gds.SREF, gds.AREF):
                 self.reference(batch, kind)
             elif kind in (gds.BOUNDARY, gds.BOX, gds.PATH):
@@ -153,6 +171,7 @@ class _Reader:
             numbers = np.array([batch.number(self.name(n)) for n in names], np.int32)
             batch.add(numbers[child], x, y, QUARTERS[0])
             self.at = end
+            forget(self.data, end)
             self.count(len(child))
 
     def count(self, more: int) -> None:

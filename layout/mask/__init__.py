@@ -7,8 +7,10 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from layout.mask import build as build
     from layout.mask import fields as fields
+    from layout.mask import tone as tone
     from layout.mask.field_figure import with_fields as with_fields
     from layout.mask.fields import FieldPlan as FieldPlan
+    from layout.mask.plan import UNDRAWN as UNDRAWN
     from layout.mask.plan import Figure as Figure
     from layout.mask.plan import Lattice as Lattice
     from layout.mask.plan import MaskPlan as MaskPlan
@@ -22,8 +24,10 @@ __getattr__, __dir__, __all__ = attach(
         "Lattice": "plan",
         "MaskPlan": "plan",
         "PillarClass": "plan",
+        "UNDRAWN": "plan",
         "build": "",
         "fields": "",
+        "tone": "",
         "with_fields": "field_figure",
     },
 )

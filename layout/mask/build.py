@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.dose import Solution
-from layout.mask import cells, die, dosed
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, pillar_classes
+from layout.mask import cells, die, dosed, tone
+from layout.mask.plan import Lattice, MaskPlan, PillarClass, pillar_classes
 from layout.process import LayerNumber, Process, names
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -62,10 +62,11 @@ def prepare(
     pitch = pitch_units(diameters.pitch_um, process)
     found = cells.quantise(diameters, process)
     classes = _plain_classes(found.diameters_nm, process)
-    lattice, axis = _lattice(found.classes, pitch, process.rules.grid_nm)
+    x0, y0, axis = _origin(found.sites.shape, pitch, process.rules.grid_nm)
+    lattice = found.sites.lattice("LENS", pitch=pitch, x0=x0, y0=y0, upside_down=True)
     bare = MaskPlan(
         name=name,
-        classes=_toned(classes, pitch, process),
+        classes=classes,
         lattices=(lattice,),
         unit_nm=UNIT_NM,
         grid=process.rules.grid_nm,
@@ -77,7 +78,7 @@ def prepare(
     if furnished:
         bare = die.furnish(bare, process, radius_um=radius_um, label=_label(source, radius_um))
     if process.tone == "negative":
-        bare = bare.replace(figures=(*bare.figures, Figure("CLEAR", {process.layers.pillar: _cleared(bare)})))
+        bare = tone.inverted(bare, process)
     solution = None
     if with_doses and process.exposure.corrected:
         bare, solution = dosed.corrected(bare, process)
@@ -125,7 +126,8 @@ def stream(
 
     x0, y0, axis = _origin(shape, pitch, rules.grid_nm)
     lattice = Lattice("LENS", shape[0], shape[1], pitch, x0, y0, sites)
-    return MaskPlan(name, _toned(classes, pitch, process), (lattice,), grid=rules.grid_nm, axis=axis)
+    made = MaskPlan(name, classes, (lattice,), grid=rules.grid_nm, axis=axis)
+    return tone.inverted(made, process) if process.tone == "negative" else made
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:
@@ -141,13 +143,6 @@ def pitch_units(pitch_um: float, process: Process) -> int:
             "lie off the grid; choose another pitch or a finer grid_nm"
         )
     return round(steps) * process.rules.grid_nm
-
-
-def _lattice(sites: Array, pitch: int, grid: int) -> tuple[Lattice, tuple[float, float]]:
-    """The map upside down: its rows run towards +y, and +y is up on the mask."""
-    sites = np.ascontiguousarray(sites[::-1])
-    x0, y0, axis = _origin(sites.shape, pitch, grid)
-    return Lattice.of("LENS", sites, pitch=pitch, x0=x0, y0=y0), axis
 
 
 def _origin(shape: tuple[int, ...], pitch: int, grid: int) -> tuple[int, int, tuple[float, float]]:
@@ -185,51 +180,6 @@ def _check_layers(plan: MaskPlan, process: Process) -> None:
                 f"layer {layer[0]}/{layer[1]} is a dose of the {kind} layer and the {other} layer; give "
                 f"{kind} and {other} different layer numbers"
             )
-
-
-def _toned(classes: tuple[PillarClass, ...], pitch: int, process: Process) -> tuple[PillarClass, ...]:
-    """For a negative tone each class draws its lattice square without the pillar, in two halves."""
-    if process.tone == "positive":
-        return classes
-    if pitch % (2 * process.rules.grid_nm):
-        raise ProcessError(
-            f"tone 'negative' draws squares of the pitch around each site: {pitch} units must be an even number of "
-            f"grid steps of {process.rules.grid_nm} nm"
-        )
-    return tuple(
-        PillarClass(c.name, c.diameter_nm, c.diameter_units, c.layer, c.outline, _halves(c.outline, pitch), c.dose)
-        for c in classes
-    )
-
-
-def _halves(outline: Array, pitch: int) -> tuple[Array, ...]:
-    """Right and left half of the lattice square without the pillar; the cut runs along x = 0."""
-    h = pitch // 2
-    right = outline[outline[:, 0] > 0]
-    right = right[np.argsort(np.arctan2(right[:, 1], right[:, 0]))]
-    top = int(outline[:, 1].max())
-    inner = np.concatenate([[[0, -top]], right, [[0, top]]])
-    half = np.concatenate([[[0, h], [0, top]], inner[::-1][1:-1], [[0, -top], [0, -h], [h, -h], [h, h]]])
-    return half[::-1].copy(), half * (-1, 1)
-
-
-def _cleared(plan: MaskPlan) -> tuple[Array, ...]:
-    """Rectangles over all sites without pillar: equal runs of neighbouring rows together."""
-    made = []
-    for lattice in plan.lattices:
-        half, pitch = lattice.pitch // 2, lattice.pitch
-        open_runs: dict[tuple[int, int], int] = {}
-        for row in range(lattice.rows + 1):
-            empty = lattice.source(row, row + 1)[0] == 0 if row < lattice.rows else np.zeros(lattice.columns, bool)
-            edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
-            runs = set(zip(edges[::2], edges[1::2], strict=True))
-            for first, end in sorted(open_runs.keys() - runs):
-                left, right = lattice.x0 + first * pitch - half, lattice.x0 + end * pitch - half
-                top, bottom = (lattice.y0 - r * pitch + half for r in (open_runs.pop((first, end)), row))
-                made.append(np.array([[left, bottom], [right, bottom], [right, top], [left, top]]))
-            for run in runs - open_runs.keys():
-                open_runs[run] = row
-    return tuple(made)
 
 
 def _label(source: Lens | DiameterMap, radius_um: float) -> str:

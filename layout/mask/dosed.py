@@ -1,12 +1,13 @@
 """A mask with its doses: everything that is exposed together is corrected together, a datatype for each dose."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from layout.dose import Body, Rects, Solution
 from layout.dose import correct as dose
+from layout.mask.held import hold
 from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
@@ -15,7 +16,7 @@ from metalens.ground.units import nm
 
 EXPOSED = ("MARKS", "LABEL", "VERNIERS")  # figures that are written in the same exposure as the pillars
 _KINDS = {"T": "dose", "W": "witness"}  # by the first letter of a class
-MOST_HELD = 1 << 27  # sites of a lattice that are kept in memory
+_BLOCK_SITES = 1 << 22
 
 
 def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
@@ -130,17 +131,13 @@ def _kind(made: PillarClass) -> str:
 
 
 def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> Lattice:
-    def rows(first: int, end: int) -> Array:
-        block = np.ascontiguousarray(lattice.source(first, end))
-        return np.asarray(lookup[block, found.classes(number, first, block)])
+    def rows() -> Iterator[tuple[int, Array]]:
+        for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
+            whole = np.ascontiguousarray(block)
+            yield first, lookup[whole, found.classes(number, first, whole)]
 
-    if lattice.rows * lattice.columns > MOST_HELD:
-        return dataclasses.replace(lattice, source=rows, array=None)
-    whole = np.empty((lattice.rows, lattice.columns), lookup.dtype)
-    step = max(1, (1 << 22) // max(1, lattice.columns))
-    for first in range(0, lattice.rows, step):
-        whole[first : first + step] = rows(first, min(first + step, lattice.rows))
-    return Lattice.of(lattice.name, whole, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
+    kept = hold((lattice.rows, lattice.columns), lookup.dtype, rows())
+    return kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
 
 
 def _figures(

@@ -4,6 +4,8 @@ Borders run midway between lattice sites, so that every pillar lies whole in one
 from the border. A field is then a block of rows and columns: no pillar needs a field number of its own.
 """
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +14,11 @@ import numpy as np
 from layout.process import Process, WriteField
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
+from metalens.ground.units import nm
 from metalens.lens import DiameterMap
+
+_BLOCK_SITES = 1 << 20
+_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -25,7 +31,7 @@ class FieldPlan:
     mode: ``floating`` or ``shift``, see :class:`layout.process.process.WriteField`.
     used: fields that hold pillars.
     cut_before: pillars that the same raster, left where the axis of the lens is a field corner, would cut.
-    clearance_um: least distance from a border to the edge of a pillar.
+    clearance_um: least distance from a border to the edge of a pillar as it is drawn.
     """
 
     rows: Array
@@ -68,22 +74,74 @@ class FieldPlan:
 
 
 def split(diameters: DiameterMap, process: Process) -> FieldPlan:
-    """Fields for the drawn pillars.
+    """Fields for the pillars as they are drawn (bias taken off), found in blocks of rows.
 
     Raises:
         ProcessError: a field smaller than the pitch.
     """
-    settings, d, pitch = process.write_field, diameters.diameter_um, diameters.pitch_um
+    settings, pitch = process.write_field, diameters.pitch_um
     sites = int(settings.size_um / pitch + 1e-9)
     if sites < 1:
         raise ProcessError(f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it")
-    rows = _edges(settings, np.asarray(d.any(axis=1)), sites)
-    columns = _edges(settings, np.asarray(d.any(axis=0)), sites)
-    plan = FieldPlan(rows, columns, (d.shape[0], d.shape[1]), pitch, settings.mode, 0, 0, 0.0)
-    used = sum(bool(d[block].any()) for block in plan.blocks())
-    cut = _cut(diameters, settings.size_um)
-    clearance = (pitch - float(d.max())) / 2
-    return FieldPlan(rows, columns, plan.shape, pitch, settings.mode, used, cut, clearance)
+    seen = _Seen.of(diameters, process)
+    rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, sites)
+    shape = diameters.diameter_um.shape
+    used = _used(diameters.diameter_um, rows, columns)
+    clearance = (pitch - seen.widest_um) / 2
+    return FieldPlan(rows, columns, (shape[0], shape[1]), pitch, settings.mode, used, seen.cut, clearance)
+
+
+@dataclass(eq=False, slots=True)
+class _Seen:
+    """rows, columns: which hold pillars; cut: pillars that a raster about the axis cuts; widest_um: as drawn."""
+
+    rows: Array
+    columns: Array
+    cut: int = 0
+    widest_um: float = 0.0
+
+    @classmethod
+    def of(cls, diameters: DiameterMap, process: Process) -> "_Seen":
+        """In one pass over the map."""
+        d, size_um = diameters.diameter_um, process.write_field.size_um
+        found = cls(np.zeros(d.shape[0], bool), np.zeros(d.shape[1], bool))
+        near_x, near_y = _near(diameters.x_um, size_um), _near(diameters.y_um, size_um)
+        columns, widest = np.flatnonzero(near_x < np.inf), 0.0
+        for first, block in _blocks(d):
+            there = block > 0
+            found.rows[first : first + len(block)] = there.any(1)
+            found.columns |= there.any(0)
+            widest = max(widest, float(block.max()))
+            rows = np.flatnonzero(near_y[first : first + len(block)] < np.inf)
+            upright = _drawn_um(block[:, columns], process) > 2 * near_x[columns]
+            level = _drawn_um(block[rows], process) > 2 * near_y[first + rows, None]
+            found.cut += int(upright.sum() + level.sum() - (upright[rows] & level[:, columns]).sum())
+        found.widest_um = float(_drawn_um(np.array([widest]), process)[0])
+        return found
+
+
+def _blocks(d: Array) -> Iterator[tuple[int, Array]]:
+    size = max(1, _BLOCK_SITES // max(1, d.shape[1]))
+    for first in range(0, d.shape[0], size):
+        yield first, np.asarray(d[first : first + size])
+
+
+def _drawn_um(designed_um: Array, process: Process) -> Array:
+    """Diameters of the written polygons; 0 where there is no pillar."""
+    written = process.written_diameter_nm(designed_um / nm) * nm
+    return np.where(designed_um > 0, written, 0.0)
+
+
+def _used(d: Array, rows: Array, columns: Array) -> int:
+    """Fields that hold pillars."""
+    inside = np.clip(columns, 0, d.shape[1])
+    total = 0
+    for first, end in itertools.pairwise(np.clip(rows, 0, d.shape[0]).tolist()):
+        held = np.zeros(d.shape[1], bool)
+        for begin in range(first, end, _ROWS):
+            held |= (np.asarray(d[begin : min(begin + _ROWS, end)]) > 0).any(0)
+        total += sum(bool(held[a:b].any()) for a, b in itertools.pairwise(inside.tolist()))
+    return total
 
 
 def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
@@ -94,17 +152,6 @@ def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
     if settings.mode == "floating":
         return np.asarray(first + np.arange(count + 1) * span // count)
     return np.asarray(first - (count * sites - span) // 2 + sites * np.arange(count + 1))
-
-
-def _cut(diameters: DiameterMap, size_um: float) -> int:
-    """Pillars that borders at multiples of ``size_um`` from the axis go through."""
-    d = diameters.diameter_um
-    through_x, through_y = _near(diameters.x_um, size_um), _near(diameters.y_um, size_um)
-    columns, rows = np.flatnonzero(through_x < np.inf), np.flatnonzero(through_y < np.inf)
-    by_x = d[:, columns] > 2 * through_x[columns]
-    by_y = d[rows] > 2 * through_y[rows, None]
-    both = (d[np.ix_(rows, columns)] > 2 * through_x[columns]) & (d[np.ix_(rows, columns)] > 2 * through_y[rows, None])
-    return int(by_x.sum() + by_y.sum() - both.sum())
 
 
 def _near(positions_um: Array, size_um: float) -> Array:

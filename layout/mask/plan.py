@@ -21,6 +21,7 @@ from metalens.ground.errors import ProcessError
 
 MOST_CLASSES = 65535
 FARTHEST = 2**31 - 1
+UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
 RowSource = Callable[[int, int], Array]  # (first row, end row) -> (rows, columns) class numbers
 
 
@@ -118,6 +119,7 @@ class MaskPlan:
     layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
     axis: of the lens in database units (off (0, 0) by at most half a grid step, where the lattice cannot be centred
     on the grid).
+    standing: for a negative tone, the mask of what stays; None where the drawn shapes stay.
     """
 
     name: str
@@ -129,6 +131,7 @@ class MaskPlan:
     layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
     doses: Mapping[LayerNumber, float] = field(default_factory=dict)
     axis: tuple[float, float] = (0.0, 0.0)
+    standing: "MaskPlan | None" = None
 
     def __post_init__(self) -> None:
         if not 0 < len(self.classes) <= MOST_CLASSES:

@@ -1,11 +1,12 @@
 """What stands in the cells of an OASIS file: placements, rectangles, polygons, circles, texts, with modal values."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 
-from layout.files import NOTHING, QUARTERS, CellContent, Placed, Turn, paths, placements
+from layout.files import NOTHING, QUARTERS, CellContent, Gathered, Placed, Turn, paths, placements
 from layout.oasis import bytes as oasis
 from layout.oasis import trapezoids
 from layout.oasis.cursor import Cursor, Repetition
@@ -48,19 +49,25 @@ class OpenCell:
     key: Child
     polygons: dict[tuple[int, int], list[Array]] = field(default_factory=dict)
     circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(default_factory=dict)
-    parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
+    held: Gathered = field(default_factory=Gathered)
     names: dict[str, int] = field(default_factory=dict)
     turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
     texts: int = 0
 
     def close(self, name: str, table: dict[int, str]) -> CellContent:
         """The finished cell; KeyError names a reference number without a name."""
-        return CellContent(name, self.polygons, self.circles, self._placed(table), self.texts)
+        digest = self.held.digest
+        sums = None if digest is None else digest.of(digest.children)
+        return CellContent(name, self.polygons, self.circles, self._placed(table), self.texts, sums)
 
     def _placed(self, table: dict[int, str]) -> Placed:
-        if not self.parts:
+        if not self.held.count:
             return NOTHING
-        child, x, y, turn = (np.concatenate(part) for part in zip(*self.parts, strict=True))
+        own = {number: name for name, number in self.names.items()}
+        if self.held.digest is not None:
+            every = self.held.digest.children.tolist()
+            return dataclasses.replace(NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every))
+        child, x, y, turn = (np.concatenate(part) for part in zip(*self.held.parts, strict=True))
         low, high = int(child.min()), int(child.max())
         if high - low < 1 << 22:
             used = np.flatnonzero(np.bincount(child - low)) + low
@@ -69,7 +76,6 @@ class OpenCell:
             index = lookup[child - low]
         else:
             used, index = np.unique(child, return_inverse=True)
-        own = {number: name for name, number in self.names.items()}
         names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
         return Placed(names, index.astype(np.int32), x, y, turn, tuple(self.turns))
 
@@ -121,9 +127,9 @@ class CellReader:
             if not moved:
                 return
 
-    def _add(self, c: Cursor, *part: Array) -> None:
-        self._count(c, len(part[0]))
-        self.cell.parts.append(part)  # type: ignore[arg-type]
+    def _add(self, c: Cursor, child: Array, x: Array, y: Array, turn: Array) -> None:
+        self._count(c, len(child))
+        self.cell.held.add(child, x, y, turn)
 
     def _count(self, c: Cursor, more: int) -> None:
         self.limit -= more

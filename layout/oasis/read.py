@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import CellContent, MaskContent, mapped
+from layout.files import CellContent, Gathered, MaskContent, mapped
 from layout.oasis import bytes as oasis
 from layout.oasis.cells import CellReader, Child, OpenCell
 from layout.oasis.cursor import Cursor
@@ -19,30 +19,32 @@ LIMIT = 2**29
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 
-def read(path: str | Path, *, limit: int = LIMIT) -> MaskContent:
+def read(path: str | Path, *, limit: int = LIMIT, keep: int | None = None) -> MaskContent:
     """Read an OASIS file.
 
     Args:
         limit: most placements and copies that are read.
+        keep: most placements of one cell that are kept; of more only the sums are (:mod:`layout.files.digest`), in
+            bounded memory. None: all are kept.
 
     Raises:
         MaskFileError: not OASIS, cut, broken anywhere, of a wrong checksum, or with records that no mask of
             pillars holds; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    return parse(mapped(path), limit=limit, where=str(path))
+    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(data: Array, *, limit: int = LIMIT, where: str = "data") -> MaskContent:
+def parse(data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data") -> MaskContent:
     """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them in errors."""
-    return _Reader(Cursor(where, data), limit).whole_file()
+    return _Reader(Cursor(where, data), limit, keep).whole_file()
 
 
 class _Reader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
-    def __init__(self, cursor: Cursor, limit: int) -> None:
-        self.file, self.limit = cursor, limit
+    def __init__(self, cursor: Cursor, limit: int, keep: int | None) -> None:
+        self.file, self.limit, self.keep = cursor, limit, keep
         self.cell: CellReader | None = None
         self.cells: list[OpenCell] = []
         self.names: dict[int, str] = {}
@@ -117,7 +119,7 @@ class _Reader:
     def _begin_cell(self, key: Child) -> None:
         if self.cell is not None:
             self.limit = self.cell.limit
-        self.cells.append(OpenCell(key))
+        self.cells.append(OpenCell(key, held=Gathered(self.keep)))
         self.cell = CellReader(self.cells[-1], self.limit)
 
     def _block(self, c: Cursor) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from layout.mask import Lattice, MaskPlan, PillarClass
 from layout.process import Rules
 from layout.rules import loops as drc_loops
-from layout.rules.figures import figures_kept
+from layout.rules.figures import figures_kept, frame_kept
 from layout.rules.report import DrcReport, Violation
 from layout.rules.zones import in_zones, structures_apart
 from layout.shapes import convex, polygon
@@ -51,6 +51,8 @@ class _Shapes:
 def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcReport:
     """Check gap, overlap, feature, grid, density and exclusion zones of all pillars and figures as they are drawn.
 
+    With a negative tone the gaps and features are those of what stays; what is drawn is held to the same limits.
+
     Args:
         foot_nm: (classes,) diameter of each class at its foot, as it comes out of the etch: the gaps there are
             checked too.
@@ -58,15 +60,18 @@ def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcR
     Accuracy:
         exact for gap, overlap, feature and grid; density in windows that step by half their size.
     """
+    report = DrcReport.empty(plan, rules)
+    _off_grid(plan, report)
+    if plan.standing is not None:
+        frame_kept(plan, rules, report)
+        plan = plan.standing  # gaps and features are those of what stays
     shapes = _Shapes.of(plan.classes)
     features = {k: convex.width(o) * plan.unit_nm for k, o in enumerate(shapes.outlines, 1)}
-    report = DrcReport.empty(plan, rules)
     for lattice in plan.lattices:
         counts, density = _count(plan, lattice, rules, report)
         _features(plan, lattice, rules, (shapes, features, counts), report)
         _gaps(plan, lattice, rules, (shapes, counts), report, foot_nm)
         report.maximum_density = max(report.maximum_density, density)
-    _off_grid(plan, report)
     figures_kept(plan, rules, report)
     in_zones(plan, rules, report, _SHOWN)
     structures_apart(plan, rules, report)

@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from layout.mask import MaskPlan
+from layout.mask import UNDRAWN, MaskPlan, tone
 from layout.process import Rules
 from layout.rules import edges as facing
 from layout.rules.report import DrcReport, Violation
 from layout.shapes import region
 from metalens.ground.arrays import Array
-
-UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
 
 
 def figures_kept(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
@@ -19,23 +17,46 @@ def figures_kept(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
         if figure.name not in UNDRAWN:
             for layer, drawn in figure.polygons.items():
                 layers.setdefault(layer[0], []).extend(np.asarray(p, np.int64) for p in drawn)
+    limits = rules.minimum_feature_nm, rules.minimum_gap_nm
     for number, polygons in layers.items():
-        _layer(region.union(polygons), number, rules, report)
+        _facing(region.union(polygons), limits, f"figures of layer {number}", report)
 
 
-def _layer(contours: list[Array], number: int, rules: Rules, report: DrcReport) -> None:
+def frame_kept(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
+    """A negative tone: what is drawn around the lattices is as wide as a gap, what it spares as wide as a feature.
+
+    Squares of empty sites are whole lattice squares beside others; they cannot be narrower than the pitch.
+    """
+    drawn = [tone.lattice_box(lattice, plan.grid) for lattice in plan.lattices]
+    outside = {layer for figure in plan.figures if figure.name == "APERTURE" for layer in figure.polygons}
+    for figure in plan.figures:
+        if figure.name not in (*UNDRAWN, "CLEAR"):
+            drawn += [p for layer, shapes in figure.polygons.items() if layer not in outside for p in shapes]
+    limits = rules.minimum_gap_nm, rules.minimum_feature_nm
+    _facing(region.union(drawn), limits, "frame of the negative tone", report, rules=("gap", "feature"))
+
+
+def _facing(
+    contours: list[Array],
+    limits: tuple[float, float],
+    text: str,
+    report: DrcReport,
+    *,
+    rules: tuple[str, str] = ("feature", "gap"),
+) -> None:
+    """Widths and spaces of contours below their limits, as violations of the two rules."""
     lines = [np.hstack([c, np.roll(c, -1, axis=0)]) for c in contours]
     if not lines:
         return
     edge, unit = np.concatenate(lines), report.unit_nm
     shape = np.zeros(len(edge), np.int64)  # holes belong to what is around them
-    found = facing.facing(edge, shape, rules.minimum_feature_nm / unit, rules.minimum_gap_nm / unit)
+    found = facing.facing(edge, shape, limits[0] / unit, limits[1] / unit)
     for a, b, kind, away in found.tolist():
         corners = np.concatenate([edge[int(a)].reshape(2, 2), edge[int(b)].reshape(2, 2)])
         box = (*corners.min(0).tolist(), *corners.max(0).tolist())
-        rule, limit = ("feature", rules.minimum_feature_nm) if kind == facing.WIDTH else ("gap", rules.minimum_gap_nm)
-        report.add(rule, 1, Violation(rule, box, away * unit, limit, f"figures of layer {number}"))
-        if kind == facing.WIDTH:
+        which = 0 if kind == facing.WIDTH else 1
+        report.add(rules[which], 1, Violation(rules[which], box, away * unit, limits[which], text))
+        if rules[which] == "feature":
             report.minimum_feature_nm = min(report.minimum_feature_nm, away * unit)
         else:
             report.minimum_gap_nm = min(report.minimum_gap_nm, away * unit)

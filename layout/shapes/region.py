@@ -13,14 +13,23 @@ def union(polygons: Iterable[Array]) -> list[Array]:
     return _contours(_section(polygons))
 
 
-def difference(polygons: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
-    """Contours of what is left of ``polygons`` without ``taken``."""
-    return _contours(_section(polygons) - _section(taken))
+def difference(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
+    """Contours of what is left of ``contours`` (outlines counter-clockwise, holes clockwise) without ``taken``."""
+    return _contours(_section(contours, filled=False) - _section(taken))
 
 
-def without_holes(contours: Sequence[Array]) -> list[Array]:
-    """The same area as polygons that any mask file holds: cut through the middle of each hole, and again."""
-    return list(_cut(_section(contours, filled=False)))
+def overlap(contours: Iterable[Array], polygons: Iterable[Array]) -> list[Array]:
+    """Contours (outlines and holes) of what ``contours`` share with ``polygons``."""
+    return _contours(_section(contours, filled=False) ^ _section(polygons))
+
+
+def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
+    """The same area as polygons that any mask file holds: cut upright through the middle of each hole, and again.
+
+    Args:
+        grid: step of the places of the cuts.
+    """
+    return list(_cut(_section(contours, filled=False), grid))
 
 
 def _section(polygons: Iterable[Array], *, filled: bool = True) -> Any:
@@ -36,7 +45,7 @@ def _contours(section: Any) -> list[Array]:
     return [p for p in kept if len(p) > 2]
 
 
-def _cut(section: Any) -> Iterable[Array]:
+def _cut(section: Any, grid: int) -> Iterable[Array]:
     from manifold3d import CrossSection
 
     for part in section.decompose():
@@ -45,8 +54,8 @@ def _cut(section: Any) -> Iterable[Array]:
             yield from contours
             continue
         hole = contours[1]
-        x = int(hole[:, 0].min() + hole[:, 0].max()) // 2
+        x = round(float(hole[:, 0].min() + hole[:, 0].max()) / 2 / grid) * grid
         left, bottom, right, top = part.bounds()
         for low, high in ((left - 1, x), (x, right + 1)):
             box = np.array([[low, bottom - 1], [high, bottom - 1], [high, top + 1], [low, top + 1]], float)
-            yield from _cut(part ^ CrossSection([box]))
+            yield from _cut(part ^ CrossSection([box]), grid)

@@ -49,7 +49,9 @@ def tile(
     away = abs(grid.x_um - centre_um[0]), abs(grid.y_um - centre_um[1])
     reach = np.inf if side_um is None else side_um / 2 + 1e-9
     columns, rows = np.flatnonzero(away[0] <= reach), np.flatnonzero(away[1] <= reach)
-    part = grid.diameter_um[np.ix_(rows, columns)]
+    part = np.zeros((0, 0))
+    if len(rows) and len(columns):
+        part = grid.diameter_um[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     row, column = np.nonzero(part)
     if not len(row):
         raise ProcessError(f"no pillar within {side_um} um around {centre_um}; move or enlarge the square")

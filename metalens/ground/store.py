@@ -8,7 +8,7 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -176,11 +176,12 @@ def save(
         file.write(image.getbuffer())
 
 
-def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stored:
+def load(path: str | Path, kind: str | None = None, *, version: int = 1, without: Collection[str] = ()) -> Stored:
     """Read an artefact and check its header.
 
     Args:
         kind: the kind that is needed; None takes any (``metalens info``).
+        without: arrays that are left in the file.
 
     Arrays and header are under checksums of HDF5: a file that was cut or damaged is refused, not read wrongly, and one
     that was edited with an HDF5 library is read as it now stands.
@@ -194,7 +195,7 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1) -> Stor
         raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
     try:
         with h5py.File(path, "r") as file:
-            return _read(path, file, kind, version)
+            return _read(path, file, kind, version, without)
     except StoreError:
         raise
     except DAMAGE as error:
@@ -211,7 +212,7 @@ def kind_of(path: str | Path) -> str:
     return found if isinstance(found, str) and units == _UNITS else ""
 
 
-def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored:
+def _read(path: Path, file: h5py.File, kind: str | None, version: int, without: Collection[str]) -> Stored:
     found = _plain(file.attrs.get("kind"))
     if found is None:
         raise StoreError(f"{path}: an HDF5 file without 'kind', not made by this toolchain")
@@ -224,7 +225,8 @@ def _read(path: Path, file: h5py.File, kind: str | None, version: int) -> Stored
             "make it again with this release or give another file"
         )
     arrays: dict[str, Array] = _Held(path)
-    arrays |= {name: item[...] for name, item in _listed(path, file) if not name.startswith("provenance/")}
+    wanted = ((name, item) for name, item in _listed(path, file) if name not in without)
+    arrays |= {name: item[...] for name, item in wanted if not name.startswith("provenance/")}
     attributes: dict[str, Any] = _Held(path)
     attributes |= {k: _plain(v) for k, v in file.attrs.items() if k not in ("kind", "version", "units")}
     return Stored(str(found), number, arrays, attributes, _read_provenance(file))

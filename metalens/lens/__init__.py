@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from metalens.lens.record import load as load
     from metalens.lens.record import parts as parts
     from metalens.lens.record import save as save
+    from metalens.lens.record import streamed as streamed
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -23,5 +24,6 @@ __getattr__, __dir__, __all__ = attach(
         "parts": "record",
         "picture": "",
         "save": "record",
+        "streamed": "record",
     },
 )

@@ -1,10 +1,12 @@
 """The lens that is handed on: a diameter map, and what is needed to know its phase at any wavelength."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import h5py
 import numpy as np
 
 from metalens.cell import Cell
@@ -13,9 +15,12 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
+from metalens.lens.rows import RowsOnDisk
 from metalens.pillars import Proxy
 
 _BLOCK_ROWS = 256
+_NAME = "diameter_um"
+MOST_HELD_BYTES = 1 << 28  # of diameters, beyond which the mask reads them from the file row by row
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,7 +43,7 @@ class DiameterMap:
             raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
         widest, thinnest = float(d.max(initial=0)), float(d.min(initial=0))
         if not (thinnest >= 0 and widest < self.pitch_um):
-            row, column = (int(i) for i in np.argwhere(~((d >= 0) & (d < self.pitch_um)))[0])
+            row, column = _first_bad(d, self.pitch_um)
             raise LensError(
                 f"diameter at row {row}, column {column} is {d[row, column]} um, "
                 f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
@@ -126,6 +131,32 @@ def load(path: str | Path) -> Lens:
     stored = store.load(path, "lens")
     lens = from_parts(stored.arrays, stored.attributes, where=str(path))
     return replace(lens, provenance=stored.provenance)
+
+
+def _first_bad(d: Array, pitch_um: float) -> tuple[int, int]:
+    """(row, column) of the first diameter that cannot be."""
+    for first in range(0, len(d), _BLOCK_ROWS):
+        block = np.asarray(d[first : first + _BLOCK_ROWS])
+        wrong = np.argwhere(~((block >= 0) & (block < pitch_um)))
+        if len(wrong):
+            return first + int(wrong[0, 0]), int(wrong[0, 1])
+    return 0, 0
+
+
+@reader
+def streamed(path: str | Path) -> Lens:
+    """As :func:`load`; diameters that would take much memory stay in the file, as :class:`RowsOnDisk`.
+
+    What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray`` gives all of them.
+    """
+    large = False
+    with contextlib.suppress(*store.DAMAGE), h5py.File(path, "r") as file:  # damage is told by the loader
+        large = file[_NAME].nbytes > MOST_HELD_BYTES
+    if not large:
+        return load(path)
+    stored = store.load(path, "lens", without=(_NAME,))
+    held = {**stored.arrays, _NAME: cast(Array, RowsOnDisk(path, _NAME))}
+    return replace(from_parts(held, stored.attributes, where=str(path)), provenance=stored.provenance)
 
 
 def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:

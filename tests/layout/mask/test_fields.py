@@ -13,6 +13,7 @@ from layout.study import focus, stitching
 from metalens.cell.record import Cell
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
+from metalens.made import Bias
 from metalens.pillars.proxy import Proxy
 
 PROXY = Proxy(np.array([[3.3, 3.3, 0.2]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
@@ -147,3 +148,11 @@ def test_the_loss_is_what_the_variance_of_the_ramps_says():
         plane = np.linalg.lstsq(a, ((phase - mean) * np.sqrt(weight)).ravel(), rcond=None)[0]
         want.append(np.average((phase - mean - plane[0] * ramp[0] - plane[1] * ramp[1]) ** 2, weights=weight))
     assert 1 - report.strehl.mean() == pytest.approx(np.mean(want), rel=0.2)  # sampled peak, two sets of 400 draws
+
+
+def test_the_clearance_is_that_of_what_is_drawn():
+    bias = dataclasses.replace(process(30.0), bias=Bias(table_nm=((50.0, -20.0), (400.0, -20.0))))
+    plan = fields.split(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
+    drawn_um = float(bias.written_diameter_nm(250.0)) * 1e-3
+    assert drawn_um > 0.269  # drawn wider by what the process takes
+    assert plan.clearance_um == pytest.approx((0.4 - drawn_um) / 2, abs=1e-12)

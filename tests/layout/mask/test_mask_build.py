@@ -195,34 +195,6 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
     assert set(np.round(goal[which], 2)) >= {0.8, 1.0, 1.2}
 
 
-def test_a_negative_tone_draws_what_is_left_of_the_square():
-    process = Process(tone="negative", exposure=Exposure(correct=False))
-    plan = layout.plan(disc_map(21), process, furnished=False)
-    for made in plan.classes:
-        drawn = sum(polygon.twice_area(half) for half in made.polygons)
-        assert abs(drawn) == 2 * 400**2 - polygon.twice_area(made.outline)
-    db = pytest.importorskip("klayout.db")
-    made = plan.classes[0]
-    shapes = [
-        db.Region(db.Polygon([db.Point(*map(int, p)) for p in shape])) for shape in (*made.polygons, made.outline)
-    ]
-    assert (shapes[0] & shapes[1]).is_empty()
-    assert ((shapes[0] + shapes[1]) & shapes[2]).is_empty()
-    assert ((shapes[0] + shapes[1] + shapes[2]) ^ db.Region(db.Box(-200, -200, 200, 200))).is_empty()
-
-
-def test_a_negative_tone_clears_the_sites_without_pillar():
-    source, process = disc_map(21), Process(tone="negative")
-    plan = layout.plan(source, process, furnished=False)
-    clear = next(f for f in plan.figures if f.name == "CLEAR").polygons[process.layers.pillar]
-    area = sum(polygon.twice_area(p) for p in clear) / 2
-    assert area == 400**2 * np.count_nonzero(source.diameter_um == 0)
-    sites = plan.lattices[0]
-    for row, column in np.argwhere(sites.whole() > 0):
-        x, y = sites.x0 + column * 400, sites.y0 - row * 400
-        assert not any(p[0, 0] < x < p[1, 0] and p[0, 1] < y < p[2, 1] for p in clear)
-
-
 def test_the_die_holds_everything_within_its_street_and_apart():
     process = Process(exposure=Exposure(correct=False))
     plan = layout.plan(disc_map(101), process, name="LENS_7")

@@ -1,0 +1,111 @@
+"""Millions of placements by their sums alone: for each child how many, where on average, and a hash of all places.
+
+Each place (x, y) becomes 64 well-mixed bits (splitmix64); their sum over the placements of a child, modulo 2^64, does
+not depend on their order. Two different sets of places agree in count, both sums and hash by chance once in 2^64.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.process import compiled
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+_FIRST, _SECOND, _THIRD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_ROOM = 256
+_MOST = 1 << 24  # children
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sums:
+    """Of the placements of each child. count, x, y, turned: (children,) int64; hashed: (children,) uint64.
+
+    x, y: sums of the places. turned: placements that are turned, mirrored or scaled.
+    """
+
+    count: Array
+    x: Array
+    y: Array
+    turned: Array
+    hashed: Array
+
+    def __iter__(self) -> Iterator[Array]:
+        """count, x, y, turned, hashed."""
+        return iter((self.count, self.x, self.y, self.turned, self.hashed))
+
+
+class Digest:
+    """Running sums over placements; children are numbered from any integer."""
+
+    def __init__(self) -> None:
+        self._sums, self._hashes = np.zeros((_ROOM, 4), np.int64), np.zeros(_ROOM, np.uint64)
+
+    def take(self, child: Array, x: Array, y: Array, turn: Array) -> None:
+        """Add placements: (n,) numbers, places and turns (0: as it is)."""
+        if not len(child):
+            return
+        slot = np.where(child >= 0, 2 * child.astype(np.int64), -2 * child.astype(np.int64) - 1)
+        self._grow(int(slot.max()) + 1)
+        _take(slot, x.astype(np.int64), y.astype(np.int64), turn, self._sums, self._hashes)
+
+    def sites(self, block: Array, x0: int, y0: int, pitch: int) -> None:
+        """Add the sites of a block of class numbers (0: none), its first site at (x0, y0), rows towards -y."""
+        self._grow(2 * int(block.max(initial=0)) + 1)
+        _sites(np.ascontiguousarray(block), x0, y0, pitch, self._sums, self._hashes)
+
+    @property
+    def children(self) -> Array:
+        """(children,) numbers of those that occur."""
+        slot = np.flatnonzero(self._sums[:, 0])
+        return np.where(slot % 2 == 0, slot // 2, -(slot + 1) // 2)
+
+    def of(self, children: Array) -> Sums:
+        """Sums of some children, by number."""
+        slot = np.where(children >= 0, 2 * children, -2 * children - 1)
+        self._grow(int(slot.max(initial=0)) + 1)
+        count, x, y, turned = self._sums[slot].T
+        return Sums(count, x, y, turned, self._hashes[slot])
+
+    def _grow(self, size: int) -> None:
+        if size > _MOST:
+            raise MaskFileError(f"cells numbered beyond {_MOST // 2}: too many for sums; read all placements")
+        if size > len(self._hashes):
+            more = 2 * size - len(self._hashes)
+            self._sums = np.concatenate([self._sums, np.zeros((more, 4), np.int64)])
+            self._hashes = np.concatenate([self._hashes, np.zeros(more, np.uint64)])
+
+
+@compiled
+def _mixed(x: int, y: int) -> np.uint64:
+    """splitmix64 of x and y side by side."""
+    z = (np.uint64(x & 0xFFFFFFFF) << np.uint64(32)) | np.uint64(y & 0xFFFFFFFF)
+    z = z + _FIRST
+    z = (z ^ (z >> np.uint64(30))) * _SECOND
+    z = (z ^ (z >> np.uint64(27))) * _THIRD
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled
+def _take(slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Array) -> None:
+    for n in range(slot.shape[0]):
+        k = slot[n]
+        sums[k, 0] += 1
+        sums[k, 1] += x[n]
+        sums[k, 2] += y[n]
+        sums[k, 3] += turn[n] != 0
+        hashes[k] += _mixed(x[n], y[n])
+
+
+@compiled
+def _sites(block: Array, x0: int, y0: int, pitch: int, sums: Array, hashes: Array) -> None:
+    for row in range(block.shape[0]):
+        y = y0 - row * pitch
+        for column in range(block.shape[1]):
+            if block[row, column]:
+                k, x = 2 * block[row, column], x0 + column * pitch
+                sums[k, 0] += 1
+                sums[k, 1] += x
+                sums[k, 2] += y
+                hashes[k] += _mixed(x, y)

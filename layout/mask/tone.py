@@ -1,0 +1,115 @@
+"""Negative tone: what the mask of the standing structures leaves empty is drawn, and nothing else.
+
+The exposed area is the die without pillars, marks, verniers and labels. It is written as lattice squares without their
+pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around the marks and labels without
+these, each on its own layer, and the rest of the die (FRAME). All of them abut; none overlaps another.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from layout.mask.plan import UNDRAWN, Figure, Lattice, MaskPlan, PillarClass
+from layout.process import LayerNumber, Process
+from layout.shapes import rectilinear, region
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+_WINDOW_UM = 5.0  # around marks and labels, on their own layer
+_BLOCK_SITES = 1 << 20
+
+
+def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
+    """The mask that leaves standing what ``plan`` draws; the layers of a second step (aperture) stay as they are.
+
+    Raises:
+        ProcessError: a pillar wider than its lattice square, lattices of different pitches.
+    """
+    pitches = {lattice.pitch for lattice in plan.lattices}
+    if len(pitches) > 1:
+        raise ProcessError(
+            f"tone 'negative' with lattices of pitches {sorted(pitches)}: put them on masks of their own"
+        )
+    square = _square(pitches.pop(), plan.grid)
+    classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
+    boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
+    clear = [box for lattice in plan.lattices for box in _empty(lattice, square)]
+    figures = _surroundings(plan, process, boxes)
+    if clear:
+        figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
+    kept = [figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)]
+    return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
+
+
+def lattice_box(lattice: Lattice, grid: int) -> Array:
+    """(4, 2) corners of all lattice squares together."""
+    left, bottom, right, top = _square(lattice.pitch, grid)
+    across, down = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.pitch
+    x, y = lattice.x0, lattice.y0
+    return rectilinear.corners(np.array([x + left, y - down + bottom, x + across + right, y + top]))
+
+
+def _unexposed(process: Process) -> set[LayerNumber]:
+    """Layers that the exposure of the pillars does not see."""
+    return {process.layers.aperture, process.layers.outline, process.layers.fields}
+
+
+def _square(pitch: int, grid: int) -> tuple[int, int, int, int]:
+    """Left, bottom, right, top of the lattice square about a site, on the grid; squares of neighbours abut."""
+    low = -(pitch // 2 // grid) * grid
+    return low, low, low + pitch, low + pitch
+
+
+def _around(made: PillarClass, square: tuple[int, int, int, int], grid: int) -> PillarClass:
+    (left, bottom), (right, top) = made.outline.min(0), made.outline.max(0)
+    if left < square[0] or bottom < square[1] or right > square[2] or top > square[3]:
+        raise ProcessError(
+            f"class {made.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
+            f"{square[2] - square[0]}: tone 'negative' draws what is left of the square; widen the pitch"
+        )
+    left_over = region.difference([rectilinear.corners(np.array(square))], [made.outline])
+    return dataclasses.replace(made, drawn=tuple(region.without_holes(left_over, grid=grid)))
+
+
+def _empty(lattice: Lattice, square: tuple[int, int, int, int]) -> list[Array]:
+    """Rectangles over all sites without pillar: equal runs of neighbouring rows together."""
+    pitch, made = lattice.pitch, []
+    open_runs: dict[tuple[int, int], int] = {}
+
+    def close(run: tuple[int, int], end: int) -> Array:
+        left, right = (lattice.x0 + column * pitch + square[0] for column in run)
+        top, bottom = (lattice.y0 - row * pitch + square[3] for row in (open_runs.pop(run), end))
+        return rectilinear.corners(np.array([left, bottom, right, top]))
+
+    for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
+        for row, empty in enumerate(block == 0, first):
+            edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
+            runs = set(zip(edges[::2], edges[1::2], strict=True))
+            made += [close(run, row) for run in sorted(open_runs.keys() - runs)]
+            open_runs.update(dict.fromkeys(runs - open_runs.keys(), row))
+    return made + [close(run, lattice.rows) for run in sorted(open_runs)]
+
+
+def _surroundings(plan: MaskPlan, process: Process, boxes: list[Array]) -> list[Figure]:
+    """Windows without their marks and labels, and the rest of the die."""
+    die = [p for figure in plan.figures if figure.name == "OUTLINE" for p in figure.polygons[process.layers.outline]]
+    if not die:
+        return []
+    margin = round(_WINDOW_UM * 1e3 / plan.unit_nm / plan.grid) * plan.grid
+    drawn = [f for f in plan.figures if f.name not in UNDRAWN and not set(f.polygons) <= _unexposed(process)]
+    standing = [shape for figure in drawn for shapes in figure.polygons.values() for shape in shapes]
+    taken, made = list(boxes), []
+    for figure in drawn:
+        left = {}
+        for layer, shapes in figure.polygons.items():
+            window = region.overlap(region.difference([_grown(s, margin) for s in shapes], taken), die)
+            left[layer] = tuple(region.without_holes(region.difference(window, standing), grid=plan.grid))
+            taken += [_grown(s, margin) for s in shapes]
+        made.append(Figure(figure.name, left))
+    rest = region.without_holes(region.difference(die, [*taken, *standing]), grid=plan.grid)
+    return [*made, Figure("FRAME", {process.layers.pillar: tuple(rest)})]
+
+
+def _grown(shape: Array, margin: int) -> Array:
+    """Box around a shape, wider by a margin on all sides."""
+    return rectilinear.corners(np.array([*(shape.min(0) - margin), *(shape.max(0) + margin)]))
