@@ -6,7 +6,7 @@ Nothing of the fit's reduced model is used: pillars are changed one by one, the 
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -63,8 +63,8 @@ class Truth:
     parameter: tuple[Known, ...] = ()
     camera: Camera = Camera()
     diameter_noise_nm: float = 0.0
-    dark_frames: int = 8
-    flat_frames: int = 16
+    dark_frames: int = field(default=8, metadata={"above": 0})
+    flat_frames: int = field(default=16, metadata={"above": 0})
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ covariance in typical units (A), then exchanged one by one as long as that helps
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -38,10 +38,10 @@ class Protocol:
     frames: int = 8
     criterion: Literal["D", "A"] = "A"
     peak_e: float = 8000.0
-    full_well_e: float = 10000.0
+    full_well_e: float = field(default=10000.0, metadata={"above": 0})
     read_noise_e: float = 2.0
     pixel_um: float = 3.0
-    pixels: int = 32
+    pixels: int = field(default=32, metadata={"above": 0})
     free: tuple[str, ...] = ()
     known: tuple[Known, ...] = ()
 

@@ -1,7 +1,7 @@
 """Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
@@ -24,8 +24,8 @@ class Metrology:
 
     known: tuple[Known, ...] = ()
     free: tuple[str, ...] = ()
-    window: int = 48
-    scan_um: float | None = None
+    window: int = field(default=48, metadata={"above": 0})
+    scan_um: float | None = field(default=None, metadata={"above": 0})
 
 
 @dataclass(frozen=True)

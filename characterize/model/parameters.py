@@ -5,7 +5,7 @@ Those of the lens are the table of :mod:`metalens.made.causes`; those of the ben
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class Known:
     """
 
     name: str
-    value: float
+    value: float = field(metadata={"signed": True})
     sigma: float = 0.0
 
     def __post_init__(self) -> None:

@@ -5,7 +5,7 @@ apodisation 1 / sqrt(cos theta)), or its scalar form for low apertures; phase an
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -36,12 +36,12 @@ class PupilSpec:
     """
 
     numerical_aperture: float
-    wavelength_um: float = math.nan
-    pixel_um: float = math.nan
+    wavelength_um: float = field(default=math.nan, metadata={"above": 0})
+    pixel_um: float = field(default=math.nan, metadata={"above": 0})
     index: float = 1.0
-    step_um: float = math.nan
+    step_um: float = field(default=math.nan, metadata={"signed": True})
     bead_um: float = 0.0
-    window: int = 40
+    window: int = field(default=40, metadata={"above": 0})
     center: tuple[int, int] | None = None
     phase_order: int = 8
     amplitude_order: int = 5

@@ -50,9 +50,9 @@ class PlanConfig:
     """
 
     aperture_mm: float = 1.0
-    wavelength_nm: float = 850.0
-    sensor_distance_mm: float = 2.0
-    source_distance_mm: float = 20.0
+    wavelength_nm: float = field(default=850.0, metadata={"above": 0})
+    sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
+    source_distance_mm: float = field(default=20.0, metadata={"above": 0})
     led_fwhm_nm: float = 0.0
     stacks: int = 200
     frames: int = 10_000

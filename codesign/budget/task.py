@@ -39,14 +39,14 @@ class TaskSetting:
     sensor_distance_um: of the lens.
     """
 
-    scenes: int = 6
-    pixels: int = 64
+    scenes: int = field(default=6, metadata={"above": 0})
+    pixels: int = field(default=64, metadata={"above": 0})
     margin: int = 8
-    pitch_um: float = 18.0
+    pitch_um: float = field(default=18.0, metadata={"above": 0})
     seed: int = 0
     sensor: Sensor = field(default_factory=Sensor)
     mismatch: float = 0.03
-    sensor_distance_um: float = 2000.0
+    sensor_distance_um: float = field(default=2000.0, metadata={"above": 0})
 
     @property
     def rig(self) -> Rig:

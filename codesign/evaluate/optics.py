@@ -3,7 +3,7 @@ of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals ov
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ class Setting:
     window_um: float = 192.0
     sample_um: float = 0.75
     radius_um: float = 18.0
-    tolerance: float = 1e-3
+    tolerance: float = field(default=1e-3, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -62,7 +62,7 @@ class Scenes:
     count: int = 24
     seed: int = 11
     gaze_step_deg: float = 1.0
-    slip_step_mm: float = 0.5
+    slip_step_mm: float = field(default=0.5, metadata={"signed": True})
     pitch_um: float = 6.0
     pixels: int = 240
     window_um: float = 288.0

@@ -57,7 +57,7 @@ class Space:
     resolution: (least, largest) scale of the input; the search moves in steps of 0.1, training in any.
     """
 
-    stem_channels: int = 16
+    stem_channels: int = field(default=16, metadata={"above": 0})
     stages: tuple[Stage, ...] = field(
         default_factory=lambda: (
             Stage(24, 2, False, "relu"),

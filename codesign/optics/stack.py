@@ -58,7 +58,7 @@ class OpticsConfig:
     depth_count: int = 24
     sample_um: float = 9.0
     window_samples: int = 33
-    tolerance: float = 3e-3
+    tolerance: float = field(default=3e-3, metadata={"above": 0})
     spread: LensErrors = field(default_factory=LensErrors)
     angle_deg: float = 0.0
 

@@ -41,9 +41,9 @@ class Design:
 
     profile: Profile = "hyperbolic"
     aperture_mm: float = 1.0
-    wavelength_nm: float = 850.0
-    sensor_distance_mm: float = 2.0
-    source_distance_mm: float = field(default=20.0, metadata={"may_be_inf": True})
+    wavelength_nm: float = field(default=850.0, metadata={"above": 0})
+    sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
+    source_distance_mm: float = field(default=20.0, metadata={"may_be_inf": True, "above": 0})
     library: Path | None = None
     cell: Cell | None = None
     limits: Limits = field(default_factory=Limits)

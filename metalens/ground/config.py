@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+import re
 import reprlib
 import tomllib
 import types
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,11 +15,18 @@ from metalens.ground.errors import ConfigError, nearest
 
 Record = TypeVar("Record")
 _LARGEST = 1 << 24  # bytes of a config
-_MOST = (1 << 63) - 1  # of a whole number
+_WORDS = re.compile(r"[^\x00-\x08\x0b-\x1f\x7f]*")  # text: blanks and line ends, no other control characters
+_LONGEST = 500  # characters of what a record says of its values
+_EITHER_SIGN = ("_rad", "_deg", "_offset")
+_MOST, _LARGE = (1 << 63) - 1, 1e9  # of a seed; of any other number, in the unit of its key
 
 
 def load(path: str | Path, record: type[Record]) -> Record:
     """Read a TOML file into ``record``, a frozen dataclass (nested dataclasses are tables).
+
+    A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its field says more: ``signed`` (or
+    not), ``above`` (more than that), ``most``, ``may_be_inf``. A seed is any whole number from 0. What a record itself
+    refuses comes with file and key.
 
     Raises:
         ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
@@ -96,29 +105,76 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     for key, value in values.items():
         _check_range(fields[key], value, where, prefix + key)
     for name, f in fields.items():
-        needed = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        if needed and name not in values:
+        if _required(f) and name not in values:
             raise ConfigError(f"{where}: missing key {prefix + name!r} in {record.__name__}")
     try:
-        return record(**values)
-    except ConfigError:
-        raise
+        made = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
-        raise ConfigError(f"{where}: {prefix or 'top level: '}{error}") from error
+        raise ConfigError(f"{where}: {_culprit(record, values, prefix, str(error))}") from error
+    for key, value in values.items():  # what the record lets pass
+        _check_sign(fields[key], value, where, prefix + key)
+    return made
+
+
+def _required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _culprit(record: Any, values: dict[str, Any], prefix: str, said: str) -> str:
+    """What a record says of its values, after the key without which it would be content, unless it names the key."""
+    required = {f.name for f in dataclasses.fields(record) if _required(f)}
+    said = said if len(said) <= _LONGEST else said[:_LONGEST] + " ..."
+    fitting = [k for k in values if k not in required and _content(record, {n: v for n, v in values.items() if n != k})]
+    if any(key in said for key in fitting):
+        return f"[{prefix[:-1]}] {said}" if prefix else said
+    named = [f"{prefix}{key} is {_shown(values[key])}" for key in fitting[:3]]
+    return f"{' or '.join(named) or prefix[:-1] or 'top level'}: {said}"
+
+
+def _content(record: Any, values: dict[str, Any]) -> bool:
+    try:
+        record(**values)
+    except (ValueError, TypeError, ArithmeticError):
+        return False
+    return True
 
 
 def _check_range(field: dataclasses.Field[Any], value: Any, where: str, key: str) -> None:
-    """Infinity only where a field expects it; seeds as random generators take them."""
-    if field.name == "seed" and isinstance(value, int) and value < 0:
-        raise ConfigError(f"{where}: {key} is {value}, need 0 or more")
-    if _holds_infinity(value) and field.default != math.inf and not field.metadata.get("may_be_inf"):
-        raise ConfigError(f"{where}: {key} is {value}, need a finite number")
+    """Numbers finite and at most 1e9 in size; lists and names not empty, but where the default is; see :func:`load`."""
+    told, empty = field.metadata, field.default in ("", ()) or _made(field) == ()
+    if (value in ((), "") and not empty) or (isinstance(value, Path) and not value.name):
+        raise ConfigError(f"{where}: {key} is empty, need {'entries' if value == () else 'a name'}")
+    largest = _MOST if field.name == "seed" else told.get("most", _LARGE)
+    for number in _numbers(value):
+        if number == math.inf and (told.get("may_be_inf") or field.default == math.inf):
+            continue
+        if math.isinf(number):
+            raise ConfigError(f"{where}: {key} is {number}, need a finite number")
+        if abs(number) > largest:
+            raise ConfigError(f"{where}: {key} is {_shown(number)}, need at most {largest:g} in magnitude")
 
 
-def _holds_infinity(value: Any) -> bool:
+def _check_sign(field: dataclasses.Field[Any], value: Any, where: str, key: str) -> None:
+    """A number on the side of 0 that its field says."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        told = field.metadata
+        if value < 0 and not told.get("signed", field.name.endswith(_EITHER_SIGN)):
+            raise ConfigError(f"{where}: {key} is {value}, need 0 or more")
+        if "above" in told and value <= told["above"]:
+            raise ConfigError(f"{where}: {key} is {value}, need more than {told['above']}")
+
+
+def _made(field: dataclasses.Field[Any]) -> Any:
+    return None if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+def _numbers(value: Any) -> Iterator[int | float]:
+    """Numbers in a value or in the lists of a value."""
     if isinstance(value, tuple):
-        return any(map(_holds_infinity, value))
-    return isinstance(value, float) and math.isinf(value)
+        for part in value:
+            yield from _numbers(part)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
 
 
 def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
@@ -185,9 +241,9 @@ def _convert_tuple(value: Any, options: tuple[Any, ...], where: str, key: str) -
 
 
 def _convert_scalar(value: Any, hint: Any, where: str, key: str) -> Any:
+    if isinstance(value, str) and hint in (str, Path) and not _WORDS.fullmatch(value):
+        raise ConfigError(f"{where}: {key} is {_shown(value)}, need text without control characters")
     if hint is Path and isinstance(value, str):
-        if "\0" in value:
-            raise ConfigError(f"{where}: {key} is {_shown(value)}, need the name of a file")
         return Path(value)
     if isinstance(value, int) and not -_MOST <= value <= _MOST:
         raise ConfigError(f"{where}: {key} is {_shown(value)}, need at most {_MOST:g} in magnitude")

@@ -1,7 +1,7 @@
 """The sensor: continuous pixel pitch, photon and read noise, full well, quantisation (paper Sec. 3.1)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ class Sensor:
 
     pitch_um: float = 3.0
     base_pitch_um: float = 3.0
-    exposure_e: float = 4000.0
+    exposure_e: float = field(default=4000.0, metadata={"above": 0})
     ambient_e: float = 0.0
     full_well_e: float = 8000.0
     read_noise_e: float = 3.0

@@ -1,7 +1,7 @@
 """Etch and exposure bias: what is drawn is not what is made; draw so that the designed pillar is made."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ class Bias:
     table_nm: tuple[tuple[float, float], ...] = ()
     curve_nm: tuple[float, ...] = ()
     csv: Path | None = None
-    isolated_nm: float = 0.0
+    isolated_nm: float = field(default=0.0, metadata={"signed": True})
     range_um: float = 1.0
 
     def __post_init__(self) -> None:

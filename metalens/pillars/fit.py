@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -33,9 +33,9 @@ class Wanted:
     within_um: (least, largest) diameter to consider; all entries without it.
     """
 
-    phase_tolerance_rad: float = 1e-3
-    transmission_tolerance: float = 1e-3
-    coefficients: int = 24
+    phase_tolerance_rad: float = field(default=1e-3, metadata={"above": 0})
+    transmission_tolerance: float = field(default=1e-3, metadata={"above": 0})
+    coefficients: int = field(default=24, metadata={"above": 0})
     least_transmission: float = 0.7
     least_half_width_um: float = 0.005
     within_um: tuple[float, float] | None = None

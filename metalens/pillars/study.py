@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,11 +39,11 @@ class Study:
     heights_um: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     wavelengths_um: tuple[float, ...] = (0.85, 0.94)
     pillar: Material = PLAIN
-    min_diameter_um: float = 0.08
+    min_diameter_um: float = field(default=0.08, metadata={"above": 0})
     min_gap_um: float = 0.06
     least_transmission: float = 0.8
     least_half_width_um: float = 0.005
-    tolerance: float = 3e-3
+    tolerance: float = field(default=3e-3, metadata={"above": 0})
     others: tuple[str, ...] = ("a-Si",)
 
     def __post_init__(self) -> None:

@@ -60,7 +60,7 @@ class Fisher:
     iterations: int = 800
     starts: int = 3
     zones: tuple[int, ...] = (0,)
-    spread_rad: float = 3.0
+    spread_rad: float = field(default=3.0, metadata={"signed": False})
     even: float = 0.1
     normalisation: Literal["sum", "l2"] = "l2"
     seed: int = 0

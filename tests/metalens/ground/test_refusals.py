@@ -1,6 +1,7 @@
 """What is damaged, endless or foreign is refused by type, before memory is taken; what nobody foresaw is one line."""
 
 import math
+import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,7 +41,11 @@ class Record:
         ("seed = -4", "seed is -4, need 0 or more"),
         ("[inner]\nlevel = -inf", "inner.level is -inf, need a finite number"),
         ("[inner]\nlevel = nan", "inner.level is nan"),
-        ('file = "a\\u0000b"', "file is 'a\\x00b', need the name of a file"),
+        ('file = "a\\u0000b"', "file is 'a\\x00b', need text without control characters"),
+        ('name = "a\\u001b[2J"', "name is 'a\\x1b[2J', need text without control characters"),
+        ('file = ""', "file is empty, need a name"),
+        ("[inner]\nlevel = 1e20", "inner.level is 1e+20, need at most 1e+09"),
+        ("[inner]\nlevel = -0.5", "inner.level is -0.5, need 0 or more"),
         ("name = " + "{a = " * 60 + "1" + "}" * 60, "name is {'a': "),
     ],
 )
@@ -60,7 +65,7 @@ def test_a_byte_order_mark_and_infinity_where_it_means_something_are_accepted(tm
 
 def test_any_text_survives_dumps():
     record = Record(name="".join(map(chr, range(0x20))) + 'ä"\\\x7f')
-    assert config.loads(config.dumps(record), Record) == record
+    assert tomllib.loads(config.dumps(record))["name"] == record.name
 
 
 def test_a_name_that_no_file_can_have_is_refused():
