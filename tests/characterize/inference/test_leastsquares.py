@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from characterize.inference.leastsquares import Data, Settings, fit
+from characterize.inference.leastsquares import Data, Prior, Settings, fit, invert
 
 
 @pytest.mark.parametrize("huber", [6.0, 2.6])
@@ -29,3 +29,59 @@ def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
     # scipy halves the square; the light's own noise, 170 / 1e12 of a variance, is left out
     want = 2 * special.huber(huber, left).sum() + 2 * np.log(sigma) * (usable & ~saturated).sum()
     assert found.merit == pytest.approx(want, rel=1e-9)
+
+
+def test_the_variance_of_a_pixel_has_three_parts():
+    """Floor + light over its scale + (share of the light)²; darkness below zero has no shot noise."""
+    image = np.array([[[57.0, -8.0], [0.0, 1300.0]]])
+    floor, scale = np.array([[[3.1, 4.7], [2.2, 9.3]]]), np.array([[[1.7, 0.6], [1.1, 2.3]]])
+    data = Data(image, image > 0, image < 0, floor, scale, 0.03)
+    want = [[[3.1 + 57 / 1.7 + (0.03 * 57) ** 2, 4.7], [2.2, 9.3 + 1300 / 2.3 + 39.0**2]]]
+    assert data.variance(image) == pytest.approx(np.array(want), rel=1e-12)
+
+
+def test_some_frames_keep_what_belongs_to_them():
+    stack = np.arange(24.0).reshape(3, 2, 4)
+    data = Data(stack, stack > 5, stack > 20, stack + 0.3, stack + 0.7, 0.02)
+    part = data.planes(np.array([0, 2]))
+    assert part.model_error == 0.02
+    for name, want in (
+        ("electrons", stack),
+        ("usable", stack > 5),
+        ("saturated", stack > 20),
+        ("variance_e2", stack + 0.3),
+        ("scale", stack + 0.7),
+    ):
+        assert np.array_equal(getattr(part, name), want[[0, 2]])
+
+
+def test_a_straight_model_has_the_covariance_of_normal_equations():
+    """Two amplitudes, one with a prior, pixels of unlike noise: information, covariance, estimate and chi² in numpy."""
+    rng = np.random.default_rng(8)
+    shapes, sigma = rng.uniform(0.3, 1.6, (2, 3, 6, 5)), rng.uniform(1.2, 4.1, (3, 6, 5))
+    usable = rng.uniform(size=sigma.shape) > 0.1
+    image = 31.0 * shapes[0] + 17.0 * shapes[1] + sigma * rng.standard_normal(sigma.shape)
+    data = Data(image, usable, np.zeros_like(usable), sigma**2, np.full(sigma.shape, 1e15))
+    wide = np.full(2, np.inf)
+    prior = Prior(np.array([0.0, 14.0]), np.array([np.inf, 0.21]), -wide, wide)
+
+    def model(x, slopes):
+        return np.tensordot(x, shapes, 1), shapes if slopes else None
+
+    found = fit(model, data, np.array([20.0, 20.0]), prior=prior, settings=Settings(step_tolerance=1e-6))
+    columns = (shapes / sigma * usable).reshape(2, -1)
+    told, information = np.diag([0.0, 0.21**-2]), columns @ columns.T
+    covariance = np.linalg.inv(information + told)
+    value = covariance @ (columns @ (image / sigma).ravel() + told @ [0.0, 14.0])
+    left = (image - np.tensordot(value, shapes, 1)) / sigma * usable
+    assert found.information == pytest.approx(information, rel=1e-9)
+    assert found.covariance == pytest.approx(covariance, rel=1e-9)
+    assert found.value == pytest.approx(value, rel=1e-7)  # it stops when a step moves 1e-6 sigma
+    assert found.residual_sigma == pytest.approx(left, abs=1e-5)
+    assert found.chi2_per_dof == pytest.approx((left**2).sum() / (usable.sum() - 2), rel=1e-7)
+
+
+def test_parameters_of_unlike_units_are_inverted_alike():
+    matrix = np.array([[3.0, 0.8, -0.1], [0.8, 2.0, 0.3], [-0.1, 0.3, 1.4]])
+    units = np.array([1e-7, 3.0, 4e8])
+    assert invert(matrix / np.outer(units, units)) / np.outer(units, units) == pytest.approx(np.linalg.inv(matrix))

@@ -1,0 +1,148 @@
+"""What a fit leaves open, on models that are sums of given images: every number has a formula."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference import explore, posterior, residual
+from characterize.inference.leastsquares import Data, Prior
+from characterize.model import MODES, PLACE, prior_rad
+from characterize.model.forward import Setting
+from characterize.model.parameters import NAMES
+
+REACH = 1.959964
+NAMED = ("bias_nm", "height_nm", "background_e")
+RNG = np.random.default_rng(11)
+DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])  # not in order
+START = np.zeros(len(NAMES))
+
+
+class Straight:
+    """A lens whose frames are ``bright`` plus a picture for each parameter; ``only`` takes some frames."""
+
+    def __init__(self, bright, pictures, depth=DEPTH):
+        self.bright, self.pictures = bright, pictures
+        self.setting = Setting(depth, np.zeros((len(depth), 2)), np.ones(len(depth)), 1.7, *bright.shape[1:])
+        self.groups = [SimpleNamespace(index=np.arange(len(depth)))]
+
+    def only(self, index):
+        return Straight(self.bright[index], self.pictures[:, index], self.setting.depth_um[index])
+
+    def images(self, x, names=None):
+        values = [x[PLACE[name]] for name in NAMED]
+        image = self.bright + np.tensordot(values, self.pictures, 1)
+        return image, None if names is None else np.stack([self.pictures[NAMED.index(n)] for n in names])
+
+
+def task(model, data=None, names=NAMED):
+    wide = np.full(len(names), np.inf)
+    prior = Prior(np.zeros(len(names)), wide, -wide, wide)
+    return SimpleNamespace(model=model, data=data, names=names, prior=prior, start=START)
+
+
+def valley(sigma, rho, least):
+    covariance = np.array([[1, rho], [rho, 1]]) * np.outer(sigma, sigma)
+    return SimpleNamespace(sigma=np.array(sigma), covariance=covariance, least=least)
+
+
+def test_a_mode_is_as_probable_as_its_depth_and_its_volume():
+    """Laplace: exp(-misfit / 2) sqrt(det covariance)."""
+    first, second = valley((0.7, 2.1), 0.6, 10.3), valley((1.9, 0.4), -0.3, 11.7)
+    ratio = np.exp(1.4 / 2) * np.sqrt(np.linalg.det(first.covariance) / np.linalg.det(second.covariance))
+    assert posterior.shares([first, second]) == pytest.approx([ratio / (1 + ratio), 1 / (1 + ratio)], rel=1e-12)
+
+
+def test_draws_give_the_correlation_and_intervals_the_sigma():
+    drawn = RNG.multivariate_normal([3.0, -1.0], [[4.0, -1.2], [-1.2, 0.9]], 70)
+    rho = np.corrcoef(drawn.T)[0, 1]
+    got = explore._covariance(drawn, valley((0.7, 2.1), 0.6, 0.0), np.array([0.31, 5.3]))
+    mixed = 0.8 * rho + 0.2 * 0.6
+    assert got == pytest.approx(np.array([[0.31**2, 0.31 * 5.3 * mixed], [0.31 * 5.3 * mixed, 5.3**2]]), rel=1e-6)
+
+
+def test_a_second_valley_widens_the_intervals_by_what_its_misfit_leaves():
+    """chi² of 1.44 a degree widens all; a mode 1.7 above the best reaches 1 - 1.7 / (1.96² 1.44) of its own, rooted."""
+    best = SimpleNamespace(value=np.array([1.0, 2.0]), merit=50.0, chi2_per_dof=1.44)
+    other = SimpleNamespace(value=np.array([1.6, -9.0]), merit=51.7, chi2_per_dof=1.44)
+    valleys = [valley((0.7, 2.1), 0.6, 0.0), valley((0.9, 0.5), 0.2, 30.0)]
+    found = explore._joined(SimpleNamespace(names=("bias_nm", "background_e")), [best, other], valleys, {})
+    wide = REACH * 1.2 * np.array([0.7, 2.1])
+    reach = np.sqrt(1 - 1.7 / (REACH**2 * 1.44)) * REACH * 1.2 * np.array([0.9, 0.5])
+    assert found.low == pytest.approx(np.minimum(best.value - wide, other.value - reach), rel=1e-12)
+    assert found.high == pytest.approx(np.maximum(best.value + wide, other.value + reach), rel=1e-12)
+    assert found.covariance == pytest.approx(1.44 * valleys[0].covariance, rel=1e-12)
+    profile = posterior.Profile(-0.4, 3.1, np.zeros(1), np.zeros(1), parabolic=True)
+    found = explore._joined(
+        SimpleNamespace(names=("bias_nm", "background_e")), [best], valleys[:1], {"bias_nm": profile}
+    )
+    assert (found.low[0], found.high[0]) == (-0.4, 3.1)
+    assert found.low[1] == pytest.approx(2.0 - wide[1])
+    assert not len(found.draws)
+
+
+def test_predicted_error_is_the_sine_between_the_images():
+    """A share a of a picture at right angles turns the image by atan(a q): its rms sine; the background is left out."""
+    bright = np.zeros((5, 6, 7))
+    bright[:, 1:3, 1:6] = 3.3
+    picture = np.zeros((3, 5, 6, 7))
+    picture[0, :, 4, 2:4] = 1.9
+    picture[2] = 0.8
+    drawn = RNG.normal(0, 1.3, (24, 3))
+    drawn[:, 1] = 0
+    found = SimpleNamespace(draws=drawn, best=SimpleNamespace(value=np.array([0.0, 0.0, 5.0])))
+    q2 = (picture[0] ** 2).sum() / (bright**2).sum()
+    want = np.sqrt(np.mean(drawn[:, 0] ** 2 * q2 / (1 + drawn[:, 0] ** 2 * q2)))
+    assert explore.predicted_error(task(Straight(bright, picture)), found) == pytest.approx((want, want), rel=1e-9)
+
+
+def test_frames_in_between_lie_half_way_in_inverse_depth():
+    model = Straight(np.ones((5, 2, 2)), np.ones((3, 5, 2, 2)))
+    got = explore.between(model).setting.depth_um
+    rising = np.sort(DEPTH)
+    middle = 2 / (1 / rising[1:] + 1 / rising[:-1])
+    want = dict(zip(rising, [*middle, middle[-1]], strict=True))
+    assert got == pytest.approx([want[d] for d in DEPTH], rel=1e-12)
+
+
+def test_frames_left_out_are_judged_with_what_the_others_know():
+    """Each half of the depths, in order of depth, predicts the other: residual² over noise + J C Jᵀ, in numpy."""
+    bright, pictures = RNG.uniform(2, 9, (5, 4, 3)), RNG.standard_normal((3, 5, 4, 3))
+    sigma = 0.83
+    frames = bright + np.tensordot([0.4, -0.9, 1.1], pictures, 1) + sigma * RNG.standard_normal(bright.shape)
+    everywhere = np.ones(bright.shape, bool)
+    data = Data(frames, everywhere, ~everywhere, np.full(bright.shape, sigma**2), np.full(bright.shape, 1e15))
+    model = Straight(bright, pictures)
+    got = explore.left_out(task(model, data), SimpleNamespace(value=np.array([0.4, -0.9, 1.1])))
+    order, total = np.argsort(DEPTH), 0.0
+    for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
+        a, b = (pictures[:, part].reshape(3, -1).T for part in (seen, hidden))
+        covariance = sigma**2 * np.linalg.inv(a.T @ a)
+        value = np.linalg.lstsq(a, (frames - bright)[seen].ravel(), rcond=None)[0]
+        variance = sigma**2 + np.einsum("ni,ij,nj->n", b, covariance, b)
+        total += (((frames - bright)[hidden].ravel() - b @ value) ** 2 / variance).sum()
+    assert got == pytest.approx(total / bright.size, rel=1e-4)  # a descent ends within 0.02 of the misfit
+    assert np.isnan(explore.left_out(task(model.only(np.arange(3)), data.planes(np.arange(3))), None))
+
+
+def test_modes_of_a_phase_that_nobody_knows_take_information_away():
+    """What is left of the information is the inverse of the covariance's own block (Schur)."""
+    p = 3
+    root = RNG.standard_normal((p + MODES, p + MODES + 4))
+    information = root @ root.T
+    joint = information + np.diag([0.0] * p + list(prior_rad() ** -2.0))
+    want = np.linalg.inv(np.linalg.inv(joint)[:p, :p])
+    assert residual._without_modes(information, p) == pytest.approx(want, rel=1e-6)
+
+
+def test_misfit_of_hidden_frames_is_capped_at_six_sigma():
+    image = np.full((1, 2, 3), 40.0)
+    data = Data(
+        image + np.array([[[1.0, -3.0, 80.0], [5.0, 7.0, 9.0]]]),
+        np.array([[[True, True, True], [True, False, True]]]),
+        np.array([[[False, False, False], [True, False, False]]]),
+        np.full(image.shape, 2.3),
+        np.full(image.shape, 1.6),
+    )
+    got = residual._misfit(lambda x, jacobian: (image, None), data, np.zeros(1))
+    assert got == pytest.approx((1 + 9 + 81) / (2.3 + 40 / 1.6) + 36, rel=1e-12)
