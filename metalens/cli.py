@@ -68,6 +68,13 @@ OBJECTIVES = {"scenes": "codesign.evaluate.scenes"}
 OBJECTIVES["process"] = "layout.process.limits"
 # source of ``metalens psf`` by kind of file: module with its ``stack(path, view, tolerance)``
 PSF_SOURCES = {"asbuilt": "characterize.commands.psf"}
+# what ``metalens view`` shows of a kind: "module:function" with its panels
+VIEWS = {
+    "mask": "layout.commands.view:panels",
+    "capture": "characterize.commands.view:capture",
+    "asbuilt": "characterize.commands.view:asbuilt",
+    "run": "codesign.commands.view:panels",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -184,6 +191,8 @@ def _dispatch(verb: str, words: list[str]) -> int:
         module.OBJECTIVES.update(OBJECTIVES)
     if verb == "psf":
         module.SOURCES.update(PSF_SOURCES)
+    if verb == "view":
+        module.VIEWS.update(VIEWS)
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
     return int(module.run(options))
 

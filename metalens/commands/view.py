@@ -8,11 +8,18 @@ from pathlib import Path
 import tyro
 
 from metalens.commands.common import Common, MaybeOutput
-from metalens.ground import store
+from metalens.ground import manifest, store
 from metalens.ground.errors import ConfigError
 from metalens.view import Panel, write
 
 VIEWS: dict[str, str] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
+MASKS = (".oas", ".oasis", ".gds", ".gdsii")
+# what tells the kind of a folder: names of files in it, any of them
+FOLDERS = {
+    "mask": tuple(f"*{end}" for end in MASKS),
+    "run": ("log.jsonl", "checkpoint.safetensors"),
+    "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
+}
 OWN = {"library": "library_panels", "lens": "lens_panels", "psf": "psf_panels"}
 
 
@@ -21,7 +28,8 @@ class Options(Common):
     """Options of ``metalens view``.
 
     Attributes:
-        file: an artefact: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain.
+        file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain; a mask (GDSII or OASIS);
+            or the folder of a mask, of captures, or of a co-design run.
         output: the page to write; by default the file's name with .html, beside it.
     """
 
@@ -31,13 +39,11 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Write the page; exit 0."""
-    if options.file.is_dir():
-        raise ConfigError(f"{options.file} is a folder; give one of its files")
-    target = options.output or options.file.with_suffix(".html")
+    target = options.output or options.file.with_name(options.file.name.removesuffix(".h5") + ".html")
     with options.claim(target) as draft:
-        kind, about = head(options.file)
+        kind = kind_of(options.file)
         panels = panels_of(kind)(options.file)
-        write(draft.path, f"{options.file.name} ({kind})", panels, about=about)
+        write(draft.path, f"{options.file.name} ({kind})", panels, about=_about(options.file))
     size = target.stat().st_size
     options.console.result(
         {"page": target.name, "panels": len(panels), "bytes": size},
@@ -46,11 +52,31 @@ def run(options: Options) -> int:
     return 0
 
 
-def head(path: Path) -> tuple[str, dict[str, object]]:
-    """Kind of a file, and where it comes from."""
-    stored = store.load(path)
-    made = stored.provenance
-    return stored.kind, {
+def kind_of(path: Path) -> str:
+    """What an artefact is: a kind of HDF5 file, ``mask``, ``run`` or ``capture``.
+
+    Raises:
+        ConfigError: a folder of none of these kinds; what can be shown of it is named. StoreError: no artefact.
+    """
+    if path.is_dir():
+        for kind, names in FOLDERS.items():
+            if any(True for name in names for _ in path.glob(name)):
+                return kind
+        inside = [p.relative_to(path).as_posix() for p in sorted(path.rglob("*")) if p.suffix in (".h5", *MASKS)]
+        raise ConfigError(
+            f"{path} is no folder of a mask, of captures or of a run"
+            + (f"; give one of {', '.join(inside[:9])}" if inside else "; give a file")
+        )
+    return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
+
+
+def _about(path: Path) -> dict[str, object]:
+    """Where an artefact comes from."""
+    if path.is_dir() or path.suffix != ".h5":
+        found = manifest.read(path if path.is_dir() else path.parent) or {}
+        return {name: found[name] for name in found if name != "files"}
+    made = store.load(path).provenance
+    return {
         "made with": ", ".join(f"{k} {v}" for k, v in made.versions.items()),
         "from": {name: digest for name, digest in made.inputs.items()},
         "settings": made.config,

@@ -14,9 +14,9 @@ import numpy as np
 from metalens import __version__
 from metalens.ground import store
 from metalens.ground.arrays import Array
-from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel
+from metalens.view.panels import Axis, Classes, Curves, Drawing, Images, Numbers, Outline, Panel
 
-DTYPES = {"float32": "Float32Array", "uint8": "Uint8Array", "uint16": "Uint16Array"}
+DTYPES = {"float32": "Float32Array", "int32": "Int32Array", "uint8": "Uint8Array", "uint16": "Uint16Array"}
 
 
 def write(path: str | Path, title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None) -> None:
@@ -83,7 +83,26 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "columns": {name: [_number(v) for v in column] for name, column in panel.columns.items()},
             "marks": [list(mark) for mark in panel.marks],
         }
+    if isinstance(panel, Drawing):
+        return shared | {
+            "outlines": [_outline(outline) for outline in panel.outlines],
+            "unit": panel.unit_um,
+            "marks": [list(mark) for mark in panel.marks],
+        }
     return shared | _table(panel)
+
+
+def _outline(outline: Outline) -> dict[str, Any]:
+    """Places by rising y, then x, as steps: those of a lattice repeat and deflate to a fraction of a byte."""
+    places = outline.places[np.lexsort((outline.places[:, 0], outline.places[:, 1]))]
+    steps = np.diff(places, axis=0, prepend=np.zeros((1, 2), places.dtype))
+    return {
+        "layer": outline.layer,
+        "corners": packed(np.asarray(outline.corners, np.float32)),
+        "dx": packed(np.asarray(steps[:, 0], np.int32)),
+        "dy": packed(np.asarray(steps[:, 1], np.int32)),
+        "notes": {name: _number(value) for name, value in outline.notes.items()},
+    }
 
 
 def _table(panel: Numbers) -> dict[str, Any]:

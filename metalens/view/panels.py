@@ -96,7 +96,35 @@ class Numbers:
     caption: str = ""
 
 
-Panel = Images | Curves | Classes | Numbers
+@dataclass(frozen=True, eq=False, slots=True)
+class Outline:
+    """Copies of one polygon, nothing left out.
+
+    layer: name of the layer it is drawn on. corners: (n, 2), places: (m, 2) int32, both in the drawing's unit.
+    notes: shown where the pointer is (cell, size, dose).
+    """
+
+    layer: str
+    corners: Array
+    places: Array
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Drawing:
+    """Polygons on layers that can be turned on and off; far away the covered part of a pixel is shown.
+
+    unit_um: of corners and places. marks: (x_um, y_um, text) places with something to say (broken rules).
+    """
+
+    title: str
+    outlines: Sequence[Outline]
+    unit_um: float
+    caption: str = ""
+    marks: Sequence[tuple[float, float, str]] = ()
+
+
+Panel = Images | Curves | Classes | Drawing | Numbers
 
 
 def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:

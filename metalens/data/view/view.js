@@ -1,6 +1,6 @@
 "use strict";
 // Arrays come deflated in base 64; the browser inflates them. Nothing is fetched from anywhere.
-const KINDS = { Float32Array, Uint8Array, Uint16Array };
+const KINDS = { Float32Array, Int32Array, Uint8Array, Uint16Array };
 async function unpacked(p) {
   const bytes = Uint8Array.from(atob(p.data), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -175,31 +175,67 @@ function pyramid(index, sizes, ny, nx) {
   }
   return levels;
 }
+// A plane to move about on: drag, wheel, keys, buttons. box: {w, h} of the whole in its own lengths, y down, from 0.
+// paint(c, view) draws what view = {scale, cx, cy, W, H} shows (scale: pixels a length); tell(x, y, scale) says what lies there.
+function board(panel, section, box, um, closeup, paint, tell) {
+  const controls = element("div", section, { class: "controls" });
+  const canvas = element("canvas", section, { class: "map", tabindex: 0, role: "img", "aria-label": `${panel.title}; arrow keys move, plus and minus zoom, 0 shows all` });
+  const readout = element("p", section, { class: "readout", "aria-live": "polite" });
+  const view = { scale: 1, cx: box.w / 2, cy: box.h / 2, W: 1, H: 1 };
+  let fit = 1, queued = false;
+  function sized() {
+    const ratio = devicePixelRatio || 1;
+    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+    view.W = canvas.width; view.H = canvas.height;
+    fit = Math.min(view.W / box.w, view.H / box.h) * 0.98;
+  }
+  const whole = () => { sized(); Object.assign(view, { scale: fit, cx: box.w / 2, cy: box.h / 2 }); later(); };
+  function draw() {
+    queued = false;
+    const c = canvas.getContext("2d");
+    c.fillStyle = "#fff"; c.fillRect(0, 0, view.W, view.H);
+    paint(c, view);
+    const wanted = 120 / view.scale * um, power = 10 ** Math.floor(Math.log10(wanted)), length = [5, 2, 1].map((m) => m * power).find((v) => v <= wanted) || power, px = length / um * view.scale;
+    c.fillStyle = "#fff"; c.fillRect(8, view.H - 44, px + 16, 36); c.fillStyle = "#111"; c.fillRect(16, view.H - 18, px, 4);
+    c.font = `${13 * (devicePixelRatio || 1)}px system-ui`; c.fillText(`${text(length)} µm`, 16, view.H - 24);
+  }
+  const later = () => { if (!queued) { queued = true; requestAnimationFrame(draw); } };
+  const zoom = (factor) => { view.scale = Math.max(fit / 2, Math.min(6 * closeup, view.scale * factor)); later(); };
+  let drag = null;
+  canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
+  canvas.addEventListener("pointerup", () => { drag = null; });
+  canvas.addEventListener("pointermove", (e) => {
+    const r = canvas.getBoundingClientRect(), ratio = canvas.width / r.width;
+    if (drag) { view.cx -= (e.clientX - drag[0]) * ratio / view.scale; view.cy -= (e.clientY - drag[1]) * ratio / view.scale; drag = [e.clientX, e.clientY]; later(); }
+    readout.textContent = tell(view.cx + ((e.clientX - r.left) * ratio - view.W / 2) / view.scale, view.cy + ((e.clientY - r.top) * ratio - view.H / 2) / view.scale, view.scale);
+  });
+  canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(2 ** (-e.deltaY / 300)); }, { passive: false });
+  canvas.addEventListener("keydown", (e) => {
+    const step = view.W / 8 / view.scale, move = { ArrowUp: [0, -step], ArrowDown: [0, step], ArrowLeft: [-step, 0], ArrowRight: [step, 0] }[e.key];
+    if (move) { view.cx += move[0]; view.cy += move[1]; later(); } else if (e.key === "+") zoom(1.5); else if (e.key === "-") zoom(1 / 1.5); else if (e.key === "0") whole(); else return;
+    readout.textContent = tell(view.cx, view.cy, view.scale);
+    e.preventDefault();
+  });
+  for (const [name, act] of [["zoom in", () => zoom(2)], ["zoom out", () => zoom(0.5)], ["whole", whole], ["one pillar", () => { view.scale = closeup; later(); }]]) element("button", controls, { type: "button" }, name).addEventListener("click", act);
+  addEventListener("resize", () => { const keep = view.scale / fit; sized(); view.scale = keep * fit; later(); });
+  whole();
+  return { controls, later };
+}
+function markers(c, marks, place) {
+  c.strokeStyle = "#c0392b"; c.lineWidth = 2;
+  for (const [x, y] of marks) { const [px, py] = place(x, y); c.strokeRect(px - 5, py - 5, 10, 10); }
+}
 async function classes(panel, section) {
   const { values: index, shape: [ny, nx] } = await unpacked(panel.index), sizes = panel.sizes;
-  const controls = element("div", section, { class: "controls" });
-  const canvas = element("canvas", section, { class: "map", tabindex: 0, role: "img", "aria-label": `${panel.title}: ${nx} by ${ny} sites; arrow keys move, plus and minus zoom, 0 shows all` });
-  const readout = element("p", section, { class: "readout", "aria-live": "polite" });
   const levels = pyramid(index, sizes, ny, nx), table = TABLE(CIVIDIS);
   let low = Infinity, high = -Infinity;
   for (const v of sizes) { low = Math.min(low, v); high = Math.max(high, v); }
   const shade = (v) => table[Math.max(0, Math.min(255, Math.round(255 * (v - low) / (high - low || 1))))];
-  let scale = 1, cx = nx / 2, cy = ny / 2, fit = 1, queued = false; // pixels a site; site at the middle of the canvas
-  function sized() {
-    const ratio = devicePixelRatio || 1;
-    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
-    fit = Math.min(canvas.width / nx, canvas.height / ny) * 0.98;
+  function paint(c, v) {
+    (v.scale >= 6 ? near : far)(c, v);
+    markers(c, panel.marks, (x, y) => [(x / panel.pitch + nx / 2 - v.cx) * v.scale + v.W / 2, (y / panel.pitch + ny / 2 - v.cy) * v.scale + v.H / 2]);
   }
-  const whole = () => { sized(); scale = fit; cx = nx / 2; cy = ny / 2; later(); };
-  function draw() {
-    queued = false;
-    const c = canvas.getContext("2d"), W = canvas.width, H = canvas.height;
-    c.fillStyle = "#fff"; c.fillRect(0, 0, W, H);
-    if (scale >= 6) near(c, W, H); else far(c, W, H);
-    for (const [x, y, what] of panel.marks) { const [px, py] = [(x / panel.pitch + nx / 2 - cx) * scale + W / 2, (y / panel.pitch + ny / 2 - cy) * scale + H / 2]; c.strokeStyle = "#c0392b"; c.lineWidth = 2; c.strokeRect(px - 5, py - 5, 10, 10); }
-    bar(c, H);
-  }
-  function near(c, W, H) {
+  function near(c, { scale, cx, cy, W, H }) {
     const i0 = Math.max(0, Math.floor(cy - H / 2 / scale)), i1 = Math.min(ny, Math.ceil(cy + H / 2 / scale)), k0 = Math.max(0, Math.floor(cx - W / 2 / scale)), k1 = Math.min(nx, Math.ceil(cx + W / 2 / scale));
     for (let i = i0; i < i1; i++) for (let k = k0; k < k1; k++) {
       const one = index[i * nx + k];
@@ -209,7 +245,7 @@ async function classes(panel, section) {
       c.beginPath(); c.arc((k + 0.5 - cx) * scale + W / 2, (i + 0.5 - cy) * scale + H / 2, radius, 0, 7); c.fill();
     }
   }
-  function far(c, W, H) {
+  function far(c, { scale, cx, cy, W, H }) {
     const level = scale >= 1 || !levels.length ? null : levels[Math.min(levels.length - 1, Math.max(0, Math.ceil(Math.log2(1 / scale)) - 1))];
     const sites = level ? level.sites : 1, w = level ? level.w : nx, h = level ? level.h : ny, out = c.createImageData(W, H);
     for (let y = 0; y < H; y++) {
@@ -226,39 +262,119 @@ async function classes(panel, section) {
     }
     c.putImageData(out, 0, 0);
   }
-  function bar(c, H) {
-    const wanted = 120 / scale * panel.pitch, power = 10 ** Math.floor(Math.log10(wanted)), length = [5, 2, 1].map((m) => m * power).find((v) => v <= wanted) || power, px = length / panel.pitch * scale;
-    c.fillStyle = "#fff"; c.fillRect(8, H - 44, px + 16, 36); c.fillStyle = "#111"; c.fillRect(16, H - 18, px, 4);
-    c.font = `${13 * (devicePixelRatio || 1)}px system-ui`; c.fillText(`${text(length)} µm`, 16, H - 24);
-  }
-  const later = () => { if (!queued) { queued = true; requestAnimationFrame(draw); } };
-  const zoom = (factor) => { scale = Math.max(fit / 2, Math.min(400, scale * factor)); later(); };
-  function say(event) {
-    const r = canvas.getBoundingClientRect(), ratio = canvas.width / r.width;
-    const k = Math.floor(cx + ((event.clientX - r.left) * ratio - canvas.width / 2) / scale), i = Math.floor(cy + ((event.clientY - r.top) * ratio - canvas.height / 2) / scale);
-    if (i < 0 || k < 0 || i >= ny || k >= nx) { readout.textContent = ""; return; }
+  function tell(atX, atY, scale) {
+    const k = Math.floor(atX), i = Math.floor(atY);
+    if (i < 0 || k < 0 || i >= ny || k >= nx) return "";
     const one = index[i * nx + k], x = (k - (nx - 1) / 2) * panel.pitch, y = (i - (ny - 1) / 2) * panel.pitch;
     const more = one ? Object.entries(panel.columns).map(([name, column]) => `, ${name} ${text(column[one - 1])}`).join("") : "";
     const mark = panel.marks.find(([mx, my]) => Math.hypot(mx - x, my - y) < Math.max(panel.pitch, 6 / scale * panel.pitch));
-    readout.textContent = `row ${i}, column ${k} (x ${text(x)}, y ${text(y)} µm): ` + (one ? `${text(sizes[one - 1])} ${panel.unit}${more}` : "nothing here") + (mark ? `. ${mark[2]}` : "");
+    return `row ${i}, column ${k} (x ${text(x)}, y ${text(y)} µm): ` + (one ? `${text(sizes[one - 1])} ${panel.unit}${more}` : "nothing here") + (mark ? `. ${mark[2]}` : "");
   }
-  let drag = null;
-  canvas.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
-  canvas.addEventListener("pointerup", () => { drag = null; });
-  canvas.addEventListener("pointermove", (e) => { const ratio = canvas.width / canvas.clientWidth; if (drag) { cx -= (e.clientX - drag[0]) * ratio / scale; cy -= (e.clientY - drag[1]) * ratio / scale; drag = [e.clientX, e.clientY]; later(); } say(e); });
-  canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(2 ** (-e.deltaY / 300)); }, { passive: false });
-  canvas.addEventListener("keydown", (e) => {
-    const step = canvas.width / 8 / scale, move = { ArrowUp: [0, -step], ArrowDown: [0, step], ArrowLeft: [-step, 0], ArrowRight: [step, 0] }[e.key];
-    if (move) { cx += move[0]; cy += move[1]; later(); } else if (e.key === "+") zoom(1.5); else if (e.key === "-") zoom(1 / 1.5); else if (e.key === "0") whole(); else return;
-    e.preventDefault();
-  });
-  for (const [name, act] of [["zoom in", () => zoom(2)], ["zoom out", () => zoom(0.5)], ["whole", whole], ["one pillar", () => { scale = 80; later(); }]]) element("button", controls, { type: "button" }, name).addEventListener("click", act);
-  addEventListener("resize", () => { const keep = scale / fit; sized(); scale = keep * fit; later(); });
+  board(panel, section, { w: nx, h: ny }, panel.pitch, 80, paint, tell);
   tableOf(section, [`size / ${panel.unit}`, "sites", ...Object.keys(panel.columns)], () => { const n = new Float64Array(sizes.length + 1); for (const v of index) n[v]++; return sizes.map((v, i) => [v, n[i + 1], ...Object.values(panel.columns).map((c) => c[i])]).filter((row) => row[1]); }, "Sizes and how many sites have them");
-  whole();
 }
 
-const DRAW = { Images: images, Curves: curves, Classes: classes, Numbers: async (panel, section) => fill(element("div", section, { class: "scroll", tabindex: 0 }), panel.head, panel.rows) };
+// Places of each outline by rising y; its own box and area, so that far away it adds its area to a pixel.
+async function placed(outline) {
+  const corners = (await unpacked(outline.corners)).values, x = (await unpacked(outline.dx)).values, y = (await unpacked(outline.dy)).values;
+  for (let i = 1; i < x.length; i++) { x[i] += x[i - 1]; y[i] += y[i - 1]; }
+  const own = { left: Infinity, right: -Infinity, low: Infinity, high: -Infinity };
+  let area = 0;
+  for (let i = 0, n = corners.length; i < n; i += 2) {
+    own.left = Math.min(own.left, corners[i]); own.right = Math.max(own.right, corners[i]); own.low = Math.min(own.low, corners[i + 1]); own.high = Math.max(own.high, corners[i + 1]);
+    area += (corners[i] * corners[(i + 3) % n] - corners[(i + 2) % n] * corners[i + 1]) / 2;
+  }
+  let left = Infinity, right = -Infinity;
+  for (const v of x) { if (v < left) left = v; if (v > right) right = v; }
+  return { ...outline, corners, x, y, own, area: Math.abs(area), box: { left: left + own.left, right: right + own.right, low: y[0] + own.low, high: y[y.length - 1] + own.high } };
+}
+function firstAbove(sorted, value) {
+  let a = 0, b = sorted.length;
+  while (a < b) { const m = (a + b) >> 1; if (sorted[m] < value) a = m + 1; else b = m; }
+  return a;
+}
+async function drawing(panel, section) {
+  const outlines = (await Promise.all(panel.outlines.map(placed))).sort((a, b) => b.area - a.area), hidden = new Set();
+  const names = [...new Set(outlines.map((o) => o.layer))].sort();
+  const palette = names.map((_, i) => (names.length < 2 ? [0, 34, 78] : colour(CIVIDIS, (0.86 * i) / (names.length - 1)).map(Math.round)));
+  const left = Math.min(...outlines.map((o) => o.box.left)), top = Math.max(...outlines.map((o) => o.box.high));
+  const box = { w: Math.max(...outlines.map((o) => o.box.right)) - left, h: top - Math.min(...outlines.map((o) => o.box.low)) };
+  const shown = () => outlines.filter((o) => !hidden.has(o.layer));
+  function paint(c, v) {
+    const cover = new Float32Array(v.W * v.H * 4);
+    for (const o of shown()) {
+      const size = Math.max(o.own.right - o.own.left, o.own.high - o.own.low) * v.scale;
+      if (size < 2) spread(o, v, cover, palette[names.indexOf(o.layer)]);
+    }
+    blend(c, v, cover);
+    for (const o of shown()) if (Math.max(o.own.right - o.own.left, o.own.high - o.own.low) * v.scale >= 2) outlined(c, o, v, palette[names.indexOf(o.layer)]);
+    markers(c, panel.marks, (x, y) => [(x / panel.unit - left - v.cx) * v.scale + v.W / 2, (top - y / panel.unit - v.cy) * v.scale + v.H / 2]);
+  }
+  const inView = (o, v) => {
+    const high = top - (v.cy - v.H / 2 / v.scale), low = top - (v.cy + v.H / 2 / v.scale);
+    return [firstAbove(o.y, low - o.own.high), firstAbove(o.y, high - o.own.low)];
+  };
+  function spread(o, v, cover, rgb) {
+    const [a, b] = inView(o, v), share = o.area * v.scale * v.scale, mx = (o.own.left + o.own.right) / 2, my = (o.own.low + o.own.high) / 2;
+    for (let i = a; i < b; i++) { // shared among four pixels, so that a lattice gives no beat with theirs
+      const fx = (o.x[i] + mx - left - v.cx) * v.scale + v.W / 2 - 0.5, fy = (top - o.y[i] - my - v.cy) * v.scale + v.H / 2 - 0.5, px = Math.floor(fx), py = Math.floor(fy);
+      if (px < 0 || py < 0 || px >= v.W - 1 || py >= v.H - 1) continue;
+      const ux = fx - px, uy = fy - py;
+      for (const [step, part] of [[0, (1 - ux) * (1 - uy)], [1, ux * (1 - uy)], [v.W, (1 - ux) * uy], [v.W + 1, ux * uy]]) {
+        const at = 4 * (py * v.W + px + step), one = share * part;
+        cover[at] += one * rgb[0]; cover[at + 1] += one * rgb[1]; cover[at + 2] += one * rgb[2]; cover[at + 3] += one;
+      }
+    }
+  }
+  function blend(c, v, cover) {
+    const out = c.createImageData(v.W, v.H);
+    for (let i = 0; i < cover.length; i += 4) {
+      const share = cover[i + 3], part = Math.min(1, share);
+      for (let k = 0; k < 3; k++) out.data[i + k] = share ? 255 + part * (cover[i + k] / share - 255) : 255;
+      out.data[i + 3] = 255;
+    }
+    c.putImageData(out, 0, 0);
+  }
+  function outlined(c, o, v, rgb) {
+    const [a, b] = inView(o, v), lo = v.cx - v.W / 2 / v.scale + left - o.own.right, hi = v.cx + v.W / 2 / v.scale + left - o.own.left;
+    c.fillStyle = `rgba(${rgb.join()},${o.area > box.w * box.h / 50 ? 0.06 : 0.75})`; c.strokeStyle = `rgb(${rgb.join()})`; c.lineWidth = 1;
+    for (let i = a; i < b; i++) {
+      if (o.x[i] < lo || o.x[i] > hi) continue;
+      c.beginPath();
+      for (let k = 0; k < o.corners.length; k += 2) c.lineTo((o.x[i] + o.corners[k] - left - v.cx) * v.scale + v.W / 2, (top - o.y[i] - o.corners[k + 1] - v.cy) * v.scale + v.H / 2);
+      c.closePath(); c.fill(); c.stroke();
+    }
+  }
+  const inside = (p, x, y) => {
+    let odd = false;
+    for (let i = 0, j = p.length - 2; i < p.length; j = i, i += 2) if (p[i + 1] > y !== p[j + 1] > y && x < ((p[j] - p[i]) * (y - p[i + 1])) / (p[j + 1] - p[i + 1]) + p[i]) odd = !odd;
+    return odd;
+  };
+  function tell(atX, atY, scale) {
+    const x = atX + left, y = top - atY, found = [];
+    for (const o of shown()) for (let i = firstAbove(o.y, y - o.own.high); i < o.y.length && o.y[i] <= y - o.own.low; i++) {
+      if (x < o.x[i] + o.own.left || x > o.x[i] + o.own.right || !inside(o.corners, x - o.x[i], y - o.y[i])) continue;
+      found.push(`${o.layer}, ${Object.entries(o.notes).map(([name, v]) => `${name} ${text(v)}`).join(", ")}`);
+      break;
+    }
+    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx / panel.unit - x, my / panel.unit - y) < 8 / scale);
+    return `x ${(x * panel.unit).toFixed(3)}, y ${(y * panel.unit).toFixed(3)} µm: ` + (found.slice(0, 3).join("; ") || "nothing here") + (mark ? `. ${mark[2]}` : "");
+  }
+  const small = Math.min(...outlines.map((o) => Math.max(o.own.right - o.own.left, o.own.high - o.own.low)));
+  const { controls, later } = board(panel, section, box, panel.unit, 40 / small, paint, tell);
+  names.forEach((name) => {
+    const label = element("label", controls, { class: "tick" }), tick = element("input", label, { type: "checkbox" });
+    tick.checked = true;
+    element("span", label, {}, name);
+    tick.addEventListener("change", () => { if (tick.checked) hidden.delete(name); else hidden.add(name); later(); });
+  });
+  tableOf(section, ["layer", "copies", "area / µm²", ...new Set(outlines.flatMap((o) => Object.keys(o.notes)))], () => {
+    const notes = [...new Set(outlines.flatMap((o) => Object.keys(o.notes)))];
+    return outlines.map((o) => [o.layer, o.x.length, o.area * panel.unit ** 2, ...notes.map((name) => o.notes[name] ?? "")]);
+  }, "Shapes and how many copies they have");
+}
+
+const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Numbers: async (panel, section) => fill(element("div", section, { class: "scroll", tabindex: 0 }), panel.head, panel.rows) };
 (async () => {
   const data = JSON.parse(document.getElementById("data").textContent), main = document.getElementById("panels"), status = document.getElementById("status");
   for (const panel of data.panels) {

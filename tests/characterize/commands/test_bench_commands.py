@@ -67,6 +67,9 @@ def test_capture_then_fit(bench, capsys):
     assert abs(value - 3.0) < 4 * sigma
     assert asbuilt.load(bench / "as.h5").trusted
     assert (bench / "as.html").stat().st_size > 20000
+    for shown, title in (("shots", "Frames"), ("as.h5", "Captured less fitted")):
+        assert main(["view", str(bench / shown), "-o", str(bench / "page.html"), "--force", "--quiet"]) == 0
+        assert f'"title": "{title}"' in (bench / "page.html").read_text(encoding="utf-8")
 
 
 def test_bad_words_end_with_2_and_leave_nothing(bench):

@@ -1,0 +1,77 @@
+"""Panels of a capture (its frames) and of an as-built lens: frames, fit and residual; parameters; PSFs."""
+
+from pathlib import Path
+
+import numpy as np
+
+from characterize.captures import capture as captures
+from characterize.inference import AsBuilt
+from metalens.ground.arrays import Array
+from metalens.psf import PsfStack
+from metalens.view import Axis, Images, Numbers, Panel
+
+
+def capture(path: Path) -> list[Panel]:
+    """Every frame of a capture, in counts, and what was written down with it."""
+    read = captures.load(path)
+    frames = np.asarray(read.frames, float)
+    step = read.pixel_um if np.isfinite(read.pixel_um) else 1.0
+    rows = [
+        (name, *(round(float(v), 6) for v in (position, *np.degrees(angle), exposure)))
+        for name, position, angle, exposure in zip(
+            read.names, read.position_um, read.angle_rad, read.exposure_s, strict=True
+        )
+    ]
+    about = [("converter / bits", read.bits), ("pixel / um", read.pixel_um), ("wavelength / um", read.wavelength_um)]
+    about += [(key, str(value)) for key, value in sorted(read.about.items())]
+    about += [("put right", text) for text in read.corrections]
+    return [
+        Images("Frames", frames, [Axis("frame", list(read.names))], step, "counts"),
+        Numbers("Stage", ("frame", "position / um", "x angle / deg", "y angle / deg", "exposure / s"), rows),
+        Numbers("As captured", ("name", "value"), about),
+    ]
+
+
+def asbuilt(path: Path) -> list[Panel]:
+    """The lens as built: its parameters with intervals, frames beside fit and residual, and its PSFs."""
+    made = AsBuilt.load(path)
+    axis = [Axis("frame", [_said(d, a) for d, a in zip(made.depth_um, made.angle_rad, strict=True)])]
+    peak = float(made.measured.max())
+    panels: list[Panel] = [
+        Numbers(
+            "Parameters",
+            ("parameter", "value", "95 % from", "to"),
+            [(name, float(v), *made.interval(name)) for name, v in zip(made.names, made.value, strict=True)],
+        ),
+        Images("Frames as captured", made.measured / peak, axis, made.pixel_um, "of the brightest pixel"),
+        Images("Frames as fitted", made.predicted / peak, axis, made.pixel_um, "of the brightest pixel captured"),
+        Images("Captured less fitted", made.residual_sigma, axis, made.pixel_um, "sigma", signed=True),
+        Numbers("What is known", ("", "in words"), _words(made)),
+    ]
+    if made.psf is not None:
+        panels.append(_psf(made.psf))
+    return panels
+
+
+def _psf(stack: PsfStack) -> Panel:
+    values = np.asarray(stack.intensity)
+    axes = [
+        Axis("field angle", [_said(None, pair) for pair in stack.angles_rad]),
+        Axis("depth", (1e-3 * stack.depths_um).tolist(), "mm"),
+    ]
+    values = values.reshape(len(axes[0].values), len(axes[1].values), *values.shape[-2:])
+    peak = float(values.max())
+    return Images("PSF as built", values / peak, axes, stack.step_um, "of the highest peak", optics=True)
+
+
+def _said(depth_um: float | None, angle_rad: Array) -> str:
+    x, y = np.degrees(angle_rad)
+    turn = f"{x:.3g}, {y:.3g} deg"
+    return turn if depth_um is None else f"{1e-3 * depth_um:.4g} mm, {turn}"
+
+
+def _words(made: AsBuilt) -> list[tuple[str, str]]:
+    found = [("verdict", text) for text in made.verdicts]
+    found += [("problem", text) for text in made.problems] + [("caution", text) for text in made.cautions]
+    found += [("cannot be told apart", text) for text in made.degeneracies]
+    return [*found, ("chi² per degree of freedom", f"{made.chi2_per_dof:.3f}"), ("search", made.reason)]

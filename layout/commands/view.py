@@ -1,0 +1,115 @@
+"""Panels of a mask: every shape of the file on its layers, with size, dose and broken rules."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from layout.commands.check import read
+from layout.files import MaskContent, doses, flat
+from layout.process import LayerNumber
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+from metalens.view import Drawing, Numbers, Outline, Panel
+
+SUFFIXES = (".oas", ".gds", ".oasis", ".gdsii")
+
+
+def mask_of(folder: Path) -> Path | None:
+    """The mask file of a folder, OASIS before GDSII."""
+    return next((p for end in SUFFIXES for p in sorted(folder.glob(f"*{end}"))), None)
+
+
+def panels(path: Path) -> list[Panel]:
+    """The drawing of a mask file, or of the one in a folder, and its layers with their doses.
+
+    Raises:
+        MaskFileError: no mask file, one that cannot be read, or that draws nothing.
+    """
+    found = mask_of(path) if path.is_dir() else path
+    if found is None:
+        raise MaskFileError(f"{path}: no mask file ({', '.join(SUFFIXES)}) in it")
+    content = read(found)
+    table = found.with_name("doses.csv")
+    dose = doses.read(table) if table.is_file() else {}
+    outlines = [_outline(content, shape, dose) for top in content.tops for shape in _gathered(content, top)]
+    if not outlines:
+        raise MaskFileError(f"{found} holds no shape to be shown")
+    marks = _marks(found.with_suffix(".lyrdb"))
+    caption = (
+        f"{sum(len(o.places) for o in outlines):,} shapes, each as it is in the file. Drag to move, wheel or + and - "
+        "to zoom: far away a pixel shows how much of it is covered, near by the outlines are drawn. "
+        + (f"Boxes: {len(marks)} places where a rule is broken." if marks else "")
+    )
+    drawn = Drawing(found.name, outlines, 1e-3 * content.unit_nm, caption, marks)
+    return [drawn, _layers(content, outlines, dose)]
+
+
+def _gathered(content: MaskContent, top: str) -> list[flat.Shapes]:
+    """Copies of one polygon together, wherever in the hierarchy they are placed."""
+    found: dict[tuple[str, LayerNumber, bytes], list[flat.Shapes]] = {}
+    for shape in flat.shapes(content, top):
+        found.setdefault((shape.cell, shape.layer, np.ascontiguousarray(shape.outline).tobytes()), []).append(shape)
+    return [
+        flat.Shapes(
+            some[0].cell,
+            some[0].layer,
+            some[0].outline,
+            np.concatenate([s.x for s in some]),
+            np.concatenate([s.y for s in some]),
+        )
+        for some in found.values()
+    ]
+
+
+def _outline(content: MaskContent, shape: flat.Shapes, dose: dict[LayerNumber, float]) -> Outline:
+    size = np.ptp(shape.outline, axis=0) * content.unit_nm
+    number = "/".join(map(str, shape.layer))
+    notes = {"layer": number, "cell": shape.cell, "width / nm": float(size[0]), "height / nm": float(size[1])}
+    if shape.layer in dose:
+        notes["relative dose"] = dose[shape.layer]
+    places = np.column_stack([shape.x, shape.y]).astype(np.int32)
+    return Outline(_name(content, shape.layer), shape.outline, places, notes)
+
+
+def _name(content: MaskContent, layer: LayerNumber) -> str:
+    """One switch for all doses of a layer."""
+    name = content.layer_names.get(layer, "").partition("_dose_")[0]
+    return f"{layer[0]} {name.replace('_', ' ')}".strip()
+
+
+def _layers(content: MaskContent, outlines: list[Outline], dose: dict[LayerNumber, float]) -> Numbers:
+    """Shapes, area and dose of each (layer, datatype)."""
+    rows = []
+    for layer in sorted({layer for cell in content.cells.values() for layer in (*cell.polygons, *cell.circles)}):
+        number = "/".join(map(str, layer))
+        some = [o for o in outlines if o.notes["layer"] == number]
+        area = sum(len(o.places) * _area(o.corners) for o in some) * (1e-3 * content.unit_nm) ** 2
+        name = content.layer_names.get(layer, "")
+        rows.append((number, name, sum(len(o.places) for o in some), area, dose.get(layer, "none stated")))
+    return Numbers("Layers", ("layer/datatype", "name", "shapes", "area / um²", "relative dose"), rows)
+
+
+def _area(corners: Array) -> float:
+    after = np.roll(corners, -1, axis=0).astype(float)
+    return float(abs((corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]).sum()) / 2)
+
+
+def _marks(path: Path) -> list[tuple[float, float, str]]:
+    """Centres and rules of a marker database of this toolchain; none where there is no such file."""
+    if not path.is_file():
+        return []
+    try:
+        items = list(ElementTree.parse(path).getroot().iter("item"))
+    except ElementTree.ParseError as error:
+        raise MaskFileError(f"{path}: no marker database ({error})") from None
+    found = []
+    for item in items:
+        box = next((v.text or "" for v in item.iter("value") if (v.text or "").startswith("box:")), "")
+        try:
+            corners = [float(number) for number in box[4:].strip(" ()").replace(";", ",").split(",")]
+            x, y = (corners[0] + corners[2]) / 2, (corners[1] + corners[3]) / 2
+        except (ValueError, IndexError):
+            continue
+        found.append((x, y, f"{item.findtext('category', '').strip(chr(39))}"))
+    return found
