@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from layout.dose.exposure import PointExposure, at_edges, disc, fit, point_exposure, rim_of_own_disc, slope_at_rim
+from layout.dose.exposure import (
+    PointExposure,
+    _fit_error,
+    at_edges,
+    disc,
+    fit,
+    point_exposure,
+    rim_of_own_disc,
+    slope_at_rim,
+)
 from layout.process.process import Exposure
 from metalens.ground.errors import ProcessError
 
@@ -82,3 +91,15 @@ def test_edges_of_two_pillars_see_each_other():
     distance = np.hypot(0.1 * np.cos(angle) - 0.4, 0.1 * np.sin(angle))
     want = rim_of_own_disc(0.2, 0.3) + 2 * disc(distance, 0.1, 0.3).mean()
     assert got[0] == pytest.approx(float(want), rel=1e-9)
+
+
+def test_the_error_of_a_fit_is_against_the_integral_of_its_table():
+    """Density r^-1.5 and then r^-2 between 1, 4 and 9 um: rings of 4π (√4 - √1) and 2π c ln(9 / 4)."""
+    radius = np.array([1.0, 4.0, 9.0])
+    density = np.array([1.0, 1 / 8, 1 / 8 * (4 / 9) ** 2])
+    rings = np.array([4 * np.pi * (2 - 1), 2 * np.pi * density[1] * 16 * np.log(9 / 4)])
+    narrow = PointExposure(np.array([1e-6]), np.array([1.0]))  # all of its energy lies within the first radius
+    assert _fit_error(narrow, radius, density) == pytest.approx(rings.sum(), rel=1e-9)
+    whole = PointExposure(np.array([2.7]), np.array([1.0]))
+    within = np.exp(-((1 / 2.7) ** 2)) - np.exp(-((radius[1:] / 2.7) ** 2))
+    assert _fit_error(whole, radius, density) == pytest.approx(np.abs(within - np.cumsum(rings)).max(), rel=1e-9)

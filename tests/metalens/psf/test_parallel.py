@@ -99,3 +99,30 @@ def test_an_axis_with_nothing_to_split_is_refused():
             window_um=8.0,
             samples=4,
         )
+
+
+@pytest.mark.parametrize("weights", [None, [1.0, 3.0, 2.0]])
+def test_a_share_of_the_wavelengths_gives_its_share_of_the_light(monkeypatch, weights):
+    """The parts of two processes, one after the other, add up to the light of one; equal weights by default."""
+    monkeypatch.setattr(parallel, "add", lambda tensor: tensor)
+    monkeypatch.setattr(parallel.dist, "all_reduce", lambda *words, **more: None)
+    generator = torch.Generator().manual_seed(3)
+    phase = torch.randn(3, 24, 24, generator=generator, dtype=torch.float64)
+    level = torch.rand(24, 24, generator=generator, dtype=torch.float64)
+    arguments = {
+        "pitch_um": 0.4,
+        "sensor_distance_um": 60.0,
+        "window_um": 8.0,
+        "samples": 6,
+        "tolerance": 1e-6,
+        "wavelength_um": [0.80, 0.85, 0.90],
+        "depths_um": [900.0, 1500.0],
+    }
+    arguments |= {} if weights is None else {"weights": weights}
+    parts = [parallel._by_wavelength(phase, level, part, 3, arguments) for part in (slice(0, 2), slice(2, 3))]
+    one = parallel.psf_stack(phase, level, **arguments)
+    light = sum(part.intensity * part.energy_um2[..., None, None] for part in parts)
+    energy = sum(part.energy_um2 for part in parts)
+    assert torch.allclose(energy, one.energy_um2, rtol=1e-5)
+    assert torch.allclose(light / energy[..., None, None], one.intensity, atol=1e-5 * float(one.intensity.max()))
+    assert np.allclose(parts[0].weights, np.full(3, 1 / 3) if weights is None else np.array(weights) / 6)
