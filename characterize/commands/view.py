@@ -22,7 +22,11 @@ def capture(path: Path) -> list[Panel]:
             read.names, read.position_um, read.angle_rad, read.exposure_s, strict=True
         )
     ]
-    about = [("converter / bits", read.bits), ("pixel / um", read.pixel_um), ("wavelength / um", read.wavelength_um)]
+    about: list[tuple[str, object]] = [
+        ("converter / bits", read.bits),
+        ("pixel / um", read.pixel_um),
+        ("wavelength / um", read.wavelength_um),
+    ]
     about += [(key, str(value)) for key, value in sorted(read.about.items())]
     about += [("put right", text) for text in read.corrections]
     return [

@@ -13,7 +13,11 @@ _ZOOM = 28  # pillars along the side of the zoom
 
 
 def picture(lens: Lens) -> bytes:
-    """PNG: wrapped phase at the design wavelength (every n-th pillar), and single pillars halfway to the rim."""
+    """PNG: wrapped phase at the design wavelength, and single pillars halfway to the rim.
+
+    A pixel has the phase of the mean of exp(iφ) over its sites and fades where the phase turns within it, so that no
+    lenses appear that are none.
+    """
     figure, (left, right) = report.canvas(1, 2, size=(9.6, 4.4))
     _phase(figure, left, lens)
     _pillars(figure, right, lens)
@@ -21,15 +25,37 @@ def picture(lens: Lens) -> bytes:
 
 
 def _phase(figure: Any, axes: Any, lens: Lens) -> None:
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
     d = lens.diameters
-    stride = max(1, -(-max(d.diameter_um.shape) // _PIXELS))
-    part = d.diameter_um[::stride, ::stride]
-    phase = np.where(part > 0, np.mod(_phase_of(lens, part), 2 * np.pi), np.nan)
+    field = mean_field(lens, max(1, -(-max(d.diameter_um.shape) // _PIXELS)))
+    colour = colormaps["twilight"](np.mod(np.angle(field), 2 * np.pi) / (2 * np.pi))
+    colour[..., 3] = np.minimum(1, np.abs(field))
     edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
-    shown = axes.imshow(phase, extent=edge, cmap="twilight", vmin=0, vmax=2 * np.pi, interpolation="nearest")
-    figure.colorbar(shown, ax=axes, label="phase / rad", shrink=0.85)
+    axes.imshow(colour, extent=edge, interpolation="nearest")
+    scale = ScalarMappable(Normalize(0, 2 * np.pi), "twilight")
+    figure.colorbar(scale, ax=axes, label="phase / rad, faded where it turns in a pixel", shrink=0.85)
     axes.set(title=f"{lens.profile} lens, {lens.wavelength_um * 1e3:.0f} nm", xlabel="x / µm", ylabel="y / µm")
     axes.grid(visible=False)
+
+
+def mean_field(lens: Lens, sites: int) -> Array:
+    """Mean of exp(iφ) over blocks of ``sites`` by ``sites``, 0 where there is no pillar; complex (y, x), blocks whole.
+
+    Read in bands of rows: a large lens stays in its file.
+    """
+    d = lens.diameters.diameter_um
+    height, width = (-(-n // sites) for n in d.shape)
+    mean = np.empty((height, width), complex)
+    for i in range(height):
+        band = np.zeros((sites, width * sites))
+        rows = np.asarray(d[i * sites : (i + 1) * sites])
+        band[: len(rows), : rows.shape[1]] = rows
+        field = np.where(band > 0, np.exp(1j * _phase_of(lens, band)), 0)
+        mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
+    return mean
 
 
 def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
