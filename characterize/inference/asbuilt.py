@@ -31,7 +31,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Sensitivity
+from metalens.made import Sensitivity, Solved
 from metalens.psf import PsfStack
 
 if TYPE_CHECKING:
@@ -205,6 +205,10 @@ def save(path: str | Path, result: AsBuilt) -> None:
     if len(result.residual_modes):
         arrays["residual_modes"] = result.residual_modes
     arrays |= {"response/coefficients": result.response.coefficients}
+    if result.response.solved is not None:
+        solved = result.response.solved
+        arrays |= {"response/diameter_um": solved.diameter_um, "response/powers": solved.powers}
+        arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
     if result.psf is not None:
         arrays |= {f"psf/{name}": np.asarray(getattr(result.psf, name)) for name in _PSF}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
@@ -253,7 +257,13 @@ def load(path: str | Path) -> AsBuilt:
 
 def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
     ends = about.get("response_low_um", -math.inf), about.get("response_high_um", math.inf)
-    return Sensitivity(arrays["response/coefficients"], about["response_center_um"], about["response_error"], *ends)
+    solved = None
+    if "response/powers" in arrays:
+        wave = float(arrays["response/wavelength_um"])
+        solved = Solved(wave, arrays["response/diameter_um"], arrays["response/powers"])
+    return Sensitivity(
+        arrays["response/coefficients"], about["response_center_um"], about["response_error"], *ends, solved
+    )
 
 
 def _psf(arrays: dict[str, Array]) -> PsfStack | None:

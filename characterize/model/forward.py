@@ -266,7 +266,7 @@ class ForwardModel:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, and by units of the answering causes."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
-        weight, rate = group.pillars.weights(np.clip(bias, -1.1 * reach, 1.1 * reach))
+        weight, rate = group.pillars.weights(np.clip(bias, -reach, reach))
         gathered = group.reduced.gathered
         r, b, shape = len(gathered), len(weight), gathered.shape[1:]
         values = group.pillars.coefficients(change(x))

@@ -1,4 +1,4 @@
-"""Exact derivatives of the pillars by the answering causes, from the cell solvers, as smooth functions of D."""
+"""What the answering causes do to the pillars, from the cell solvers: t itself where they are quick, else slopes."""
 
 import functools
 from collections.abc import Container
@@ -6,20 +6,26 @@ from collections.abc import Container
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from characterize.model import solving
 from metalens import modal, rcwa
 from metalens.cell import Cell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, MaterialError
 from metalens.lens import Lens
-from metalens.made import Answers, Cause, Sensitivity, of_kind, sensitivity
+from metalens.made import Answers, Cause, Sensitivity, Solved, of_kind, sensitivity
 
 _NODES, _MOST = 25, 14
 
 
 def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) -> Sensitivity:
-    """d ln t by the answering causes of :mod:`metalens.made.causes` over the diameters of a lens.
+    """d ln t by the answering causes of :mod:`metalens.made.causes` over the diameters of a lens, or t itself.
 
-    Exact derivatives at 25 Chebyshev diameters (modal method; RCWA for cells with films or tilted walls), as the
+    Upright round pillars whose proxy is that of the cell: t by the modal method at every diameter that a bias can
+    lead to and at five heights and three indices within the bounds of the fit (:class:`metalens.made.Solved`), to
+    3e-3. No slope is taken for a curve, and past the proxy's domain, where pillars begin to resonate, nothing is
+    extrapolated.
+
+    Other cells: exact derivatives at 25 Chebyshev diameters (RCWA for films or tilted walls), as the
     polynomial of least degree whose error on diameters that it was not made from meets ``tolerance``, relative to
     the largest change of the slope across the lens; the best one below degree 15 where none does. The error reached
     is in ``error``. Cells that no solver takes get the effective-index slopes of :func:`metalens.made.sensitivity`.
@@ -34,25 +40,37 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     diameters = (low + high) / 2 + (high - low) / 2 * unit
     try:
-        rows = np.array([_exact(lens.cell, float(one), lens.wavelength_um, wanted) for one in diameters]).T
+        found = solving.solved(lens) if _upright(lens.cell) else None
+        rows = np.array([_exact(lens.cell, float(one), lens.wavelength_um, wanted, found) for one in diameters]).T
     except (CellError, MaterialError):
         return sensitivity(lens)
     degree, error = _degree(unit, rows, tolerance)
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
-    return Sensitivity(np.array(padded) * scale, (low + high) / 2, error, low, high)
+    return Sensitivity(np.array(padded) * scale, (low + high) / 2, error, low, high, found)
 
 
-def _exact(cell: Cell, diameter_um: float, wavelength_um: float, wanted: Container[str]) -> list[complex]:
+def _upright(cell: Cell) -> bool:
+    return cell.round and not (cell.under or cell.over or cell.sidewall_rad)
+
+
+def _exact(
+    cell: Cell, diameter_um: float, wavelength_um: float, wanted: Container[str], table: Solved | None
+) -> list[complex]:
     """d ln t by each answering cause: the solver's own derivative, or its differences where that is wanted."""
-    plain = not (cell.under or cell.over or cell.sidewall_rad)
-    solve = functools.partial(modal.gradient, tolerance=1e-2) if plain else rcwa.derivatives
-    found = solve(cell, diameter_um, wavelength_um)
+    if table is not None:
+        series = table.series(np.array(diameter_um))
+        slope = dict(zip((row.name for _, row in of_kind(Answers)), series[:, 1] / series[:, 0], strict=True))
+    else:
+        solve = functools.partial(modal.gradient, tolerance=1e-2) if _upright(cell) else rcwa.derivatives
+        found = solve(cell, diameter_um, wavelength_um)
 
     def by(row: Cause) -> complex:
         if not isinstance(row.acts, Answers) or not (row.acts.exact or row.name in wanted):
             return 0.0
+        if row.acts.exact and table is not None:
+            return complex(slope[row.name])
         if row.acts.exact:
             return complex(getattr(found, row.acts.exact) / found.t)
         step = row.acts.step

@@ -9,14 +9,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE, state
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Sensitivity, of_kind, transmission
+from metalens.made import Answers, Sensitivity, answer, designed, of_kind, transmission
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
+_MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(Answers)]
 
@@ -44,7 +46,7 @@ class Range:
 class Pillars:
     """Transmission of pillars under change, exact and in its low-rank basis.
 
-    basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,) biases where coefficients are
+    basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,) biases where t is
     formed. error: largest |t - low-rank| met on random changes inside the range, that the basis was not made from.
     """
 
@@ -62,14 +64,24 @@ class Pillars:
         built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
         b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
-        self.nodes_um = np.cos(np.pi * (np.arange(b) + 0.5) / b) * span.bias_um
-        self._slopes = response.at(self.diameter_um + self.nodes_um[:, None])
+        for count in (b, 2 * b - 1, 3 * b - 2):  # resonances want more
+            self._lay(count, tolerance)
+            self.error = self._measure()
+            if self.error < _MISSED:
+                break
+
+    def _lay(self, count: int, tolerance: float) -> None:
+        """Bias nodes, and the basis of what happens there."""
+        unit = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+        self.nodes_um = unit * self.span.bias_um
+        share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
+        self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
+        self._answer = answer(self.lens.proxy, self.response, self.diameter_um + self.nodes_um[:, None])
         self._designed: dict[float, Array] = {}
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
         self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
-        self.error = self._measure()
 
     def exact(self, bias_um: Array | float, change: Change) -> Array:
         """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
@@ -78,12 +90,13 @@ class Pillars:
         return transmission(self.lens.proxy, self.response, d, wave, np.array(change.answers), angle_rad=self.angle_rad)
 
     def coefficients(self, change: Change) -> Array:
-        """(b, r) coefficients of t in the basis at the bias nodes."""
-        return np.asarray(self._at_nodes(change) @ self.basis.T)
+        """(b, r) coefficients of t in the basis, as Chebyshev series of the bias."""
+        return np.asarray(self._to_series @ (self._at_nodes(change) @ self.basis.T))
 
     def slopes(self, change: Change) -> Array:
         """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering causes, in base units."""
-        return np.asarray((self._slopes * self._at_nodes(change)) @ self.basis.T)
+        rates = self._answer.rates(np.array(change.answers)) * self._at_nodes(change)
+        return np.asarray(self._to_series @ (rates @ self.basis.T))
 
     def _at_nodes(self, change: Change) -> Array:
         """:meth:`exact` at the bias nodes; what the last few wavelengths made of the design is kept."""
@@ -92,8 +105,9 @@ class Pillars:
             bias = self.nodes_um[:, None]
             if len(self._designed) >= 8:
                 self._designed.pop(next(iter(self._designed)))
-            self._designed[wave] = self.exact(bias, Change(wavelength_um=change.wavelength_um))
-        return np.asarray(self._designed[wave] * np.exp(np.tensordot(change.answers, self._slopes, 1)))
+            d = self.diameter_um + bias
+            self._designed[wave] = designed(self.lens.proxy, d, wave, angle_rad=self.angle_rad)
+        return np.asarray(self._designed[wave] * self._answer.factor(np.array(change.answers)))
 
     def table(self) -> Array:
         """(r, entries): the conjugate basis on a fine grid of diameters; the last entry is no pillar."""
@@ -108,17 +122,15 @@ class Pillars:
         return np.where(diameter_um > 0, entry, _ENTRIES)
 
     def weights(self, bias_um: Array) -> tuple[Array, Array]:
-        """(b, *shape) Lagrange weights of the bias nodes at ``bias_um``, and their derivatives."""
-        n = self.nodes_um
-        value = np.ones((len(n), *np.shape(bias_um)))
-        slope = np.zeros_like(value)
-        for i in range(len(n)):
-            for j in range(len(n)):
-                if i != j:
-                    factor = (bias_um - n[j]) / (n[i] - n[j])
-                    slope[i] = slope[i] * factor + value[i] / (n[i] - n[j])
-                    value[i] = value[i] * factor
-        return value, slope
+        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, and their derivatives."""
+        x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
+        value = np.empty((len(self.nodes_um), *x.shape))
+        slope = np.empty_like(value)
+        value[0], value[1], slope[0], slope[1] = 1.0, x, 0.0, 1.0
+        for n in range(2, len(value)):
+            value[n] = 2 * x * value[n - 1] - value[n - 2]
+            slope[n] = 2 * value[n - 1] + 2 * x * slope[n - 1] - slope[n - 2]
+        return value, slope / reach
 
     def _training(self) -> list[Change]:
         s, waves = self.span, self._waves()

@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from metalens.made.printed import with_table as with_table
     from metalens.made.response import Sensitivity as Sensitivity
     from metalens.made.response import Slopes as Slopes
+    from metalens.made.response import answer as answer
     from metalens.made.response import designed as designed
     from metalens.made.response import guide as guide
     from metalens.made.response import sensitivity as sensitivity
     from metalens.made.response import transmission as transmission
+    from metalens.made.solved import Solved as Solved
     from metalens.made.spread import DRAWN as DRAWN
     from metalens.made.spread import Draw as Draw
     from metalens.made.spread import Spread as Spread
@@ -51,9 +53,11 @@ __getattr__, __dir__, __all__ = attach(
         "STEEPEST": "bias",
         "Sensitivity": "response",
         "Slopes": "response",
+        "Solved": "solved",
         "Spread": "spread",
         "State": "state",
         "Widens": "causes",
+        "answer": "response",
         "causes": "",
         "designed": "response",
         "draws": "spread",

@@ -12,6 +12,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
 from metalens.made.causes import Answers, Guide, of_kind
+from metalens.made.solved import Solved
 from metalens.pillars import Proxy
 
 
@@ -23,6 +24,7 @@ class Sensitivity:
         (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row that is not there.
     error: of the slopes, relative to their change across the lens; nan where not known.
     low_um, high_um: diameters that the polynomials were made for; beyond them they go on along their tangents.
+    solved: t itself under large changes, where a solver was asked; it stands for the proxy then.
     """
 
     coefficients: Array
@@ -30,6 +32,7 @@ class Sensitivity:
     error: float = math.nan
     low_um: float = -math.inf
     high_um: float = math.inf
+    solved: Solved | None = None
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t."""
@@ -41,6 +44,39 @@ class Sensitivity:
             values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
         missing = len(list(of_kind(Answers))) - len(values)
         return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answer:
+    """Pillars of given diameters under the answering causes: t over that of the proxy at the design's wavelength.
+
+    slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes, orders, *shape) of t in powers of
+    the others, the designed t first; None where all are linear. proxy: (*shape) t of the proxy.
+    """
+
+    slopes: Array
+    series: Array | None
+    proxy: Array
+
+    def factor(self, amounts: Array) -> Array:
+        """(*shape) t under the change over the proxy's: prod_c t(a_c) / t(0) times exp(sum_c a_c s_c)."""
+        change = np.exp(np.tensordot(amounts, self.slopes, 1))
+        if self.series is None:
+            return np.asarray(change)
+        change = change * self.series[0, 0] / self.proxy
+        for amount, row in zip(amounts, self.series, strict=False):
+            if amount:
+                change = change * (polynomial.polyval(amount, row) / row[0])
+        return np.asarray(change)
+
+    def rates(self, amounts: Array) -> Array:
+        """(causes, *shape) d ln t by every cause at the change."""
+        out = self.slopes.astype(complex)
+        if self.series is not None:
+            for n, (amount, row) in enumerate(zip(amounts, self.series, strict=False)):
+                if row[1:].any():
+                    out[n] = polynomial.polyval(amount, polynomial.polyder(row)) / polynomial.polyval(amount, row)
+        return out
 
 
 class Slopes(Protocol):
@@ -111,6 +147,21 @@ def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: floa
     return np.asarray(np.clip(level, 0, 1) * np.exp(1j * phase))
 
 
+def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
+    """What pillars of these diameters (any shape) do under any change of the process, made ready once for many.
+
+    Beyond the diameters that a solver was asked for, its last word goes on with the proxy.
+    """
+    slopes = np.asarray(response.at(diameter_um))
+    solved = response.solved if isinstance(response, Sensitivity) else None
+    if solved is None:
+        return Answer(slopes, None, np.ones(1))
+    inside = np.clip(diameter_um, solved.diameter_um[0], solved.diameter_um[-1])
+    series = solved.series(inside)
+    slopes[np.flatnonzero(solved.powers[:, 1:].any((1, 2)))] = 0.0
+    return Answer(slopes, series, designed(proxy, inside, solved.wavelength_um))
+
+
 def transmission(
     proxy: Proxy,
     response: Slopes,
@@ -120,10 +171,10 @@ def transmission(
     *,
     angle_rad: float = 0.0,
 ) -> Array:
-    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc).
+    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc), or as the solver has it.
 
     Args:
         answers: (answering causes,) amounts in base units: :meth:`State.answers`.
     """
-    changed = np.exp(np.tensordot(answers, response.at(d_um), 1))
+    changed = answer(proxy, response, d_um).factor(answers)
     return np.asarray(designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed)

@@ -1,0 +1,84 @@
+"""t of the pillars of a fit under a process, against the referee's table: height, bias past the proxy, wavelength."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import hidden_lens as hidden
+import pillar_table
+
+from characterize.model import slopes
+from characterize.model.pillars import Change, Pillars
+from metalens import modal
+from metalens.cell import Index
+from metalens.made import Answers, answer, of_kind, transmission
+from metalens.pillars.record import DEFAULT_CELL
+
+D = np.array([0.0837, 0.1121, 0.1493, 0.1772, 0.1994])
+
+
+@pytest.fixture(scope="module")
+def response():
+    return slopes(hidden.lens())
+
+
+@pytest.mark.parametrize("bias_um", [-0.0237, 0.0113, 0.0261])
+@pytest.mark.parametrize("height_um", [-0.0193, 0.0091, 0.0214])
+def test_pillars_are_those_of_the_solver_under_a_bias_and_a_height(response, bias_um, height_um):
+    """Cubics over D add 1e-3, the referee's quartic over the height as much; most at the resonance past 0.21 um."""
+    want = pillar_table.load().at(D + bias_um, 0.7 + height_um, 0.85)
+    found = transmission(hidden.lens().proxy, response, D + bias_um, 0.85, np.array([height_um, 0.0, 0.0]))
+    assert np.abs(found - want).max() < 3e-3
+
+
+def test_the_wavelength_comes_from_the_proxy_and_goes_on_beyond_it(response):
+    """1.1 nm at a height 9 nm off: the mixed derivative is left out, 2e-3 of t."""
+    want = pillar_table.load().at(D, 0.709, 0.8511)
+    found = transmission(hidden.lens().proxy, response, D, 0.8511, np.array([0.009, 0.0, 0.0]))
+    assert np.abs(found - want).max() < 4e-3
+    still = transmission(hidden.lens().proxy, response, D, 0.85, np.array([0.009, 0.0, 0.0]))
+    assert np.abs(still - want).max() > 1.5 * np.abs(found - want).max()
+
+
+def test_index_and_height_act_together(response):
+    cell = dataclasses.replace(DEFAULT_CELL, pillar=Index(3.56), height_um=0.712)
+    want = np.array([modal.solve(cell, d, 0.85, tolerance=1e-3).t for d in D])
+    found = transmission(hidden.lens().proxy, response, D, 0.85, np.array([0.012, -0.04, 0.0]))
+    assert np.abs(found - want)[:4].max() < 6e-3  # the mixed derivative and the third by the index are left out
+    assert np.abs(found - want)[4] < 0.05  # 0.1994 um: next to a resonance, which the index moves
+    alone = transmission(hidden.lens().proxy, response, D, 0.85, np.array([0.012, 0.0, 0.0]))
+    assert np.abs(alone - want).max() > 0.1
+
+
+def test_rates_are_derivatives_of_the_factor(response):
+    ready = answer(hidden.lens().proxy, response, D + 0.0071)
+    amounts, step = np.array([0.0117, -0.021, 0.004]), 1e-5
+    for n in range(len(list(of_kind(Answers)))):
+        up, down = amounts.copy(), amounts.copy()
+        up[n] += step
+        down[n] -= step
+        want = np.log(ready.factor(up) / ready.factor(down)) / (2 * step)
+        assert ready.rates(amounts)[n] == pytest.approx(want, rel=1e-6, abs=1e-8)  # third derivative times step²
+
+
+def test_few_functions_hold_every_change(response):
+    pillars = Pillars(hidden.lens(), response)
+    change = Change((0.0163, 0.0, 0.0), 0.0007)
+    for bias_um in (-0.0117, 0.0, 0.0193):
+        weight, rate = pillars.weights(np.array(bias_um))
+        coefficients = pillars.coefficients(change)
+        found = pillars.basis.conj().T @ (weight @ coefficients)
+        assert np.abs(found - pillars.exact(bias_um, change)).max() < 2e-3
+        near = [pillars.weights(np.array(bias_um + s))[0] @ coefficients for s in (1e-6, -1e-6)]
+        assert rate @ coefficients == pytest.approx((near[0] - near[1]) / 2e-6, rel=1e-5, abs=1e-5)
+
+
+def test_a_proxy_of_something_else_is_believed():
+    """Twice the phase of this cell: a measured library, say. The solver is not put in its place."""
+    lens = hidden.lens()
+    proxy = dataclasses.replace(lens.proxy, phase_coefficients=0.8 * lens.proxy.phase_coefficients)
+    assert slopes(dataclasses.replace(lens, proxy=proxy)).solved is None
