@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.model import PLACE, Known, incidence_rad, made, spectrum, vector
+from characterize.model import PLACE, Known, extra_path, incidence_rad, made, spectrum, vector
 from metalens import psf
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -139,6 +139,11 @@ def _frame(
     shift = [distance * (c - s) + x[PLACE[f"decentre_{a}_um"]] for c, s, a in zip(chief, source, "xy", strict=True)]
     incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
     t = made.pillars(lens, response, x, noise_um=noise, angle_rad=incidence)
+    if x[PLACE["glass_um"]]:
+        d, k = lens.diameters, 2 * math.pi / (lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
+        across, down = np.meshgrid(d.x_um, d.y_um)
+        path = extra_path(across, down, tangents=(source[0], source[1]), depth_um=z, values=x)
+        t = t * np.exp(1j * k * path)
     margin = 4
     side = camera.pixels + 2 * margin
     middle = 0.0 if camera.pixels % 2 else -camera.pixel_um / 2  # the chief ray meets pixel (n // 2, n // 2)

@@ -101,7 +101,7 @@ def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
     for name, stack in (("dark", shots.dark), ("flat", shots.flat)):
         tifffile.imwrite(folder / f"{name}.tif", stack, photometric="minisblack", metadata=None)
     about = {"pixel_um": truth.camera.pixel_um, "wavelength_um": lens.wavelength_um, "bits": truth.camera.bits}
-    pinhole = [k.value for k in truth.parameter if k.name == "pinhole_um" and k.value > 0]
-    about |= {"pinhole_um": pinhole[0]} if pinhole else {}
+    stated = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
+    about |= {k.name: k.value for k in truth.parameter if k.name in stated and k.value}
     text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
     (folder / "capture.toml").write_text(text, encoding="utf-8")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.captures import Capture, Gain, clean
-from characterize.inference import explore, knowable, residual, search, verdict
+from characterize.inference import explore, knowable, missing, residual, search, verdict
 from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.explore import Posterior
@@ -160,6 +160,8 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
     unseen = explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
     seen = verdict.structure(solution.residual_sigma) if gain.known else []
+    absent = missing.leans(task, solution) if gain.known else []
+    seen += missing.words(absent)
     if gain.known and unseen > _LEFT_OUT:
         seen.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
     return AsBuilt(
@@ -183,7 +185,11 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
-        degeneracies=(*explore.words(task, found), *knowable.degeneracies(names, covariance, task.prior.sigma)),
+        degeneracies=(
+            *explore.words(task, found),
+            *knowable.degeneracies(names, covariance, task.prior.sigma),
+            *missing.untold(absent),
+        ),
         cautions=(*cautions, *seen),
         problems=tuple(_problems(task, solution, gain)),
         low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),

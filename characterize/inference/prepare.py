@@ -122,10 +122,16 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
 
 
 def stated(capture: Capture, lens: Lens) -> list[Known]:
-    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole."""
+    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole, glass."""
     offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
     known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
-    if "pinhole_um" in capture.about:
-        size = float(capture.about["pinhole_um"])
-        known.append(Known("pinhole_um", size, 0.0))
+    held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
+    known += [Known(name, _number(capture, name), 0.0) for name in held if name in capture.about]
     return known
+
+
+def _number(capture: Capture, name: str) -> float:
+    value = capture.about[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CaptureError(f"capture.toml: {name} = {value!r}; need a finite number")
+    return float(value)

@@ -63,7 +63,7 @@ def problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Gai
 def at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[tuple[str, float]]:
     """Parameters that ended on a bound which is not the natural zero of a blur."""
     ends = zip(names, solution.value.tolist(), prior.low, prior.high, strict=True)
-    blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px")
+    blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px", "glass_um")
     return [(n, v) for n, v, low, high in ends if v >= high or (v <= low and n not in blurs)]
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from characterize.model.forward import Setting as Setting
     from characterize.model.forward import spectrum as spectrum
     from characterize.model.forward import true_depth as true_depth
+    from characterize.model.glass import extra_path as extra_path
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
     from characterize.model.parameters import PLACE as PLACE
@@ -36,6 +37,7 @@ __getattr__, __dir__, __all__ = attach(
         "Setting": "forward",
         "basis": "thinplate",
         "detector": "",
+        "extra_path": "glass",
         "incidence_rad": "pillars",
         "made": "",
         "prior_rad": "thinplate",

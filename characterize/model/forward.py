@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from characterize.model import detector
+from characterize.model.glass import extra_path
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Operators, Reduced
@@ -30,6 +31,9 @@ GEOMETRY = (
     "source_y_um",
     "stage_zero_um",
     "stage_scale",
+    "glass_um",
+    "glass_tilt_x_deg",
+    "glass_tilt_y_deg",
 )
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
@@ -297,7 +301,10 @@ class ForwardModel:
         out = np.empty((len(index), *reduced.x_um.shape))
         for i, z in enumerate(depth):
             tangents = tx - lateral[0] / z, ty - lateral[1] / z
-            out[i] = k * (source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path) - known
+            path = source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path
+            if x[PLACE["glass_um"]] != 0:
+                path = path + extra_path(reduced.x_um, reduced.y_um, tangents=tangents, depth_um=float(z), values=x)
+            out[i] = k * path - known
         out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
         return out + np.tensordot(self.modes, group.residual, 1) if len(self.modes) else out
 

@@ -20,11 +20,12 @@ from characterize.model.parameters import NAMES, PARAMETERS, PLACE, Known, vecto
 from characterize.model.pillars import Pillars
 from metalens import psf
 from metalens.ground.errors import CaptureError, ConfigError, FitError
-from metalens.made import sensitivity
+from metalens.made import Solved, sensitivity
 from metalens.psf.of_lens import View
 
 SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
 USUAL = Options(scan_um=60.0)
+GLASS = {"glass_um": 40.0, "glass_tilt_x_deg": 5.0, "glass_tilt_y_deg": -3.0}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def test_low_rank_pillars_know_their_error():
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "bandwidth_nm"])
 def test_derivatives_match_finite_differences(model, name):
-    x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0})
+    x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0} | GLASS)
     h = 0.1 * PARAMETERS[PLACE[name]].scale  # images are in single precision
     up, down = x.copy(), x.copy()
     up[PLACE[name]] += h
@@ -116,6 +117,13 @@ def test_degeneracies_are_named(fitted):
     assert fitted.identifiable
 
 
+def test_glass_that_nobody_stated_is_declared_and_nothing_is_found_where_nothing_is(fitted):
+    assert "residuals lean" not in " ".join(fitted.cautions)
+    glass = next(words for words in fitted.degeneracies if "plate of glass" in words)
+    assert "glass_um 100 would be taken for" in glass
+    assert "distance_um" in glass or "stage_zero_um" in glass
+
+
 def test_saved_result_comes_back(fitted, tmp_path):
     asbuilt.save(tmp_path / "a.h5", fitted)
     again = asbuilt.load(tmp_path / "a.h5")
@@ -126,6 +134,18 @@ def test_saved_result_comes_back(fitted, tmp_path):
     assert again.samples(3, seed=1).shape == (3, len(fitted.names))
     asbuilt.save(tmp_path / "b.h5", fitted)
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
+    rng = np.random.default_rng(3)
+    powers = rng.normal(size=(3, 4, 7)) + 1j * rng.normal(size=(3, 4, 7))
+    solved = Solved(0.8471, np.linspace(0.071, 0.233, 7), powers)
+    built = dataclasses.replace(fitted, response=dataclasses.replace(fitted.response, solved=solved))
+    built.save(tmp_path / "asbuilt.h5")
+    read = AsBuilt.load(tmp_path / "asbuilt.h5").response.solved
+    assert read.wavelength_um == 0.8471
+    assert np.array_equal(read.diameter_um, solved.diameter_um)
+    assert np.array_equal(read.powers, powers)
 
 
 def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
