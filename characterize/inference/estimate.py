@@ -12,6 +12,7 @@ from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
+from characterize.inference.missing import Lean
 from characterize.inference.prepare import check_depths, check_enough, data_of, merged, setting_of, stated
 from characterize.inference.search import Task, with_values
 from characterize.model import (
@@ -159,11 +160,7 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
     captured, between = explore.predicted_error(task, found)
     unseen = explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
-    seen = verdict.structure(solution.residual_sigma) if gain.known else []
     absent = missing.leans(task, solution) if gain.known else []
-    seen += missing.words(absent)
-    if gain.known and unseen > _LEFT_OUT:
-        seen.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
     return AsBuilt(
         design=model.lens,
         response=model.response,
@@ -185,12 +182,8 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
-        degeneracies=(
-            *explore.words(task, found),
-            *knowable.degeneracies(names, covariance, task.prior.sigma),
-            *missing.untold(absent),
-        ),
-        cautions=(*cautions, *seen),
+        degeneracies=_open(task, found, covariance, absent),
+        cautions=(*cautions, *(_seen(solution, absent, unseen) if gain.known else ())),
         problems=tuple(_problems(task, solution, gain)),
         low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
         high=np.maximum(found.high, solution.value + explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
@@ -200,6 +193,20 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
             verdict.process_verdict(names, found.low, found.high, _told(task, found)),
         ),
     )
+
+
+def _seen(solution: Solution, absent: list[Lean], unseen: float) -> list[str]:
+    """What is in the frames and in no parameter: structure of the residuals, causes, frames left out."""
+    words = [*verdict.structure(solution.residual_sigma), *missing.words(absent)]
+    if unseen > _LEFT_OUT:
+        words.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
+    return words
+
+
+def _open(task: Task, found: Posterior, covariance: Array, absent: list[Lean]) -> tuple[str, ...]:
+    """What cannot be told apart: bent and double posteriors, pairs, and causes that nobody fitted."""
+    pairs = knowable.degeneracies(task.names, covariance, task.prior.sigma)
+    return (*explore.words(task, found), *pairs, *missing.untold(absent))
 
 
 def _named(names: tuple[str, ...]) -> Array:

@@ -22,7 +22,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
 
-CHANCE = 1e-5  # of one cause to be spoken of where there is none: one fit in some thousands with them all
+CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _STITCH_UM = 0.05
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
@@ -160,11 +160,12 @@ def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> It
         if "wavelength_nm" in slopes:
             ramp = np.linspace(-1, 1, n)[:, None, None]
             yield "a wavelength that drifts", "", (slopes["wavelength_nm"] * ramp)[None]
-    yield "a wrong pixel pitch", "", _stretched(image - _background(x, model.setting))[None]
+    stretched = _stretched(image - _background(x, model.setting))
+    yield "a wrong pixel pitch", "1 % of the pitch", 0.01 * stretched[None]
     if not len(model.modes):
         step = 0.05
         uneven = [model.with_residual(-1j * step * np.eye(5)[i], _low_orders).images(x)[0] - image for i in range(5)]
-        yield "uneven illumination", "", np.array(uneven)
+        yield "uneven illumination", "10 % more light at the right rim", np.array(uneven)
         names = [f"residual_{k}" for k in range(MODES)]
         bent = model.with_residual(np.zeros(MODES), basis).images(x, names)[1]
         yield "a smooth phase that no parameter describes", "", np.asarray(bent) * prior_rad()[:, None, None, None]

@@ -9,9 +9,6 @@ if TYPE_CHECKING:
     from characterize.model import made as made
     from characterize.model import thinplate as thinplate
     from characterize.model.forward import ForwardModel as ForwardModel
-    from characterize.model.forward import Setting as Setting
-    from characterize.model.forward import spectrum as spectrum
-    from characterize.model.forward import true_depth as true_depth
     from characterize.model.glass import extra_path as extra_path
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
@@ -21,6 +18,9 @@ if TYPE_CHECKING:
     from characterize.model.parameters import vector as vector
     from characterize.model.pillar_slopes import slopes as slopes
     from characterize.model.pillars import incidence_rad as incidence_rad
+    from characterize.model.setting import Setting as Setting
+    from characterize.model.setting import spectrum as spectrum
+    from characterize.model.setting import true_depth as true_depth
     from characterize.model.thinplate import MODES as MODES
     from characterize.model.thinplate import basis as basis
     from characterize.model.thinplate import prior_rad as prior_rad
@@ -34,7 +34,7 @@ __getattr__, __dir__, __all__ = attach(
         "NAMES": "parameters",
         "PARAMETERS": "parameters",
         "PLACE": "parameters",
-        "Setting": "forward",
+        "Setting": "setting",
         "basis": "thinplate",
         "detector": "",
         "extra_path": "glass",
@@ -42,10 +42,10 @@ __getattr__, __dir__, __all__ = attach(
         "made": "",
         "prior_rad": "thinplate",
         "slopes": "pillar_slopes",
-        "spectrum": "forward",
+        "spectrum": "setting",
         "state": "parameters",
         "thinplate": "",
-        "true_depth": "forward",
+        "true_depth": "setting",
         "vector": "parameters",
     },
 )
