@@ -28,18 +28,18 @@ _STITCH_UM = 0.05
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
-_OF_MODEL: tuple[tuple[str, dict[str, float], str], ...] = (  # cause, from, what is added to the last of them
-    ("a source of finite size", {}, "pinhole_um 6"),
-    ("a spectrum of finite width", {}, "bandwidth_nm 2"),
-    ("a tilt of the lens about y", {}, "tilt_x_deg 0.3"),
-    ("a tilt of the lens about x", {}, "tilt_y_deg 0.3"),
-    ("a saddle of the diameters", {}, "bias_a_nm 3"),
-    ("an oblique saddle of the diameters", {}, "bias_o_nm 3"),
-    ("a tilted side wall", {}, "sidewall_deg 0.5"),
-    ("another refractive index", {}, "index 0.01"),
-    ("a plate of glass in the beam", {}, "glass_um 100"),
-    ("a tilt of 100 um of glass about y", _TILTED, "glass_tilt_x_deg 5"),
-    ("a tilt of 100 um of glass about x", _TILTED, "glass_tilt_y_deg 5"),
+_OF_MODEL: tuple[tuple[str, dict[str, float], str, float], ...] = (  # cause, from, name and amount that is added
+    ("a source of finite size", {}, "pinhole_um", 6),
+    ("a spectrum of finite width", {}, "bandwidth_nm", 2),
+    ("a tilt of the lens about y", {}, "tilt_x_deg", 0.3),
+    ("a tilt of the lens about x", {}, "tilt_y_deg", 0.3),
+    ("a saddle of the diameters", {}, "bias_a_nm", 3),
+    ("an oblique saddle of the diameters", {}, "bias_o_nm", 3),
+    ("a tilted side wall", {}, "sidewall_deg", 0.5),
+    ("another refractive index", {}, "index", 0.01),
+    ("a plate of glass in the beam", {}, "glass_um", 100),
+    ("a tilt of 100 um of glass about y", _TILTED, "glass_tilt_x_deg", 5),
+    ("a tilt of 100 um of glass about x", _TILTED, "glass_tilt_y_deg", 5),
 )
 
 
@@ -68,9 +68,11 @@ def leans(task: Task, mode: Solution) -> list[Lean]:
     spread = max(1.0, mode.chi2_per_dof)
     fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread))
     found = []
-    for cause, told, changes in _changes(task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))):
+    for cause, amount, told, changes in _changes(
+        task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))
+    ):
         change = (changes * root).reshape(len(changes), -1)
-        taken = fit.taken(change[0], told) if told else ""
+        taken = fit.taken(change[0], amount, told) if told else ""
         found.append(dataclasses.replace(fit.lean(cause, change), taken=taken))
     found.append(_ghost(task, x, image, root, fit))
     return sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
@@ -118,57 +120,56 @@ class Fitted:
         chi2, degrees = float((score**2 / values[seen]).sum()), int(seen.sum())
         return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)) if degrees else 1.0)
 
-    def taken(self, change: Array, told: str) -> str:
-        """What the parameters would do with one change of the images; empty where it is seen, or does nothing.
+    def taken(self, change: Array, amount: float, told: str) -> str:
+        """What the parameters would do with a change of the images; empty where it does nothing.
 
-        Seen: what they leave of it has 4 sigma. Nothing: no parameter moves by one sigma.
+        Of ``amount``, or as much of it as would not be seen: of what they leave ``_SEEN`` sigma or less. Nothing: no
+        parameter moves by one sigma. ``told``: the cause's amount in words, with a place for the number.
         """
         moved = np.linalg.solve(self.known, self.slopes @ change)
-        left = float(change @ change - (self.slopes @ change) @ moved)
-        step = moved / np.sqrt(np.diag(np.linalg.inv(self.known)))
+        left = math.sqrt(max(float(change @ change - (self.slopes @ change) @ moved), 0.0))
+        share = min(1.0, _SEEN / max(left, 1e-12))
+        step = share * moved / np.sqrt(np.diag(np.linalg.inv(self.known)))
         most = [i for i in np.argsort(-np.abs(step))[:3] if abs(step[i]) > 1]
-        if left > _SEEN**2 or not most:
-            return ""
-        parts = ", ".join(f"{self.names[i]} {moved[i]:+.2g} ({abs(step[i]):.1f} sigma)" for i in most)
-        return f"{told} would be taken for {parts}; state it if there is any"
+        parts = ", ".join(f"{self.names[i]} {share * moved[i]:+.2g} ({abs(step[i]):.1f} sigma)" for i in most)
+        return f"{told.format(share * amount)} would be taken for {parts}; state it if there is any" if most else ""
 
 
-def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[tuple[str, str, Array]]:
-    """(cause, its amount in words where it is one, (k, n, y, x) changes of the images by it)."""
+def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[tuple[str, float, str, Array]]:
+    """(cause, amount and its words where it is one, (k, n, y, x) changes of the images by it)."""
     model, n = task.model, len(image)
-    for cause, base, told in _OF_MODEL:
-        name, amount = told.split()
+    for cause, base, name, amount in _OF_MODEL:
         if name not in task.names and all(key == name or x[PLACE[key]] == 0 for key in base):
             before, after = x.copy(), x.copy()
             for key, value in base.items():
                 before[PLACE[key]] = after[PLACE[key]] = value
-            after[PLACE[name]] += float(amount)
+            after[PLACE[name]] += amount
             with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows
                 first = model.images(before)[0] if base else image
-                yield cause, told, (model.images(after)[0] - first)[None]
+                yield cause, amount, name + " {:.3g}", (model.images(after)[0] - first)[None]
     for along, name in enumerate(("x", "y")):
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
         if not len(model.modes):
-            yield f"a write field off along {name}", f"{_STITCH_UM * 1e3:g} nm of the right half", moved[None]
+            yield f"a write field off along {name}", _STITCH_UM * 1e3, "{:.3g} nm of the right half", moved[None]
     if n > 2:
         light = image - _background(x, model.setting)
-        yield "a lamp or exposure that changes from frame to frame", "", _each(light)
-        yield "shifts from frame to frame", "", np.concatenate([_each(np.gradient(light, axis=a)) for a in (1, 2)])
-        yield "vibration or blur in single frames", "", _each(_curvature(light))
-        yield "a stage error in single frames", "", _each(slopes["stage_zero_um"])
+        yield "a lamp or exposure that changes from frame to frame", 0.0, "", _each(light)
+        yield "shifts from frame to frame", 0.0, "", np.concatenate([_each(np.gradient(light, axis=a)) for a in (1, 2)])
+        yield "vibration or blur in single frames", 0.0, "", _each(_curvature(light))
+        yield "a stage error in single frames", 0.0, "", _each(slopes["stage_zero_um"])
         if "wavelength_nm" in slopes:
             ramp = np.linspace(-1, 1, n)[:, None, None]
-            yield "a wavelength that drifts", "", (slopes["wavelength_nm"] * ramp)[None]
+            yield "a wavelength that drifts", 0.0, "", (slopes["wavelength_nm"] * ramp)[None]
     stretched = _stretched(image - _background(x, model.setting))
-    yield "a wrong pixel pitch", "1 % of the pitch", 0.01 * stretched[None]
+    yield "a wrong pixel pitch", 1.0, "{:.3g} % of the pitch", 0.01 * stretched[None]
     if not len(model.modes):
         step = 0.05
         uneven = [model.with_residual(-1j * step * np.eye(5)[i], _low_orders).images(x)[0] - image for i in range(5)]
-        yield "uneven illumination", "10 % more light at the right rim", np.array(uneven)
+        yield "uneven illumination", 10.0, "{:.3g} % more light at the right rim", np.array(uneven)
         names = [f"residual_{k}" for k in range(MODES)]
         bent = model.with_residual(np.zeros(MODES), basis).images(x, names)[1]
-        yield "a smooth phase that no parameter describes", "", np.asarray(bent) * prior_rad()[:, None, None, None]
+        yield "a smooth phase that no parameter describes", 0.0, "", np.asarray(bent) * prior_rad()[:, None, None, None]
 
 
 def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:

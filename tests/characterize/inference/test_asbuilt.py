@@ -117,11 +117,9 @@ def test_degeneracies_are_named(fitted):
     assert fitted.identifiable
 
 
-def test_glass_that_nobody_stated_is_declared_and_nothing_is_found_where_nothing_is(fitted):
+def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fitted):
     assert "residuals lean" not in " ".join(fitted.cautions)
-    glass = next(words for words in fitted.degeneracies if "plate of glass" in words)
-    assert "glass_um 100 would be taken for" in glass
-    assert "distance_um" in glass or "stage_zero_um" in glass
+    assert any("glass" in words and "would be taken for" in words for words in fitted.degeneracies)
 
 
 def test_saved_result_comes_back(fitted, tmp_path):
