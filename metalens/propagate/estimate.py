@@ -18,7 +18,7 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.threads import one_blas_thread, split
 from metalens.propagate.geometry import Case
-from metalens.propagate.nodes import reference_depth
+from metalens.propagate.kernels import reference_depth
 from metalens.propagate.sincos import turns64
 
 MORE = 8

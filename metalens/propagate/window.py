@@ -12,17 +12,9 @@ from metalens.ground.errors import PropagationError
 from metalens.ground.paths import sensor_path
 from metalens.propagate.estimate import MORE
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.nodes import (
-    Depths,
-    Layout,
-    depth_basis,
-    depth_factors,
-    layout,
-    operators,
-    over_blocks,
-    pairs,
-    reference_depth,
-)
+from metalens.propagate.kernels import over_blocks, reference_depth
+from metalens.propagate.nodes import Layout, layout
+from metalens.propagate.operators import Depths, depth_basis, depth_factors, operators, pairs
 from metalens.propagate.pillars import Moments, moments, reduce
 
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache

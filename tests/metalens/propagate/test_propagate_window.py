@@ -12,7 +12,8 @@ import torch
 from metalens import propagate, psf
 from metalens.ground import legendre
 from metalens.ground.errors import PropagationError
-from metalens.propagate.nodes import depth_basis, depth_factors, layout
+from metalens.propagate.nodes import layout
+from metalens.propagate.operators import depth_basis, depth_factors
 
 WAVELENGTH, PITCH = 0.85, 0.4
 K = 2 * np.pi / WAVELENGTH
@@ -222,7 +223,7 @@ def score(phase, level, **geometry):
 
 
 def test_gradcheck_of_the_moments_and_of_the_window():
-    from metalens.propagate.nodes import over_blocks
+    from metalens.propagate.kernels import over_blocks
     from metalens.propagate.pillars import moments, reduce
     from metalens.propagate.window import plan, zoom
 
