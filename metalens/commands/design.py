@@ -11,12 +11,24 @@ import tyro
 from metalens import design, lens, library
 from metalens.cell import Cell
 from metalens.commands.common import Common, Output
-from metalens.design import Cubic, DoubleHelix, Focus, FocusCheck, Limits, PhaseMap, PhaseOf, Quality, check_focus
+from metalens.design import (
+    Cubic,
+    DoubleHelix,
+    Focus,
+    FocusCheck,
+    Limits,
+    PhaseMap,
+    PhaseOf,
+    Quality,
+    check_focus,
+    focuses,
+)
 from metalens.design.free_form import Fisher
 from metalens.ground import config, store
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
+from metalens.lens import Layers, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import Proxy
 
@@ -36,6 +48,8 @@ class Design:
     library: library.h5 of the pillar cell, relative to the config; without it ``cell`` is swept first.
     cell: the pillar cell, where no library is given.
     limits: what the process prints.
+    layers: [[layers.front]] and [[layers.behind]] with material and thickness_um, in the order that the light meets
+        them: films that the phase is corrected for; the gap behind the pillars is filled by the cell's cover.
     double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` chooses its own source distance.
     """
 
@@ -51,6 +65,7 @@ class Design:
     cubic: Cubic = field(default_factory=Cubic)
     fisher: Fisher = field(default_factory=Fisher)
     map: PhaseMap | None = None
+    layers: Layers = field(default_factory=Layers)
 
     def __post_init__(self) -> None:
         if not 0 < self.aperture_mm <= 10:
@@ -59,11 +74,13 @@ class Design:
             raise ConfigError("profile 'map' needs a table [map] with file and pitch_um")
         if self.library is not None and self.cell is not None:
             raise ConfigError("library and cell are both given; a library holds its cell: give one of them")
+        check_gaps(self.layers, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
 
     @property
     def focus(self) -> Focus:
-        """What is imaged onto what, in um."""
-        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
+        """What is imaged onto what, in um, through which films."""
+        distances = self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3
+        return Focus(self.wavelength_nm * 1e-3, *distances, self.layers)
 
 
 @dataclass(frozen=True)
@@ -111,6 +128,7 @@ def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusC
         wanted = replace(wanted, limits=_printable(options.process, cell))
         inputs[options.process.name] = store.sha256(options.process)
     inputs[options.config.name] = store.sha256(options.config)
+    wanted = replace(wanted, layers=_filled(wanted.layers, cell))
     own = _located(wanted, options.config)
     if wanted.profile == "map" and own is not None and own.file.is_file():
         inputs[own.file.name] = store.sha256(own.file)
@@ -127,12 +145,25 @@ def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusC
         provenance=store.Provenance(config=config.dumps(wanted), inputs=inputs),
         accept_partial_turn=options.accept_partial_turn,
     )
+    meets = wanted.profile != "map" or focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
+    quality = replace(quality, focuses=meets)
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
     return quality, check, judged
+
+
+def _filled(layers: Layers, cell: Cell) -> Layers:
+    """The films with the cell's cover between them.
+
+    Raises:
+        ConfigError: another cover is given.
+    """
+    if layers.cover not in (None, cell.cover):
+        raise ConfigError(f"layers.cover = {layers.cover!r}, but the cell has {cell.cover!r}: leave layers.cover out")
+    return replace(layers, cover=cell.cover)
 
 
 def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
@@ -221,11 +252,16 @@ def _located(wanted: Design, where: Path) -> PhaseMap | None:
 
 
 def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
-    values: dict[str, object] = {
-        "pillars": quality.pillars,
-        "numerical_aperture": quality.numerical_aperture,
-        "field_of_view_deg": math.degrees(quality.field_of_view_rad),
-        "efficiency": quality.efficiency,
+    values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
+    if quality.focuses:
+        values |= {
+            "numerical_aperture": quality.numerical_aperture,
+            "field_of_view_deg": math.degrees(quality.field_of_view_rad),
+            "efficiency": quality.efficiency,
+        }
+    else:
+        values["wave_efficiency"] = quality.efficiency
+    values |= {
         "transmission": quality.transmission,
         "strehl": quality.strehl,
         "max_phase_error_rad": quality.max_phase_error_rad,
@@ -239,14 +275,35 @@ def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
     return values
 
 
+def _cone(quality: Quality) -> list[str]:
+    """Aperture and field of a lens that has a focus."""
+    if not quality.focuses:
+        return ["  the phase brings no light together on the sensor: it has no focusing efficiency, NA or field"]
+    return [
+        f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
+        f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)"
+    ]
+
+
+def _films(layers: Layers) -> list[str]:
+    """What the light passes beside the pillars."""
+    found = []
+    for where, films in (("front", layers.front), ("behind", layers.behind)):
+        if films:
+            named = ", ".join(f"{film.thickness_um:g} um {film.material}" for film in films)
+            found.append(f"  phase corrected for layers {where}: {named}")
+    return found
+
+
 def _text(target: Path, wanted: Design, quality: Quality, check: FocusCheck | None) -> str:
     lines = [
         f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
         f"{wanted.wavelength_nm:g} nm",
-        f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
-        f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)",
-        f"  focusing efficiency {quality.efficiency:.3f}, mean |T|² {quality.transmission:.3f}, "
+        *_cone(quality),
+        f"  {'focusing' if quality.focuses else 'wave-front'} efficiency {quality.efficiency:.3f}, "
+        f"mean |T|² {quality.transmission:.3f}, "
         f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
+        *_films(wanted.layers),
     ]
     if quality.turns < 1:
         lines.append(

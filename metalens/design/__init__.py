@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from metalens.design import profiles as profiles
     from metalens.design.focus_check import FocusCheck as FocusCheck
     from metalens.design.focus_check import check_focus as check_focus
+    from metalens.design.focusing import focuses as focuses
     from metalens.design.of_phase import Limits as Limits
     from metalens.design.of_phase import PhaseOf as PhaseOf
     from metalens.design.of_phase import Quality as Quality
@@ -35,6 +36,7 @@ __getattr__, __dir__, __all__ = attach(
         "Quality": "of_phase",
         "check_focus": "focus_check",
         "field_angle": "of_phase",
+        "focuses": "focusing",
         "hyperbolic": "profiles",
         "make": "of_phase",
         "neighbours": "",

@@ -1,13 +1,15 @@
 """Whether the pillars focus where they should, by the direct Rayleigh-Sommerfeld sum on a small window."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from metalens import propagate
+from metalens.design.profiles import Focus
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.propagate import Case, field_at
+from metalens.propagate import Case, field_at, kernel
 
 _ARM = np.linspace(-1.2, 1.2, 9)  # arms of the cross of points, in units of wavelength / (2 NA)
 _SHIFTS = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])  # sensor distances tried, in units of wavelength / NA²
@@ -61,21 +63,14 @@ def check_focus(lens: Lens, *, axial: bool = True) -> FocusCheck:
         of a line, within 2 % of the resolution.
     """
     d = lens.diameters
-    aperture = math.sin(math.atan((d.radius_um + d.pitch_um / 2) / lens.sensor_distance_um))
-    resolution, depth = lens.wavelength_um / (2 * aperture), lens.wavelength_um / aperture**2
-    zones = (d.radius_um + d.pitch_um / 2) ** 2 / (lens.wavelength_um * lens.sensor_distance_um)
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    aperture = focus.aperture(d.radius_um + d.pitch_um / 2)
+    resolution, depth = lens.wavelength_um / (2 * aperture), after.index[0] * lens.wavelength_um / aperture**2
+    zones = (d.radius_um + d.pitch_um / 2) ** 2 / (lens.wavelength_um * after.reduced_um)
     phase, level = lens.phase_rad(), lens.transmission()
-    case = Case(
-        shape=(d.diameter_um.shape[0], d.diameter_um.shape[1]),
-        pitch_um=d.pitch_um,
-        wavelength_um=lens.wavelength_um,
-        sensor_distance_um=lens.sensor_distance_um,
-        tangents=(0.0, 0.0),
-        inverse_depths_per_um=(1 / lens.source_distance_um,),
-        centre_um=(0.0, 0.0),
-        step_um=resolution,
-        samples=(1, 1),
-    )
+    case = _case(lens, resolution, 0.0)
+    axial = axial and after.thickness_um[0] > depth / 2
     arm, rest = _ARM * resolution, np.zeros_like(_ARM)
     cross = np.concatenate([np.stack([arm, rest], 1), np.stack([rest, arm], 1)])
     power = np.abs(field_at(phase, level, case, cross)[0]) ** 2
@@ -83,23 +78,31 @@ def check_focus(lens: Lens, *, axial: bool = True) -> FocusCheck:
     return FocusCheck(
         x_um=_vertex(arm, along_x),
         y_um=_vertex(arm, along_y),
-        z_um=_axial_peak(phase, level, case, depth) if axial and zones >= 5 else math.nan,
+        z_um=_axial_peak(lens, (phase, level), resolution, depth) if axial and zones >= 5 else math.nan,
         strehl=float(max(along_x.max(), along_y.max())) / _in_step(level, case) ** 2,
         resolution_um=resolution,
         depth_um=depth,
     )
 
 
-def _axial_peak(phase: Array, level: Array, case: Case, depth_um: float) -> float:
+def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
+    """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
+    return propagate.case(
+        lens.diameters.diameter_um.shape,
+        pitch_um=lens.diameters.pitch_um,
+        wavelength_um=lens.wavelength_um,
+        sensor_distance_um=lens.sensor_distance_um + shift_um,
+        depths_um=lens.source_distance_um,
+        window_um=step_um,
+        samples=1,
+        layers=lens.layers,
+    )
+
+
+def _axial_peak(lens: Lens, maps: tuple[Array, Array], step_um: float, depth_um: float) -> float:
     shifts = _SHIFTS * depth_um
-    power = [
-        float(
-            np.abs(field_at(phase, level, replace(case, sensor_distance_um=case.sensor_distance_um + s), _AXIS)[0, 0])
-        )
-        ** 2
-        for s in shifts
-    ]
-    return _vertex(shifts, np.array(power))
+    fields = [field_at(*maps, _case(lens, step_um, float(s)), _AXIS)[0, 0] for s in shifts]
+    return _vertex(shifts, np.abs(np.array(fields)) ** 2)
 
 
 _AXIS = np.zeros((1, 2))
@@ -108,11 +111,10 @@ _AXIS = np.zeros((1, 2))
 def _in_step(level: Array, case: Case) -> float:
     """Magnitude at the focus if all pillars were in step: sum of p² T d / (2 pi r²) |1/r - ik|."""
     y, x = case.pillars_um
-    total = 0.0
-    for row, position in zip(level, y, strict=True):
-        r2 = x**2 + position**2 + case.sensor_distance_um**2
-        total += float((row / r2 * np.sqrt(1 / r2 + case.wavenumber**2)).sum())
-    return total * case.pitch_um**2 * case.sensor_distance_um / (2 * math.pi)
+    total = sum(
+        float((row * np.abs(kernel(case, x, at, 0.0, 0.0, 0.0))).sum()) for row, at in zip(level, y, strict=True)
+    )
+    return total * case.pitch_um**2
 
 
 def _vertex(position: Array, value: Array) -> float:

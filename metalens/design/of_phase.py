@@ -12,7 +12,6 @@ from metalens.design import phase_map, profiles
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, LensError
-from metalens.ground.paths import source_path
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
@@ -35,6 +34,8 @@ class Quality:
     max_phase_error_rad: largest difference between wanted and made phase.
     rms_phase_error_rad: root mean square of it over the pillars.
     turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the phases that none has.
+    focuses: whether rays of the design source meet in one spot (:func:`metalens.design.focuses`); where they do not,
+        aperture and field have no meaning, and the efficiency is that of the wanted wave front.
     """
 
     pillars: int
@@ -46,6 +47,7 @@ class Quality:
     max_phase_error_rad: float
     rms_phase_error_rad: float = 0.0
     turns: float = 1.0
+    focuses: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +131,7 @@ def make(
         source_distance_um=focus.source_distance_um,
         profile=profile,
         provenance=provenance or Provenance(),
+        layers=focus.layers,
     )
     return lens, sums.quality(
         focus, aperture_um / 2, proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
@@ -194,7 +197,7 @@ class _Sums:
         peak = abs(self.field) ** 2
         return Quality(
             pillars=self.count,
-            numerical_aperture=float(np.sin(np.arctan(radius_um / focus.sensor_distance_um))),
+            numerical_aperture=focus.aperture(radius_um),
             efficiency=peak / self.count**2,
             transmission=self.power / self.count,
             strehl=peak / self.level**2,
@@ -225,8 +228,8 @@ def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> flo
     x, y = (g[np.hypot(*np.meshgrid(unit, unit)) <= 1] * radius_um for g in np.meshgrid(unit, unit))
     tangent = math.tan(angle_rad)
     path = profiles.hyperbolic(x, y, focus)
-    for distance, side in ((focus.sensor_distance_um, -tangent), (focus.source_distance_um, tangent)):
-        path = path + 2 * np.pi / focus.wavelength_um * source_path(x, y, (side, 0.0), 1 / distance)
+    for one in focus.paths_from(x, y, tangent):
+        path = path + 2 * np.pi / focus.wavelength_um * one
     basis = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=1)
     basis /= np.abs(basis).max(axis=0)
     residual = path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]

@@ -5,14 +5,15 @@ All focus a point source on the axis at ``source_distance_um`` before the lens o
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, LensError
-from metalens.ground.paths import path_difference
+from metalens.ground.paths import path_difference, source_path
+from metalens.lens import Layers, check_gaps, media
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,16 +21,57 @@ class Focus:
     """What the lens images onto what.
 
     source_distance_um: object distance of best focus; inf for a collimated beam.
+    layers: films in front and behind that the phase is corrected for; none by default.
     """
 
     wavelength_um: float
     sensor_distance_um: float
     source_distance_um: float = math.inf
+    layers: Layers = field(default_factory=Layers)
 
     def __post_init__(self) -> None:
         for name in ("wavelength_um", "sensor_distance_um", "source_distance_um"):
             if not getattr(self, name) > 0:
                 raise LensError(f"{name} = {getattr(self, name)}: need a length above 0")
+        check_gaps(self.layers, self.sensor_distance_um, self.source_distance_um)
+
+    def path_um(self, radius2_um2: Array) -> Array:
+        """Optical path source - lens - sensor through a ring of squared radius r², less that along the axis, um.
+
+        Paper Eq. 1 on both sides; through films that of the ray which reaches r, to rounding.
+        """
+        if self.layers.plain:
+            near, far = self.sensor_distance_um, self.source_distance_um
+            return np.asarray(path_difference(radius2_um2, near) + path_difference(radius2_um2, far))
+        after = self.layers.after(self.sensor_distance_um, self.wavelength_um).layers
+        total = media.longer(after, 0.0, 0.0, radius2_um2)[1]
+        if math.isfinite(self.source_distance_um):
+            before = self.layers.before(self.source_distance_um, self.wavelength_um).layers
+            total = total + media.longer(before, 0.0, 0.0, radius2_um2)[1]
+        return np.asarray(total)
+
+    def aperture(self, radius_um: float) -> float:
+        """Numerical aperture n sin θ of the cone that leaves a lens of this radius towards the sensor."""
+        after = self.layers.after(self.sensor_distance_um, self.wavelength_um)
+        return float(media.direction(after, radius_um))
+
+    def paths_from(self, x_um: Array, y_um: Array, tangent: float) -> tuple[Array, Array]:
+        """Optical paths to (x, y) of the lens from the source and the sensor point of a field angle along x, less those
+        to its middle, um."""
+        near, far = self.sensor_distance_um, self.source_distance_um
+        if self.layers.plain:
+            sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / near)
+            return np.asarray(sensor), np.asarray(source_path(x_um, y_um, (tangent, 0.0), 1 / far))
+        sine2 = tangent**2 / (1 + tangent**2)
+        found = []
+        for gap, side in ((self.layers.after(near, self.wavelength_um), 1), (None, -1)):
+            if gap is None and not math.isfinite(far):
+                found.append(np.asarray(x_um * math.sqrt(sine2)))
+                continue
+            pairs = (gap or self.layers.before(far, self.wavelength_um)).layers
+            reach = side * math.sqrt(sine2) * media.bend(pairs, sine2)
+            found.append(np.asarray(media.longer(pairs, sine2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um)[1]))
+        return found[0], found[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +128,7 @@ def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
     Returns:
         (y, x) phase in rad, 0 on the axis and negative outwards, float64.
     """
-    radius2 = x_um**2 + y_um**2
-    path = path_difference(radius2, focus.sensor_distance_um) + path_difference(radius2, focus.source_distance_um)
-    return np.asarray(-2 * np.pi / focus.wavelength_um * path)
+    return np.asarray(-2 * np.pi / focus.wavelength_um * focus.path_um(x_um**2 + y_um**2))
 
 
 def double_helix(x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float) -> Array:

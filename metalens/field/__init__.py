@@ -9,10 +9,8 @@ if TYPE_CHECKING:
     from metalens.field.engine import node_psfs as node_psfs
     from metalens.field.forming import Imager as Imager
     from metalens.field.forming import with_psfs as with_psfs
-    from metalens.field.media import Media as Media
     from metalens.field.plan import Grid as Grid
     from metalens.field.plan import Plan as Plan
-    from metalens.field.points import Layers as Layers
     from metalens.field.points import Optics as Optics
     from metalens.field.points import Window as Window
     from metalens.field.points import psfs as psfs
@@ -22,14 +20,16 @@ if TYPE_CHECKING:
     from metalens.field.waves import PillarWave as PillarWave
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
+    from metalens.lens import Layers as Layers
+    from metalens.lens import Media as Media
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Grid": "plan",
         "Imager": "forming",
-        "Layers": "points",
-        "Media": "media",
+        "Layers": "metalens.lens.layers",
+        "Media": "metalens.lens.media",
         "Optics": "points",
         "PillarWave": "waves",
         "Plan": "plan",

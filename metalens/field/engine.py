@@ -11,11 +11,11 @@ from metalens.field import patches as cutting
 from metalens.field.forming import Imager, blurred, trimmed, vergence, with_psfs
 from metalens.field.patches import dense, relative
 from metalens.field.plan import SHARES, Grid, Plan, planned, spectral
-from metalens.field.points import Layers, Optics, psfs, sampling
+from metalens.field.points import Optics, psfs, sampling
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.image import Frames
-from metalens.lens import Lens
+from metalens.lens import Layers, Lens
 from metalens.psf import Nodes, Source
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve

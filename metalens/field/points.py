@@ -16,51 +16,13 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from metalens.cell import Film, Material, index
-from metalens.field import media
-from metalens.field.media import Media
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
+from metalens.lens import Layers, media
 
 SPARE = 1.06  # period of the nodes per width of the window
 VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 LARGEST_P = 0.9  # of a ray, in units of the rarest index
-
-
-@dataclass(frozen=True, slots=True)
-class Layers:
-    """Plane-parallel films around a lens; the light meets them in this order.
-
-    front: between the source and the pillars (a substrate, a cover before it); the rest of the depth is air.
-    behind: between the pillars and the sensor (filter, cover glass); the rest of the distance is ``cover``.
-    """
-
-    front: tuple[Film, ...] = ()
-    behind: tuple[Film, ...] = ()
-    cover: Material = "air"
-
-    def after(self, distance_um: float, wavelength_um: float) -> Media:
-        """Media from pillars to sensor, the cover first.
-
-        Raises:
-            PropagationError: the films are thicker than the distance.
-        """
-        return _media(self.behind, self.cover, distance_um, wavelength_um, "lens to sensor")
-
-    def before(self, depth_um: float, wavelength_um: float) -> Media:
-        """Media from a source at this depth to the pillars, air first."""
-        return _media(self.front, "air", depth_um, wavelength_um, "source to lens")
-
-
-def _media(films: tuple[Film, ...], rest: Material, distance_um: float, wavelength_um: float, where: str) -> Media:
-    thick = sum(film.thickness_um for film in films)
-    if thick > distance_um:
-        raise PropagationError(
-            f"films of {thick:g} um in the {distance_um:g} um from {where}; need films no thicker than the gap"
-        )
-    names = (rest, *(film.material for film in films))
-    indices = tuple(float(index(name, wavelength_um).real) for name in names)
-    return Media(indices, (distance_um - thick, *(film.thickness_um for film in films)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,14 +175,9 @@ def seen(
     # width of a node across the rim: how fast the radius changes with p
     step = torch.sqrt(media.spread(after, p)) * (wavelength_um / grid.period_um)
     inside = ((radius - r) / step + 0.5).clamp(0, 1)
-    order = (float(index(optics.layers.cover, wavelength_um).real), *_indices(optics.layers.behind, wavelength_um))
     whole = inside * torch.sqrt(media.spread(after, p))
     phase = optics.wave.carrier_rad(x, y) + 2 * math.pi / wavelength_um * media.path(after, p)
-    return Pupil(x, y, whole * torch.sqrt(media.passed(order, p)), phase, float((whole**2).sum()))
-
-
-def _indices(films: tuple[Film, ...], wavelength_um: float) -> tuple[float, ...]:
-    return tuple(float(index(film.material, wavelength_um).real) for film in films if film.thickness_um > 0)
+    return Pupil(x, y, whole * torch.sqrt(media.passed(after.order, p)), phase, float((whole**2).sum()))
 
 
 def source_paths(

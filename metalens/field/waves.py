@@ -69,7 +69,7 @@ class PillarWave:
 
     def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
         self.lens = lens
-        self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
+        self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
         d = lens.diameters
         self.radius_um = d.radius_um + d.pitch_um / 2
         self.diameter_um = torch.as_tensor(np.ascontiguousarray(d.diameter_um)) if diameter_um is None else diameter_um

@@ -1,11 +1,15 @@
-"""A lens: pillar diameters on a lattice with their cell and proxy."""
+"""A lens: pillar diameters on a lattice with their cell, their proxy, and the films around them."""
 
 from typing import TYPE_CHECKING
 
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.lens import media as media
     from metalens.lens import picture as picture
+    from metalens.lens.layers import Layers as Layers
+    from metalens.lens.layers import check_gaps as check_gaps
+    from metalens.lens.media import Media as Media
     from metalens.lens.record import DiameterMap as DiameterMap
     from metalens.lens.record import Lens as Lens
     from metalens.lens.record import from_parts as from_parts
@@ -18,9 +22,13 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "DiameterMap": "record",
+        "Layers": "layers",
         "Lens": "record",
+        "Media": "media",
+        "check_gaps": "layers",
         "from_parts": "record",
         "load": "record",
+        "media": "",
         "parts": "record",
         "picture": "",
         "save": "record",

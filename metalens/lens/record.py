@@ -15,6 +15,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
+from metalens.lens.layers import Layers, check_gaps
 from metalens.lens.rows import RowsOnDisk
 from metalens.pillars import Proxy
 
@@ -88,6 +89,10 @@ class Lens:
     source_distance_um: object distance of best focus (inf for a collimated beam).
     profile: name of the design (hyperbolic, double-helix, cubic, fisher, map, as-built).
     provenance: config and inputs that made it.
+    layers: films in front and behind; their cover is that of the cell.
+
+    Raises:
+        LensError: layers with another cover than the cell's; PropagationError: films thicker than their gap.
     """
 
     diameters: DiameterMap
@@ -98,6 +103,16 @@ class Lens:
     source_distance_um: float
     profile: str
     provenance: Provenance = field(default_factory=Provenance)
+    layers: Layers = field(default_factory=Layers)
+
+    def __post_init__(self) -> None:
+        cover = self.cell.cover
+        if self.layers.cover not in (None, cover):
+            raise LensError(
+                f"layers: cover {self.layers.cover!r}, but the pillars' cell has {cover!r}; leave cover out"
+            )
+        object.__setattr__(self, "layers", replace(self.layers, cover=cover))
+        check_gaps(self.layers, self.sensor_distance_um, self.source_distance_um)
 
     def phase_rad(self, wavelength_um: float | None = None) -> Array:
         """(y, x) phase of every pillar through the proxy; 0 where there is none."""
@@ -171,6 +186,8 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
         "source_distance_um": lens.source_distance_um,
         "profile": lens.profile,
     }
+    if lens.layers.films:
+        attributes["layers"] = config.dumps(lens.layers)
     return arrays, attributes
 
 
@@ -186,7 +203,14 @@ def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, wh
         sensor_distance_um=attributes["sensor_distance_um"],
         source_distance_um=attributes["source_distance_um"],
         profile=attributes["profile"],
+        layers=_layers(attributes, where),
     )
+
+
+def _layers(attributes: Mapping[str, Any], where: str) -> Layers:
+    """The films of a file; none in files that name none."""
+    text = attributes.get("layers")
+    return Layers() if text is None else config.loads(text, Layers, where=f"{where}: layers")
 
 
 def _axis(count: int, pitch_um: float) -> Array:

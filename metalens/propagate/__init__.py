@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from metalens.propagate.geometry import Case as Case
     from metalens.propagate.geometry import axis as axis
     from metalens.propagate.geometry import check_aperture as check_aperture
-    from metalens.propagate.geometry import chief_path as chief_path
+    from metalens.propagate.kernels import kernel as kernel
+    from metalens.propagate.paths import chief_path as chief_path
     from metalens.propagate.verbs import angles as angles
     from metalens.propagate.verbs import angular_spectrum as angular_spectrum
     from metalens.propagate.verbs import case as case
+    from metalens.propagate.verbs import chief as chief
     from metalens.propagate.verbs import exact as exact
     from metalens.propagate.verbs import windowed as windowed
     from metalens.propagate.window import Moving as Moving
@@ -45,14 +47,16 @@ __getattr__, __dir__, __all__ = attach(
         "angular_spectrum": "verbs",
         "axis": "geometry",
         "case": "verbs",
+        "chief": "verbs",
         "check_aperture": "geometry",
-        "chief_path": "geometry",
+        "chief_path": "paths",
         "choose": "choice",
         "draw": "estimate",
         "exact": "verbs",
         "field_at": "direct",
         "field_exact": "direct",
         "field_windowed": "window",
+        "kernel": "kernels",
         "plan": "window",
         "relative_error": "estimate",
         "scan": "estimate",

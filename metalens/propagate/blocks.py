@@ -15,8 +15,8 @@ from numpy.polynomial import chebyshev
 
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
-from metalens.ground.paths import sensor_path, source_path
 from metalens.propagate.geometry import Case
+from metalens.propagate.paths import from_source, to_sensor
 
 LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  # of rows, of columns
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
@@ -110,8 +110,7 @@ def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float
 
 def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
     """Source path (of the reference depth) plus sensor path (to the window centre), in wavelengths."""
-    path = source_path(x, y, case.tangents, reference)
-    return (path + sensor_path(x, y, case.centre_um, case.sensor_distance_um)) / case.wavelength_um
+    return (from_source(case, x, y, case.tangents, reference) + to_sensor(case, x, y)) / case.wavelength_um
 
 
 def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:

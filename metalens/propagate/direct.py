@@ -6,9 +6,10 @@ import numba
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.ground.paths import source_path
 from metalens.ground.threads import split
 from metalens.propagate.geometry import Case, check_aperture
+from metalens.propagate.layered import add_rays, media_arrays
+from metalens.propagate.paths import from_source
 from metalens.propagate.sincos import turns64
 
 
@@ -16,6 +17,7 @@ def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
     """Field on the window, every pillar a point source of area p² (paper Eqs. 1-3 in space, exp(-iωt)).
 
     U(X) = Σ p² T e^{iφ} U_in · d/(2πr²) (1/r - ik) e^{ikr}, with |U_in| = 1 and its phase zero at the lens centre.
+    Through films the kernel is that of :mod:`metalens.propagate.paths`.
 
     Args:
         phase_rad, transmission: (y, x).
@@ -55,8 +57,10 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
     """Add the light of pillar rows (depth, y, x) to ``out`` (depth, point)."""
     y, x = at_um
     real, imaginary = np.ascontiguousarray(light.real), np.ascontiguousarray(light.imag)
-    numbers = (case.wavenumber, case.sensor_distance_um, case.pitch_um**2)
+    numbers: Any = (case.wavenumber, case.sensor_distance_um, case.pitch_um**2)
     kernel: Any = _accumulate
+    if case.behind is not None:
+        kernel, numbers = add_rays, (case.wavenumber, case.pitch_um**2, *media_arrays(case.behind))
 
     def work(a: int, b: int) -> None:
         kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])
@@ -67,7 +71,7 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
 def leaving(phase_rad: Array, transmission: Array, case: Case, y_um: Array, x_um: Array) -> Array:
     """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth: (depth, y, x) complex128."""
     inverse = np.array(case.inverse_depths_per_um)[:, None, None]
-    path = source_path(x_um[None, :], y_um[:, None], case.tangents, inverse)
+    path = from_source(case, x_um[None, :], y_um[:, None], case.tangents, inverse)
     return np.asarray(transmission * np.exp(1j * (phase_rad + case.wavenumber * path)))
 
 

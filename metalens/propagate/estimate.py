@@ -18,7 +18,9 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.threads import one_blas_thread, split
 from metalens.propagate.geometry import Case
-from metalens.propagate.kernels import reference_depth
+from metalens.propagate.layered import media_arrays, sum_rays
+from metalens.propagate.operators import depth_factors
+from metalens.propagate.paths import reference_depth
 from metalens.propagate.sincos import turns64
 
 MORE = 8
@@ -159,13 +161,20 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
     e, x = legendre.mapped(m, -hy, hy), legendre.mapped(n, -hx, hx)
     points = np.stack([wx[at[1]], wy[at[0]]], -1)
     lengths = [*case.centre_um, case.sensor_distance_um, case.wavelength_um]
-    numbers = np.array([*case.tangents, reference_depth(case), *lengths])
+    numbers: Any = np.array([*case.tangents, reference_depth(case), *lengths])
     inverse = np.array(case.inverse_depths_per_um)[depths]
     re, im = np.empty((2, m, len(depths), n))
     out = np.zeros((len(depths), len(points)), complex)
     turn: Any = _curved
     total: Any = _sum_nodes
-    split(m, lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, re[a:b], im[a:b]))
+    if case.front:
+        angle = depth_factors(case, e[:, None], x, case.tangents, inverse[:, None, None])
+        turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
+        re[:], im[:] = turned.real, turned.imag
+    else:
+        split(m, lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, re[a:b], im[a:b]))
+    if case.behind is not None:
+        total, numbers = sum_rays, (case.wavenumber, *case.centre_um, *media_arrays(case.behind))
     split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
     return np.asarray(out * case.pitch_um**2)
 

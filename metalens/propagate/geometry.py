@@ -12,6 +12,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
+from metalens.lens import Media
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,11 +20,13 @@ class Case:
     """Geometry of one propagation; hashable, so that plans can be kept.
 
     shape: (y, x) pillars; pitch_um: their lattice constant.
-    wavelength_um: in the medium on both sides of the lens.
+    wavelength_um: in the medium on both sides of the lens; in vacuum where films are given.
     sensor_distance_um: lens plane to sensor plane.
-    tangents: (x, y) tangents of the field angle.
+    tangents: (x, y) tangents of the field angle; in air where films are given.
     inverse_depths_per_um: 1/z of every source, 0 for a source at infinity.
     centre_um: (x, y) of the window on the sensor; step_um: its sampling; samples: (y, x) points of the window.
+    front: (index, thickness) of the films between source and lens, the rest air; behind: the media from lens to sensor,
+        the one that fills the gap first, their thicknesses adding up to the distance; None for one medium.
 
     Raises:
         PropagationError: a length that is not positive and finite, no depth, no sample.
@@ -38,6 +41,8 @@ class Case:
     centre_um: tuple[float, float]
     step_um: float
     samples: tuple[int, int]
+    front: tuple[tuple[float, float], ...] = ()
+    behind: Media | None = None
 
     def __post_init__(self) -> None:
         for name in ("pitch_um", "wavelength_um", "sensor_distance_um", "step_um"):
@@ -51,6 +56,11 @@ class Case:
             raise PropagationError("depths_um must hold at least one source depth above 0 (inf for a far source)")
         if not np.isfinite([*self.tangents, *self.centre_um]).all():
             raise PropagationError(f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}")
+        if inverse.max() * sum(t for _, t in self.front) > 1:
+            raise PropagationError(
+                f"layers: films of {sum(t for _, t in self.front):g} um in the {1 / inverse.max():g} um from source to "
+                "lens; need films no thicker than the gap"
+            )
 
     @property
     def wavenumber(self) -> float:
@@ -111,11 +121,6 @@ def _part(case: Case, row: tuple[int, int], column: tuple[int, int]) -> Case:
 
 def _cut(count: int, parts: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
-
-
-def chief_path(case: Case) -> float:
-    """Distance from the lens centre to the window centre, um: the phase that all methods share."""
-    return float(np.sqrt(case.centre_um[0] ** 2 + case.centre_um[1] ** 2 + case.sensor_distance_um**2))
 
 
 def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:

@@ -17,7 +17,8 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.kernels import correction, cosine_y, direction_range, kernel, probe
+from metalens.propagate.kernels import correction, direction_range, kernel, probe
+from metalens.propagate.paths import cosine_y
 
 MOST_NODES = 400
 MOST_TABLE = 4e6

@@ -7,10 +7,10 @@ import numpy as np
 
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
-from metalens.ground.paths import source_path
-from metalens.propagate.geometry import Case, chief_path
-from metalens.propagate.kernels import correction, cosine_y, direction_range, reference_depth, slopes
+from metalens.propagate.geometry import Case
+from metalens.propagate.kernels import correction, direction_range
 from metalens.propagate.nodes import Sizes
+from metalens.propagate.paths import chief_path, cosine_y, cosines, from_source, reference_depth, slopes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,8 +43,8 @@ class Operators:
 
 def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> Any:
     """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands."""
-    reference = source_path(x, e, case.tangents, reference_depth(case))
-    return case.wavenumber * (source_path(x, e, tangents, inverse) - reference)
+    reference = from_source(case, x, e, case.tangents, reference_depth(case))
+    return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
 
 
 def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False) -> Depths:
@@ -84,7 +84,7 @@ def _tangents(case: Case, e: Array, x: Array, inverse: Array, fields: Array) -> 
     h = 1e-30
     for step in ((0, 0, 1j * h), (1j * h, 0, 0), (0, 1j * h, 0)):
         tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
-        slope = case.wavenumber * source_path(x, e, tangents, inverse + step[2]).imag / h
+        slope = case.wavenumber * from_source(case, x, e, tangents, inverse + step[2]).imag / h
         slope = np.broadcast_to(slope, fields.shape)
         scale = np.sqrt((np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum())
         if scale > 0:
@@ -109,14 +109,13 @@ def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None 
     low, high = direction_range(case, e)
     p = legendre.mapped(m, low, high)
     far = (e - case.centre_um[1])[:, None]
-    across = x - case.centre_um[0]
-    cosines = across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
+    towards = cosines(case, x - case.centre_um[0], far)
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = cosine_y(case, p[:, None], e[None, :])
     lens_terms, window_terms, strength = _low_rank(case, chosen, tolerance / 2, (low, high), slope)
     return Operators(
-        to_directions=legendre.interpolation(m, (2 * cosines - low - high) / (high - low)),
+        to_directions=legendre.interpolation(m, (2 * towards - low - high) / (high - low)),
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
         along_x=np.exp(-1j * k * x_um[:, None] * p),
         lens_terms=lens_terms,

@@ -42,6 +42,8 @@ def angular_spectrum(
     Accuracy: 4e-4 of the PSF for a 1 mm lens at 2 mm; worse where the window is near the edge of the padded grid.
     """
     check_aperture(phase_rad, transmission, case)
+    if case.behind is not None:
+        raise PropagationError("the textbook angular spectrum knows no films; use propagate.exact")
     columns, rows = _lattice(case, pad)
     count = (case.shape[0] * pad, case.shape[1] * pad)
     h = transfer(case, count, band_limited=band_limited)

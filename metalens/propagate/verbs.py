@@ -5,6 +5,7 @@ at the lens centre. The window is a square grid of ``samples`` cells of width ``
 centres and centred on the chief ray, which meets the sensor at d·(tan angle_x, tan angle_y).
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
+from metalens.lens import Layers, Media, media
 from metalens.propagate.choice import Choice, choose
 from metalens.propagate.direct import field_at, field_exact
 from metalens.propagate.geometry import Case
@@ -31,6 +33,7 @@ def case(
     window_um: float,
     samples: int,
     offset_um: tuple[float, float] = (0.0, 0.0),
+    layers: Layers | None = None,
 ) -> Case:
     """Geometry of one propagation.
 
@@ -40,6 +43,7 @@ def case(
         angle_rad: field angle along x, or the pair (x, y); light of a positive angle moves to +x (+y).
         window_um, samples: full width of the square window, and cells along it.
         offset_um: (x, y) of the window centre from the chief ray.
+        layers: films around the lens; ``wavelength_um`` is then that in vacuum, and ``angle_rad`` that in air.
 
     Raises:
         PropagationError: a length that is not positive, an angle of 90° or more, no depth.
@@ -49,10 +53,11 @@ def case(
     depths = np.atleast_1d(np.asarray(depths_um, float))
     if not (depths > 0).all():
         depths = np.array([np.nan])
-    centre = (
-        sensor_distance_um * tangents[0] + float(offset_um[0]),
-        sensor_distance_um * tangents[1] + float(offset_um[1]),
-    )
+    d = sensor_distance_um
+    films: dict[str, Any] = {}
+    if layers is not None and not layers.plain and d > 0:
+        films = around(layers, float(d), float(wavelength_um))
+    meets = [chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i]) for i in (0, 1)]
     return Case(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
@@ -60,10 +65,36 @@ def case(
         sensor_distance_um=float(sensor_distance_um),
         tangents=tangents,
         inverse_depths_per_um=tuple((1 / depths).tolist()),
-        centre_um=centre,
+        centre_um=(meets[0], meets[1]),
         step_um=float(window_um) / max(int(samples), 1),
         samples=(int(samples), int(samples)),
+        **films,
     )
+
+
+def around(layers: Layers, sensor_distance_um: float, wavelength_um: float) -> dict[str, Any]:
+    """``front`` and ``behind`` of a :class:`Case` with these films.
+
+    Raises:
+        PropagationError: films thicker than the distance, or of metal.
+    """
+    before = layers.before(math.inf, wavelength_um)
+    films = tuple((n, t) for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True) if t > 0)
+    return {"front": films, "behind": layers.after(sensor_distance_um, wavelength_um)}
+
+
+def chief(behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int) -> Any:
+    """Where the chief ray of these tangents (in air) meets the sensor, along x (axis 0) or y (1), um.
+
+    Operands may be torch tensors: behind films the cover takes what the distance gains.
+    """
+    if behind is None:
+        return sensor_distance_um * tangents[axis]
+    steep = 1 + tangents[0] * tangents[0] + tangents[1] * tangents[1]
+    value = sensor_distance_um.detach() if hasattr(sensor_distance_um, "detach") else sensor_distance_um
+    gained = [(n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0]
+    pairs = [*gained, (behind.index[0], sensor_distance_um - value)]
+    return media.bend(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
 
 
 def angles(angle_rad: Any) -> tuple[float, float]:

@@ -9,12 +9,12 @@ import torch
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.ground.paths import sensor_path
 from metalens.propagate.estimate import MORE
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.kernels import over_blocks, reference_depth
+from metalens.propagate.kernels import over_blocks
 from metalens.propagate.nodes import Layout, layout
 from metalens.propagate.operators import Depths, depth_basis, depth_factors, operators, pairs
+from metalens.propagate.paths import reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, moments, reduce
 
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
@@ -98,7 +98,7 @@ def _shared(
         arrays[f"{name}_to_tile"] = legendre.interpolation(few, legendre.nodes(all_)[0])
     e, x = _nodes_um(case, found.nodes)
     parts = [part for row in tiles(case, found.parts)[1] for part in row]
-    away = [sensor_path(x, e[:, None], c.centre_um, c.sensor_distance_um) for c in (case, *parts)]
+    away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
     return {name: torch.tensor(a, dtype=_complex(dtype), device=device) for name, a in arrays.items()}
 

@@ -67,6 +67,7 @@ def from_lens(
                 window_um=view.window_um,
                 samples=view.samples,
                 tolerance=tolerance,
+                layers=lens.layers,
             ).numpy()
         )
     return _joined(parts, provenance or Provenance())

@@ -1,5 +1,6 @@
 """PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
+from metalens.lens import Layers
 from metalens.propagate import Case, Moving
 from metalens.psf.compute import Result, intensity
 from metalens.psf.record import PsfStack
@@ -28,6 +30,7 @@ def psf_stack(
     tolerance: float = 1e-4,
     weights: Sequence[float] | None = None,
     offset_um: Any = (0.0, 0.0),
+    layers: Layers | None = None,
 ) -> PsfStack:
     """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
 
@@ -40,6 +43,8 @@ def psf_stack(
         window_um, samples: full width of the square window, and cells along it; samples lie at cell centres.
         tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
         offset_um: (x, y) of the window from the chief ray.
+        layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
+            that in air, and what the sensor distance gains is cover.
 
     Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
     window moves with the chief ray, and so do the derivatives.
@@ -55,12 +60,14 @@ def psf_stack(
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
-    about |= {"offset_um": _value(offset_um)}
+    about |= {"offset_um": _value(offset_um), "layers": layers}
     several = np.ndim(_value(angle_rad)) == 2
     cases, found = [], []
     for angle in angle_rad if several else [angle_rad]:
-        cases.append([propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves])
-        moving = _moving(angle, depths_um, sensor_distance_um, offset_um)
+        seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
+        main = seen[int(share.argmax())]  # all wavelengths share its window
+        cases.append([dataclasses.replace(one, centre_um=main.centre_um) for one in seen])
+        moving = _moving(angle, depths_um, sensor_distance_um, offset_um, main)
         found.append(_direction(maps, cases[-1], share.tolist(), tolerance, moving))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
@@ -114,7 +121,7 @@ def _value(argument: Any) -> Any:
     return argument
 
 
-def _moving(angle: Any, depths: Any, distance: Any, offset: Any) -> Moving | None:
+def _moving(angle: Any, depths: Any, distance: Any, offset: Any, case: Case) -> Moving | None:
     """Geometry as tensors where any of it carries a gradient."""
     given = [angle, depths, distance, *(offset if isinstance(offset, list | tuple) else [offset])]
     if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in given):
@@ -123,7 +130,8 @@ def _moving(angle: Any, depths: Any, distance: Any, offset: Any) -> Moving | Non
     tangents = torch.tan(pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)]))
     d = _double(distance).reshape(())
     shift = torch.stack([_double(o).reshape(()) for o in offset])
-    return Moving(tangents, 1 / _double(depths).reshape(-1), d, d * tangents + shift)
+    meets = torch.stack([propagate.chief(case.behind, d, tangents, i) for i in (0, 1)])
+    return Moving(tangents, 1 / _double(depths).reshape(-1), d, meets + shift)
 
 
 def _double(argument: Any) -> torch.Tensor:

@@ -59,7 +59,7 @@ def fisher_profile(
     settings = settings or Fisher()
     pupil = design_pupil(focus, radius_um)
     found = optimise(pupil, settings, objective=objective)
-    base = Focus(focus.wavelength_um, focus.sensor_distance_um, found.focus_um)
+    base = replace(focus, source_distance_um=found.focus_um)
     extra = free_form(found.controls.numpy(), pupil, cells=found.cells)
 
     def phase(x_um: Array, y_um: Array) -> Array:

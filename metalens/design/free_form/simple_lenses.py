@@ -1,7 +1,7 @@
 """Baselines tuned as hard as a design: the focus of a hyperbolic lens, zones and focus of a double helix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ class Baseline:
 
     def phase(self, focus: Focus, *, radius_um: float) -> tuple[PhaseOf, Focus]:
         """The wanted phase as a function of position, and what it images onto what."""
-        mine = Focus(focus.wavelength_um, focus.sensor_distance_um, self.focus_um)
+        mine = replace(focus, source_distance_um=self.focus_um)
         shape = DoubleHelix(zones=self.zones) if self.zones else None
         return phase_of(shape, mine, radius_um=radius_um), mine
 

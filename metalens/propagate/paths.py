@@ -1,0 +1,173 @@
+"""Paths and amplitudes of a case: closed forms in one medium, rays through plane-parallel films where there are some.
+
+The field of a point behind films is the stationary phase of its plane waves,
+
+    h = -ik/(2π√spread) (1 + i/(kL)) √passed exp(ikL),
+
+L the optical path of the ray, spread the area on the sensor per area of p = n sin θ, passed the power that the faces
+let through. In one medium that is d/(2πr²)(1/r - ik) exp(ikr) itself.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.paths import longer, source_path
+from metalens.ground.paths import sensor_path as sensor_path_in_air
+from metalens.lens import media
+from metalens.propagate.geometry import Case
+
+
+def reference_depth(case: Case) -> float:
+    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the range."""
+    inverse = case.inverse_depths_per_um
+    return (min(inverse) + max(inverse)) / 2
+
+
+def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
+    """Optical path from a source to (x, y), less its path to the lens centre, um; numpy or torch operands.
+
+    ``tangents`` are those in air; without films :func:`metalens.ground.paths.source_path`.
+    """
+    if not case.front:
+        return source_path(x, y, tangents, inverse)
+    tx, ty = tangents
+    sine2 = (tx * tx + ty * ty) / (1 + tx * tx + ty * ty)
+    cosine = (1 - sine2) ** 0.5
+    thick = sum(t for _, t in case.front)
+    pairs = [(1.0, 1 - thick * inverse), *((n, t * inverse) for n, t in case.front)]
+    g = media.bend(pairs, sine2)
+    more = (x * x + y * y) * inverse + 2 * g * cosine * (x * tx + y * ty)
+    return media.longer(pairs, sine2, sine2 * g * g, more, inverse)[1]
+
+
+def to_sensor(case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None) -> Any:
+    """Optical path from (x, y) on the lens to a point of the sensor, by default the middle of the window, less that
+    from the lens centre, um."""
+    cx, cy = case.centre_um if centre is None else centre
+    if case.behind is None:
+        return sensor_path_in_air(x, y, (cx, cy), case.sensor_distance_um)
+    reach2 = cx * cx + cy * cy
+    pairs = case.behind.layers
+    more = x * x + y * y - 2 * (x * cx + y * cy)
+    return media.longer(pairs, media.square(pairs, reach2), reach2, more)[1]
+
+
+def chief_path(case: Case) -> float:
+    """Optical path from the lens centre to the window centre, um: the phase that all methods share."""
+    reach2 = case.centre_um[0] ** 2 + case.centre_um[1] ** 2
+    if case.behind is None:
+        return float(np.sqrt(reach2 + case.sensor_distance_um**2))
+    pairs = case.behind.layers
+    return float(media.whole_path(pairs, media.square(pairs, reach2)))
+
+
+def beyond(case: Case, x: Any, y: Any, X: Any, Y: Any) -> tuple[Any, Any]:
+    """(amplitude, path) from lens (x, y) to the window offset (X, Y); the path less that to the window's centre."""
+    dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
+    more = X * X + Y * Y + 2 * (X * dx + Y * dy)
+    if case.behind is None:
+        k, d = case.wavenumber, case.sensor_distance_um
+        r_w = np.sqrt(dx * dx + dy * dy + d * d)
+        away = longer(r_w, more)
+        r = r_w + away
+        return d / (2 * np.pi * r * r) * (1 / r - 1j * k), away
+    reach2 = dx * dx + dy * dy
+    w0 = media.square(case.behind.layers, reach2)
+    w, away = media.longer(case.behind.layers, w0, reach2, more)
+    return amplitude(case, case.behind.layers, w), away
+
+
+def amplitude(case: Case, pairs: media.Pairs, w: Any) -> Any:
+    """Complex amplitude of the module's heading for the ray of w = p², the phase kL taken off."""
+    real, turn = amplitudes(case, pairs, w)
+    return -1j * real * (1 + 1j * turn)
+
+
+def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any]:
+    """(k/(2π) √(passed / spread), 1/(kL)) of the ray of w = p²; real for real w."""
+    k = case.wavenumber
+    order = case.behind.order if case.behind is not None else ()
+    level = k / (2 * np.pi) * (media.passed_at(order, w) / media.widening(pairs, w)) ** 0.5
+    return level, 1 / (k * media.whole_path(pairs, w))
+
+
+def cosines(case: Case, across: Any, far: Any) -> Any:
+    """p along x of the rays to the window centre from lens points ``across``, ``far`` beside it: n sin θ cos φ."""
+    if case.behind is None:
+        return across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
+    pairs = case.behind.layers
+    return across / media.bend(pairs, media.square(pairs, across * across + far * far))
+
+
+def cosine_y(case: Case, p: Any, e: Any) -> Any:
+    """q along y of the ray from lens row e with p along x to the window centre."""
+    far = e - case.centre_um[1]
+    if case.behind is None:
+        return far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
+    pairs = case.behind.layers
+    return far / media.bend(pairs, media.square(pairs, far * far, p * p))
+
+
+def residual(case: Case, p: Any, e: Any, X: Any, Y: Any) -> tuple[Any, Any]:
+    """(amplitude, path difference + pX + qY) of the ray (p, e), without cancellation."""
+    far = e - case.centre_um[1]
+    if case.behind is None:
+        k, d = case.wavenumber, case.sensor_distance_um
+        r_w = np.sqrt((far * far + d * d) / (1 - p * p))
+        g = p * X + cosine_y(case, p, e) * Y
+        q = X * X + Y * Y - 2 * r_w * g
+        r = np.sqrt(r_w * r_w + q)
+        path = (X * X + Y * Y + g * q / (r + r_w)) / (r + r_w)
+        return d / (2 * np.pi * r * r) * (1 / r - 1j * k), path
+    w0, g, more = _from_ray(case, p, far, X, Y)
+    w, away = media.longer(case.behind.layers, w0, (p * g) ** 2 + far * far, more)
+    return amplitude(case, case.behind.layers, w), away + p * X + far / g * Y
+
+
+def _from_ray(case: Case, p: Any, far: Any, X: Any, Y: Any) -> tuple[Any, Any, Any]:
+    """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x from ``far`` rows away."""
+    pairs: Any = case.behind.layers if case.behind is not None else ()
+    w0 = media.square(pairs, far * far, p * p)
+    g = media.bend(pairs, w0)
+    return w0, g, X * X + Y * Y - 2 * (g * p * X + far * Y)
+
+
+def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
+    """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x and y, at fixed pillar."""
+    k, d = case.wavenumber, case.sensor_distance_um
+    far = e - case.centre_um[1]
+    if case.behind is not None:
+        return _slopes(case, p, far, X, Y)
+    r_w = np.sqrt((far * far + d * d) / (1 - p * p))
+    g = p * X + cosine_y(case, p, e) * Y
+    r = np.sqrt(r_w * r_w + X * X + Y * Y - 2 * r_w * g)
+    radial = 1j * k - 2 / r - 1 / (r * r) / (1 / r - 1j * k)
+    along = np.stack(np.broadcast_arrays(d / r, (X - r_w * p) / r, (Y - far) / r))
+    out = np.asarray(radial * along)
+    out[0] += 1 / d
+    return out
+
+
+def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
+    """As :func:`slopes` through films: the cover takes what the distance gains; by complex steps."""
+    h = 1e-30
+    behind: Any = case.behind
+    _, g, more = _from_ray(case, p, far, X, Y)
+    reach2 = (p * g) ** 2 + far * far + more
+    across, down = X - g * p, Y - far
+    out = []
+    for step in (0, 1, 2):
+        pairs, moved = behind.layers, reach2 + 0j
+        if step == 0:
+            pairs = [(n, t + (1j * h if n == behind.index[0] else 0)) for n, t in behind.layers]
+            if not any(n == behind.index[0] for n, _ in pairs):
+                pairs = [*pairs, (behind.index[0], 1j * h)]
+        else:
+            moved = moved + 2j * h * (across, down)[step - 1]
+        w = media.square(pairs, moved)
+        level, turn = amplitudes(case, pairs, w)
+        rate = level.imag / level.real + 1j * turn.imag / (1 + 1j * turn.real)
+        out.append((rate + 1j * case.wavenumber * media.whole_path(pairs, w).imag) / h)
+    return np.stack(np.broadcast_arrays(*out))
