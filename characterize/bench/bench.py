@@ -159,6 +159,7 @@ def _frame(
         samples=side * FINE,
         tolerance=1e-5,
         offset_um=(shift[0] + middle, shift[1] + middle),
+        layers=lens.layers,
     )
     light = stack.intensity[0] * stack.energy_um2[0]
     step = camera.pixel_um / FINE

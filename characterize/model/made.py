@@ -82,6 +82,7 @@ def built_lens(design: Lens, x: Array) -> Lens:
         source_distance_um=design.source_distance_um,
         profile="as-built",
         provenance=design.provenance,
+        layers=design.layers,
     )
 
 
@@ -119,6 +120,7 @@ def psf_stack(
                 samples=view.samples,
                 tolerance=tolerance,
                 offset_um=offset_um,
+                layers=lens.layers,
             )
         )
     worst = max(parts, key=lambda part: part.error)

@@ -7,7 +7,7 @@ from metalens.design.profiles import Focus
 from metalens.lens import media
 
 RAYS = 25  # along an axis
-SPREAD = 0.1  # rms distance of the rays on the sensor, of that on the lens, up to which they are said to meet
+SPREAD = 0.2  # rms distance of the rays on the sensor, of that on the lens, up to which they are said to meet
 DARK = 1e-3  # of the peak of a perfect lens, below which the place where they meet is dark: a vortex
 
 

@@ -28,8 +28,8 @@ __getattr__, __dir__, __all__ = attach(
     {
         "Grid": "plan",
         "Imager": "forming",
-        "Layers": "metalens.lens.layers",
-        "Media": "metalens.lens.media",
+        "Layers": "metalens.lens",
+        "Media": "metalens.lens",
         "Optics": "points",
         "PillarWave": "waves",
         "Plan": "plan",

@@ -121,7 +121,7 @@ def bend(layers: Pairs, w: Any) -> Any:
 
 def widening(layers: Pairs, w: Any) -> Any:
     """Area on the plane per area of p, as :func:`spread`, of w = p²."""
-    along = _sum([t * n * n / rest**3 for n, t, rest in _with_normals(layers, w)])
+    along = _sum([t * n * n / (rest * rest * rest) for n, t, rest in _with_normals(layers, w)])
     return bend(layers, w) * along
 
 
@@ -142,8 +142,9 @@ def square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
     s = along2 / (low2 - along2) + reach2 * 0
     for _ in range(NEWTON):
         w = low2 * s / (1 + s)
-        g = bend(layers, w)
-        slope = _sum([t / rest**3 for _, t, rest in _with_normals(layers, w)])
+        near = [(t, 1 / (n * n - w) ** 0.5) for n, t in layers]
+        g = _sum([t * v for t, v in near])
+        slope = _sum([t * (v * v * v) for t, v in near])
         rate = (g * g + (w - along2) * g * slope) * low2 / (1 + s) ** 2
         step = (reach2 - (w - along2) * g * g) / rate
         s = s + step
