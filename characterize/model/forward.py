@@ -16,6 +16,7 @@ from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Operators, Reduced
 from characterize.model.setting import Setting, spectrum, true_depth
 from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path, source_path
 from metalens.lens import Lens
 from metalens.made import Answers, Bends, Sensitivity, Widens, maps, named, of_kind
