@@ -115,7 +115,7 @@ def _page(path: Path, best: Plan, measured: Pilot) -> None:
             gaze = math.degrees(float((error**2).sum(-1).mean() ** 0.5))
             rows.append(
                 (
-                    knob.replace("_", " "),
+                    report.in_words(knob),
                     f"{level:g}",
                     f"{gaze:.2g}",
                     f"{seconds:.3g}",

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from metalens.ground import report
 from metalens.ground.errors import StoreError
 from metalens.view import Curves, Numbers, Panel, lens_panels
 
@@ -50,7 +51,7 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
     x = np.array([entry["step"] for entry in steps], float)
     names = [k for k, v in steps[0].items() if k not in ("kind", "step") and isinstance(v, (int, float))]
     lines = {name: np.array([entry.get(name, np.nan) for entry in steps], float) for name in names}
-    said = {name: name.replace("_", " ") for name in names}
+    said = {name: report.in_words(name) for name in names}
     moving = [name for name in names if np.ptp(lines[name]) > 0]
     return [Curves(f"Training: {said[name]}", x, "step", {said[name]: lines[name]}, "") for name in moving]
 
@@ -59,4 +60,4 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
     rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
     names = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float, str))})
     table = [[row.get(name, "") for name in names] for row in rows]
-    return [Numbers("Networks of the run", [name.replace("_", " ") for name in names], table)]
+    return [Numbers("Networks of the run", [report.in_words(name) for name in names], table)]

@@ -168,7 +168,7 @@ def _tables(outcome: Outcome) -> Iterator[report.Table]:
     listed = outcome.values.get("rows")
     if isinstance(listed, list) and listed and isinstance(listed[0], dict):
         head = [k for k, v in listed[0].items() if not isinstance(v, dict | list)]
-        yield report.Table([h.replace("_", " ") for h in head], [[_cell(row[k]) for k in head] for row in listed])
+        yield report.Table([report.in_words(h) for h in head], [[_cell(row[k]) for k in head] for row in listed])
     fitted = outcome.values.get("parameters")
     if isinstance(fitted, dict):
         rows = [
@@ -177,7 +177,7 @@ def _tables(outcome: Outcome) -> Iterator[report.Table]:
         ]
         yield report.Table(("parameter", "value", "1 sigma", "95 % interval"), rows)
     plain = [
-        (name.replace("_", " "), _cell(value))
+        (report.in_words(name), _cell(value))
         for name, value in outcome.values.items()
         if isinstance(value, bool | int | float | str)
     ]

@@ -80,8 +80,42 @@ class KeyFigure:
     good: bool | None = None
 
 
-def png(figure: "Canvas", *, dpi: int = 110) -> bytes:
-    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the figure is closed."""
+UNITS = {"um": "um", "nm": "nm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "seconds": "s", "e": "electrons"}
+UNITS |= {"px": "px", "mb": "MB", "waves": "waves", "um2": "um²", "rad2": "rad²", "e2": "electrons²", "percent": "%"}
+UNITS |= {"mmacs": "million MACs"}
+WORDS = {
+    "max": "largest",
+    "min": "least",
+    "rms": "root-mean-square",
+    "psf": "PSF",
+    "mtf": "MTF",
+    "iou": "overlap of masks",
+}
+WORDS |= {"fwhm": "width at half maximum", "macs": "MACs", "chi2": "chi²", "dof": "degree of freedom", "t": "t"}
+WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time"}
+
+
+def in_words(key: str) -> str:
+    """A key of a result as a reader says it, with its unit behind a stroke.
+
+    >>> in_words("max_phase_error_rad")
+    'largest phase error / rad'
+    >>> in_words("mtf50_x_per_um")
+    'mtf50 x / (1/um)'
+    """
+    *parts, last = key.split("_")
+    unit = UNITS.get(last, "") if parts else ""
+    if unit and parts[-1] == "per":
+        unit, parts = f"(1/{unit})", parts[:-1]
+    said = " ".join(WORDS.get(part, part) for part in (parts if unit else [*parts, last]))
+    return f"{said} / {unit}" if unit else said
+
+
+def png(figure: "Canvas", *, dpi: int = 220) -> bytes:
+    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the figure is closed.
+
+    Two pixels of the file stand for one of the page: sharp on dense screens and on paper.
+    """
     from matplotlib import pyplot
 
     buffer = io.BytesIO()

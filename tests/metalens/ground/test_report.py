@@ -57,3 +57,32 @@ def test_same_drawing_gives_the_same_bytes():
         return report.png(figure)
 
     assert draw() == draw()
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("max_phase_error_rad", "largest phase error / rad"),
+        ("chi2_per_dof", "chi² per degree of freedom"),
+        ("mtf50_x_per_um", "mtf50 x / (1/um)"),
+        ("gaze_axial_deg", "gaze axial / deg"),
+        ("energy_um2", "energy / um²"),
+        ("seconds", "time"),
+        ("peak_e", "peak / electrons"),
+        ("strehl", "strehl"),
+        ("psf_tolerance", "PSF tolerance"),
+    ],
+)
+def test_keys_are_said_in_plain_words_with_their_unit(key, said):
+    assert report.in_words(key) == said
+
+
+def test_a_picture_has_two_pixels_for_each_of_the_page():
+    figure, _ = report.canvas(size=(4.0, 3.0))
+    width = int.from_bytes(report.png(figure)[16:20], "big")
+    assert width == pytest.approx(2 * 4.0 * 110, rel=0.1)  # cut to what is drawn
+
+
+def test_paper_and_dark_rooms_have_their_own_look(page):
+    for media in ("print", "(prefers-color-scheme: dark)", "(max-width:40rem)"):
+        assert f"@media {media}" in page
