@@ -37,6 +37,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "metalens.commands.psf",
         "lens.h5 or asbuilt.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
+    "export": ("metalens.commands.export", "lens.h5 -> NPZ, MATLAB or Zemax grid phase for other programs"),
     "scene": ("codesign.commands.scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
     "evaluate": ("codesign.commands.evaluate", "optics and more: the paper's tables and figures for your own files"),
     "layout": ("layout.commands.layout", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.lens import export as export
     from metalens.lens import media as media
     from metalens.lens import picture as picture
     from metalens.lens.layers import Layers as Layers
@@ -26,6 +27,7 @@ __getattr__, __dir__, __all__ = attach(
         "Lens": "record",
         "Media": "media",
         "check_gaps": "layers",
+        "export": "",
         "from_parts": "record",
         "load": "record",
         "media": "",

@@ -1,0 +1,39 @@
+"""lens.h5 for other programs: arrays with axes (.npz, .mat), or the smooth phase of ray tracers (Zemax .dat)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from metalens import lens
+from metalens.commands.common import Common, Output
+from metalens.lens import export
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens export``.
+
+    Attributes:
+        lens: the lens file.
+        output: file to write; its ending says the format: .npz, .mat (x, y, diameter, phase, transmission of every
+            pillar) or .dat (Zemax OpticStudio grid phase, unwrapped, in mm; other ray tracers read it too).
+        samples: points across the aperture of a .dat.
+    """
+
+    lens: tyro.conf.Positional[Path]
+    output: Output = Path("lens.npz")
+    samples: int = 501
+
+
+def run(options: Options) -> int:
+    """Write the file; exit 0."""
+    export.check(options.output)
+    with options.claim(options.output) as draft:
+        error = export.write(draft.path, lens.load(options.lens), samples=options.samples)
+    how = ""
+    if options.output.suffix.lower() == export.GRID:
+        how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"
+    told = {"file": options.output.name, "bytes": options.output.stat().st_size, "interpolation_error_rad": error}
+    options.console.result(told, f"{options.output}: {told['bytes']:,} bytes{how}")
+    return 0
