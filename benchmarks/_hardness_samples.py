@@ -81,7 +81,7 @@ def _shown(verb: str) -> Reader:
     """A command that only reads, as the command line calls it; what it prints is thrown away."""
 
     def read(path: Path) -> object:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        with open(os.devnull, "w", errors="backslashreplace") as nowhere, contextlib.redirect_stdout(nowhere):
             module = __import__(cli.VERBS[verb][0], fromlist=["run"])
             return module.run(module.Options(path))
 

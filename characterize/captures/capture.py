@@ -1,6 +1,7 @@
 """Bench captures as they lie on disk: frames, stage positions, dark and flat, with their bit depth found out."""
 
 import dataclasses
+import logging
 import math
 import re
 import struct
@@ -15,9 +16,9 @@ import h5py
 import numpy as np
 
 from characterize.captures import stage, tiff_tags
-from metalens.ground import manifest, store
+from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.ground.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
 _DEPTHS = (8, 10, 12, 14, 16)
@@ -86,7 +87,13 @@ def load(path: str | Path) -> Capture:
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)")
-    return _load_folder(path) if path.is_dir() else _load_file(path)
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it makes of a damaged file is said in one error
+    try:
+        return _load_folder(path) if path.is_dir() else _load_file(path)
+    except MetalensError:
+        raise
+    except (*store.DAMAGE, IndexError, ArithmeticError, RecursionError, struct.error) as error:
+        raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
 
 
 def read_images(path: Path) -> Array:
@@ -104,8 +111,8 @@ def read_images(path: Path) -> Array:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
     images = reader(path)
     images = images[None] if images.ndim == 2 else images
-    if images.ndim != 3:
-        raise CaptureError(f"{path}: images of shape {images.shape}; need grey frames (n, y, x), not colour")
+    if images.ndim != 3 or images.size == 0:
+        raise CaptureError(f"{path}: images of shape {images.shape}; need grey frames (n, y, x), not colour, not empty")
     _check_values(images, path)
     return images
 
@@ -290,20 +297,24 @@ def _read_png(path: Path) -> Array:
 
 def _read_hdf5(path: Path) -> Array:
     try:
-        with h5py.File(path, "r") as file:
-            if "frames" not in file:
-                raise CaptureError(
-                    f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}"
-                )
-            frames = file["frames"]
-            if not isinstance(frames, h5py.Dataset):
-                raise CaptureError(f"{path}: 'frames' is a group, need a data set (n, y, x)")
-            store.check_claim(path, frames, "frames")
-            return np.asarray(frames[...])
-    except CaptureError:
+        return reading.survived(path, lambda file: _frames_of(path, file))
+    except MetalensError:
         raise
     except store.DAMAGE as error:
         raise CaptureError(f"{path}: truncated or not an HDF5 file ({error})") from error
+
+
+def _frames_of(path: Path, file: h5py.File) -> Array:
+    """The data set ``frames``."""
+    if "frames" not in file:
+        raise CaptureError(f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}")
+    if not isinstance(file.get("frames", getlink=True), h5py.HardLink):
+        raise CaptureError(f"{path}: 'frames' is a link; need the data set itself")
+    frames = file["frames"]
+    if not isinstance(frames, h5py.Dataset):
+        raise CaptureError(f"{path}: 'frames' is a group, need a data set (n, y, x)")
+    store.check_claim(path, frames, "frames")
+    return np.asarray(frames[...])
 
 
 def _check_values(images: Array, path: Path) -> None:

@@ -94,7 +94,7 @@ def _about(path: Path | None) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         about = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of the format, of the text, or an integer of thousands of digits
         raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
     if not isinstance(about, dict):
         raise CaptureError(f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)")
@@ -132,7 +132,7 @@ def _read_csv(path: Path) -> list[dict[str, Any]]:
 def _read_json(path: Path) -> list[dict[str, Any]]:
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(table, list) or not all(isinstance(row, dict) for row in table):
         raise CaptureError(f"{path}: need a list of objects, one a frame")

@@ -13,6 +13,7 @@ from codesign.batches.scenes import EyeScenes, decoupled
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
+from metalens.ground.reading import reader
 
 MASK = 64  # pixels along a side of the kept masks, where the frame allows it
 CHUNK = 64  # frames rendered at a time
@@ -53,6 +54,7 @@ def save(path: Path, pool: Pool) -> None:
     store.save(path, "pool", {name: getattr(pool, name) for name in Pool.__slots__})
 
 
+@reader
 def load(path: Path) -> Pool:
     """A pool that was kept.
 

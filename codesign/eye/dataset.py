@@ -14,6 +14,7 @@ from codesign.eye.renderer import Camera, Rendered, render
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
+from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.image import Frames
 
@@ -171,6 +172,7 @@ def write_shard(path: str | Path, rendered: Rendered, *, seed: int, provenance: 
     store.save(path, "scene", arrays, provenance=replace(provenance or Provenance(), seed=seed))
 
 
+@reader
 def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
     """Frames, pupil masks and labels by name of a shard.
 

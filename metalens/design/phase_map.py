@@ -10,7 +10,7 @@ import numpy as np
 
 from metalens.design import limited
 from metalens.design.profiles import PhaseMap
-from metalens.ground import store
+from metalens.ground import reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError, StoreError, nearest
 
@@ -160,16 +160,22 @@ def _mat5(path: Path) -> dict[str, Any]:
 
 def _mat73(path: Path) -> dict[str, Any]:
     """Matrices at the top of an HDF5 file of MATLAB, which keeps columns first."""
-    import h5py
-
     try:
-        with h5py.File(path, "r") as file:
-            held = {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
-            for name, item in held.items():
-                store.check_claim(path, item, name)
-            return {k: v[...].T for k, v in held.items()}
+        return reading.survived(path, lambda file: _matrices(path, file))
+    except StoreError as error:
+        raise LensError(str(error)) from None
     except store.DAMAGE as error:
         raise LensError(f"{path}: not a MATLAB file: {error}") from error
+
+
+def _matrices(path: Path, file: Any) -> dict[str, Any]:
+    import h5py
+
+    inside = [k for k in file if isinstance(file.get(k, getlink=True), h5py.HardLink)]  # links may leave the file
+    held = {k: file[k] for k in inside if isinstance(file[k], h5py.Dataset)}
+    for name, item in held.items():
+        store.check_claim(path, item, name)
+    return {k: v[...].T for k, v in held.items()}
 
 
 def _zemax(path: Path, pitch_um: float | None) -> Samples:

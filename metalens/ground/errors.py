@@ -6,6 +6,9 @@ All derive from ``ValueError``, so a caller may catch one type; commands turn th
 import difflib
 from collections.abc import Iterable
 
+# what libraries raise on damaged files
+DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
+
 
 class MetalensError(ValueError):
     """Base of every refusal in the toolchain."""

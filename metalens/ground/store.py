@@ -16,12 +16,12 @@ from typing import Any
 import h5py
 import numpy as np
 
-from metalens.ground import lock
+from metalens.ground import lock, reading
 from metalens.ground.arrays import Array
+from metalens.ground.errors import DAMAGE as DAMAGE
 from metalens.ground.errors import StoreError
 
 Attribute = str | int | float | bool
-DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
 _FORMAT = ("v110", "v110")  # of HDF5: every block of metadata carries a checksum, files can still be edited
 _UNITS = "um, rad"
 _MOST_BYTES = 1 << 36  # of all arrays of a file
@@ -194,8 +194,7 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1, without
     if not path.is_file():
         raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
     try:
-        with h5py.File(path, "r") as file:
-            return _read(path, file, kind, version, without)
+        return reading.survived(path, lambda file: _read(path, file, kind, version, without))
     except StoreError:
         raise
     except DAMAGE as error:
@@ -205,8 +204,7 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1, without
 def kind_of(path: str | Path) -> str:
     """The kind that an artefact file says it is; '' for any other file."""
     try:
-        with h5py.File(path, "r") as file:
-            found, units = _plain(file.attrs.get("kind")), _plain(file.attrs.get("units"))
+        found, units = reading.survived(path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")])
     except DAMAGE:
         return ""
     return found if isinstance(found, str) and units == _UNITS else ""
@@ -246,11 +244,13 @@ def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
 
 
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
-    """Refuse a data set that claims more values than its bytes in the file can hold.
+    """Refuse a data set that claims more values than its bytes in the file can hold, or that lies in other files.
 
     Raises:
-        StoreError: naming both.
+        StoreError: naming what it claims and what is there.
     """
+    if item.is_virtual or item.external:
+        raise StoreError(f"{path}: {name!r} lies in other files; need a file that holds all of its values")
     if item.nbytes > _DENSEST * item.id.get_storage_size() + _SMALL:
         raise StoreError(
             f"{path}: {name!r} claims {item.nbytes:g} bytes of shape {item.shape}, the file holds "
