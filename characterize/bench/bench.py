@@ -4,7 +4,6 @@ Nothing of the fit's reduced model is used: pillars are changed one by one, the 
 :func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -204,8 +203,3 @@ def _read(electrons: Array, camera: Camera, random: np.random.Generator, hot: Ar
     seen = random.poisson(np.maximum(electrons, 0)) + random.normal(0, camera.read_noise_e, electrons.shape)
     counts = np.clip(np.round(seen / camera.gain_e + camera.offset), 0, top)
     return np.asarray(np.where(hot, 0.97 * top, counts).astype(np.uint16))
-
-
-def with_peak(truth: Truth, peak_e: float, seed: int) -> Truth:
-    """The same hidden lens with another exposure and other noise."""
-    return dataclasses.replace(truth, peak_e=peak_e, seed=seed)

@@ -323,8 +323,3 @@ def _check_values(images: Array, path: Path) -> None:
     if images.dtype.kind == "f" and not np.isfinite(images).all():
         frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
         raise CaptureError(f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}")
-
-
-def describe(capture: Capture, **known: Any) -> Capture:
-    """The capture with fields filled in that its files left open (pixel_um, wavelength_um, position_um ...)."""
-    return dataclasses.replace(capture, **known)

@@ -16,7 +16,6 @@ from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
 from layout.process import Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
 
 DOSES = tuple(0.8 + 0.05 * k for k in range(9))  # of the test array, relative to dose-to-size
 _BLOCK = 16  # pillars along a block of the dose array
@@ -254,9 +253,3 @@ def _plain_doses(process: Process) -> dict[tuple[int, int], float]:
     """Of the figures that are written, before any correction."""
     layers = process.layers
     return {layers.aperture: 1.0, layers.marks: 1.0, layers.labels: 1.0}
-
-
-def least_margin_um(pitch_nm: float) -> float:
-    """Margin around the aperture that the test structures need at this pitch, street not counted."""
-    widest = max(2 * _WITNESS + _SPACE, _TESTED * (_BLOCK + _SPACE) - _SPACE)
-    return widest * pitch_nm * nm + 3 * _CLEAR_UM

@@ -150,11 +150,6 @@ class MaskPlan:
         """Cells that the top cell places: figures and lattices."""
         return [*(figure.name for figure in self.figures), *(lattice.name for lattice in self.lattices)]
 
-    @property
-    def class_dtype(self) -> type[np.unsignedinteger]:
-        """Narrowest type of the class numbers."""
-        return np.uint8 if len(self.classes) <= 255 else np.uint16
-
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
         total = np.zeros(len(self.classes) + 1, np.int64)
