@@ -147,3 +147,12 @@ def test_terminated_while_writing_leaves_the_old_file_whole(tmp_path):
     child.wait()
     assert path.read_bytes() == before
     store.load(path, "lens")
+
+
+def test_a_journal_s_last_line_counts_where_it_is_whole(tmp_path):
+    path = tmp_path / "log"
+    assert store.whole_lines(path) == []
+    path.write_text("one\ntwo\nthr")
+    assert store.whole_lines(path) == ["one", "two"]
+    store.append_line(path, "four")
+    assert store.whole_lines(path) == ["one", "two", "four"]

@@ -1,0 +1,44 @@
+"""Errors of a network's answers, from answers that are typed in."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from codesign.train import assess
+from codesign.train.assess import Assessment, Seen
+
+
+class Typed(torch.nn.Module):
+    """Answers in the units of its scale, frame by frame."""
+
+    def __init__(self, slip, logits):
+        super().__init__()
+        self.slip, self.logits, self.at = slip, logits, 0
+
+    def forward(self, frames, architecture):
+        part = slice(self.at, self.at + len(frames))
+        self.at += len(frames)
+        return SimpleNamespace(slip=self.slip[part], mask_logits=self.logits[part], centre=self.slip[part, :2])
+
+
+def test_architectures_are_chosen_by_the_mean_of_three_axes():
+    assert Assessment(0.9, 0.3, 0.7).slip_mm == pytest.approx((0.9 + 0.3 + 0.3) / 3)
+
+
+def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
+    monkeypatch.setattr(assess, "recalibrate", lambda *words: None)
+    truth = torch.tensor([[0.3, -0.2, 1.1], [-0.6, 0.4, 0.2], [0.1, 0.9, -1.5]])
+    off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.2, 0.1]])
+    scale = torch.tensor([0.5, 2.0, 4.0])
+    logits, mask = -torch.ones(3, 4, 5), torch.zeros(3, 4, 5)
+    logits[0, :2], mask[0, 1:3] = 1.0, 1.0  # 10 and 10 pixels, 5 of them shared: 5 of 15
+    logits[1, 0], mask[1, 0] = 1.0, 1.0
+    seen = Seen(torch.zeros(3, 1, 4, 5), mask, truth, batch=2)
+    net = Typed((truth + off) / scale, logits)
+    inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
+    got = assess.assess(net, None, seen, inner)
+    assert got.axial_mm == pytest.approx((0.7 + 0.4 + 0.1) / 3)
+    assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.2) / 6)
+    assert got.iou == pytest.approx((1 / 3 + 1 + 1) / 3)  # two empty masks agree
+    assert [len(part) for part in assess.parts(seen)] == [2, 1]
