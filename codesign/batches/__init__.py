@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from codesign.batches import parallel as parallel
     from codesign.batches.batch import Batch as Batch
     from codesign.batches.flat import Flat as Flat
+    from codesign.batches.flat import depth_um as depth_um
     from codesign.batches.flat import irradiance as irradiance
     from codesign.batches.flat import samples as samples
     from codesign.batches.pool import PoolScenes as PoolScenes
@@ -33,6 +34,7 @@ __getattr__, __dir__, __all__ = attach(
         "VALIDATION": "scenes",
         "as_batch": "scenes",
         "decoupled": "scenes",
+        "depth_um": "flat",
         "fill": "pool",
         "irradiance": "flat",
         "parallel": "",

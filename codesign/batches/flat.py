@@ -15,7 +15,7 @@ from torch import Tensor
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
-from metalens.image import CODES, Frames, UniformImager, image, weight_maps
+from metalens.image import CODES, Frames, Imager, UniformImager, image, weight_maps
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,8 +55,30 @@ def samples(frames: Frames | Flat) -> int:
     return int((frames.light if isinstance(frames, Flat) else frames.radiance).shape[-1])
 
 
-def irradiance(frames: Frames | Flat, optics: UniformImager, *, margin: int) -> Tensor:
+def depth_um(frames: Frames | Flat, *, margin: int = 0) -> Tensor:
+    """(n, y, x) depth of what is seen at every sample without the margin: of the sheet that covers more of it."""
+    if isinstance(frames, Flat):
+        made = torch.from_numpy(frames.depth_um.astype(np.float32) * frames.scale.astype(np.float32)[:, None, None])
+    else:
+        made = torch.where(frames.coverage[:, 1] > 0.5, frames.depth_um[:, 1], frames.depth_um[:, 0])
+    inside = slice(margin, made.shape[-1] - margin)
+    return made[:, inside, inside].clamp_min(1.0)
+
+
+def sheets(frames: Frames | Flat) -> Frames:
+    """Flat frames as a far sheet that covers all; frames of two sheets as they are."""
+    if isinstance(frames, Frames):
+        return frames
+    cover = torch.zeros(len(frames.light), 2, *frames.light.shape[-2:])
+    cover[:, 1] = 1
+    light = torch.from_numpy(frames.light.astype(np.float32) * np.float32(1 / 255))[:, None]
+    return Frames(light * cover, cover, depth_um(frames)[:, None].expand_as(cover).contiguous())
+
+
+def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin: int) -> Tensor:
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the kernels of ``optics``."""
+    if isinstance(optics, Imager):
+        return optics(sheets(frames))
     if isinstance(frames, Frames):
         return image(frames, optics, margin=margin)
     table = _table(optics)

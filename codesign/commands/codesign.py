@@ -211,12 +211,15 @@ def _plot(going: Run) -> bytes:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    head = "budget  MMACs  pixels seen / um  axial / mm  lateral / mm   IoU  mm per mm of PSF depth"
+    head = "budget  MMACs  pixels seen / um  axial / mm  90 % interval (covers)  lateral / mm   IoU  mm per mm of depth"
     lines = []
     for r in rows:
         budget = "     -" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:6g}"
         iou = "    -" if r["iou"] is None else f"{r['iou']:.3f}"
-        errors = f"{r['axial_slip_mm']:10.3f}  {r['lateral_slip_mm']:12.3f}"
+        told = "                     -"
+        if "axial_coverage_90" in r:
+            told = f"+-{r['axial_interval_mm']:5.2f} mm ({100 * r['axial_coverage_90']:7.0f} %)"
+        errors = f"{r['axial_slip_mm']:10.3f}  {told}  {r['lateral_slip_mm']:12.3f}"
         costs = f"{r['mmacs']:5.2f}  {r['effective_pitch_um']:16.1f}"
         lines.append(f"{budget}  {costs}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}")
     return "\n".join([head, *lines])

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from codesign.network import blur as blur
     from codesign.network import cost as cost
     from codesign.network import losses as losses
     from codesign.network.architecture import Architecture as Architecture
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "Subnet": "subnet",
         "Supernet": "supernet",
         "active": "architecture",
+        "blur": "",
         "check": "architecture",
         "cost": "",
         "largest": "architecture",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.network import blur
 from codesign.network.architecture import Architecture, Block, Space, blocks, divisible, stem_channels
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
@@ -27,15 +28,19 @@ class Cost:
 
     per_pixel: {total stride: multiply-accumulates per output pixel at that stride}.
     constant: of layers whose size does not follow the image.
+    blur: whether the branch of :mod:`codesign.network.blur` is counted too.
     """
 
     per_pixel: dict[int, int]
     constant: int
+    blur: bool = False
 
     def at(self, size: int | Array) -> Array:
         """Exact count for square inputs of ``size`` pixels (integers)."""
         size = np.asarray(size)
         parts = [macs * (-(-size // stride)) ** 2 for stride, macs in self.per_pixel.items()]
+        if self.blur:
+            parts.append(np.vectorize(blur.macs, otypes=[np.int64])(size))
         return np.asarray(sum(parts) + self.constant)
 
 
@@ -53,7 +58,7 @@ def backbone(stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: 
 
 
 def network(space: Space, architecture: Architecture) -> Cost:
-    """Cost of backbone, perception head and calibration head."""
+    """Cost of backbone, blur branch, perception head and calibration head."""
     rows = blocks(space, architecture)
     body = backbone(stem_channels(space, architecture), [b for row in rows for b in row])
     per_pixel = dict(body.per_pixel)
@@ -64,7 +69,8 @@ def network(space: Space, architecture: Architecture) -> Cost:
     per_pixel[finest] += MASK_CHANNELS * (9 + 1)  # depthwise 3x3, then the mask itself
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
-    return Cost(per_pixel, body.constant + SLIP_CHANNELS * SLIP_GRID**2 * SLIP_HIDDEN + SLIP_HIDDEN * 3)
+    heads = (SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES) * SLIP_HIDDEN + SLIP_HIDDEN * (2 * SLIP_HIDDEN + 6)
+    return Cost(per_pixel, body.constant + heads, blur=True)
 
 
 def lateral_strides(space: Space) -> list[tuple[int, int]]:

@@ -6,6 +6,8 @@ from torch.nn import functional as F
 
 from codesign.network.supernet import Prediction
 
+SPREAD_WEIGHT = 0.1  # of the uncertainty's own loss: it moves its own layer alone
+
 
 def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
     """Mean Dice loss 1 - (2 sum pm + s) / (sum p + sum m + s): 0 for a perfect mask, finite for an empty one.
@@ -34,10 +36,44 @@ def slip(predicted: Tensor, truth: Tensor, scale: Tensor, *, knee: float = 0.3) 
     return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
 
 
+def depth(told: Tensor, vergence: Tensor) -> Tensor:
+    """Negative log likelihood of the windows' vergences under normal distributions, less its constant.
+
+    Args:
+        told: (batch, 2, y, x) mean and logarithm of the standard deviation. vergence: (batch, y, x) the truth.
+    """
+    miss = told[:, 0] - vergence
+    return (0.5 * miss**2 * torch.exp(-2 * told[:, 1]) + told[:, 1]).mean()
+
+
+def spread(found: Prediction, truth: Tensor) -> Tensor:
+    """The same of the slippage's errors as they are: trains the uncertainty alone; 0 for a network that tells none.
+
+    Args:
+        truth: (batch, 3) slippage in units of its scale.
+    """
+    if found.slip_log_sd is None:
+        return found.slip.new_zeros(())
+    miss = (found.slip - truth).detach()
+    return (0.5 * miss**2 * torch.exp(-2 * found.slip_log_sd) + found.slip_log_sd).mean()
+
+
 def task(found: Prediction, mask: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, slip_weight: float = 2.0) -> Tensor:
     """L_task = L_seg + lambda_slip L_calib; a network without a mask is held to the pupil's centre in its place."""
     seen = segmentation(found.mask_logits, mask) if found.mask_logits.numel() else place(found.centre, mask)
     return seen + slip_weight * slip(found.slip, slip_mm, scale_mm)
+
+
+def reading(
+    found: Prediction, vergence: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, depth_weight: float = 0.5
+) -> Tensor:
+    """lambda_depth L_depth + the uncertainty's own loss: what a network that reads depth is trained on beside the task.
+
+    Args:
+        vergence: (batch, y, x) of the windows (:func:`codesign.network.blur.window_vergence`).
+    """
+    told = found.slip.new_zeros(()) if found.depth is None else depth_weight * depth(found.depth, vergence)
+    return told + SPREAD_WEIGHT * spread(found, slip_mm / scale_mm)
 
 
 def place(centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3) -> Tensor:
@@ -66,10 +102,21 @@ def resized(mask: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
 
 
-def overlap(logits: Tensor, mask: Tensor) -> Tensor:
-    """(batch,) intersection over union of the thresholded masks; 1 where both are empty, nan without a mask."""
+def overlap(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tensor:
+    """(batch,) intersection over union of the thresholded masks; 1 where both are empty, nan without a mask.
+
+    Args:
+        pixels: along a side of the grid that both are brought to: logits interpolated, coverage averaged. The
+            sensor's pixels tell what a user of the mask sees; without it the grid of the logits serves.
+    """
     if not logits.numel():
         return torch.full((len(mask),), float("nan"))
+    if pixels is not None:
+        size = (pixels, pixels)
+        logits = F.interpolate(logits[:, None], size=size, mode="bilinear", align_corners=False)[:, 0]
+        coarse = min(pixels, *mask.shape[-2:])  # a mask that was kept coarser than the pixels is interpolated
+        mask = F.interpolate(mask[:, None], size=(coarse, coarse), mode="area")
+        mask = F.interpolate(mask, size=size, mode="bilinear", align_corners=False)[:, 0]
     found, truth = logits > 0, resized(mask, logits) > 0.5
     union = (found | truth).sum((1, 2))
     both = (found & truth).sum((1, 2))

@@ -1,4 +1,6 @@
-"""Elastic MobileNetV3 with two heads: every architecture of the space is a slice of one set of weights.
+"""Elastic MobileNetV3 with a branch for blur, and heads for mask, slip and depth.
+
+Every architecture of the space is a slice of one set of weights.
 
 A kernel is the centre of a larger one, channels are the first of more, blocks are the first of a stage (after
 Cai et al. 2019). Batch statistics belong to one architecture at a time: :func:`recalibrate` measures them.
@@ -13,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from codesign.batches import parallel
+from codesign.network import blur
 from codesign.network.architecture import Architecture, Block, Space, blocks, largest, stem_channels
 from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
 from metalens.ground.arrays import Array
@@ -26,11 +29,16 @@ class Prediction:
     mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a network that gives no mask.
     centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle, -0.5 at the left and top edge.
     slip: (batch, 3) camera displacement in units of the scale that the loss divides by (paper Eq. 7).
+    depth: (batch, 2, windows, windows) what blur tells of each window's depth (:mod:`codesign.network.blur`): vergence
+        and the logarithm of its standard deviation; None of a network without that branch.
+    slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``; None of a network that does not tell it.
     """
 
     mask_logits: Tensor
     centre: Tensor
     slip: Tensor
+    depth: Tensor | None = None
+    slip_log_sd: Tensor | None = None
 
 
 class SlicedNorm(nn.Module):
@@ -146,19 +154,26 @@ class PerceptionHead(nn.Module):
 
 
 class CalibrationHead(nn.Module):
-    """Slip from the flattened last feature map, so that place in the image is kept (paper Eq. 7)."""
+    """Slip from the flattened last feature map, so that place in the image is kept (paper Eq. 7), and from the depths.
+
+    Its uncertainty is read from the same features, but does not shape them.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.reduce = SlicedConv(channels, SLIP_CHANNELS)
         self.hidden = nn.Linear(SLIP_CHANNELS * SLIP_GRID**2, SLIP_HIDDEN)
+        self.depths = nn.Linear(blur.SLIP_FEATURES, SLIP_HIDDEN)
+        self.joined = nn.Linear(2 * SLIP_HIDDEN, SLIP_HIDDEN)
         self.slip = nn.Linear(SLIP_HIDDEN, 3)
+        self.spread = nn.Linear(SLIP_HIDDEN, 3)
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor, depths: Tensor) -> tuple[Tensor, Tensor]:
         reduced = F.hardswish(self.reduce(features, SLIP_CHANNELS))
         grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
-        slip: Tensor = self.slip(F.hardswish(self.hidden(grid.flatten(1))))
-        return slip
+        both = torch.cat([self.hidden(grid.flatten(1)), self.depths(depths)], 1)
+        joined = F.hardswish(self.joined(F.hardswish(both)))
+        return self.slip(joined), self.spread(joined.detach()).clamp(-4, 2)
 
 
 class Supernet(nn.Module):
@@ -176,11 +191,11 @@ class Supernet(nn.Module):
         self.stages = nn.ModuleList(nn.ModuleList(ElasticBlock(b) for b in row) for row in rows)
         self.perception = PerceptionHead([rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)])
         self.calibration = CalibrationHead(rows[-1][-1].outputs)
+        self.blur = blur.BlurBranch(SlicedNorm(blur.FEATURES))
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
-        x = F.hardswish(
-            self.stem(scaled(frames, architecture.resolution), self._stem(architecture), kernel=3, stride=2)
-        )
+        seen = scaled(frames, architecture.resolution)
+        x = F.hardswish(self.stem(seen, self._stem(architecture), kernel=3, stride=2))
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(zip(self.stages, blocks(self.space, architecture), strict=True)):
@@ -189,7 +204,9 @@ class Supernet(nn.Module):
             if i in kept:
                 features.append(x)
         logits = self.perception(features)
-        return Prediction(logits, soft_argmax(logits), self.calibration(x))
+        depth, told = self.blur(seen)
+        slip, spread = self.calibration(x, told)
+        return Prediction(logits, soft_argmax(logits), slip, depth, spread)
 
     def counts(self, architecture: Architecture, sizes: Array) -> Array:
         """Multiply-accumulates of a member for square frames of these sizes after scaling (integers), exact."""

@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from codesign.optics import built as built
+    from codesign.optics import formed as formed
     from codesign.optics import stack as stack
     from codesign.optics.built import MadeLens as MadeLens
     from codesign.optics.built import posterior as posterior
@@ -32,6 +33,7 @@ __getattr__, __dir__, __all__ = attach(
         "Stack": "stack",
         "Window": "numerics",
         "built": "",
+        "formed": "",
         "kernels": "numerics",
         "posterior": "built",
         "psf_difference": "numerics",

@@ -7,6 +7,7 @@ A smooth phase is enough to shape a PSF, keeps its gradients of one size, and le
 import functools
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import scipy.fft
@@ -45,7 +46,12 @@ class OpticsConfig:
     window_samples: of the PSFs.
     tolerance: of the low-rank PSF basis.
     spread: of the lenses that are made.
-    angle_deg: field angle, towards +x, of the whole image: sources and window lie around that chief ray.
+    angle_deg: field angle, towards +x, of the middle of the image; of all of it where ``image`` is "uniform".
+    image: "true", every part of the image through the PSFs of its own field angle and of the whole spectrum; or
+        "uniform", one PSF a depth, of one chief ray and one wavelength: much faster, wrong by what a run's report says.
+    fwhm_nm: spectral width of the light source about ``wavelength_nm``, 0 for one wavelength. filter_nm: width of a
+        band-pass filter before the sensor, 0 for none; the light that it stops is lost. Of the true image alone.
+    image_tolerance: of the true image, relative L2 of a texture.
     """
 
     aperture_mm: float = 1.0
@@ -61,6 +67,10 @@ class OpticsConfig:
     tolerance: float = field(default=3e-3, metadata={"above": 0})
     spread: LensErrors = field(default_factory=LensErrors)
     angle_deg: float = 0.0
+    image: Literal["true", "uniform"] = "uniform"
+    fwhm_nm: float = 0.0
+    filter_nm: float = 0.0
+    image_tolerance: float = 0.03
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -72,6 +82,18 @@ class OpticsConfig:
             raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")
         if not abs(self.angle_deg) <= 40:
             raise ConfigError(f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees")
+        if not (self.fwhm_nm >= 0 and self.filter_nm >= 0 and 0 < self.image_tolerance < 1):
+            raise ConfigError(
+                f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, image_tolerance = {self.image_tolerance}: "
+                "need widths of 0 or more and a tolerance between 0 and 1"
+            )
+        if self.image == "uniform" and (self.fwhm_nm or self.filter_nm):
+            raise ConfigError(
+                f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm} with image = 'uniform', an image of one "
+                "wavelength: need image = 'true', or widths of 0"
+            )
+        if self.filter_nm and not self.fwhm_nm:
+            raise ConfigError(f"filter_nm = {self.filter_nm} before a source of one wavelength: give fwhm_nm too")
         if self.window_samples < 3 or self.window_samples % 2 == 0:
             raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
 
@@ -81,6 +103,11 @@ class OpticsConfig:
         pupil = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
         need = math.ceil(self.sample_um / (pupil.field_step_um / 2))
         return need + 1 - need % 2
+
+    @property
+    def passed(self) -> float:
+        """Share of the source's light that the filter passes: both Gaussian, about the same wavelength."""
+        return self.filter_nm / math.hypot(self.fwhm_nm, self.filter_nm) if self.filter_nm else 1.0
 
     @property
     def pupil(self) -> Pupil:
@@ -145,7 +172,9 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: LensError 
     low = len(columns)
     kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
     light = (rows @ (kept @ columns)).real
-    return Stack(light if error is None else _hazy(settings, light, error), settings.depths_um)
+    if error is not None:
+        light = hazy(settings, light, variance_rad2(error.state()))
+    return Stack(light, settings.depths_um)
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
@@ -218,7 +247,10 @@ def _modes(settings: OpticsConfig) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def _vortices(settings: OpticsConfig) -> Tensor:
-    x, y = _seen(settings).x_um, _seen(settings).y_um
+    return _helix(settings, _seen(settings).x_um, _seen(settings).y_um)
+
+
+def _helix(settings: OpticsConfig, x: Tensor, y: Tensor) -> Tensor:
     if not settings.zones:
         return torch.zeros_like(x)
     fraction = torch.hypot(x, y) / settings.pupil.radius_um
@@ -269,9 +301,28 @@ def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
     return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
 
 
+def phase_at(
+    settings: OpticsConfig, coefficients_rad: Tensor, x_um: Tensor, y_um: Tensor, *, error: LensError | None = None
+) -> Tensor:
+    """Phase on top of the hyperbolic focus at any places, float64; differentiable in the coefficients."""
+    rim = settings.aperture_mm * 500
+    total = _helix(settings, x_um, y_um)
+    if settings.polynomials:
+        weights = _polynomials(settings.pupil, settings.polynomials)[1].mT @ coefficients_rad.double()
+        terms = _terms((x_um / rim).numpy(), (y_um / rim).numpy(), settings.polynomials)
+        total = total + torch.einsum("n,nyx->yx", weights, torch.from_numpy(np.stack(terms)))
+    return total if error is None else total + _wave_front(settings, error, x_um / rim, y_um / rim)
+
+
 def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
+    rim = settings.pupil.radius_um
+    x, y = (c.double() / rim for c in (_seen(settings).x_um, _seen(settings).y_um))
+    return _wave_front(settings, error, x, y)
+
+
+def _wave_front(settings: OpticsConfig, error: LensError, x: Tensor, y: Tensor) -> Tensor:
+    """Phase of one made lens less that of its design, at places in units of the rim's radius."""
     pupil = settings.pupil
-    x, y = (c.double() / pupil.radius_um for c in (_seen(settings).x_um, _seen(settings).y_um))
     rho2 = x**2 + y**2
     focus_um, tilt, astigmatism = error.assembly()
     k = 2 * math.pi / pupil.wavelength_um
@@ -280,12 +331,12 @@ def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
     return assembled + wave_front_rad(error.state(), x, y)
 
 
-def _hazy(settings: OpticsConfig, light: Tensor, error: LensError) -> Tensor:
+def hazy(settings: OpticsConfig, light: Tensor, variance: float) -> Tensor:
     """Light of pillars that the process made wrong: their phases differ by more than a smooth wave front.
 
     With the phases of a lens spread evenly over a turn, an error of variance V leaves exp(-V) of the light in the
     image (Marechal) and sends the rest straight on, over the shadow of the aperture.
     """
-    kept = math.exp(-variance_rad2(error.state()))
+    kept = math.exp(-variance)
     shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)
     return kept * light + (1 - kept) * shadow

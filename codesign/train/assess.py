@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.batches import irradiance, samples
-from codesign.network import Architecture, Baseline, Supernet, losses, recalibrate
-from codesign.optics import Stack
-from codesign.optics import stack as lens
+from codesign.batches import depth_um, irradiance, samples
+from codesign.network import Architecture, Baseline, Supernet, blur, losses, recalibrate
+from codesign.optics import Stack, formed
 from codesign.train.formation import read_out
 from codesign.train.inner import InnerConfig, Scenes, Trainer
+from metalens.image import Imager, UniformImager
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -18,12 +18,14 @@ class Seen:
     """Frames as the sensor gave them, with their truth.
 
     frames: (n, 1, y, x) standardised. mask: (n, y, x). slip_mm: (n, 3). batch: frames at a time.
+    vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`; None where it is not known.
     """
 
     frames: Tensor
     mask: Tensor
     slip_mm: Tensor
     batch: int
+    vergence: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,30 +45,38 @@ class Assessment:
 @torch.no_grad()
 def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None) -> Seen:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
-    made = stack or lens.stack(trainer.optics, trainer.model.coefficients_rad)
-    pixels, masks, slips = [], [], []
+    prepared: UniformImager | Imager | None = None
+    pixels, masks, slips, depths = [], [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)
-        prepared = lens.prepared(trainer.optics, made, samples(batch.frames), margin=scenes.margin)
+        if prepared is None:
+            given = trainer.optics, trainer.model.coefficients_rad, samples(batch.frames)
+            prepared = formed.imager(*given, margin=scenes.margin, made=stack)
         light = irradiance(batch.frames, prepared, margin=scenes.margin)
         noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
         pitch = trainer.model.pitch_um
         pixels.append(read_out(light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))
         masks.append(batch.mask)
         slips.append(batch.slip_mm)
-    return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch)
+        depths.append(blur.window_vergence(depth_um(batch.frames, margin=scenes.margin)))
+    return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch, torch.cat(depths))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answers:
     """What a network said of frames.
 
-    slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle. iou: (n,) of the pupil.
+    slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle.
+    iou: (n,) of the pupil's mask, at the sensor's pixels.
+    slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of one that gives none.
+    depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its spread; likewise.
     """
 
     slip_mm: Tensor
     centre: Tensor
     iou: Tensor
+    slip_sd_mm: Tensor | None = None
+    depth: Tensor | None = None
 
 
 @torch.no_grad()
@@ -77,8 +87,17 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
     found = [net(seen.frames[i : i + seen.batch], architecture) for i in range(0, len(seen.frames), seen.batch)]
     net.train(training)
     slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
-    shared = losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask)
-    return Answers(slip, torch.cat([f.centre for f in found]), shared)
+    pixels = int(seen.frames.shape[-1])
+    shared = losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask, pixels=pixels)
+    spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
+    depth = [f.depth for f in found if f.depth is not None]
+    return Answers(
+        slip,
+        torch.cat([f.centre for f in found]),
+        shared,
+        torch.cat(spread).exp() * torch.tensor(inner.slip_scale_mm) if spread else None,
+        torch.cat(depth) if depth else None,
+    )
 
 
 def parts(seen: Seen) -> list[Tensor]:

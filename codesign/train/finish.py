@@ -2,11 +2,12 @@
 
 import copy
 import json
+import math
 from dataclasses import replace
 from typing import Any
 
-from codesign.batches import TEST
-from codesign.network import Architecture, Baseline, recalibrate, smallest
+from codesign.batches import TEST, VALIDATION
+from codesign.network import Architecture, Baseline, blur, recalibrate, smallest
 from codesign.train import ambiguity, assess, evolution
 from codesign.train.assess import Answers, Seen
 from codesign.train.depth_test import depth_response
@@ -29,6 +30,8 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
     """Rows of :func:`finish`, each with the model that reached it (fine-tuned where that is asked for).
 
     ``effective_pitch_um``: distance of the cells that the network sees: of pixels binned to its resolution.
+    ``axial_coverage_90``: share of test frames within the network's calibrated 90 % interval, whose mean half width is
+    ``axial_interval_mm``. ``window_depth_mm``: mean error of the depth of the windows.
     Batch statistics are measured on training frames through the final lens, never on those that are judged.
     """
     settings = run.settings
@@ -39,6 +42,7 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
         pairs = ambiguity.ambiguous(run.scenes(TEST), settings.ambiguity_pairs, settings.inner.seed)
         tests["ambiguous_"] = assess.frames(run.trainer, pairs, max(1, len(pairs) // settings.inner.batch))
     measured = assess.frames(run.trainer, run.trainer.scenes, min(8, settings.test_batches))
+    apart = assess.frames(run.trainer, run.scenes(VALIDATION), settings.validation_batches)
     out = []
     for i, (budget, best) in enumerate(chosen):
         trainer = _tuned(run, best.architecture, i)
@@ -46,8 +50,10 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
         recalibrate(net, architecture, assess.parts(measured))
         row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": best.macs / 1e6}
         row["effective_pitch_um"] = float(run.trainer.model.pitch_um.detach()) / architecture.resolution
+        reach = widths(assess.predict(net, architecture, apart, settings.inner), apart)
         for name, seen in tests.items():
-            row |= _errors(name, assess.predict(net, architecture, seen, settings.inner), seen)
+            answers = assess.predict(net, architecture, seen, settings.inner)
+            row |= _errors(name, answers, seen) | told(name, answers, seen, reach)
         response = depth_response(
             trainer, pairs or run.scenes(TEST), net, architecture, batches=max(1, settings.test_batches // 4)
         )
@@ -80,6 +86,31 @@ def _errors(name: str, answers: Answers, seen: Seen) -> dict[str, float | None]:
     }
 
 
+def widths(answers: Answers, seen: Seen, *, share: float = 0.9) -> float | None:
+    """Half width, in its own standard deviations, of the interval that holds this share of the axial slippages.
+
+    From frames that neither training nor test sees: with them the network's uncertainty is calibrated.
+    """
+    if answers.slip_sd_mm is None:
+        return None
+    ratio = (answers.slip_mm - seen.slip_mm)[:, 2].abs() / answers.slip_sd_mm[:, 2]
+    rank = min(math.ceil(share * (len(ratio) + 1)), len(ratio))  # conformal: holds whatever the distribution
+    return float(ratio.sort().values[rank - 1])
+
+
+def told(name: str, answers: Answers, seen: Seen, reach: float | None) -> dict[str, float]:
+    """What the network tells beside the slippage: coverage of its 90 % intervals, their width, depth of windows."""
+    row: dict[str, float] = {}
+    if answers.slip_sd_mm is not None and reach is not None:
+        wide = reach * answers.slip_sd_mm[:, 2]
+        row[f"{name}axial_coverage_90"] = float(((answers.slip_mm - seen.slip_mm)[:, 2].abs() <= wide).float().mean())
+        row[f"{name}axial_interval_mm"] = float(wide.mean())
+    if answers.depth is not None and seen.vergence is not None:
+        miss = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(seen.vergence)
+        row[f"{name}window_depth_mm"] = float(miss.abs().mean())
+    return row
+
+
 def _tuned(run: Run, architecture: Architecture, number: int) -> Trainer:
     """A copy of the trainer whose weights were trained on for one architecture, lens and pitch as they are."""
     steps = run.settings.run.finetune_steps
@@ -95,7 +126,7 @@ def _tuned(run: Run, architecture: Architecture, number: int) -> Trainer:
         pitch=Schedule(0.0),
     )
     going = Trainer(
-        inner, source.optics, source.sensor, source.scenes, made, architecture=architecture, stacks=source.stacks
+        inner, source.optics, source.sensor, source.scenes, made, architecture=architecture, stacks=source.light.stacks
     )
     for _ in going.run() if steps else ():
         pass

@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Batch, Flat, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, Name, Space, Supernet, cost, losses, make, smallest
+from codesign.batches import Batch, Flat, depth_um, irradiance, parallel, samples
+from codesign.network import Architecture, Baseline, Name, Space, Supernet, blur, cost, losses, make, smallest
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, network_macs, read_out
+from codesign.train.light import Light
 from metalens.ground.errors import ConfigError, TrainingError
-from metalens.image import Frames, Sensor, UniformImager
+from metalens.image import Frames, Imager, Sensor, UniformImager
 
 
 class Scenes(Protocol):
@@ -69,10 +70,13 @@ class InnerConfig:
         ``architecture`` fixed, that one alone is trained.
     weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image, nor
         so coarse that least resolution leaves a network less than 16 pixels.
-    slip_weight, optics_weight, budget_weight: of Eq. 10. energy: encircled share that the optics loss keeps.
+    slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of windows.
+    energy: encircled share that the optics loss keeps.
     budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their resolution to keep it
         (:func:`sandwich`); the hinge acts on those that cannot.
     slip_scale_mm: spread of the slippage, the unit of the network's answer.
+    refresh: steps after which the true image is formed anew while the lens moves. draws: field points and wavelengths a
+        step through which its gradient goes; few are noisier and quicker.
     patience: steps without a finite gradient, one after the other, that end the run.
     """
 
@@ -84,16 +88,22 @@ class InnerConfig:
     optics: Schedule = field(default_factory=lambda: Schedule(0.02, 0.1, 0.8, clip=1.0))
     pitch: Schedule = field(default_factory=lambda: Schedule(0.0, 0.1, 0.8, clip=1.0))
     slip_weight: float = 2.0
+    depth_weight: float = 0.5
     optics_weight: float = 0.05
     budget_weight: float = 1.0
     energy: float = 0.4
     budget_mmacs: float = 0.0
     slip_scale_mm: tuple[float, float, float] = (1.4, 1.2, 2.3)
+    refresh: int = 50
+    draws: int = 4
     patience: int = 20
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.patience) < 1 or self.subnets < 0:
-            raise ConfigError(f"steps {self.steps}, batch {self.batch}, patience {self.patience}: need 1 or more")
+        if min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1 or self.subnets < 0:
+            raise ConfigError(
+                f"steps {self.steps}, batch {self.batch}, patience {self.patience}, refresh {self.refresh}, draws "
+                f"{self.draws}: need 1 or more"
+            )
 
 
 @dataclass(eq=False)
@@ -166,8 +176,10 @@ class Trainer:
         self.largest_only = largest_only
         self.budgets_mmacs = (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
         self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
-        self.architecture, self.stacks = architecture, tuple(stacks)
-        self._imagers: dict[int, UniformImager] = {}
+        self.architecture = architecture
+        self.light = Light(
+            optics, stacks, refresh=inner.refresh, draws=inner.draws, seed=inner.seed, draw=self._lens_error
+        )
         self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, list(made.net.parameters())),
             "optics": (inner.optics, [made.coefficients_rad] if made.coefficients_rad.numel() else []),
@@ -179,7 +191,7 @@ class Trainer:
             if parameters
         }
         self.step, self.skipped, self.bad_run = 0, 0, 0
-        self._imager: UniformImager | None = None
+        self.pitch_held_um: float | None = None  # where the last step was held back from a finer or coarser pitch
         self._begins_um = float(made.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
@@ -200,6 +212,7 @@ class Trainer:
             "coefficients_rad": self.model.coefficients_rad.detach(),
             "log_pitch": self.model.log_pitch.detach(),
             "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
+            "light": self.light.state(),
             "counters": [self.step, self.skipped, self.bad_run],
         }
 
@@ -212,7 +225,7 @@ class Trainer:
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
-        self._imager = None
+        self.light.restore(state["light"])  # type: ignore[arg-type]
 
     def _advance(self) -> Record:
         progress = self.step / self.inner.steps
@@ -226,6 +239,7 @@ class Trainer:
         if self._budget:
             total = total + self.inner.budget_weight * losses.over_budget(each, self._budget).mean()
         total.backward()  # type: ignore[no-untyped-call]
+        self.light.pass_on(self.step, self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
         self._apply(rates, finite=math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite())
         self.step += 1
@@ -250,36 +264,28 @@ class Trainer:
             seen[resized] = read_out(
                 light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False, resized=resized
             )
+        vergence = blur.window_vergence(depth_um(batch.frames, margin=self.scenes.margin))
         parts = []
         for a in members:
             answer = self.model.net(seen[pitch_moves and a.resolution < 1], a)
             parts.append(losses.task(answer, batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight))
+            parts[-1] = parts[-1] + losses.reading(
+                answer, vergence, batch.slip_mm, scale, depth_weight=self.inner.depth_weight
+            )
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), optics_loss, macs
 
-    def _light(self, frames: Frames | Flat, live: bool) -> tuple[UniformImager, Tensor]:
-        """UniformImager of this step, and the optics loss; kept from step to step while the optics are fixed."""
-        if self.stacks:
-            return self._given(samples(frames)), torch.zeros(())
-        spread = self._lens_error()
-        if not live and spread is None and self._imager is not None:
-            return self._imager, torch.zeros(())
-        made = lens.stack(self.optics, self.model.coefficients_rad, error=spread)
-        prepared = lens.prepared(self.optics, made, samples(frames), margin=self.scenes.margin)
-        self._imager = None if live or spread is not None else prepared
-        if not (live and self.inner.optics_weight):
-            return prepared, torch.zeros(())
-        return prepared, depth_loss(made, self.optics, energy=self.inner.energy)
+    def _light(self, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
+        """What images this step's frames, and the optics loss."""
+        coefficients = self.model.coefficients_rad
+        optics = self.light.at(self.step, coefficients, samples(frames), self.scenes.margin, live=live)
+        if self.light.stacks or not (live and self.inner.optics_weight):
+            return optics, torch.zeros(())
+        made = lens.stack(self.optics, coefficients, error=self._lens_error(self.step))
+        return optics, depth_loss(made, self.optics, energy=self.inner.energy)
 
-    def _given(self, frame: int) -> UniformImager:
-        """UniformImager of the given PSFs that this step draws."""
-        drawn = int(np.random.default_rng([self.inner.seed, self.step, 4]).integers(len(self.stacks)))
-        if drawn not in self._imagers:
-            self._imagers[drawn] = lens.prepared(self.optics, self.stacks[drawn], frame, margin=self.scenes.margin)
-        return self._imagers[drawn]
-
-    def _lens_error(self) -> LensError | None:
-        return self.optics.spread.draw(self._generator(2))
+    def _lens_error(self, step: int) -> LensError | None:
+        return self.optics.spread.draw(self._generator(2, step))
 
     def _members(self, count: Count) -> Sequence[Architecture]:
         if self.architecture is not None:
@@ -289,15 +295,16 @@ class Trainer:
             return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
         members = sandwich(space, count, self._budget, generator, subnets=self.inner.subnets)
-        return members[:1] if self.largest_only else members
+        return members[:1] if self.largest_only else list(dict.fromkeys(members))  # equal ones count once
 
     @property
     def _budget(self) -> float:
         """Multiply-accumulates that this step's members may take; 0 for any."""
         return self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6 if self.budgets_mmacs else 0.0
 
-    def _generator(self, stream: int) -> torch.Generator:
-        seed = int(np.random.SeedSequence([self.inner.seed, self.step, stream]).generate_state(1, np.uint64)[0])
+    def _generator(self, stream: int, step: int | None = None) -> torch.Generator:
+        at = self.step if step is None else step
+        seed = int(np.random.SeedSequence([self.inner.seed, at, stream]).generate_state(1, np.uint64)[0])
         return torch.Generator().manual_seed(seed >> 1)
 
     def _finite(self) -> bool:
@@ -322,8 +329,10 @@ class Trainer:
                     group["lr"] = rates[name]
                 optimiser.step()
         if rates["pitch"] > 0:  # pixels finer than the image's samples show nothing new
+            finest, coarsest = min(self.optics.sample_um, self._begins_um), max(self._coarsest_um, self._begins_um)
+            wanted = float(self.model.pitch_um.detach())
+            self.pitch_held_um = finest if wanted < finest else coarsest if wanted > coarsest else None
             with torch.no_grad():
-                finest, coarsest = min(self.optics.sample_um, self._begins_um), max(self._coarsest_um, self._begins_um)
                 self.model.log_pitch.clamp_(math.log(finest), math.log(coarsest))
 
     def _culprits(self) -> str:

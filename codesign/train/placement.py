@@ -54,7 +54,7 @@ def attend(net: nn.Module, device: torch.device) -> None:
 
     def leave(_: nn.Module, __: tuple[Any, ...], answer: Prediction) -> Prediction:
         parts = (getattr(answer, name) for name in Prediction.__slots__)
-        return Prediction(*(part.cpu() if part.device == device else part for part in parts))
+        return Prediction(*(part.cpu() if part is not None and part.device == device else part for part in parts))
 
     net.register_forward_pre_hook(enter)
     net.register_forward_hook(leave)

@@ -1,0 +1,171 @@
+"""The image that training sees: true over field, depth and spectrum, or by one PSF a depth, as the settings say.
+
+    true      every part of the image through the PSFs of its own field angle, summed over the light source's spectrum
+    uniform   the PSF of one chief ray and one wavelength for the whole image: a named approximation, see :func:`apart`
+
+While the lens moves, its PSFs over the field are formed anew every few steps; between them the gradient of the light at
+the nodes of the field goes to the phase through a few field points and wavelengths that are drawn at random, which is
+unbiased (:mod:`metalens.field.subset`).
+"""
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from codesign.optics import stack as lens
+from codesign.optics.lens_errors import LensError, variance_rad2
+from codesign.optics.stack import OpticsConfig, Stack
+from metalens.field.engine import normalised, trial
+from metalens.field.forming import blurred, with_psfs
+from metalens.field.points import Layers, Optics
+from metalens.field.subset import surrogate
+from metalens.field.waves import SmoothWave
+from metalens.ground.errors import TrainingError
+from metalens.image import Frames, Grid, Imager, UniformImager, scene
+from metalens.image import imager as field_imager
+from metalens.psf import Source
+
+
+def source_of(settings: OpticsConfig) -> Source | None:
+    """The light that reaches the sensor; None for one wavelength.
+
+    A Gaussian line of width a behind a Gaussian filter of width b has the width a b / √(a² + b²).
+    """
+    width = settings.fwhm_nm
+    if width and settings.filter_nm:
+        width = width * settings.filter_nm / math.hypot(width, settings.filter_nm)
+    return Source(settings.wavelength_nm, width) if width else None
+
+
+def wave_of(settings: OpticsConfig, coefficients_rad: Tensor, error: LensError | None = None) -> SmoothWave:
+    """The lens plane of these coefficients for :func:`metalens.image.imager`; differentiable in them."""
+    if settings.polynomials or settings.zones or error is not None:
+        added = functools.partial(lens.phase_at, settings, coefficients_rad, error=error)
+    else:
+        added = None
+    return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
+
+
+def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
+    """Square frames of ``frame`` samples, margin included."""
+    side = frame - 2 * margin
+    depths = settings.depths_mm[0] * 1e3, settings.depths_mm[1] * 1e3
+    return Grid((side, side), settings.sample_um, depths, margin, settings.window_samples)
+
+
+def imager(
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    frame: int,
+    *,
+    margin: int,
+    error: LensError | None = None,
+    made: Stack | None = None,
+) -> UniformImager | Imager:
+    """What images frames of ``frame`` samples, margin included.
+
+    Args:
+        error: one draw of the lenses that are made. made: PSFs of a lens on axis in place of the coefficients.
+
+    Raises:
+        TrainingError: PSFs of one chief ray are given where the settings ask for the true image.
+    """
+    if settings.image == "uniform":
+        found = made or lens.stack(settings, coefficients_rad, error=error)
+        return lens.prepared(settings, found, frame, margin=margin)
+    if made is not None:
+        raise TrainingError(
+            "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
+            "use a run of optics.image = 'uniform' for it"
+        )
+    key = tuple(coefficients_rad.detach().tolist())
+    if error is None:
+        return _still(settings, key, frame, margin)
+    return _hazy(settings, _formed(settings, key, frame, margin, error), error)
+
+
+@functools.lru_cache(maxsize=3)
+def _still(settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int) -> Imager:
+    return _formed(settings, coefficients_rad, frame, margin, None)
+
+
+@torch.no_grad()
+def _formed(
+    settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int, error: LensError | None
+) -> Imager:
+    whole = field_imager(
+        wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error),
+        grid_of(settings, frame, margin),
+        spectrum=source_of(settings),
+        field=(math.radians(settings.angle_deg), 0.0),
+        tolerance=settings.image_tolerance,
+    )
+    if settings.passed == 1:
+        return whole
+    dimmer = [replace(patch, energy=patch.energy * settings.passed) for patch in whole.patches]
+    return replace(whole, energy=whole.energy * settings.passed, patches=dimmer)
+
+
+def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
+    """See :func:`codesign.optics.stack.hazy`; the shadow's light falls on all samples alike."""
+    light = lens.hazy(settings, whole.stack, variance_rad2(error.state()))
+    total = light.sum((-2, -1))
+    return with_psfs(whole, light / total[..., None, None], whole.energy * total)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Live:
+    """A true image whose lens moves: the imager with the light of its nodes as a leaf.
+
+    light: (rows, columns, depths, h, w), gathers the gradient of the loss. ready: the imager, differentiable in it.
+    """
+
+    light: Tensor
+    ready: Imager
+
+    def pass_on(
+        self, settings: OpticsConfig, coefficients_rad: Tensor, *, draws: int, generator: torch.Generator
+    ) -> None:
+        """Add to the gradient of the coefficients what the light gathered, from ``draws`` points and wavelengths."""
+        if self.light.grad is None:
+            return
+        optics = optics_of(settings, coefficients_rad)
+        value = surrogate(optics, self.ready.plan, self.light.grad, draws=draws, generator=generator)
+        value.backward()  # type: ignore[no-untyped-call]
+
+
+def live(settings: OpticsConfig, whole: Imager) -> Live:
+    """An imager with its nodes' light as a leaf; the relative illumination is held."""
+    with torch.no_grad():
+        unit = normalised(torch.ones_like(whole.stack[..., :1, :1]), optics_of(settings, torch.zeros(0)), whole.plan)[1]
+        light = whole.stack * (whole.energy / unit)[..., None, None]
+    light.requires_grad_()
+    psfs = light / light.sum((-2, -1), keepdim=True)
+    return Live(light, with_psfs(whole, psfs, whole.energy))
+
+
+def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
+    """Wave, surroundings and distance of the lens."""
+    moving = settings if coefficients_rad.numel() else replace(settings, polynomials=0)
+    return Optics(wave_of(moving, coefficients_rad), Layers(), settings.sensor_distance_mm * 1e3)
+
+
+@torch.no_grad()
+def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> float:
+    """Relative L2 difference of the uniform image of a texture in depth from its true image: the error of 'uniform'."""
+    true = imager(replace(settings, image="true"), coefficients_rad, frame, margin=margin)
+    one = imager(replace(settings, image="uniform"), coefficients_rad, frame, margin=margin)
+    if not isinstance(true, Imager) or not isinstance(one, UniformImager):
+        raise TrainingError("no pair of images to compare")
+    seen = trial(true.grid)
+    edge = true.grid.margin + true.grid.spare
+    inside = slice(edge, edge + true.grid.samples[0])
+    want = blurred(seen, true)[..., inside, inside]
+    start = true.grid.spare
+    part = slice(start, start + frame)
+    few = Frames(*(getattr(seen, name)[..., part, part].contiguous() for name in Frames.__slots__))
+    got = scene.image(few, one, margin=margin)
+    return float((got - want).norm() / (want - want.mean()).norm())
