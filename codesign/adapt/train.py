@@ -5,29 +5,25 @@ captures do. What retraining bought is measured against three others: the nomina
 a virtual bench, a network that was trained with the truth known.
 """
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 
 from characterize.bench import Truth
 from characterize.inference import AsBuilt
 from codesign.adapt import reading
 from codesign.adapt.reading import Accuracy
+from codesign.adapt.source import Source, architecture_of, check_lens, load, rows_of
 from codesign.batches import TEST
-from codesign.network import Architecture, Supernet, check, recalibrate
+from codesign.network import Supernet, recalibrate
 from codesign.optics import MadeLens, Stack, built
 from codesign.train import (
     Batch,
     InnerConfig,
     Record,
-    Run,
-    RunConfig,
     Scenes,
     Schedule,
     Trainer,
@@ -35,10 +31,7 @@ from codesign.train import (
     checkpoint,
     model,
 )
-from codesign.train import run as runs
-from metalens.ground import manifest
-from metalens.ground.errors import ConfigError, FitError, TrainingError
-from metalens.lens import Lens
+from metalens.ground.errors import ConfigError, TrainingError
 
 APART = 7919  # between the seeds of retrainings: no step of one is a step of another
 JOBS = ("nominal", "retrained", "known")  # networks that are trained on: for the design, the fit, and the truth
@@ -65,20 +58,6 @@ class RetrainConfig:
     def __post_init__(self) -> None:
         if min(self.steps, self.draws, self.judge, self.test_batches) < 1 or not self.rate > 0:
             raise ConfigError(f"{self}: need steps, draws, judge and test_batches of 1 or more, and a rate above 0")
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Source:
-    """A finished run that is trained on: its network, the architecture that was chosen, its row of result.json."""
-
-    run: Run
-    architecture: Architecture
-    row: dict[str, Any]
-
-    @property
-    def settings(self) -> RunConfig:
-        """The run's settings."""
-        return self.run.settings
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -138,93 +117,6 @@ class Outcome:
         """Numbers by name of the case."""
         cases = {n: getattr(self, n) for n in ("designed", "nominal", "before", "after", "known")}
         return {name: case.values() for name, case in cases.items() if case is not None}
-
-
-def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
-    """A finished run and its network of this budget.
-
-    Raises:
-        TrainingError: no run folder, half written, unfinished, of another version, or without such a budget.
-    """
-    names = ("run.toml", "checkpoint.safetensors", "lens.h5", "result.json")
-    missing = [name for name in names if not (folder / name).is_file()]
-    if missing:
-        what = "no run folder" if len(missing) == len(names) else "a half-written run"
-        raise TrainingError(
-            f"{folder} is {what}: {', '.join(missing)} missing; finish it with "
-            f"`metalens codesign RUN.toml -o {folder} --resume`"
-        )
-    manifest.check(folder)
-    settings = runs.load(folder / "run.toml")
-    made = runs.resume(folder / "checkpoint.safetensors", settings)
-    rows = rows_of(folder)
-    found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
-    if not found:
-        have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
-        raise TrainingError(f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}")
-    return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
-
-
-def rows_of(folder: Path) -> list[dict[str, Any]]:
-    """Rows of result.json, least budget first.
-
-    Raises:
-        TrainingError: the file is missing, cut short or of another version.
-    """
-    manifest.check(folder)
-    path = folder / "result.json"
-    if not path.is_file():
-        raise TrainingError(f"{path} is missing: no finished run; resume the run")
-    try:
-        rows: list[dict[str, Any]] = sorted(
-            json.loads(path.read_text("utf-8"))["rows"], key=lambda r: r["budget_mmacs"]
-        )
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise TrainingError(f"{path}: cut short or of another version ({error!r}); resume the run") from None
-    if not rows:
-        raise TrainingError(f"{path}: holds no network; resume the run")
-    return rows
-
-
-def architecture_of(entry: dict[str, Any], run: Run, folder: Path) -> Architecture:
-    """The architecture in a row of result.json.
-
-    Raises:
-        TrainingError: of another version, or outside the run's space.
-    """
-    values: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k not in ("error", "macs")
-    }
-    try:
-        return check(run.settings.space, Architecture(**values))
-    except TypeError as error:
-        raise TrainingError(f"{folder}/result.json: its network is of another version ({error})") from None
-
-
-def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
-    """Refuse an as-built record of another lens, or of a fit that failed its own checks.
-
-    Raises:
-        FitError: either of the two, with what to do.
-    """
-    mine, other = design.diameters, result.design.diameters
-    if mine.diameter_um.shape != other.diameter_um.shape or mine.pitch_um != other.pitch_um:
-        raise FitError(
-            f"the as-built record is of another lens: {other.diameter_um.shape} pillars of pitch {other.pitch_um} um, "
-            f"the run's lens has {mine.diameter_um.shape} of {mine.pitch_um} um; fit captures of the run's own lens.h5"
-        )
-    apart = float(np.abs(mine.diameter_um - other.diameter_um).max())
-    if apart > 1e-6 or design.sensor_distance_um != result.design.sensor_distance_um:
-        raise FitError(
-            f"the as-built record is of another lens: designed diameters differ by up to {apart * 1e3:.1f} nm, sensor "
-            f"distances are {design.sensor_distance_um} and {result.design.sensor_distance_um} um; "
-            "fit captures of the run's own lens.h5"
-        )
-    if not result.trusted and not insist:
-        raise FitError(
-            "the fit was refused by its own checks: " + "; ".join(result.problems) + ". Mend the captures and fit "
-            "again; --insist trains on it in spite of that"
-        )
 
 
 def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None) -> Lenses:
@@ -298,7 +190,7 @@ def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
     """
     frames = []
     for number in range(batches):
-        made = going.stacks[number % len(going.stacks)]
+        made = going.light.stacks[number % len(going.light.stacks)]
         step = _Step(going.scenes, number)
         frames.append(assess.frames(going, step, 1, stack=made).frames)
     recalibrate(network(going), source.architecture, frames)
@@ -400,3 +292,9 @@ def retrain(
         for _ in going.run():
             pass
     return outcome(source, config, found, trained)
+
+
+__all__ = [
+    "Accuracy", "Held", "Lenses", "Outcome", "RetrainConfig", "Source", "architecture_of", "check_lens", "fine_tuning",
+    "held", "job", "jobs", "judge", "lenses", "load", "network", "outcome", "retrain", "rows_of", "train", "trainer",
+]  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 import tyro
 
-from codesign.evaluate import Scenes, Setting
+from codesign.evaluate import ReaderConfig, Scenes, Setting, judged, reader
 from codesign.evaluate import optics as evaluate_optics
 from codesign.evaluate import plots as evaluate_plots
 from codesign.evaluate import tables as evaluate_tables
@@ -32,10 +32,12 @@ class Settings:
     """The content of OPTICS.toml; every key may be left out.
 
     axial: how the axial information is measured. scenes: what the scene table is made of.
+    reader: what the reference reader sees, with ``--reader``.
     """
 
     axial: Setting = field(default_factory=Setting)
     scenes: Scenes = field(default_factory=Scenes)
+    reader: ReaderConfig = field(default_factory=ReaderConfig)
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,12 @@ class Options(Common):
     Attributes:
         lenses: lens files; the first is what the others are compared with.
         output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
-        config: OPTICS.toml with the tables [axial] and [scenes]; without it the defaults.
+        config: OPTICS.toml with the tables [axial], [scenes] and [reader]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.
         baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
             and at the aperture of the first lens; tuned on axis for the finest binning.
+        reader: train the reference reader behind every lens and print what it reads: depth of windows, slippage, with
+            calibrated intervals; some minutes a lens, the same numbers every time.
     """
 
     lenses: tyro.conf.Positional[tuple[Path, ...]]
@@ -56,6 +60,7 @@ class Options(Common):
     config: Path | None = None
     scenes: int | None = None
     baselines: bool = False
+    reader: bool = False
 
 
 def run(options: Options) -> int:
@@ -88,6 +93,12 @@ def _measure(
     scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
     text = evaluate_tables.tables(axial, scenes, settings.axial)
     values = evaluate_tables.values(axial, scenes, settings.axial)
+    if options.reader:
+        told = judged(dict(zip(names, made, strict=True)), settings.reader)
+        found = dict(options.console.track(told, total=len(made), label="reader"))
+        text += "\n\n" + "\n".join(reader.table(found, settings.reader))
+        values["reader"] = {"settings": dataclasses.asdict(settings.reader)}
+        values["reader"]["lenses"] = {name: one.values() for name, one in found.items()}
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from codesign.evaluate import paper as paper
     from codesign.evaluate import paper_runs as paper_runs
     from codesign.evaluate import plots as plots
+    from codesign.evaluate import reader as reader
     from codesign.evaluate import tables as tables
     from codesign.evaluate.gaze_experiment import AXIAL as AXIAL
     from codesign.evaluate.gaze_experiment import LATERAL as LATERAL
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from codesign.evaluate.paper import ROLES as ROLES
     from codesign.evaluate.paper import Line as Line
     from codesign.evaluate.paper import Measured as Measured
+    from codesign.evaluate.reader import ReaderConfig as ReaderConfig
+    from codesign.evaluate.reader import judged as judged
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -31,15 +34,18 @@ __getattr__, __dir__, __all__ = attach(
         "Line": "paper",
         "Measured": "paper",
         "ROLES": "paper",
+        "ReaderConfig": "reader",
         "Result": "gaze_experiment",
         "Scenes": "optics",
         "Setting": "optics",
         "experiment": "gaze_experiment",
         "experiment_plots": "",
+        "judged": "reader",
         "optics": "",
         "paper": "",
         "paper_runs": "",
         "plots": "",
+        "reader": "",
         "tables": "",
     },
 )

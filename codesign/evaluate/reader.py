@@ -1,0 +1,299 @@
+"""A fixed, cheap reader that judges any lens by what a small reader really collects of the depth in its images.
+
+    frames → log power of windows → depth of each window (labels of the renderer) → slippage, with its uncertainty
+
+The same for every lens: frames, noise, layers, schedule and order of the frames come from the seed alone, so a lens has
+one number. The lens images through its true image: whole field, depth, spectrum. An information bound of stationary
+texture ranks lenses that readers cannot tell apart; what is read of them does not.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from codesign.batches import (
+    EXPERIMENT,
+    TEST,
+    VALIDATION,
+    EyeScenes,
+    PoolScenes,
+    SceneConfig,
+    depth_um,
+    fill,
+    irradiance,
+)
+from codesign.network import blur, losses
+from codesign.network.blur import BlurBranch
+from codesign.train import Scenes, read_out
+from metalens.ground.errors import ConfigError
+from metalens.image import Grid, Imager, Sensor, UniformImager, imager
+from metalens.lens import Lens
+from metalens.psf import Source
+
+SHARE = 0.9  # of the intervals
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderConfig:
+    """What the reference reader sees.
+
+    frames: that it learns from, drawn from ``pool`` rendered ones at new scales; a multiple of 32. test: that judge it;
+        as many again calibrate its intervals. seed: of everything.
+    pixels, pitch_um: of the sensor, square. electrons: that a white object gives in a pixel of 9 um.
+    fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs cover.
+    tolerance: of the true image.
+    """
+
+    frames: int = 6400
+    pool: int = 1024
+    test: int = 256
+    seed: int = 0
+    pixels: int = 64
+    pitch_um: float = 18.0
+    electrons: float = 2000.0
+    fwhm_nm: float = 0.0
+    depths_mm: tuple[float, float] = (12.0, 50.0)
+    tolerance: float = 0.03
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.pool, self.test) < BATCH or self.frames % BATCH or self.test % BATCH:
+            raise ConfigError(
+                f"reader: frames = {self.frames}, pool = {self.pool}, test = {self.test}: need {BATCH} or more, frames "
+                f"and test a multiple of {BATCH}"
+            )
+        if not (32 <= self.pixels <= 512 and self.pitch_um > 0 and self.electrons > 0 and self.fwhm_nm >= 0):
+            raise ConfigError(
+                f"reader: pixels = {self.pixels}, pitch_um = {self.pitch_um}, electrons = {self.electrons}, fwhm_nm = "
+                f"{self.fwhm_nm}: need 32 to 512 pixels, pitch and electrons above 0, a width of 0 or more"
+            )
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frames: 144 um, half a window of the PSFs."""
+        return math.ceil(144.0 / self.pitch_um)
+
+    @property
+    def sensor(self) -> Sensor:
+        """Pixels of this pitch: 5 electrons of read noise, full well at twice the white object's light, 10 bits."""
+        return Sensor(self.pitch_um, 9.0, self.electrons, 0.0, 2 * self.electrons, 5.0, 10)
+
+
+BATCH = 32
+SLIP_SCALE_MM = torch.tensor([1.4, 1.2, 2.3])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Read:
+    """What was read of the test frames through one lens; errors absolute, (frames,).
+
+    axial_mm, lateral_mm: of the slippage. window_mm: of the windows' depths, mean of each frame; guess_mm: of the best
+    constant. covered: share of frames within the calibrated 90 % interval of the axial slippage, whose mean half width
+    is interval_mm. image_error: of the image, relative L2.
+    """
+
+    axial_mm: Tensor
+    lateral_mm: Tensor
+    window_mm: Tensor
+    guess_mm: float
+    covered: float
+    interval_mm: float
+    image_error: float
+
+    def values(self) -> dict[str, float]:
+        """The numbers by name, axial with its 95 % interval by a bootstrap over the frames."""
+        rows = np.random.default_rng(0).integers(0, len(self.axial_mm), (1000, len(self.axial_mm)))
+        low, high = np.quantile(self.axial_mm.numpy()[rows].mean(1), [0.025, 0.975])
+        return {
+            "axial_mm": float(self.axial_mm.mean()), "axial_low_mm": float(low), "axial_high_mm": float(high),
+            "lateral_mm": float(self.lateral_mm.mean()), "window_mm": float(self.window_mm.mean()),
+            "guess_mm": self.guess_mm, "covered": self.covered, "interval_mm": self.interval_mm,
+            "image_error": self.image_error,
+        }  # fmt: skip
+
+
+class ReferenceReader(nn.Module):
+    """The blur branch and a small network from its depths to the slippage with the logarithm of its spread."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.branch = BlurBranch(nn.BatchNorm2d(blur.FEATURES))
+        self.slip = nn.Sequential(
+            nn.BatchNorm1d(blur.SLIP_FEATURES),
+            nn.Dropout(0.1),
+            nn.Linear(blur.SLIP_FEATURES, 128),
+            nn.GELU(),
+            nn.Dropout(0.2),
+            nn.Linear(128, 64),
+            nn.GELU(),
+            nn.Linear(64, 6),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frames:
+    """Frames of one lens with their truth: pixels (n, 1, y, x), vergence (n, windows, windows), slip_mm (n, 3)."""
+
+    pixels: Tensor
+    vergence: Tensor
+    slip_mm: Tensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scenery:
+    """Scenes that are the same for every lens: to learn from, to calibrate and to judge."""
+
+    learn: Scenes
+    calibrate: Scenes
+    judge: Scenes
+
+
+def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
+    """Render what all lenses of this sensor distance are judged on; size tells no depth."""
+    scenes = SceneConfig(pixels=config.pixels, margin=config.margin)
+    of = {
+        stream: EyeScenes(scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream)
+        for stream in (EXPERIMENT, VALIDATION, TEST)
+    }
+    pools = {stream: fill(one, config.test if stream != EXPERIMENT else config.pool) for stream, one in of.items()}
+    kept = {s: PoolScenes(p, config.margin, scenes.scale, config.seed + s) for s, p in pools.items()}
+    return Scenery(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
+
+
+def lens_imager(lens: Lens, config: ReaderConfig) -> Imager:
+    """The true image of a lens file for the reader's frames."""
+    low, high = config.depths_mm
+    window = 2 * config.margin + 1
+    grid = Grid((config.pixels, config.pixels), config.pitch_um, (low * 1e3, high * 1e3), config.margin, window)
+    source = Source(lens.wavelength_um * 1e3, config.fwhm_nm) if config.fwhm_nm else None
+    return imager(lens, grid, spectrum=source, tolerance=config.tolerance)
+
+
+def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) -> Read:
+    """Train the reader on images through ``optics`` and judge it; the same seed gives the same numbers."""
+    state = torch.get_rng_state()
+    torch.manual_seed(config.seed)
+    try:
+        made = ReferenceReader()
+        learn = frames(optics, seen.learn, config, config.frames)
+        _learn_depth(made, learn)
+        _learn_slip(made, learn)
+        made.eval()
+        spare = frames(optics, seen.calibrate, config, config.test)
+        judged = frames(optics, seen.judge, config, config.test)
+        return _judge(made, spare, judged, float(getattr(optics, "error", math.nan)))
+    finally:
+        torch.set_rng_state(state)
+
+
+@torch.no_grad()
+def frames(optics: Imager | UniformImager, scenes: Scenes, config: ReaderConfig, count: int) -> Frames:
+    """``count`` frames of a stream through a lens onto the sensor, with noise of the batch's number."""
+    pixels, vergence, slip = [], [], []
+    pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
+    for number in range(count // BATCH):
+        batch = scenes.batch(number, BATCH)
+        light = irradiance(batch.frames, optics, margin=config.margin)
+        noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
+        pixels.append(read_out(light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False))
+        vergence.append(blur.window_vergence(depth_um(batch.frames, margin=config.margin)))
+        slip.append(batch.slip_mm)
+    return Frames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
+
+
+def _learn_depth(made: ReferenceReader, learn: Frames, *, passes: int = 4, batch: int = 64) -> None:
+    for rows in _steps(made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01):
+        told, _ = made.branch(learn.pixels[rows])
+        losses.depth(told, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
+
+
+def _learn_slip(made: ReferenceReader, learn: Frames, *, passes: int = 12, batch: int = 128) -> None:
+    features = _features(made, learn)
+    truth = learn.slip_mm / SLIP_SCALE_MM
+    for rows in _steps(made.slip, len(features), passes, batch, rate=2e-3, decay=0.03):
+        found = made.slip(features[rows])
+        miss, spread = found[:, :3] - truth[rows], found[:, 3:].clamp(-4, 2)
+        told = (0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread).mean()
+        loss = F.smooth_l1_loss(found[:, :3], truth[rows], beta=0.3) + 0.1 * told
+        loss.backward()  # type: ignore[no-untyped-call]
+
+
+def _steps(part: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float) -> Iterator[Tensor]:
+    """Rows of every batch; a step of AdamW on one rising and falling rate after each."""
+    part.train()
+    optimiser = torch.optim.AdamW(part.parameters(), lr=rate, weight_decay=decay)
+    total = passes * max(count // batch, 1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total)
+    for _ in range(passes):
+        order = torch.randperm(count)
+        for k in range(max(count // batch, 1)):
+            optimiser.zero_grad(set_to_none=True)
+            yield order[k * batch : (k + 1) * batch]
+            optimiser.step()
+            schedule.step()
+    part.eval()
+
+
+@torch.no_grad()
+def _features(made: ReferenceReader, seen: Frames) -> Tensor:
+    parts = [made.branch(seen.pixels[i : i + 256])[1] for i in range(0, len(seen.pixels), 256)]
+    return torch.cat(parts)
+
+
+@torch.no_grad()
+def _judge(made: ReferenceReader, spare: Frames, judged: Frames, image_error: float) -> Read:
+    def slip(seen: Frames) -> tuple[Tensor, Tensor]:
+        found = made.slip(_features(made, seen))
+        return (found[:, :3] * SLIP_SCALE_MM - seen.slip_mm).abs(), found[:, 5].clamp(-4, 2).exp() * SLIP_SCALE_MM[2]
+
+    error, spread = slip(spare)
+    ratio = (error[:, 2] / spread).sort().values
+    reach = float(ratio[min(math.ceil(SHARE * (len(ratio) + 1)), len(ratio)) - 1])
+    error, spread = slip(judged)
+    told = torch.cat([made.branch(judged.pixels[i : i + 256])[0] for i in range(0, len(judged.pixels), 256)])
+    truth = blur.depth_mm(judged.vergence)
+    window = (blur.depth_mm(told[:, 0]) - truth).abs().mean((1, 2))
+    guess = float((truth - truth.median()).abs().mean())
+    inside = float((error[:, 2] <= reach * spread).float().mean())
+    wide = float((reach * spread).mean())
+    return Read(error[:, 2], error[:, :2].mean(1), window, guess, inside, wide, image_error)
+
+
+def table(found: dict[str, Read], config: ReaderConfig) -> list[str]:
+    """Lines of text: one a lens."""
+    width = max(14, *(len(name) for name in found)) + 2
+    light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
+    lines = [
+        f"Read by the reference reader: {config.frames} frames of {config.pixels} pixels of {config.pitch_um:g} um, "
+        f"{config.electrons:g} e, {light}, whole field; 95 % interval over {config.test} test frames",
+        f"{'lens':<{width}}{'axial / mm':<22}{'90 % interval covers':<28}{'lateral / mm':<14}"
+        f"{'windows / mm (guess)':<24}image error",
+    ]
+    for name, one in found.items():
+        v = one.values()
+        axial = f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
+        wide = f"+-{v['interval_mm']:.2f} mm, {100 * v['covered']:.0f} %"
+        windows = f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})"
+        lines.append(f"{name:<{width}}{axial:<22}{wide:<28}{v['lateral_mm']:<14.2f}{windows:<24}{v['image_error']:.3f}")
+    return lines
+
+
+def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str, Read]]:
+    """Every lens by name, on the same scenes.
+
+    Raises:
+        ConfigError: lenses of different sensor distances, whose frames differ in size.
+    """
+    distances = {name: lens.sensor_distance_um for name, lens in lenses.items()}
+    if max(distances.values()) > min(distances.values()) * 1.001:
+        raise ConfigError(f"lenses of different sensor distances {distances} um: compare lenses of one distance")
+    seen = scenery(config, sensor_distance_um=next(iter(distances.values())))
+    for name, lens in lenses.items():
+        yield name, read(lens_imager(lens, config), seen, config)
+
+
+__all__ = ["Read", "ReaderConfig", "ReferenceReader", "judged", "lens_imager", "read", "scenery", "table"]
