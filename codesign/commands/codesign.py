@@ -1,6 +1,7 @@
 """RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from safetensors.torch import save_file
 
 from codesign.batches import parallel
 from codesign.network import Baseline, Subnet
+from codesign.optics import formed
 from codesign.optics import stack as trained
 from codesign.train import (
     Journal,
@@ -32,6 +34,8 @@ from metalens import design, lens, library
 from metalens.commands import Common, Output
 from metalens.ground import config, report, store, transaction
 from metalens.ground.console import Console
+from metalens.ground.errors import ConfigError, PropagationError, SceneError
+from metalens.image import sensor as camera
 
 CHECKPOINT, LOG, SETTINGS, RESULT = "checkpoint.safetensors", "log.jsonl", "run.toml", "result.json"
 
@@ -46,6 +50,7 @@ class Options(Common):
         resume: go on from the folder's checkpoint, bit for bit.
         freeze: parts that stay as they start, beside those of the config: the ablations.
         device: of the network; auto takes a GPU where there is one. Scenes and optics stay on the processor.
+        export: write every budget's network as ONNX too (opset 17), for frames of the sensor's pixels.
         events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
     """
 
@@ -54,33 +59,43 @@ class Options(Common):
     resume: bool = False
     freeze: tuple[runs.Part, ...] = ()
     device: Place = "auto"
+    export: bool = False
     events: bool = False
 
 
 def run(options: Options) -> int:
     """Train, search, finish; exit 0."""
     settings = _frozen(runs.load(options.config), options.freeze)
+    if options.export and settings.network != "supernet":
+        raise ConfigError(f"--export writes elastic networks; network = {settings.network!r} has no such export")
     device = device_of(options.device)
     parallel.join()
     if parallel.rank():
         return _assist(transaction.unfinished(options.output), settings, device)
     with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:
-        rows = _work(options, settings, device, draft.path)
-    options.console.result({"rows": rows, "folder": str(options.output)}, _table(rows))
+        rows, said = _work(options, settings, device, draft.path)
+    values = {"rows": rows, "folder": str(options.output), "image": said}
+    options.console.result(values, f"{_table(rows)}\n{_of_image(said)}")
     return 0
 
 
-def _work(options: Options, settings: RunConfig, device: torch.device, folder: Path) -> list[dict[str, Any]]:
-    """Train, search and write into the folder; a row a network."""
+def _work(
+    options: Options, settings: RunConfig, device: torch.device, folder: Path
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Train, search and write into the folder; a row a network, and what images they were trained on."""
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
     place(going.trainer, device)
     parallel.wait()
     journal = Journal(folder) if options.events else None
+    held = False
     for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
         _log(folder, {"kind": "step", **asdict(record)})
         if journal:
             _events(journal, going, record)
+        if (limit := going.trainer.pitch_held_um) is not None and not held:
+            held = True
+            console.say(f"step {record.step}: {_of_pitch(settings, limit)}")
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
@@ -91,8 +106,58 @@ def _work(options: Options, settings: RunConfig, device: torch.device, folder: P
         console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
     parallel.leave()
     ends = finished(going)
-    _keep(folder, going, ends)
-    return [row for row, _ in ends]
+    said = _image(going)
+    _keep(folder, going, ends, said)
+    if options.export:
+        _export(folder, going, ends)
+    return [row for row, _ in ends], said
+
+
+def _of_pitch(settings: RunConfig, limit_um: float) -> str:
+    if limit_um <= settings.optics.sample_um:
+        more = settings.optics.sample_um / 2
+        return (
+            f"the pitch is held at {limit_um:.3f} um, the samples of the image, and asks for less; to let it go on, "
+            f"set optics.sample_um = {more:g} with optics.window_samples, scenes.pixels and scenes.margin twice as many"
+        )
+    return f"the pitch is held at {limit_um:.3f} um: coarser pixels would leave a network less than it can take"
+
+
+def _image(going: Run) -> dict[str, Any]:
+    """What the run's images are, and how wrong: of one PSF against the true image of this lens, relative L2."""
+    settings = going.settings
+    optics, side = settings.optics, settings.scenes.pixels + 2 * settings.scenes.margin
+    given = optics, going.trainer.model.coefficients_rad.detach(), side
+    try:
+        if optics.image == "uniform":
+            error = formed.apart(*given, margin=settings.scenes.margin)
+        else:
+            error = float(getattr(formed.imager(*given, margin=settings.scenes.margin), "error", math.nan))
+    except (SceneError, PropagationError) as problem:
+        return {"kind": optics.image, "error": None, "problem": str(problem)}
+    return {"kind": optics.image, "error": error, "fwhm_nm": optics.fwhm_nm, "passed": optics.passed}
+
+
+def _of_image(said: dict[str, Any]) -> str:
+    if said["error"] is None:
+        return f"image: {said['kind']}; how far it is from the true image is not known: {said['problem']}"
+    if said["kind"] == "uniform":
+        return (
+            f"image: one PSF for the whole field, one wavelength (uniform); it differs from the true image of a "
+            f"texture by {said['error']:.2f} of its contrast; optics.image = 'true' trains on that"
+        )
+    light = f"{said['fwhm_nm']:g} nm" if said["fwhm_nm"] else "one wavelength"
+    return f"image: whole field, {light}, {100 * said['passed']:.0f} % of the light; error {said['error']:.3f}"
+
+
+def _export(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:
+    """Every budget's network as ONNX."""
+    pitch = float(going.trainer.model.pitch_um.detach())
+    size = camera.pixel_count(going.settings.scenes.pixels, going.settings.optics.sample_um, pitch)
+    for (row, made), state in zip(ends, going.searches, strict=False):
+        if not isinstance(made.net, Baseline):
+            cut = Subnet(made.net, best(state.history).architecture)
+            cut.export_onnx(folder / f"subnet_{row['budget_mmacs']:g}.onnx", size=size)
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
@@ -162,7 +227,7 @@ def _log(folder: Path, entry: dict[str, Any]) -> None:
         file.write(json.dumps(entry) + "\n")
 
 
-def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:
+def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]], said: dict[str, Any]) -> None:
     """lens.h5, the networks, result.json and the plot of the Pareto set."""
     settings = going.settings
     _lens(folder / "lens.h5", going)
@@ -176,7 +241,8 @@ def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) ->
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [row for row, _ in ends]
     found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
-    found |= {"network": settings.network, "frozen": list(settings.run.frozen)}
+    found |= {"network": settings.network, "frozen": list(settings.run.frozen), "image": said}
+    found |= {"pitch_held_um": going.trainer.pitch_held_um}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
     if going.searches:
         store.write_bytes(folder / "pareto.png", _plot(going))

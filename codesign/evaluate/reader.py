@@ -219,7 +219,7 @@ def _learn_slip(made: ReferenceReader, learn: Frames, *, passes: int = 12, batch
         miss, spread = found[:, :3] - truth[rows], found[:, 3:].clamp(-4, 2)
         told = (0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread).mean()
         loss = F.smooth_l1_loss(found[:, :3], truth[rows], beta=0.3) + 0.1 * told
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
 
 
 def _steps(part: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float) -> Iterator[Tensor]:

@@ -213,6 +213,7 @@ class Trainer:
             "log_pitch": self.model.log_pitch.detach(),
             "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
             "light": self.light.state(),
+            "pitch_held_um": self.pitch_held_um,
             "counters": [self.step, self.skipped, self.bad_run],
         }
 
@@ -226,6 +227,7 @@ class Trainer:
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
+        self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
     def _advance(self) -> Record:
         progress = self.step / self.inner.steps

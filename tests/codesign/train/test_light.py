@@ -1,0 +1,111 @@
+"""The true image while a lens trains: formed anew in time, resumed bit for bit, refused where it cannot be."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from codesign.optics import formed, stack
+from codesign.optics.stack import OpticsConfig
+from codesign.train import run
+from codesign.train.light import Light
+from metalens.ground.errors import TrainingError
+from metalens.image import Imager
+
+TRUE = """
+preset = "smoke"
+checkpoint_every = 1
+validation_batches = 1
+test_batches = 1
+[scenes]
+pixels = 32
+margin = 5
+pool = 6
+[inner]
+steps = 4
+batch = 2
+refresh = 2
+draws = 3
+optics_weight = 0.0
+[inner.optics]
+rate = 0.05
+start = 0.0
+end = 0.7
+[space]
+resolution = [0.9, 1.0]
+[search]
+population = 1
+tournament = 1
+rounds = 1
+[run]
+budgets_mmacs = [2.0]
+pitch_um = 12.0
+[optics]
+image = "true"
+image_tolerance = 0.4
+aperture_mm = 0.3
+focus_mm = 30.0
+depths_mm = [16.0, 30.0]
+sample_um = 12.0
+polynomials = 5
+depth_count = 4
+window_samples = 11
+"""
+
+
+def _never(step):
+    return None
+
+
+def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monkeypatch):
+    made = []
+
+    def imaged(settings, coefficients, frame, *, margin, error=None, made_of=made):
+        made_of.append(float(coefficients[0]))
+        return formed_once
+
+    settings = OpticsConfig(
+        aperture_mm=0.3, depths_mm=(16.0, 30.0), focus_mm=30.0, polynomials=5, sample_um=12.0, window_samples=11,
+        image="true", image_tolerance=0.5,
+    )  # fmt: skip
+    place = torch.zeros(5, dtype=torch.float64)
+    formed_once = formed.imager(settings, place, 30, margin=5)
+    assert isinstance(formed_once, Imager)
+    monkeypatch.setattr(formed, "imager", imaged)
+    monkeypatch.setattr(formed, "live", lambda settings, whole: formed.Live(place, whole))
+    light = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
+    for step, moved in enumerate((0.0, 0.0, 1.0, 2.0, 3.0, 4.0)):
+        light.at(step, place + moved, 30, 5, live=step > 0)
+    assert made == [0.0, 2.0]  # at first; then at step 3, as it had waited; at step 4 it is imaged as at step 3
+    light.at(6, place + 4.0, 30, 5, live=False)
+    light.at(7, place + 4.0, 30, 5, live=False)
+    assert made == [0.0, 2.0, 4.0]  # at rest once, as it is
+    other = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
+    other.restore(light.state())
+    other.at(8, place + 4.0, 30, 5, live=False)
+    assert made == [0.0, 2.0, 4.0, 4.0]
+
+
+def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp_path):
+    (tmp_path / "run.toml").write_text(TRUE)
+    settings = run.load(tmp_path / "run.toml")
+    whole = run.start(settings)
+    records = list(run.train(whole, tmp_path / "whole"))
+    assert all(r.skipped == 0 for r in records)
+    part = run.start(settings)
+    steps = run.train(part, tmp_path / "part")
+    next(steps), next(steps)  # imaged at step 0, moved since
+    going = run.resume(tmp_path / "part", settings)
+    list(run.train(going, tmp_path / "part"))
+    assert torch.equal(run.coefficients(whole), run.coefficients(going))
+    assert float(run.coefficients(whole).abs().max()) > 1e-3
+    with pytest.raises(TrainingError, match=r'optics\.image: "true" -> "uniform"'):
+        run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, image="uniform")))
+
+
+def test_a_made_lens_known_on_axis_alone_is_no_true_image():
+    settings = OpticsConfig(polynomials=0, image="true")
+    made = stack.stack(replace(settings, image="uniform"), torch.zeros(0))
+    light = Light(settings, (made,), refresh=2, draws=2, seed=0, draw=_never)
+    with pytest.raises(TrainingError, match="cannot stand for the field"):
+        light.at(0, torch.zeros(0), 160, 16, live=False)
