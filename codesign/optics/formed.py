@@ -18,11 +18,7 @@ from torch import Tensor
 from codesign.optics import stack as lens
 from codesign.optics.lens_errors import LensError, variance_rad2
 from codesign.optics.stack import OpticsConfig, Stack
-from metalens.field.engine import normalised, trial
-from metalens.field.forming import blurred, with_psfs
-from metalens.field.points import Layers, Optics
-from metalens.field.subset import surrogate
-from metalens.field.waves import SmoothWave
+from metalens.field import Layers, Optics, SmoothWave, blurred, normalised, surrogate, trial, with_psfs
 from metalens.ground.errors import TrainingError
 from metalens.image import Frames, Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager

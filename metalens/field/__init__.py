@@ -7,7 +7,10 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from metalens.field.engine import imager as imager
     from metalens.field.engine import node_psfs as node_psfs
+    from metalens.field.engine import normalised as normalised
+    from metalens.field.engine import trial as trial
     from metalens.field.forming import Imager as Imager
+    from metalens.field.forming import blurred as blurred
     from metalens.field.forming import with_psfs as with_psfs
     from metalens.field.plan import Grid as Grid
     from metalens.field.plan import Plan as Plan
@@ -36,11 +39,14 @@ __getattr__, __dir__, __all__ = attach(
         "SmoothWave": "waves",
         "Wave": "waves",
         "Window": "points",
+        "blurred": "forming",
         "imager": "engine",
         "node_light": "subset",
         "node_psfs": "engine",
+        "normalised": "engine",
         "psfs": "points",
         "surrogate": "subset",
+        "trial": "engine",
         "with_light": "subset",
         "with_psfs": "forming",
     },
