@@ -134,7 +134,7 @@ class BlurBranch(nn.Module):
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         power, mean = spectra(frames)
         told = self.norm(torch.cat([torch.log(power + FLOOR), mean], 1))
-        told = torch.cat([told, self.place.expand(len(frames), -1, -1, -1)], 1)
+        told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
         depth = self.depth(F.hardswish(self.second(F.hardswish(self.first(told)))))
         spread = depth[:, 1].clamp(-3, 2)
         depth = torch.stack([depth[:, 0], spread], 1)
