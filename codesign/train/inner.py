@@ -283,10 +283,10 @@ class Trainer:
         optics = self.light.at(self.step, coefficients, samples(frames), self.scenes.margin, live=live)
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
-        made = lens.stack(self.optics, coefficients, error=self._lens_error(self.step))
+        made = lens.stack(self.optics, coefficients, error=self._lens_error())
         return optics, depth_loss(made, self.optics, energy=self.inner.energy)
 
-    def _lens_error(self, step: int) -> LensError | None:
+    def _lens_error(self, step: int | None = None) -> LensError | None:
         return self.optics.spread.draw(self._generator(2, step))
 
     def _members(self, count: Count) -> Sequence[Architecture]:
