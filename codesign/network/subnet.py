@@ -1,5 +1,6 @@
 """One architecture cut out of a supernet, to be exported: it holds only the weights that it uses."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ class Subnet(nn.Module):
         """
         names = ["mask_logits", "centre", "slip"]
         example = torch.zeros(1, 1, size, size)
-        with replacing(path) as part:
+        with replacing(path) as part, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # sizes are fixed on purpose; the exporter's own age is no news here
             torch.onnx.export(
                 self, (example,), str(part), dynamo=False, input_names=["frames"], output_names=names, opset_version=17
             )
