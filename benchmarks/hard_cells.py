@@ -17,7 +17,8 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 from metalens.ground.errors import CellError
 from metalens.modal import RUNGS
-from metalens.modal.engine import case_of, evaluate
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate
 
 COUNT = 1000
 SEED = 21

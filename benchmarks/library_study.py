@@ -16,7 +16,8 @@ import numpy as np
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
 from metalens.ground.arrays import Array
-from metalens.modal.engine import case_of, evaluate
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate
 from metalens.modal.ladder import RUNGS
 from metalens.pillars import curve as reduced
 from metalens.pillars import workers

@@ -13,7 +13,8 @@ import metalens
 from benchmarks import Row, fastest
 from metalens.cell.record import Cell, Index
 from metalens.modal import gradient, solve, solve_many
-from metalens.modal.engine import basis, case_of, evaluate, geometry
+from metalens.modal.case import case_of
+from metalens.modal.engine import basis, evaluate, geometry
 from metalens.modal.ladder import RUNGS
 
 WAVELENGTH_UM = 0.85

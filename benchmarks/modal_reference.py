@@ -16,7 +16,8 @@ import numpy as np
 
 import metalens
 from metalens.cell.record import Cell, Index
-from metalens.modal.engine import case_of, evaluate
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate
 from metalens.modal.mesh import MeshPlan, build
 from metalens.modal.spaces import select
 

@@ -14,7 +14,7 @@ class Response:
     t_error: estimate of |t - exact|, not below the true error.
     orders: harmonics (RCWA) or degrees of freedom (modal) of the finest solution used.
     energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a defect if lossless).
-    engine: ``rcwa``, ``modal`` or ``film``.
+    engine: ``rcwa``, ``modal``, ``film``, or ``anchored`` (coupled waves put right by the modal method).
     converged: whether ``t_error`` meets the tolerance that was asked for.
     reason: why the solver stopped, in words.
     """

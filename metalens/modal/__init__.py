@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.modal.case import case_of as case_of
     from metalens.modal.derivatives import Gradient as Gradient
     from metalens.modal.derivatives import gradient as gradient
-    from metalens.modal.engine import case_of as case_of
     from metalens.modal.engine import evaluate as evaluate
     from metalens.modal.engine import solve as solve
     from metalens.modal.ladder import RUNGS as RUNGS
@@ -27,7 +27,7 @@ __getattr__, __dir__, __all__ = attach(
         "RUNGS": "ladder",
         "Rung": "ladder",
         "Table": "table",
-        "case_of": "engine",
+        "case_of": "case",
         "evaluate": "engine",
         "first_rung": "ladder",
         "gradient": "derivatives",

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell, index, slope
-from metalens.modal.engine import Case, basis, case_of, check_tolerance, climb, geometric_mean, geometry
+from metalens.modal.case import Case, case_of, check_tolerance
+from metalens.modal.engine import basis, climb, geometric_mean, geometry
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import half_space, scattering, zero_order

@@ -1,16 +1,17 @@
 """The public solve: one pillar cell, one wavelength, one angle, with an error estimate."""
 
 import cmath
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Response, index
+from metalens.cell import Cell, Response
 from metalens.ground.errors import CellError
 from metalens.modal.assembly import Geometry, assemble
+from metalens.modal.case import Case, case_of, check_tolerance, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import RUNGS, Rung, first_rung
@@ -19,33 +20,14 @@ from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_s
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space
+from metalens.rcwa import anchored
 
-NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
+Polarization = Literal["x", "y", "s", "p"]
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
 MOST = 8  # and of the others at most so many, the least decaying
-POLARIZATIONS = ("x", "y", "s", "p")
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One problem in half pitches: what the linear algebra needs.
-
-    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above: permittivities of the
-    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the electric field.
-    """
-
-    rho: float
-    k0: float
-    height: float
-    below: float
-    above: float
-    disc: complex
-    around: complex
-    bloch: float
-    p: bool
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -242,92 +224,6 @@ def climb(case: Case, tolerance: float) -> Climb:
     return best
 
 
-def check_tolerance(tolerance: float) -> None:
-    """Refuse what is not a finite number above 0."""
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
-
-
-def film(case: Case) -> np.ndarray:
-    """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
-    kz1, kz2 = (math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above))
-    y1, y2 = (case.below / kz1, case.above / kz2) if case.p else (kz1, kz2)
-    r, t = (y1 - y2) / (y1 + y2), 2 * math.sqrt(y1 * y2) / (y1 + y2)
-    return np.array([[r, t], [t, -r]], complex)
-
-
-def case_of(
-    cell: Cell, diameter_um: float, wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str
-) -> Case:
-    """Check a case, and put it into half pitches.
-
-    Raises:
-        CellError: films or a tilted sidewall (use metalens.rcwa), a plane of incidence off the lattice axes, an
-            absorbing half-space, an unknown polarisation, or a number out of range.
-    """
-    diameter_um, wavelength_um = float(diameter_um), float(wavelength_um)
-    angle_rad, azimuth_rad = float(angle_rad), float(azimuth_rad)
-    check_shape(cell, diameter_um)
-    if not (math.isfinite(wavelength_um) and wavelength_um > 0):
-        raise CellError(f"wavelength_um = {wavelength_um}: need a finite length above 0")
-    if not (abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
-        raise CellError(
-            f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, the first within +-pi/2"
-        )
-    if polarization not in POLARIZATIONS:
-        raise CellError(f"polarization = {polarization!r}: need one of {', '.join(POLARIZATIONS)}")
-    quarter = azimuth_rad / (math.pi / 2)
-    if angle_rad and abs(quarter - round(quarter)) > 1e-12:
-        raise CellError(
-            f"azimuth_rad = {azimuth_rad}: the modal engine takes planes of incidence along the lattice axes "
-            "(multiples of pi/2); use metalens.rcwa for others"
-        )
-    along = "x" if round(quarter) % 2 == 0 else "y"
-    below, above, disc, around = (
-        index(m, wavelength_um) for m in (cell.substrate, cell.cover, cell.pillar, cell.between)
-    )
-    for name, n in (("substrate", below), ("cover", above)):
-        if n.imag:
-            raise CellError(
-                f"{name} absorbs (index {n}): the modal engine needs real half-spaces; use metalens.rcwa, "
-                "or take the absorbing part as a film"
-            )
-    k0 = 2 * math.pi / wavelength_um
-    sine = abs(math.sin(angle_rad))
-    if sine >= min(below.real, above.real):
-        raise CellError(
-            f"angle_rad = {angle_rad}: no zero order in a half-space of index {min(below.real, above.real)}"
-        )
-    half = cell.pitch_um / 2
-    bloch = k0 * sine * half
-    return Case(
-        rho=diameter_um / cell.pitch_um,
-        k0=k0 * half,
-        height=cell.height_um / half,
-        below=below.real**2,
-        above=above.real**2,
-        disc=disc**2,
-        around=around**2,
-        bloch=bloch if bloch > NORMAL_RAD else 0.0,
-        p=polarization in ("p", along),
-    )
-
-
-def check_shape(cell: Cell, diameter_um: float) -> None:
-    """Refuse what the elements cannot follow."""
-    if not cell.round:
-        raise CellError(
-            f"the modal engine takes round pillars on a square lattice, not {cell.described}; use metalens.rcwa"
-        )
-    if cell.under or cell.over or cell.sidewall_rad:
-        raise CellError("the modal engine takes an upright pillar without films; use metalens.rcwa for this cell")
-    if not (math.isfinite(diameter_um) and 0 < diameter_um < cell.pitch_um):
-        raise CellError(
-            f"diameter_um = {diameter_um} on a pitch of {cell.pitch_um} um: the elements that follow the disc need "
-            "one above 0 and below the pitch; touching pillars are solved by metalens.rcwa"
-        )
-
-
 def solve(
     cell: Cell,
     diameter_um: float,
@@ -335,10 +231,12 @@ def solve(
     *,
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
-    polarization: str = "x",
+    polarization: Polarization = "x",
     tolerance: float = 1e-3,
 ) -> Response:
-    """Zero-order response of a round pillar by the modal method, exact along z.
+    """Zero-order response of a round pillar by the modal method, exact along z where the wall is upright.
+
+    A tilted wall and films: coupled waves put right by the modal method, see :mod:`metalens.rcwa.anchored`.
 
     diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in
     every layer by Snell's law. azimuth_rad: of the plane of incidence, a multiple of pi/2. polarization: "s" or
@@ -350,8 +248,11 @@ def solve(
     Raises:
         CellError, MaterialError: see ``case_of``.
     """
-    case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
     check_tolerance(tolerance)
+    if cell.round and (cell.sidewall_rad or cell.under or cell.over):
+        light = anchored.Light(float(wavelength_um), float(angle_rad), float(azimuth_rad), polarization)
+        return _as_built(cell, float(diameter_um), light, tolerance)
+    case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
     if case.height == 0:
         matrix = film(case)
         energy = float((np.abs(matrix[:, 0]) ** 2).sum())
@@ -360,3 +261,21 @@ def solve(
     t, r = complex(end.solution.matrix[1, 0]), complex(end.solution.matrix[0, 0])
     unknowns, energy = end.solution.unknowns, end.solution.energy
     return Response(t, r, end.error, unknowns, energy, "modal", end.converged, end.reason)
+
+
+def _as_built(cell: Cell, diameter_um: float, light: anchored.Light, tolerance: float) -> Response:
+    """A pillar with a tilted wall or films, from upright ones without."""
+    plain = anchored.plain(cell)
+    upright = [
+        solve(
+            plain,
+            node,
+            light.wavelength_um,
+            angle_rad=light.angle_rad,
+            azimuth_rad=light.azimuth_rad,
+            polarization=light.polarization,
+            tolerance=max(tolerance * anchored.SHARE, 2e-6),
+        )
+        for node in anchored.node_diameters(cell, diameter_um)
+    ]
+    return anchored.solve_anchored(cell, diameter_um, light, upright, tolerance=tolerance)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.linalg import lapack
 
-from metalens.modal.dense import eigen_pairs
 from metalens.modal.spaces import Space
 
 
@@ -150,3 +150,34 @@ def made(
         disc_curl=disc[1],
         disc_scalar=scalar.T @ space.disc.scalar @ scalar,
     )
+
+
+# Dense symmetric linear algebra without the cost of general-purpose checks: matrices here have a hundred rows.
+
+
+def below(lower: np.ndarray, right: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+    """lower⁻¹ right, or lower⁻ᵀ right if ``transposed``; real, lower triangular with zeros above."""
+    solved: np.ndarray = lapack.dtrtrs(lower.T, right, lower=0, trans=0 if transposed else 1)[0]
+    return solved
+
+
+def definite_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric positive definite matrix, symmetric to the last digit.
+
+    Raises:
+        LinAlgError: it is not definite.
+    """
+    upper: np.ndarray = lapack.dtrtri(np.linalg.cholesky(matrix).T, lower=0)[0]
+    inverse: np.ndarray = upper @ upper.T
+    return inverse
+
+
+def eigen_pairs(matrix: np.ndarray, definite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values, rising, and vectors of matrix x = value definite x, with xᵀ definite x = 1.
+
+    Raises:
+        LinAlgError: ``definite`` is not positive definite.
+    """
+    lower = np.linalg.cholesky(definite)
+    value, vectors = np.linalg.eigh(below(lower, below(lower, matrix).T))
+    return value, below(lower, vectors, transposed=True)

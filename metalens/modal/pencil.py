@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.dense import below, definite_inverse
-from metalens.modal.homogeneous import Basis
+from metalens.modal.homogeneous import Basis, below, definite_inverse
 from metalens.modal.layer import Medium
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.modal.engine import solve
+from metalens.modal.engine import Polarization, solve
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,7 +30,7 @@ def solve_many(
     wavelengths_um: Sequence[float] | np.ndarray,
     *,
     angles_rad: Sequence[float] | np.ndarray = (0.0,),
-    polarizations: Sequence[str] = ("s", "p"),
+    polarizations: Sequence[Polarization] = ("s", "p"),
     tolerance: float = 1e-3,
     progress: Callable[[int], object] | None = None,
 ) -> Table:

@@ -22,14 +22,14 @@ class Light:
 
 
 def choose(cell: Cell, engine: Engine = "auto") -> str:
-    """``modal`` for upright round pillars without films (faster and more precise), ``rcwa`` for everything else."""
-    upright = cell.round and not (cell.under or cell.over or cell.sidewall_rad)
-    if engine == "modal" and not upright:
-        raise CellError(
-            "the modal engine takes upright pillars without films, round and on a square lattice; use engine 'rcwa'"
-        )
+    """``modal`` for round pillars on a square lattice (more precise, and faster where upright), ``rcwa`` for others.
+
+    Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
+    """
+    if engine == "modal" and not cell.round:
+        raise CellError(f"the modal engine takes round pillars on a square lattice, not {cell.described}: use 'rcwa'")
     if engine == "auto":
-        return "modal" if upright else "rcwa"
+        return "modal" if cell.round else "rcwa"
     return engine
 
 
@@ -48,7 +48,8 @@ def smooth(
     It is the least that meets the tolerance at three probes. Elsewhere the error may exceed the tolerance (it is
     reported), but it has no jumps that a rational fit would take for resonances.
     """
-    if cell.height_um == 0:
+    as_built = engine == "modal" and (cell.under or cell.over or cell.sidewall_rad)
+    if cell.height_um == 0 or as_built:
         return precise(cell, light, tolerance=tolerance, engine=engine)
     make = _modal_levels if engine == "modal" else _rcwa_levels
     levels = make(cell, light, span_um[1], tolerance)

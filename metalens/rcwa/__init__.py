@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.rcwa import anchored as anchored
     from metalens.rcwa.any_shape import Jones as Jones
     from metalens.rcwa.any_shape import jones as jones
     from metalens.rcwa.any_shape import most_harmonics as most_harmonics
@@ -21,6 +22,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Jones": "any_shape",
+        "anchored": "",
         "derivatives": "verbs",
         "jones": "any_shape",
         "most_harmonics": "any_shape",

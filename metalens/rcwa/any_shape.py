@@ -1,21 +1,21 @@
 """Cells of any shape, lattice and layers: the 2 x 2 Jones matrices of transmission and reflection, with error bars."""
 
 import dataclasses
-import itertools
+import functools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Film, Layer, Response, materials
+from metalens.cell import Cell, Film, Response, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import layer as modes
-from metalens.rcwa import mirrors, pattern
+from metalens.rcwa import made, mirrors, pattern, wall
 from metalens.rcwa.conditions import Polarization, check_direction, direction
+from metalens.rcwa.made import check_size
 from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
 from metalens.rcwa.stack import Media, respond
-from metalens.rcwa.taper import sections
 from metalens.rcwa.waves import Waves
 
 _FIRST = 3  # orders of the first truncation
@@ -24,7 +24,7 @@ _COMPARED = 4
 _SAFETY = 3.0
 _ROUNDING = 1e-13
 _STRAIGHT = 1e-12
-_STEPS = 2  # of a tilted wall in each section, at first; doubled once to see what they leave
+_COARSE = 3  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,6 +63,17 @@ class _Light:
         return self.kx == 0 == self.ky
 
 
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """A cell at one size and light, its media, and the symmetries that its polarisations have."""
+
+    cell: Cell
+    size_um: float
+    light: _Light
+    media: Media
+    classes: tuple[tuple[Operation, ...], ...]
+
+
 def jones(
     cell: Cell,
     size_um: float,
@@ -80,8 +91,8 @@ def jones(
         angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of incidence, from +x to +y.
         harmonics: fix the largest truncation instead (orders as on a square lattice of the same area).
 
-    Accuracy: ``t_error`` is three times the farthest of the four truncations before the last, and what doubling the
-        steps of a tilted wall does. Corners and high contrast converge slowly: 1e-2 is usual where 1e-3 is asked.
+    Accuracy: ``t_error`` is three times the farthest of the four truncations before the last, and what the
+        collocation of a tilted wall leaves. Corners and high contrast converge slowly: 1e-2 is usual.
 
     Raises:
         CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order.
@@ -89,35 +100,43 @@ def jones(
     """
     if not (math.isfinite(tolerance) and tolerance > 0):
         raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    light = _light(wavelength_um, angle_rad, azimuth_rad)
+    media = _media(cell, light)
+    check_size(cell, size_um)
+    classes = _classes(cell, size_um, light)
+    problem = _Problem(cell, size_um, light, media, classes)
+    last = _LAST[min(len(operations) for operations in classes)] if harmonics is None else harmonics
+    first = _FIRST if harmonics is None else max(1, harmonics - _COMPARED)
+    stages, cut = 0, 0.0
+    if cell.sidewall_rad:
+        stages, cut = wall.enough(lambda count: _truncated(problem, min(last, _COARSE), count).t, tolerance)
+    history: list[Array] = []
+    for reach in range(first, last + 1):
+        found = _truncated(problem, reach, stages)
+        history.append(found.t)
+        error = _moved(history) + cut
+        if len(history) > _COMPARED and error <= tolerance:
+            break
+    error = min(error, 2.0)
+    met = error <= tolerance
+    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
+    return dataclasses.replace(found, t_error=error, converged=met, reason=reason)
+
+
+def _light(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> _Light:
+    """The tangential wave vector, its components 0 where they are 0 but for rounding."""
     check_direction(angle_rad, azimuth_rad)
     sine = math.sin(angle_rad)
     flat = 0.0 if sine == 0 else azimuth_rad
     kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(flat), sine * math.sin(flat)))
-    light = _Light(kx, ky, flat, wavelength_um)
-    media = _media(cell, light)
-    check_size(cell, size_um)
-    classes = _classes(cell, size_um, light)
-    last = _LAST[min(len(operations) for operations in classes)] if harmonics is None else harmonics
-    first = _FIRST if harmonics is None else max(1, harmonics - _COMPARED)
-    history: list[Array] = []
-    for reach in range(first, last + 1):
-        found = _truncated(cell, size_um, light, (media, classes), reach, _STEPS)
-        history.append(found.t)
-        if len(history) <= 2 and reach < last:
-            continue
-        moved = max(float(np.abs(found.t - before).max()) for before in history[-1 - _COMPARED : -1] or [found.t + 1])
-        error = min(_SAFETY * moved + _ROUNDING, 2.0)
-        if len(history) > _COMPARED and error <= tolerance:
-            break
-    cut = 0.0
-    if cell.sidewall_rad:
-        finer = _truncated(cell, size_um, light, (media, classes), min(reach, 5), 2 * _STEPS)
-        coarse = _truncated(cell, size_um, light, (media, classes), min(reach, 5), _STEPS)
-        cut = float(np.abs(finer.t - coarse.t).max())
-    error = min(error + cut, 2.0)
-    met = error <= tolerance
-    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    return dataclasses.replace(found, t_error=error, converged=met, reason=reason)
+    return _Light(kx, ky, flat, wavelength_um)
+
+
+def _moved(history: list[Array]) -> float:
+    """Error of the last truncation: three times the farthest of the four before it."""
+    before = history[-1 - _COMPARED : -1]
+    farthest = max((float(np.abs(history[-1] - t).max()) for t in before), default=1.0)
+    return _SAFETY * farthest + _ROUNDING
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,38 +170,6 @@ def most_harmonics(cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimut
     return _LAST[min(len(found) for found in _classes(cell, size_um, _Light(kx, ky, azimuth_rad, 1.0)))]
 
 
-def check_size(cell: Cell, size_um: float) -> None:
-    """Refuse sizes that leave nothing or overlap, for every section.
-
-    Raises:
-        CellError: says which section is too wide or too thin.
-    """
-    if not (math.isfinite(size_um) and size_um > 0):
-        raise CellError(f"size = {size_um} um: need a finite length above 0")
-    for (layer, grow), lift in itertools.product(_spread(cell, 0), (-0.5, 0.5)):
-        wide = layer.grow_um + grow + lift * _widening(cell) * layer.height_um + 2 * layer.coat_um
-        if cell.gap_um(size_um, grow_um=wide) <= 0:
-            raise CellError(
-                f"{cell.described}, size {size_um:g} um: a section {wide:+.4g} um wider touches its neighbour on a "
-                f"pitch of {cell.pitch_um:g} um; need a smaller size or a larger pitch"
-            )
-
-
-def _widening(cell: Cell) -> float:
-    """Change of width for each um of height above the middle."""
-    return -2 * math.tan(cell.sidewall_rad)
-
-
-def _spread(cell: Cell, steps: int) -> list[tuple[Layer, float]]:
-    """(section, widening at its middle by the tilted wall), foot first; ``steps`` is not used for upright ones."""
-    found, foot = [], 0.0
-    for layer in cell.sections:
-        middle = foot + layer.height_um / 2 - cell.height_um / 2
-        found.append((layer, _widening(cell) * middle))
-        foot += layer.height_um
-    return found
-
-
 def _media(cell: Cell, light: _Light) -> Media:
     k0 = 2 * math.pi / light.wavelength_um
 
@@ -213,24 +200,24 @@ def _classes(cell: Cell, size_um: float, light: _Light) -> tuple[tuple[Operation
     return ((IDENTITY, HALF_TURN),) if outline.keeps(-1, -1) and light.normal else ((IDENTITY,),)
 
 
-def _truncated(
-    cell: Cell,
-    size_um: float,
-    light: _Light,
-    about: tuple[Media, tuple[tuple[Operation, ...], ...]],
-    reach: int,
-    steps: int,
-) -> Jones:
-    media, classes = about
+def _truncated(problem: _Problem, reach: int, stages: int) -> Jones:
+    """All polarisations at one truncation; stages: of the collocation of a tilted wall, 0 for an upright one."""
+    cell, size_um, light = problem.cell, problem.size_um, problem.light
     t, r, energy = np.zeros((2, 2), complex), np.zeros((2, 2), complex), np.zeros(2)
-    for operations in classes:
-        frame = pattern.frame(cell, operations)
-        space = mirrors.orders(reach, frame)
+    for operations in problem.classes:
+        space = mirrors.orders(reach, pattern.frame(cell, operations))
         ways, places = _waves(space, cell, light)
-        layers, heights = _layers(space, ways, cell, size_um, light, steps)
-        whole = dataclasses.replace(media, heights=heights)
+        operators = functools.partial(_operators, space, ways, cell)
+        walls = made.walls(cell, size_um, light.wavelength_um, operators)
+        media, layers, between = problem.media, [], None
+        if stages:
+            between = functools.partial(wall.match, walls, stages=stages)
+        else:
+            symmetric = cell.outline(size_um).keeps(-1, -1)
+            layers = [modes.layer(*part.sample(0.5), symmetric=symmetric) for part in walls]
+            media = dataclasses.replace(media, heights=tuple(part.reduced_height for part in walls))
         for column, come in places.items():
-            found = respond(ways, whole, layers, come[0])
+            found = respond(ways, media, layers, come[0], between=between)
             energy[column] = float((np.abs(found.t) ** 2).sum() + (np.abs(found.r) ** 2).sum())
             for row, leave in places.items():
                 sign = come[1] * leave[1]
@@ -240,23 +227,8 @@ def _truncated(
     return Jones(names, t, r, math.inf, energy, count, False, "")
 
 
-def _layers(
-    space: mirrors.Orders, ways: Waves, cell: Cell, size_um: float, light: _Light, steps: int
-) -> tuple[list[modes.Layer], tuple[float, ...]]:
-    made, heights = [], []
-    for layer, grow in _spread(cell, steps):
-        for part in sections(steps if cell.sidewall_rad else 0):
-            pairs = []
-            for _, lift in part.nodes:
-                wide = grow + lift * _widening(cell) * layer.height_um
-                this = pattern.slab(cell, layer, size_um, light.wavelength_um, grow_um=wide)
-                pairs.append(pattern.operators(space, ways, this, cell))
-            P = sum(weight * P for (weight, _), (P, _) in zip(part.nodes, pairs, strict=True))
-            Q = sum(weight * Q for (weight, _), (_, Q) in zip(part.nodes, pairs, strict=True))
-            symmetric = cell.outline(size_um).keeps(-1, -1)
-            made.append(modes.layer(np.asarray(P), np.asarray(Q), symmetric=symmetric))
-            heights.append(part.share * layer.height_um * 2 * math.pi / light.wavelength_um)
-    return made, tuple(heights)
+def _operators(space: mirrors.Orders, ways: Waves, cell: Cell, this: pattern.Slab) -> tuple[Array, Array]:
+    return pattern.operators(space, ways, this, cell)
 
 
 def _waves(space: mirrors.Orders, cell: Cell, light: _Light) -> tuple[Waves, dict[int, tuple[int, float]]]:

@@ -95,8 +95,8 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
         raise CellError(f"diameter_um = {diameter_um}: need a finite length >= 0")
     if diameter_um == 0:
         return
-    widening = cell.height_um * math.tan(cell.sidewall_rad)
-    for name, wide in (("foot", diameter_um + widening), ("top", diameter_um - widening)):
+    slant = cell.height_um * math.tan(cell.sidewall_rad)
+    for name, wide in (("foot", diameter_um + slant), ("top", diameter_um - slant)):
         if wide > cell.pitch_um:
             raise CellError(
                 f"diameter_um = {diameter_um}: pillars overlap, {wide:.6g} um wide at the {name} on a pitch of "
@@ -105,7 +105,7 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
         if wide < 0:
             raise CellError(
                 f"diameter_um = {diameter_um}: the wall of {cell.sidewall_rad:.4g} rad over {cell.height_um:.6g} um "
-                f"closes the pillar below its {name}; need at least {abs(widening):.6g} um"
+                f"closes the pillar below its {name}; need at least {abs(slant):.6g} um"
             )
 
 
@@ -145,3 +145,8 @@ def direction(
     if along_x or along_y:
         return sine, 0.0, 0.0, wave, wave
     return sine * c, sine * s, azimuth_rad, "none", wave
+
+
+def widening(cell: Cell) -> float:
+    """Change of the diameter in micrometres for each unit of lift."""
+    return -2 * math.tan(cell.sidewall_rad) * cell.height_um

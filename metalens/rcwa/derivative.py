@@ -21,11 +21,10 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import changes
 from metalens.rcwa.changes import Change
-from metalens.rcwa.conditions import Case, case_waves
-from metalens.rcwa.layer import Layer, layer
-from metalens.rcwa.solver import homogeneous, mixed
+from metalens.rcwa.conditions import Case, case_waves, widening
+from metalens.rcwa.layer import Layer, layer, operators
+from metalens.rcwa.solver import homogeneous
 from metalens.rcwa.stack import Fields, match, outgoing
-from metalens.rcwa.taper import Section, sections, widening
 from metalens.rcwa.waves import Waves, half_space, normal_component
 
 _GRAZING = 1e-8  # |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh anomaly
@@ -45,6 +44,46 @@ class Derivatives:
     k: complex
     wavelength_um: complex
     angle_rad: complex
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One layer: its share of the height, and the (weight, lift) of the cross-sections that it mixes.
+
+    lift: height of the cross-section above the middle of the pillar, over the height of the pillar.
+    """
+
+    share: float
+    nodes: tuple[tuple[float, float], ...]
+
+
+def sections(steps: int) -> tuple[Section, ...]:
+    """Layers of a tilted wall in this many steps, foot first; 0 steps: an upright wall.
+
+    Commutator-free Magnus of fourth order: over a step two layers of half the height, mixed from the cross-sections at
+    the Gauss points 1/2 -+ sqrt(3)/6, (b, a) in the lower and (a, b) in the upper one, a, b = 1/2 -+ sqrt(3)/3 (Blanes
+    and Moan, Appl. Numer. Math. 56, 1519 (2006)). Layers have modes, which the integrals here need; ``solve`` follows
+    the wall by collocation (:mod:`metalens.rcwa.wall`).
+    """
+    if not steps:
+        return (Section(1.0, ((1.0, 0.0),)),)
+    small, large = 0.5 - math.sqrt(3) / 3, 0.5 + math.sqrt(3) / 3
+    found = []
+    for i in range(steps):
+        low, high = ((i + 0.5 + sign * math.sqrt(3) / 6) / steps - 0.5 for sign in (-1, 1))
+        found.append(Section(0.5 / steps, ((large, low), (small, high))))
+        found.append(Section(0.5 / steps, ((small, low), (large, high))))
+    return tuple(found)
+
+
+def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[Array, Array]:
+    """P and Q of one section of the pillar."""
+    wide = [diameter_um + lift * widening(this.cell) for _, lift in part.nodes]
+    here = [operators(ways, w, this.cell.pitch_um, this.pillar, this.between) for w in wide]
+    weights = [weight for weight, _ in part.nodes]
+    P = sum(weight * P for weight, (P, _) in zip(weights, here, strict=True))
+    Q = sum(weight * Q for weight, (_, Q) in zip(weights, here, strict=True))
+    return np.asarray(P), np.asarray(Q)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

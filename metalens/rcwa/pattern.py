@@ -20,6 +20,7 @@ from metalens.rcwa.waves import Waves
 
 _GRID = 192  # points along the pitch on which normals are sampled
 FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_HELD = 32  # Fourier coefficients of normals are kept for so many orders, or a multiple
 _FAR = 0.5  # of the largest distance to a boundary: there the weight of the normal field is halved
 
 
@@ -74,13 +75,21 @@ def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array
     return _real(direct), _real(inverse)
 
 
-@lru_cache(maxsize=16)
 def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Fourier coefficients of w nx nx, w ny ny, w nx ny."""
+    """Fourier coefficients of w nx nx, w ny ny, w nx ny over m, n from -2 reach to 2 reach."""
+    most = (_HELD * math.ceil(2 * reach[0] / _HELD), _HELD * math.ceil(2 * reach[1] / _HELD))
+    rows, columns = (slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True))
+    first, second, third = (whole[rows, columns] for whole in _normals(outlines, cell, most))
+    return _real(first), _real(second), _real(third)
+
+
+@lru_cache(maxsize=64)
+def _normals(outlines: tuple[Outline, ...], cell: Cell, most: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """As ``normal_tables``, over m, n from -most to most, for all truncations at once."""
     from scipy.spatial import cKDTree
 
     x, y = cell.lattice.periods_um(cell.pitch_um)
-    counts = [max(4 * r + 2, math.ceil(_GRID * edge / cell.pitch_um)) for r, edge in zip(reach, (x, y), strict=True)]
+    counts = [max(2 * m + 2, math.ceil(_GRID * edge / cell.pitch_um)) for m, edge in zip(most, (x, y), strict=True)]
     counts = [count + count % 2 for count in counts]
     found = [outline.boundary(cell.pitch_um / 200) for outline in outlines]
     points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -93,15 +102,14 @@ def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, i
     n = np.tile(normals, (int(near.sum()), 1))[place].reshape(*px.shape, 2)
     far = _FAR * distance.max()
     weight = (1 / (1 + (distance / far) ** 4)).reshape(px.shape)
-
     kept = [flips for flips in FLIPS if all(outline.keeps(*flips) for outline in outlines)]
 
     def table(values: Array, *, odd: bool = False) -> Array:
         spectrum = np.fft.fft2(values) / values.size
-        m, k = np.arange(-2 * reach[0], 2 * reach[0] + 1), np.arange(-2 * reach[1], 2 * reach[1] + 1)
+        m, k = (np.arange(-reach, reach + 1) for reach in most)
         whole = spectrum[m[:, None] % counts[0], k % counts[1]]
         images = [(sx * sy if odd else 1) * whole[::sx, ::sy] for sx, sy in kept]  # ties are even between neighbours
-        return _real(np.mean(images, axis=0))
+        return np.asarray(np.mean(images, axis=0))
 
     return (
         table(weight * n[..., 0] ** 2),

@@ -1,19 +1,22 @@
 """Harmonics chosen per entry from the tolerance, with an error estimate from how the result still moves."""
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from metalens.cell import Response
 from metalens.ground.arrays import Array
-from metalens.rcwa.conditions import Case, case_waves
+from metalens.rcwa import wall
+from metalens.rcwa.conditions import Case, case_waves, widening
 from metalens.rcwa.layer import layer, operators
-from metalens.rcwa.stack import respond
-from metalens.rcwa.taper import Section, sections, widening
+from metalens.rcwa.stack import Amplitudes, respond
 from metalens.rcwa.waves import Waves
 
+Moved = Callable[[Array], Array]
 _ROUNDING = 1e-13
 _ENTRIES = 1_500_000  # of a matrix of all diameters that are solved together: below 0.5 GB with all its companions
 
@@ -27,30 +30,42 @@ class Truncated:
     energy: Array
 
 
-def truncated(this: Case, diameter_um: Array, harmonics: int, steps: int = 0) -> Truncated:
-    """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``; a tilted wall in ``steps``."""
+def truncated(
+    this: Case, diameter_um: Array, harmonics: int, stages: int = 0, *, moved: Moved | None = None
+) -> Truncated:
+    """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``.
+
+    stages: of the collocation of a tilted wall, see :mod:`metalens.rcwa.wall`; 0: upright.
+    moved: diameter of a cross-section to the one that is taken for it.
+    """
     ways, zero = case_waves(this, harmonics)
-    parts = sections(steps)
-    heights = tuple(part.share * this.cell.height_um * this.k0 for part in parts)
-    media = dataclasses.replace(this.media, heights=heights)
-    size = max(1, _ENTRIES // (len(ways.kappa) ** 2 * len(parts)))
+    size = 1 if stages else max(1, _ENTRIES // len(ways.kappa) ** 2)
     found = []
     for start in range(0, len(diameter_um), size):
         some = diameter_um[start : start + size]
-        found.append(respond(ways, media, [layer(*mixed(this, ways, some, part)) for part in parts], zero))
-    t, r = np.concatenate([part.t for part in found]), np.concatenate([part.r for part in found])
+        if stages:
+            found.append(_tilted(this, ways, zero, float(some[0]), stages, moved))
+            continue
+        media = dataclasses.replace(this.media, heights=(this.cell.height_um * this.k0,))
+        wide = moved(some) if moved else some
+        part = layer(*operators(ways, wide, this.cell.pitch_um, this.pillar, this.between))
+        found.append(respond(ways, media, [part], zero))
+    t, r = (np.concatenate([np.atleast_2d(getattr(part, name)) for part in found]) for name in ("t", "r"))
     energy = (np.abs(t) ** 2).sum(axis=-1) + (np.abs(r) ** 2).sum(axis=-1)
     return Truncated(t[:, zero], r[:, zero], energy)
 
 
-def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[Array, Array]:
-    """P and Q of one section of the pillar."""
-    wide = [diameter_um + lift * widening(this.cell) for _, lift in part.nodes]
-    here = [operators(ways, w, this.cell.pitch_um, this.pillar, this.between) for w in wide]
-    weights = [weight for weight, _ in part.nodes]
-    P = sum(weight * P for weight, (P, _) in zip(weights, here, strict=True))
-    Q = sum(weight * Q for weight, (_, Q) in zip(weights, here, strict=True))
-    return np.asarray(P), np.asarray(Q)
+def _tilted(this: Case, ways: Waves, zero: int, diameter_um: float, stages: int, moved: Moved | None) -> Amplitudes:
+    """One pillar with a tilted wall."""
+
+    def sample(share: float) -> tuple[Array, Array]:
+        wide = np.array([diameter_um + (share - 0.5) * widening(this.cell)])
+        here = operators(ways, moved(wide) if moved else wide, this.cell.pitch_um, this.pillar, this.between)
+        return here[0][0], here[1][0]
+
+    whole = [wall.Wall(sample, this.cell.height_um * this.k0)]
+    between = functools.partial(wall.match, whole, stages=stages)
+    return respond(ways, this.media, [], zero, between=between)
 
 
 def film(this: Case, index: complex) -> Truncated:
@@ -69,26 +84,21 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
     rounding = _ROUNDING * (1 + this.k0 * this.cell.height_um)  # of the phase
     done = {int(i): _exact(empty, rounding) for i in np.flatnonzero(homogeneous(this, diameter_um))}
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
-    steps, cut = (0, 0.0)
-    if len(left) and this.cell.sidewall_rad:
-        steps, cut = _steps(this, diameter_um[left], tolerance)
+    stages, cut = wall_stages(this, diameter_um[left], tolerance)
     ladder = _ladder(this, harmonics)
     history: list[Array] = []
     for reach in ladder:
         if not len(left):
             break
         wide = diameter_um[left]
-        found = truncated(this, wide, reach, min(steps, _FEW_STEPS))
+        found = truncated(this, wide, reach, stages)
         history.append(found.t)
         if len(history) <= _COMPARED and reach != ladder[-1]:
             continue
         error = np.minimum(_blur(this, wide, reach, found.t - empty.t, _estimate(np.array(history))) + cut, 2.0)
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
-        if len(chosen) and steps > _FEW_STEPS:
-            found = truncated(this, wide[chosen], reach, steps)
-        else:
-            found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
+        found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
         for row, place in enumerate(chosen):
             done[int(left[place])] = _response(found, row, reach, float(error[place]), tolerance)
         history = [t[~settled] for t in history]
@@ -100,9 +110,7 @@ _FIRST = 4  # orders of the first truncation, too few for any use but to see t m
 _LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
 _COMPARED = 4
 _SAFETY = 3.0
-_FEW_STEPS = 2  # of a tilted wall, enough to see how t moves between truncations
-_COARSE = 5  # orders that suffice to see what cutting a tilted wall in steps does
-_MOST_STEPS = 16
+_COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
 def _ladder(this: Case, harmonics: int | None) -> range:
@@ -129,15 +137,11 @@ def _blur(this: Case, diameter_um: Array, reach: int, change: Array, error: Arra
     return np.where(reach * diameter_um < this.cell.pitch_um, np.maximum(error, np.abs(change)), error)
 
 
-def _steps(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
-    """Number of steps of a tilted wall, and its error (it falls as the fourth power), at few orders."""
-    steps, t = 2, truncated(this, diameter_um, _COARSE, 2).t
-    while True:
-        finer = truncated(this, diameter_um, _COARSE, 2 * steps).t
-        left = float(np.abs(finer - t).max()) / 4  # a fifteenth where steps are many
-        steps, t = 2 * steps, finer
-        if left <= tolerance / 4 or steps >= _MOST_STEPS:
-            return steps, left
+def wall_stages(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
+    """Stages of a tilted wall and the error they leave, the same at all orders; (0, 0) where it is upright."""
+    if not (len(diameter_um) and this.cell.sidewall_rad):
+        return 0, 0.0
+    return wall.enough(lambda stages: truncated(this, diameter_um, _COARSE, stages).t, tolerance)
 
 
 def homogeneous(this: Case, diameter_um: Array) -> Array:

@@ -6,6 +6,7 @@ reads V^T u - U^T w = 0, and a pair passes from the top of a layer to its foot b
 factors only.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,14 +60,20 @@ class Fields:
     down: list[Array]
 
 
-def respond(ways: Waves, media: Media, layers: list[Layer], zero: int) -> Amplitudes:
-    """Response to the zero order (place ``zero``) from the substrate; no layers: a stack of films."""
+Between = Callable[[Pair, Pair, Array], Fields]
+
+
+def respond(ways: Waves, media: Media, layers: list[Layer], zero: int, *, between: Between | None = None) -> Amplitudes:
+    """Response to the zero order (place ``zero``) from the substrate; no layers: a stack of films.
+
+    between: what matches the fields, given the pairs above and below and the source, in place of the layers.
+    """
     below, above = half_space(ways, media.substrate), half_space(ways, media.cover)
     top, lift = _through(ways, above, tuple(reversed(media.over)))
     foot, drop = _through(ways, below, media.under)
     source = np.zeros(len(ways.kappa), complex)
     source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
-    found = match(layers, media.heights, top, foot, source)
+    found = between(top, foot, source) if between else match(layers, media.heights, top, foot, source)
     incident = _flux(below)[zero]
     t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(_flux(above) / incident)
     r = _reflected(ways, media, foot, drop, found, zero) * np.sqrt(_flux(below) / incident)

@@ -9,8 +9,9 @@ import pytest
 from metalens import modal
 from metalens.cell.record import Cell, Index
 from metalens.modal.assembly import assemble
+from metalens.modal.case import case_of
 from metalens.modal.derivatives import form_rates, mean_rate
-from metalens.modal.engine import case_of, evaluate, geometric_mean
+from metalens.modal.engine import evaluate, geometric_mean
 from metalens.modal.homogeneous import modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import axial

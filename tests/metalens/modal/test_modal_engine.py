@@ -9,7 +9,8 @@ from metalens import modal, rcwa
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
 from metalens.modal.assembly import assemble
-from metalens.modal.engine import case_of, evaluate, geometric_mean
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate, geometric_mean
 from metalens.modal.homogeneous import modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.mesh import X0, X1, MeshPlan, build
@@ -311,9 +312,9 @@ def test_bad_numbers_are_refused(change, word):
 @pytest.mark.parametrize(
     "shape", [{"sidewall_rad": 0.02}, {"under": (Film("SiO2", 0.1),)}, {"over": (Film("SiO2", 0.1),)}]
 )
-def test_films_and_tilted_walls_are_refused_by_name(shape):
-    with pytest.raises(CellError, match="rcwa"):
-        modal.solve(Cell(0.4, **shape), 0.2, 0.85)
+def test_elements_refuse_films_and_tilted_walls_by_name(shape):
+    with pytest.raises(CellError, match="upright pillar without films"):
+        case_of(Cell(0.4, **shape), 0.2, 0.85, 0.0, 0.0, "x")
 
 
 def test_absorbing_half_space_is_refused():

@@ -5,10 +5,10 @@ import pytest
 
 from metalens.cell.record import Cell, Index
 from metalens.modal.assembly import assemble
-from metalens.modal.dense import below, definite_inverse, eigen_pairs
-from metalens.modal.engine import case_of, evaluate
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate
 from metalens.modal.few_modes import few_modes, root
-from metalens.modal.homogeneous import modes
+from metalens.modal.homogeneous import below, definite_inverse, eigen_pairs, modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import few_scattering, half_space, scattering

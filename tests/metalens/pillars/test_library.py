@@ -12,8 +12,11 @@ import pytest
 
 from metalens import library, modal, rcwa
 from metalens.cell.record import Cell, Film, Index
+from metalens.cell.shapes import Square
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError, DomainError, MaterialError, StoreError
+from metalens.pillars import engines
+from metalens.pillars.engines import Light
 from metalens.pillars.record import DEFAULT_CELL, PillarLibrary, Sweep
 
 COARSE = Sweep(wavelengths_um=(0.84, 0.86), samples=40, tolerance=2e-2)
@@ -118,12 +121,15 @@ def test_loading_a_library_needs_neither_torch_nor_matplotlib():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
 
 
-def test_films_go_to_rcwa():
+def test_films_go_to_both_solvers_and_other_shapes_to_rcwa():
     coated = dataclasses.replace(DEFAULT_CELL, over=(Film(Index(1.45), 0.1),))
-    small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12))
-    assert library.sweep(coated, small).engine == "rcwa"
-    with pytest.raises(CellError, match="upright pillars without films"):
-        library.sweep(coated, dataclasses.replace(small, engine="modal"))
+    assert engines.choose(coated) == "modal"
+    assert engines.precise(coated, Light(0.85), tolerance=5e-2, engine="modal")(0.1).engine == "anchored"
+    square = dataclasses.replace(DEFAULT_CELL, shape=Square())
+    small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12), engine="modal")
+    assert engines.choose(square) == "rcwa"
+    with pytest.raises(CellError, match="round pillars on a square lattice, not square on a square"):
+        library.sweep(square, small)
 
 
 @pytest.mark.parametrize(

@@ -325,12 +325,12 @@ def test_tilted_wall_is_the_limit_of_plain_slices(tilt_deg):
     this = case(cell, WAVELENGTH, angle_rad=0, azimuth_rad=0, polarization="x")
     coarse, fine = (plain_slices(cell, 0.15, 3, slices) for slices in (32, 64))
     limit = fine + (fine - coarse) / 3  # second order, Richardson: 1e-6 left
-    t = {steps: truncated(this, np.array([0.15]), 3, steps).t[0] for steps in (4, 8, 16)}
-    assert abs(t[16] - limit) < 1e-5
-    assert abs(t[8] - t[16]) < 0.15 * abs(t[4] - t[8])  # fourth order: a sixteenth
+    t = {stages: truncated(this, np.array([0.15]), 3, stages).t[0] for stages in (4, 5, 6)}
+    assert abs(t[6] - limit) < 1e-5
+    assert abs(t[5] - t[6]) < 0.1 * abs(t[4] - t[5])  # order 2 m: a thousandth or so
     got = amplitude(cell, 0.15, harmonics=5)
     assert abs(got.t - amplitude(CELL, 0.15, harmonics=5).t) > 1e-3
-    assert abs(got.energy - 1) < ROUNDING
+    assert abs(got.energy - 1) < 10 * ROUNDING  # forty collocation steps
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ import pytest
 from metalens import modal, rcwa
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
-from metalens.rcwa.conditions import case
-from metalens.rcwa.derivative import differentiate
+from metalens.rcwa.conditions import case, case_waves
+from metalens.rcwa.derivative import differentiate, mixed, sections
+from metalens.rcwa.layer import layer
 from metalens.rcwa.solver import truncated
+from metalens.rcwa.stack import respond
 
 PLAIN = Cell(0.4, 0.7, pillar=Index(3.6), substrate=Index(1.4525))
 LOSSY = replace(PLAIN, pillar=Index(3.6, 0.1))
@@ -37,8 +39,25 @@ def slope(value, at, step):
 
 
 def transmission(cell, diameter_um, wavelength_um, direction, steps):
+    """At three orders; a tilted wall in the layers that are differentiated."""
     this = case(cell, wavelength_um, **direction)
-    return truncated(this, np.array([diameter_um]), 3, steps).t[0]
+    if not steps:
+        return truncated(this, np.array([diameter_um]), 3).t[0]
+    ways, zero = case_waves(this, 3)
+    layers = [layer(*mixed(this, ways, np.array(diameter_um), part)) for part in sections(steps)]
+    heights = tuple(part.share * cell.height_um * this.k0 for part in sections(steps))
+    return respond(ways, replace(this.media, heights=heights), layers, zero).t[zero]
+
+
+@pytest.mark.parametrize("tilt", [0.03, -0.02])
+def test_layers_of_the_derivatives_meet_the_collocated_wall(tilt):
+    """Fourth order: sixteen times less with twice the steps, towards what ``solve`` takes."""
+    cell = replace(PLAIN, sidewall_rad=tilt)
+    direction = {"angle_rad": 0.0, "azimuth_rad": 0.0, "polarization": "x"}
+    want = truncated(case(cell, 0.85, **direction), np.array([0.21]), 3, 8).t[0]
+    errors = [abs(transmission(cell, 0.21, 0.85, direction, steps) - want) for steps in (4, 8)]
+    assert errors[1] < 2e-3
+    assert errors[1] < 0.2 * errors[0]
 
 
 @pytest.mark.parametrize(

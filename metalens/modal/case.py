@@ -1,0 +1,136 @@
+"""From a cell, a size and a plane wave to the numbers of one modal case; refuses what the elements cannot follow."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.cell import Cell, index
+from metalens.ground.errors import CellError
+
+NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
+POLARIZATIONS = ("x", "y", "s", "p")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One problem in half pitches: what the linear algebra needs.
+
+    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above: permittivities of the
+    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the electric field.
+    """
+
+    rho: float
+    k0: float
+    height: float
+    below: float
+    above: float
+    disc: complex
+    around: complex
+    bloch: float
+    p: bool
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse what is not a finite number above 0."""
+    if not (math.isfinite(tolerance) and tolerance > 0):
+        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+
+
+def film(case: Case) -> np.ndarray:
+    """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
+    kz1, kz2 = (math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above))
+    y1, y2 = (case.below / kz1, case.above / kz2) if case.p else (kz1, kz2)
+    r, t = (y1 - y2) / (y1 + y2), 2 * math.sqrt(y1 * y2) / (y1 + y2)
+    return np.array([[r, t], [t, -r]], complex)
+
+
+def case_of(
+    cell: Cell, diameter_um: float, wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str
+) -> Case:
+    """Check a case, and put it into half pitches.
+
+    Raises:
+        CellError: films or a tilted sidewall (``solve`` takes them), a plane of incidence off the lattice axes, an
+            absorbing half-space, an unknown polarisation, or a number out of range.
+    """
+    diameter_um, wavelength_um = float(diameter_um), float(wavelength_um)
+    angle_rad, azimuth_rad = float(angle_rad), float(azimuth_rad)
+    check_shape(cell, diameter_um)
+    along = plane_of_incidence(wavelength_um, angle_rad, azimuth_rad, polarization)
+    below, above = half_spaces(cell, wavelength_um, angle_rad)
+    disc, around = (index(m, wavelength_um) for m in (cell.pillar, cell.between))
+    k0, half, sine = 2 * math.pi / wavelength_um, cell.pitch_um / 2, abs(math.sin(angle_rad))
+    bloch = k0 * sine * half
+    return Case(
+        rho=diameter_um / cell.pitch_um,
+        k0=k0 * half,
+        height=cell.height_um / half,
+        below=below.real**2,
+        above=above.real**2,
+        disc=disc**2,
+        around=around**2,
+        bloch=bloch if bloch > NORMAL_RAD else 0.0,
+        p=polarization in ("p", along),
+    )
+
+
+def plane_of_incidence(wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str) -> str:
+    """The lattice axis, "x" or "y", that the plane of incidence contains.
+
+    Raises:
+        CellError: a number out of range, an unknown polarisation, a plane off the lattice axes.
+    """
+    if not (math.isfinite(wavelength_um) and wavelength_um > 0):
+        raise CellError(f"wavelength_um = {wavelength_um}: need a finite length above 0")
+    if not (abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
+        raise CellError(
+            f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, the first within +-pi/2"
+        )
+    if polarization not in POLARIZATIONS:
+        raise CellError(f"polarization = {polarization!r}: need one of {', '.join(POLARIZATIONS)}")
+    quarter = azimuth_rad / (math.pi / 2)
+    if angle_rad and abs(quarter - round(quarter)) > 1e-12:
+        raise CellError(
+            f"azimuth_rad = {azimuth_rad}: the modal engine takes planes of incidence along the lattice axes "
+            "(multiples of pi/2); use metalens.rcwa for others"
+        )
+    return "x" if round(quarter) % 2 == 0 else "y"
+
+
+def half_spaces(cell: Cell, wavelength_um: float, angle_rad: float) -> tuple[complex, complex]:
+    """Indices of substrate and cover, neither absorbing, with a zero order in both.
+
+    Raises:
+        CellError: says which absorbs, or that the angle is too large.
+    """
+    below, above = (index(m, wavelength_um) for m in (cell.substrate, cell.cover))
+    for name, n in (("substrate", below), ("cover", above)):
+        if n.imag:
+            raise CellError(
+                f"{name} absorbs (index {n}): the modal engine needs real half-spaces; use metalens.rcwa, "
+                "or take the absorbing part as a film"
+            )
+    if abs(math.sin(angle_rad)) >= min(below.real, above.real):
+        raise CellError(
+            f"angle_rad = {angle_rad}: no zero order in a half-space of index {min(below.real, above.real)}"
+        )
+    return below, above
+
+
+def check_shape(cell: Cell, diameter_um: float) -> None:
+    """Refuse what the elements cannot follow."""
+    if not cell.round:
+        raise CellError(
+            f"the modal engine takes round pillars on a square lattice, not {cell.described}; use metalens.rcwa"
+        )
+    if cell.under or cell.over or cell.sidewall_rad:
+        raise CellError(
+            "the elements take an upright pillar without films; metalens.modal.solve puts coupled waves right "
+            "for others"
+        )
+    if not (math.isfinite(diameter_um) and 0 < diameter_um < cell.pitch_um):
+        raise CellError(
+            f"diameter_um = {diameter_um} on a pitch of {cell.pitch_um} um: the elements that follow the disc need "
+            "one above 0 and below the pitch; touching pillars are solved by metalens.rcwa"
+        )

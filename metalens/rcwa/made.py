@@ -1,0 +1,81 @@
+"""The sections of a pillar as it is made: layers one upon another, their walls tilted, refused where they overlap."""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from metalens.cell import Cell, Layer
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+from metalens.rcwa import pattern
+from metalens.rcwa.wall import Sample, Wall
+
+_NODES = 8  # cross-sections of a tilted wall: coefficients turn by a few radians between foot and top
+Operators = Callable[[pattern.Slab], tuple[Array, Array]]
+
+
+def walls(cell: Cell, size_um: float, wavelength_um: float, operators: Operators) -> list[Wall]:
+    """Every section, foot first; operators: P and Q of a cross-section."""
+    made = [_wall(cell, layer, grow, size_um, wavelength_um, operators) for layer, grow in spread(cell)]
+    return [Wall(interpolated(part.sample), part.reduced_height) for part in made] if cell.sidewall_rad else made
+
+
+def interpolated(sample: Sample) -> Sample:
+    """P and Q from polynomials through their values at Chebyshev points of the height, worked out when first asked."""
+    nodes = (1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2
+    vandermonde = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes - 1, _NODES - 1))
+
+    @functools.cache
+    def values() -> tuple[Array, Array]:
+        P, Q = zip(*(sample(float(node)) for node in nodes), strict=True)
+        return np.stack(P), np.stack(Q)
+
+    def at(share: float) -> tuple[Array, Array]:
+        weights = np.polynomial.chebyshev.chebvander(2 * share - 1, _NODES - 1) @ vandermonde
+        P, Q = (np.tensordot(weights.ravel(), part, 1) for part in values())
+        return P, Q
+
+    return at
+
+
+def _wall(cell: Cell, layer: Layer, grow_um: float, size_um: float, wavelength_um: float, operators: Operators) -> Wall:
+    def sample(share: float) -> tuple[Array, Array]:
+        wide = grow_um + (share - 0.5) * widening(cell) * layer.height_um
+        return operators(pattern.slab(cell, layer, size_um, wavelength_um, grow_um=wide))
+
+    return Wall(sample, layer.height_um * 2 * math.pi / wavelength_um)
+
+
+def check_size(cell: Cell, size_um: float) -> None:
+    """Refuse sizes that leave nothing or overlap, for every section.
+
+    Raises:
+        CellError: says which section is too wide or too thin.
+    """
+    if not (math.isfinite(size_um) and size_um > 0):
+        raise CellError(f"size = {size_um} um: need a finite length above 0")
+    for (layer, grow), lift in itertools.product(spread(cell), (-0.5, 0.5)):
+        wide = layer.grow_um + grow + lift * widening(cell) * layer.height_um + 2 * layer.coat_um
+        if cell.gap_um(size_um, grow_um=wide) <= 0:
+            raise CellError(
+                f"{cell.described}, size {size_um:g} um: a section {wide:+.4g} um wider touches its neighbour on a "
+                f"pitch of {cell.pitch_um:g} um; need a smaller size or a larger pitch"
+            )
+
+
+def widening(cell: Cell) -> float:
+    """Change of width for each um of height above the middle."""
+    return -2 * math.tan(cell.sidewall_rad)
+
+
+def spread(cell: Cell) -> list[tuple[Layer, float]]:
+    """(section, widening at its middle by the tilted wall), foot first."""
+    found, foot = [], 0.0
+    for layer in cell.sections:
+        middle = foot + layer.height_um / 2 - cell.height_um / 2
+        found.append((layer, widening(cell) * middle))
+        foot += layer.height_um
+    return found
