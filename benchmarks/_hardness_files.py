@@ -95,7 +95,10 @@ def _child(folder: Path, kind: str, whole: bytes, numbers: range) -> None:
             typed, error = _outcome(read, here, base)
             refused += typed
             if error or number == numbers[-1]:
-                journal.write(json.dumps({"copy": number, "refused": refused, "error": error and f"copy {number}: {error[:300]}"}) + "\n")
+                journal.write(
+                    json.dumps({"copy": number, "refused": refused, "error": error and f"copy {number}: {error[:300]}"})
+                    + "\n"
+                )
     here.write_bytes(whole)
     os._exit(0)
 

@@ -1,6 +1,7 @@
 """Tables 1 and 3 on small lenses: pillars agree with the quick pupil model, intervals cover what they should."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,10 @@ def test_full_lens_agrees_with_the_pupil_model():
         assert got.information[0, k].numpy() == pytest.approx(want.numpy(), rel=0.05)  # oblique rim, window edge
     assert float(got.encircled.min()) > 0.5
     assert float(got.encircled.max()) <= 1.0
+    small = evaluate.axial(_lens(2000.0), replace(setting, radius_um=4.5, binnings=(1,)))
+    held = evaluate.most_encircled(near, 0.75, radius_um=4.5)  # of all light behind the pupil
+    assert small.encircled[0].numpy() == pytest.approx(held.numpy(), rel=0.05)
+    assert float(held.min()) < 0.8
 
 
 @pytest.mark.parametrize("size", [64, 65])

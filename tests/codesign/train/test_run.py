@@ -56,6 +56,16 @@ def _end(going, path):
     return finish(going)
 
 
+def test_frames_are_those_of_the_run_s_own_camera(settings):
+    """1.0 mm in the file are 1000 um to the scenes, of training and of any other stream."""
+    going = run.start(replace(settings, scenes=replace(settings.scenes, pool=0)))
+    for scenes in (going.trainer.scenes, going.scenes(5)):
+        assert scenes.sensor_distance_um == pytest.approx(1000.0)
+        assert scenes.sample_um == settings.optics.sample_um
+        assert scenes.seed == settings.inner.seed
+    assert going.scenes(5).stream == 5
+
+
 def test_preset_fills_what_the_file_leaves_out(settings):
     assert settings.scenes.pixels == 48  # from the file
     assert settings.scenes.margin == 8  # from the preset
