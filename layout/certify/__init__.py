@@ -6,12 +6,16 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.certify.certificate import Certificate as Certificate
+    from layout.certify.certificate import Edges as Edges
     from layout.certify.certificate import certify as certify
+    from layout.certify.made_lens import as_made as as_made
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Certificate": "certificate",
+        "Edges": "certificate",
+        "as_made": "made_lens",
         "certify": "certificate",
     },
 )

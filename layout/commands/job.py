@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from layout.certify import Certificate
+from layout.commands.stages import Stages
 from layout.files import Window, verify
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
@@ -57,7 +58,7 @@ class Options(Common):
 class Job:
     """What a run of the command has made so far.
 
-    seconds: of each stage. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
+    stages: what the time went to. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
     certified: {file name: what the file and the dose table make, by the simulator}.
     undosed: {file name: layers with shapes that the dose table lacks}.
     """
@@ -69,11 +70,16 @@ class Job:
     fields: FieldPlan
     plan: MaskPlan
     drc: DrcReport
-    seconds: dict[str, float]
+    stages: Stages
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, verify.Comparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     certified: dict[str, Certificate] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Of each stage."""
+        return self.stages.seconds
 
     @property
     def failures(self) -> list[str]:

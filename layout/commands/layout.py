@@ -1,23 +1,22 @@
 """lens.h5 to a mask: quantised, dosed, checked, written, read back and compared, with report and pictures."""
 
 import json
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from layout.certify import certify
+from layout.certify import as_made, certify
 from layout.commands.job import Job, Options
-from layout.files import MaskContent, doses, verify
-from layout.files import write as write_dxf
+from layout.commands.stages import Stages
+from layout.files import MaskContent, doses, dxf, verify
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
 from layout.mask import MaskPlan, build, fields, with_fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
+from layout.process import noticed
 from layout.process import process as processes
 from layout.rules import check as drc
 from layout.rules import markers
@@ -33,11 +32,11 @@ _MOST_READ = 2**40
 
 def run(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken or a file does not read back as planned."""
-    with options.claim_folder(options.output) as draft:
+    with options.claim_folder(options.output) as draft, noticed(options.console.say):
         job = _prepare(options)
         doses.write(job.plan, job.process, draft.path / "doses.csv")
         _write_masks(job, draft.path)
-        with _timed(job.seconds, "report"):
+        with job.stages("report"):
             _accompany(job, draft.path)
         values = _values(job)
         store.write_text(draft.path / "layout.json", json.dumps(values, indent=1) + "\n")
@@ -46,18 +45,18 @@ def run(options: Options) -> int:
 
 
 def _prepare(options: Options) -> Job:
-    seconds: dict[str, float] = {}
-    with _timed(seconds, "read"):
+    stages = Stages(options.console.say)
+    with stages("read"):
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
-    with _timed(seconds, "classes and dose"):
+    with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, with_doses=options.dose)
-    with _timed(seconds, "write fields"):
-        split = fields.split(source.diameters, rules)
-        plan = with_fields(made.plan, split, rules)
-    with _timed(seconds, "check"):
+    with stages("write fields"):
+        split = fields.split(source.diameters, rules, drawn=made.cells)
+        plan = stages.rows.watched(with_fields(made.plan, split, rules))
+    with stages("check"):
         found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
-    return Job(options, source, rules, made, split, plan, found, seconds)
+    return Job(options, source, rules, made, split, plan, found, stages)
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
@@ -73,18 +72,21 @@ def _write_masks(job: Job, target: Path) -> None:
     neither = not (options.oasis or options.gds)
     if options.oasis or neither:
         path = target / "mask.oas"
-        with _timed(job.seconds, "write OASIS"):
+        with job.stages("write OASIS"):
             oasis_write.write(plan, path, form=options.form, circles=options.circles)
         _read_back(job, path, oasis_read.read)
     if options.gds or neither:
         path = target / "mask.gds"
-        with _timed(job.seconds, "write GDSII"):
+        with job.stages("write GDSII"):
             gdsii_write.write(plan, path)
         _read_back(job, path, gdsii_read.read)
     if options.dxf:
-        with _timed(job.seconds, "write DXF"):
-            write_dxf(plan, target / "mask.dxf", window=options.window)
-        job.written["mask.dxf"] = (target / "mask.dxf").stat().st_size
+        path = target / "mask.dxf"
+        with job.stages("write DXF"):
+            count = dxf.write(plan, path, window=options.window)
+        with job.stages("read back dxf"):
+            job.compared[path.name] = verify.Comparison(count, dxf.differences(plan, path, window=options.window))
+        job.written[path.name] = path.stat().st_size
     if options.stl or options.step:
         _write_solids(job, target)
 
@@ -94,23 +96,23 @@ def _write_solids(job: Job, target: Path) -> None:
 
     options, made = job.options, []
     if options.stl:
-        with _timed(job.seconds, "write STL"):
+        with job.stages("write STL"):
             made += solid_files.write_stl(job.source, job.process, target, options.window)
     if options.step:
-        with _timed(job.seconds, "write STEP"):
+        with job.stages("write STEP"):
             made += solid_files.write_step(job.source, job.process, target, options.window)
     job.written |= {path.name: path.stat().st_size for path in made}
 
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
-    with _timed(job.seconds, f"read back {path.suffix[1:]}"):
+    with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=_MOST_READ, keep=MOST_CERTIFIED)
         job.compared[path.name] = verify.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)
     if _certifiable(job):
-        with _timed(job.seconds, f"certify {path.suffix[1:]}"):
-            job.certified[path.name] = certify(content, table, job.process)
+        with job.stages(f"certify {path.suffix[1:]}"):
+            job.certified[path.name] = certify(content, table, job.process, height_um=job.source.cell.height_um)
     job.written[path.name] = path.stat().st_size
 
 
@@ -128,14 +130,9 @@ def _accompany(job: Job, target: Path) -> None:
     markers.write_lyp(job.plan, target / "mask.lyp")
     markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
+    if job.certified:
+        lenses.save(target / "made.h5", as_made(job.source, job.plan, next(iter(job.certified.values()))))
     page.write(job, target)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - start
 
 
 def _values(job: Job) -> dict[str, Any]:
@@ -153,7 +150,12 @@ def _values(job: Job) -> dict[str, Any]:
         "violations": found.counts,
         "files": job.written,
         "exposure": {
-            name: {"worst_relative": c.worst_exposure, "worst_diameter_nm": c.worst_nm, "pillars": len(c.x_um)}
+            name: {
+                "worst_relative": c.worst_exposure,
+                "worst_diameter_nm": c.worst_nm,
+                "pillars": len(c.x_um),
+                "edges": len(c.edges.x_um),
+            }
             for name, c in job.certified.items()
         },
         "differences": {name: list(outcome.differences) for name, outcome in job.compared.items()},

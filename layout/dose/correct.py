@@ -26,7 +26,8 @@ from metalens.lens import DiameterMap
 
 _UNIT_UM = 1e-4  # resolution of the diameters in the table
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
-_PIECES = 10  # of a rectangle, along the narrowest far Gaussian
+_PIECES = 24  # of a rectangle, along the narrowest far Gaussian
+_SPOTS = 10  # of a piece on the nodes, along the same
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,7 +92,7 @@ def solve(
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
         diameter_um, goal: (entries,) of the table, entry 0 for none.
-        cut: rectangles, none with a side beyond a tenth of the narrowest far Gaussian (:func:`piece_um`).
+        cut: rectangles, none with a side beyond a 24th of the narrowest far Gaussian (:func:`piece_um`).
 
     Raises:
         ProcessError: as :func:`correct`.
@@ -180,7 +181,7 @@ def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> 
         np.r_[ranges.near.widths_um, ranges.middle.widths_um], np.r_[ranges.near.weights, ranges.middle.weights]
     )
     own, points, piece = rects.own(cut, beside)
-    spots, area, of = rects.samples(cut, width / _PIECES)
+    spots, area, of = rects.samples(cut, width / _SPOTS)
     plain, wanted, goal = _masses(parts, drawn, grid)
     if len(spots):
         per_own = area / own[of]

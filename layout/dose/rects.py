@@ -70,7 +70,9 @@ def samples(rects: Rects, step_um: float) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the rectangle of each (n,)."""
     if not len(rects.box_um):
         return np.empty((0, 2)), np.empty(0), np.empty(0, np.int64)
-    parts = [_cut(box, step_um) for box in rects.box_um]
+    sides = rects.box_um[:, 2:] - rects.box_um[:, :2]
+    small = (sides.max(1) <= step_um * (1 + 1e-9)).tolist()
+    parts = [box[None] if one else _cut(box, step_um) for box, one in zip(rects.box_um, small, strict=True)]
     cut = np.concatenate(parts)
     middle = (cut[:, :2] + cut[:, 2:]) / 2
     area = (cut[:, 2] - cut[:, 0]) * (cut[:, 3] - cut[:, 1])

@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.files import doses as doses
+    from layout.files import dxf as dxf
     from layout.files import flat as flat
     from layout.files import paths as paths
     from layout.files import verify as verify
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from layout.files.digest import Sums as Sums
     from layout.files.dxf import Window as Window
     from layout.files.dxf import sites_in as sites_in
-    from layout.files.dxf import write as write
     from layout.files.read_loops import FARTHEST as FARTHEST
     from layout.files.read_loops import deltas as deltas
     from layout.files.read_loops import placements as placements
@@ -42,6 +42,7 @@ __getattr__, __dir__, __all__ = attach(
         "Window": "dxf",
         "deltas": "read_loops",
         "doses": "",
+        "dxf": "",
         "flat": "",
         "forget": "content",
         "mapped": "content",
@@ -50,6 +51,5 @@ __getattr__, __dir__, __all__ = attach(
         "sites_in": "dxf",
         "sref_run": "read_loops",
         "verify": "",
-        "write": "dxf",
     },
 )

@@ -193,7 +193,7 @@ def mapped(path: str | Path) -> Array:
 
 def forget(data: Array, end: int) -> None:
     """Give back the memory of the bytes before ``end`` of a mapped file; they are read again if they are looked at."""
-    base: object = data.base
+    base: object = data.base.obj if isinstance(data.base, memoryview) else data.base
     if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") and end >= mmap.PAGESIZE:
         base.madvise(mmap.MADV_DONTNEED, 0, end // mmap.PAGESIZE * mmap.PAGESIZE)
 

@@ -1,17 +1,26 @@
-"""DXF (R12) of a window of the mask: closed polylines in micrometres, one DXF layer for each mask layer."""
+"""DXF of a window of the mask (ezdxf): closed polylines in micrometres, one DXF layer for each mask layer; read back.
 
+The header says the unit ($INSUNITS 13, micrometres); a layer's name is that of the mask layer, its description the
+layer and datatype. Same input, same bytes.
+"""
+
+import io
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from layout.mask import Lattice, MaskPlan
 from metalens.ground import store
 from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.ground.errors import MaskFileError, ProcessError
 
 MOST_PILLARS = 200_000
+_UM = 13  # of $INSUNITS
+_COLOURS = 7  # of the colour index that have names: red, yellow, green, cyan, blue, magenta, white
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +40,64 @@ def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
     """Write the pillars whose site lies in the window, and all figures; the number of pillars.
 
     Raises:
-        ProcessError: more than 200 000 pillars in the window.
+        ProcessError: more than 200 000 pillars in the window, or ezdxf is not installed.
         OSError: the target cannot be written.
     """
-    sites = [(k, x, y) for lattice in plan.lattices for k, x, y in sites_in(plan, lattice, window)]
+    sites = _sites(plan, window)
     if len(sites) > MOST_PILLARS:
         raise ProcessError(
             f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
             f"at most {MOST_PILLARS}, or OASIS for the whole mask"
         )
-    with store.replacing(path) as part, open(part, "w", encoding="ascii", newline="\r\n") as file:
-        file.writelines(line + "\n" for line in _lines(plan, sites))
+    drawing = _ezdxf().new("R2000", units=_UM)
+    for n, (layer, name) in enumerate(_names(plan).items()):
+        made = drawing.layers.add(name, color=1 + n % _COLOURS)
+        made.description = f"{layer[0]}/{layer[1]}"
+    space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
+    for name, points in _drawn(plan, sites):
+        space.add_lwpolyline((points * scale).tolist(), format="xy", close=True, dxfattribs={"layer": name})
+    text = io.StringIO()
+    drawing.write(text)
+    store.write_text(path, text.getvalue())
     return len(sites)
+
+
+def differences(plan: MaskPlan, path: str | Path, *, window: Window) -> tuple[str, ...]:
+    """What a DXF file, read by ezdxf, holds that the window of the plan does not, and the other way, in words.
+
+    Raises:
+        MaskFileError: the file cannot be read as DXF.
+    """
+    ezdxf = _ezdxf()
+    try:
+        drawing = ezdxf.readfile(path)
+    except (OSError, ezdxf.DXFError) as error:
+        raise MaskFileError(f"{path}: cannot be read as DXF ({error})") from None
+    found = [] if drawing.units == _UM else [f"unit {drawing.units}, planned {_UM} (um)"]
+    scale = plan.unit_nm * 1e-3
+    read = Counter(
+        (line.dxf.layer, _key(np.rint(np.array(line.get_points("xy")) / scale)))
+        for line in drawing.modelspace().query("LWPOLYLINE")
+    )
+    planned = Counter((name, _key(points)) for name, points in _drawn(plan, _sites(plan, window)))
+    for text, unlike in (("missing", planned - read), ("not planned", read - planned)):
+        for layer, number in sorted(Counter(name for name, _ in unlike.elements()).items()):
+            found.append(f"layer {layer}: {number} polygons {text}")
+    return tuple(found)
+
+
+def _ezdxf() -> Any:
+    try:
+        import ezdxf
+    except ImportError:
+        raise ProcessError("DXF needs ezdxf: pip install 'metalens-toolchain[cad]'") from None
+    options = vars(ezdxf)["options"]  # exported, and not said to be
+    options.write_fixed_meta_data_for_testing = True  # no time stamps, no random identifiers
+    return ezdxf
+
+
+def _sites(plan: MaskPlan, window: Window) -> list[tuple[int, int, int]]:
+    return [site for lattice in plan.lattices for site in sites_in(plan, lattice, window)]
 
 
 def sites_in(plan: MaskPlan, lattice: Lattice, window: Window) -> Iterator[tuple[int, int, int]]:
@@ -65,27 +120,33 @@ def _ceil(distance: float, pitch: int, count: int) -> int:
     return int(np.clip(np.ceil(distance / pitch), 0, count))
 
 
-def _lines(plan: MaskPlan, sites: list[tuple[int, int, int]]) -> Iterator[str]:
-    scale = plan.unit_nm * 1e-3
-    yield from ("0", "SECTION", "2", "HEADER", "9", "$ACADVER", "1", "AC1009", "0", "ENDSEC", "0", "SECTION")
-    yield from ("2", "ENTITIES")
+def _drawn(plan: MaskPlan, sites: list[tuple[int, int, int]]) -> Iterator[tuple[str, Array]]:
+    """(DXF layer, polygon) of everything that is written."""
+    names = _names(plan)
     for k, x, y in sites:
         made = plan.classes[k - 1]
         for shape in made.polygons:
-            yield from _polyline(_layer(plan, made.layer), shape + np.array([x, y]), scale)
+            yield names[made.layer], shape + np.array([x, y])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
             for shape in shapes:
-                yield from _polyline(_layer(plan, layer), shape, scale)
-    yield from ("0", "ENDSEC", "0", "EOF")
+                yield names[layer], shape
 
 
-def _layer(plan: MaskPlan, layer: tuple[int, int]) -> str:
-    return plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}").upper().replace(".", "_")
+def _names(plan: MaskPlan) -> dict[tuple[int, int], str]:
+    """{(layer, datatype): DXF layer}, each its own."""
+    used = {made.layer for made in plan.classes} | {layer for figure in plan.figures for layer in figure.polygons}
+    found: dict[tuple[int, int], str] = {}
+    for layer in sorted(used):
+        name = plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}").upper().replace(".", "_")
+        found[layer] = name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
+    return found
 
 
-def _polyline(layer: str, points: Array, scale: float) -> Iterator[str]:
-    yield from ("0", "POLYLINE", "8", layer, "66", "1", "70", "1")
-    for x, y in (points * scale).tolist():
-        yield from ("0", "VERTEX", "8", layer, "10", f"{x:.6f}", "20", f"{y:.6f}")
-    yield from ("0", "SEQEND", "8", layer)
+def _key(points: Array) -> tuple[tuple[int, int], ...]:
+    """Corners from the smallest on, counter-clockwise."""
+    p = [(int(x), int(y)) for x, y in points]
+    if sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(p, p[1:] + p[:1], strict=True)) < 0:
+        p.reverse()
+    first = p.index(min(p))
+    return tuple(p[first:] + p[:first])

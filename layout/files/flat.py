@@ -28,20 +28,44 @@ class Shapes:
     y: Array
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Stack:
+    """Polygons of one cell and layer with equally many corners, at the same places.
+
+    outlines: (k, n, 2), counter-clockwise, turned as placed. x, y: (m,) places of the cell.
+    """
+
+    cell: str
+    layer: LayerNumber
+    outlines: Array
+    x: Array
+    y: Array
+
+
 def shapes(content: MaskContent, top: str) -> Iterator[Shapes]:
     """Every polygon below ``top``; true circles as polygons of 64 corners of their area.
 
     Raises:
         MaskFileError: a cell that places itself or is missing, a place beyond 32 bits.
     """
+    for stack in stacks(content, top):
+        for outline in stack.outlines:
+            yield Shapes(stack.cell, stack.layer, outline, stack.x, stack.y)
+
+
+def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
+    """As :func:`shapes`, polygons of a cell that have equally many corners together."""
     for name, x, y, turn in _cells(content, top, (0, 0), QUARTERS[0], ()):
         cell = content.cells[name]
-        for layer, polygons in cell.polygons.items():
-            for points in polygons:
-                yield Shapes(name, layer, _turned(points, turn), x, y)
+        drawn = {layer: list(polygons) for layer, polygons in cell.polygons.items()}
         for layer, circles in cell.circles.items():
-            for cx, cy, radius in circles:
-                yield Shapes(name, layer, _turned(_circle(cx, cy, radius), turn), x, y)
+            drawn.setdefault(layer, []).extend(_circle(*circle) for circle in circles)
+        for layer, polygons in drawn.items():
+            alike: dict[int, list[Array]] = {}
+            for points in polygons:
+                alike.setdefault(len(points), []).append(points)
+            for group in alike.values():
+                yield Stack(name, layer, _turned(np.stack(group).astype(np.int64), turn), x, y)
 
 
 def _circle(x: int, y: int, radius: int) -> Array:
@@ -50,11 +74,13 @@ def _circle(x: int, y: int, radius: int) -> Array:
     return np.asarray(np.rint(np.column_stack([x + reach * np.cos(angle), y + reach * np.sin(angle)])), np.int64)
 
 
-def _turned(points: Array, turn: Turn) -> Array:
-    """Corners turned, counter-clockwise again."""
-    made = np.column_stack(turn.apply(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64)))
-    after = np.roll(made, -1, axis=0)
-    return made if (made[:, 0] * after[:, 1] - after[:, 0] * made[:, 1]).sum() >= 0 else made[::-1]
+def _turned(outlines: Array, turn: Turn) -> Array:
+    """(k, n, 2) corners turned, counter-clockwise again."""
+    made = np.stack(turn.apply(outlines[..., 0], outlines[..., 1]), -1)
+    after = np.roll(made, -1, axis=1)
+    backwards = (made[..., 0] * after[..., 1] - after[..., 0] * made[..., 1]).sum(1) < 0
+    made[backwards] = made[backwards, ::-1]
+    return made
 
 
 def _cells(
@@ -74,7 +100,7 @@ def _cells(
     if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
         raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
     key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
-    order = np.argsort(key, kind="stable")
+    order = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
     kinds, first = np.unique(key[order], return_index=True)
     for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
         child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])

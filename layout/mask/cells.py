@@ -46,8 +46,14 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
         LensError: no pillar at all.
     """
     counts = np.zeros(1 << 16, np.int64)
-    for _, block in drawn_blocks(diameters, process):
-        counts += np.bincount(block.ravel(), minlength=len(counts))
+
+    def counted() -> Iterator[tuple[int, Array]]:
+        for first, block in drawn_blocks(diameters, process):
+            found = np.bincount(block.ravel())
+            counts[: len(found)] += found
+            yield first, block
+
+    drawn = hold(diameters.diameter_um.shape, np.dtype(np.uint16), counted())
     if counts[1:].sum() == 0:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     used = np.flatnonzero(counts)
@@ -56,9 +62,9 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
         raise ProcessError(f"{len(used)} different diameters, at most {MOST_CLASSES}; raise diameter_step_nm")
     lookup = np.zeros(len(counts), np.uint8 if len(used) <= 255 else np.uint16)
     lookup[used] = np.arange(1, len(used) + 1)
-    blocks = ((first, lookup.take(block)) for first, block in drawn_blocks(diameters, process))
+    blocks = ((first, lookup.take(block)) for first, block in drawn.blocks(_BLOCK_SITES))
     step = process.rules.diameter_step_nm
-    return Cells(hold(diameters.diameter_um.shape, lookup.dtype, blocks), used * step, counts[used], step / 2)
+    return Cells(hold(drawn.shape, lookup.dtype, blocks), used * step, counts[used], step / 2)
 
 
 def drawn_steps(diameters: DiameterMap, process: Process) -> Array:

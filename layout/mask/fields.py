@@ -5,12 +5,12 @@ from the border. A field is then a block of rows and columns: no pillar needs a 
 """
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from layout.mask.cells import Cells, quantise
 from layout.process import Process, WriteField
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -18,7 +18,6 @@ from metalens.ground.units import nm
 from metalens.lens import DiameterMap
 
 _BLOCK_SITES = 1 << 20
-_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,74 +72,64 @@ class FieldPlan:
         return [(row, column) for row in spans[0] for column in spans[1]]
 
 
-def split(diameters: DiameterMap, process: Process) -> FieldPlan:
+def split(diameters: DiameterMap, process: Process, *, drawn: Cells | None = None) -> FieldPlan:
     """Fields for the pillars as they are drawn (bias taken off), found in blocks of rows.
 
+    Args:
+        drawn: the pillars of this map, quantised; left out: quantised here.
+
     Raises:
-        ProcessError: a field smaller than the pitch.
+        ProcessError: a field smaller than the pitch; as :func:`layout.mask.cells.quantise`.
     """
     settings, pitch = process.write_field, diameters.pitch_um
     sites = int(settings.size_um / pitch + 1e-9)
     if sites < 1:
         raise ProcessError(f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it")
-    seen = _Seen.of(diameters, process)
+    made = quantise(diameters, process) if drawn is None else drawn
+    seen = _Seen.of(diameters, made, settings.size_um)
     rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, sites)
-    shape = diameters.diameter_um.shape
-    used = _used(diameters.diameter_um, rows, columns)
-    clearance = (pitch - seen.widest_um) / 2
-    return FieldPlan(rows, columns, (shape[0], shape[1]), pitch, settings.mode, used, seen.cut, clearance)
+    clearance = (pitch - float(made.diameters_nm[-1]) * nm) / 2
+    return FieldPlan(
+        rows, columns, made.sites.shape, pitch, settings.mode, _used(made, rows, columns), seen.cut, clearance
+    )
 
 
 @dataclass(eq=False, slots=True)
 class _Seen:
-    """rows, columns: which hold pillars; cut: pillars that a raster about the axis cuts; widest_um: as drawn."""
+    """rows, columns: which hold pillars; cut: pillars that a raster about the axis cuts."""
 
     rows: Array
     columns: Array
     cut: int = 0
-    widest_um: float = 0.0
 
     @classmethod
-    def of(cls, diameters: DiameterMap, process: Process) -> "_Seen":
-        """In one pass over the map."""
-        d, size_um = diameters.diameter_um, process.write_field.size_um
-        found = cls(np.zeros(d.shape[0], bool), np.zeros(d.shape[1], bool))
+    def of(cls, diameters: DiameterMap, made: Cells, size_um: float) -> "_Seen":
+        """In one pass over the classes."""
+        shape, table = made.sites.shape, np.r_[0.0, made.diameters_nm * nm]
+        found = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
         near_x, near_y = _near(diameters.x_um, size_um), _near(diameters.y_um, size_um)
-        columns, widest = np.flatnonzero(near_x < np.inf), 0.0
-        for first, block in _blocks(d):
-            there = block > 0
-            found.rows[first : first + len(block)] = there.any(1)
-            found.columns |= there.any(0)
-            widest = max(widest, float(block.max()))
+        columns = np.flatnonzero(near_x < np.inf)
+        for first, block in made.sites.blocks(_BLOCK_SITES):
+            found.rows[first : first + len(block)] = block.any(1)
+            found.columns |= block.any(0)
             rows = np.flatnonzero(near_y[first : first + len(block)] < np.inf)
-            upright = _drawn_um(block[:, columns], process) > 2 * near_x[columns]
-            level = _drawn_um(block[rows], process) > 2 * near_y[first + rows, None]
+            upright = table[block[:, columns]] > 2 * near_x[columns]
+            level = table[block[rows]] > 2 * near_y[first + rows, None]
             found.cut += int(upright.sum() + level.sum() - (upright[rows] & level[:, columns]).sum())
-        found.widest_um = float(_drawn_um(np.array([widest]), process)[0])
         return found
 
 
-def _blocks(d: Array) -> Iterator[tuple[int, Array]]:
-    size = max(1, _BLOCK_SITES // max(1, d.shape[1]))
-    for first in range(0, d.shape[0], size):
-        yield first, np.asarray(d[first : first + size])
-
-
-def _drawn_um(designed_um: Array, process: Process) -> Array:
-    """Diameters of the written polygons; 0 where there is no pillar."""
-    written = process.written_diameter_nm(designed_um / nm) * nm
-    return np.where(designed_um > 0, written, 0.0)
-
-
-def _used(d: Array, rows: Array, columns: Array) -> int:
+def _used(made: Cells, rows: Array, columns: Array) -> int:
     """Fields that hold pillars."""
-    inside = np.clip(columns, 0, d.shape[1])
-    total = 0
-    for first, end in itertools.pairwise(np.clip(rows, 0, d.shape[0]).tolist()):
-        held = np.zeros(d.shape[1], bool)
-        for begin in range(first, end, _ROWS):
-            held |= (np.asarray(d[begin : min(begin + _ROWS, end)]) > 0).any(0)
-        total += sum(bool(held[a:b].any()) for a, b in itertools.pairwise(inside.tolist()))
+    down, across = (
+        np.clip(edges, 0, most).tolist() for edges, most in zip((rows, columns), made.sites.shape, strict=True)
+    )
+    step, total = max(1, _BLOCK_SITES // max(1, made.sites.shape[1])), 0
+    for first, end in itertools.pairwise(down):
+        held = np.zeros(made.sites.shape[1], bool)
+        for begin in range(first, end, step):
+            held |= made.sites.source(begin, min(begin + step, end)).any(0)
+        total += sum(bool(held[a:b].any()) for a, b in itertools.pairwise(across))
     return total
 
 

@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,12 @@ class Held:
     def whole(self) -> Array:
         """All of them, read from the scratch file where they are there."""
         return self.source(0, self.shape[0]) if self.array is None else self.array
+
+    def blocks(self, sites: int) -> Iterator[tuple[int, Array]]:
+        """(first row, class numbers) in blocks of rows of some ``sites``."""
+        size = max(1, sites // max(1, self.shape[1]))
+        for first in range(0, self.shape[0], size):
+            yield first, self.source(first, min(first + size, self.shape[0]))
 
     def lattice(self, name: str, *, pitch: int, x0: int, y0: int, upside_down: bool = False) -> Lattice:
         """As a lattice of the mask; ``upside_down``: the last row on top."""

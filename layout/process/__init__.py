@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from layout.process import names as names
     from layout.process import process as process
     from layout.process.jit import compiled as compiled
+    from layout.process.jit import noticed as noticed
     from layout.process.process import Exposure as Exposure
     from layout.process.process import LayerNumber as LayerNumber
     from layout.process.process import Process as Process
@@ -28,6 +29,7 @@ __getattr__, __dir__, __all__ = attach(
         "compiled": "jit",
         "isolation": "",
         "names": "",
+        "noticed": "jit",
         "process": "",
     },
 )

@@ -21,7 +21,7 @@ from metalens.pillars import Proxy
 
 _BLOCK_ROWS = 256
 _NAME = "diameter_um"
-MOST_HELD_BYTES = 1 << 28  # of diameters, beyond which the mask reads them from the file row by row
+MOST_HELD_BYTES = 1 << 26  # of diameters, beyond which the mask reads them from the file row by row
 
 
 @dataclass(frozen=True, eq=False, slots=True)

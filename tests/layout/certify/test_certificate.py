@@ -1,16 +1,25 @@
 """The certificate of written files: against the direct sum over all shapes, and against faults put in on purpose."""
 
+import functools
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.special import erf
 
 import layout
-from layout.certify import certify
+from layout.certify import as_made, certify, outlines
+from layout.certify.gathered import Polygons
 from layout.dose import exposure
 from layout.files import doses
 from layout.mask import build
-from layout.process.process import Exposure, Process
+from layout.process.process import Etch, Exposure, Process
+from metalens.cell import Cell
 from metalens.ground.errors import ProcessError
-from metalens.lens.record import DiameterMap
+from metalens.lens.record import DiameterMap, Lens
+from metalens.made import Bias
+from metalens.pillars import Proxy
 
 BEAM = {"alpha_um": 0.013, "beta_um": 24.0, "eta": 0.7}
 
@@ -22,18 +31,20 @@ def lens_map(n=61, pitch=0.4):
     return DiameterMap(d, pitch)
 
 
-def written(tmp_path, process, **options):
-    """The mask as files: what a reader finds, and its dose table."""
-    plan = build.prepare(lens_map(), process, **options).plan
-    layout.write_oasis(plan, tmp_path / "m.oas")
-    doses.write(plan, process, tmp_path / "doses.csv")
-    return plan, layout.read_oasis(tmp_path / "m.oas"), doses.read(tmp_path / "doses.csv")
+@functools.cache
+def written(process, furnished=True):
+    """The mask as files: the plan, what a reader finds, and its dose table."""
+    plan = build.prepare(lens_map(), process, furnished=furnished).plan
+    with tempfile.TemporaryDirectory() as folder:
+        layout.write_oasis(plan, Path(folder) / "m.oas")
+        doses.write(plan, process, Path(folder) / "doses.csv")
+        return plan, layout.read_oasis(Path(folder) / "m.oas"), doses.read(Path(folder) / "doses.csv")
 
 
 @pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
-def test_exposures_are_those_of_the_direct_sum(tmp_path, third):
+def test_exposures_are_those_of_the_direct_sum(third):
     process = Process(exposure=Exposure(**BEAM, **third, correct=False))
-    _, content, table = written(tmp_path, process, furnished=False)
+    _, content, table = written(process, furnished=False)
     found = certify(content, table, process)
     centres = np.stack([found.x_um, found.y_um], -1)
     which = np.linspace(0, len(centres) - 1, 12).astype(int)
@@ -43,9 +54,9 @@ def test_exposures_are_those_of_the_direct_sum(tmp_path, third):
     assert found.exposure[which] * 0.5 == pytest.approx(exact, rel=2e-3)  # neighbours as Gaussians of their moment
 
 
-def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters(tmp_path):
+def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
     process = Process(exposure=Exposure(**BEAM, tolerance=0.008))
-    plan, content, table = written(tmp_path, process)
+    plan, content, table = written(process)
     found = certify(content, table, process)
     assert len(found.drawn_nm) == plan.counts()[1:].sum()
     assert found.worst_exposure < 0.008 + 2e-3
@@ -55,12 +66,12 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters(tmp_path):
     assert (test.min(), test.max()) == (pytest.approx(0.8, abs=0.01), pytest.approx(1.2, abs=0.012))
 
 
-def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found(tmp_path):
+def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     plain = Process(exposure=Exposure(**BEAM, correct=False))
-    _, content, table = written(tmp_path, plain)
+    _, content, table = written(plain)
     assert not certify(content, table, plain).ok
     process = Process(exposure=Exposure(**BEAM))
-    _, content, table = written(tmp_path, process)
+    _, content, table = written(process)
     layer = max(k for k in table if k[0] == 1)
     more = certify(content, {**table, layer: 1.05 * table[layer]}, process)
     assert not more.ok
@@ -70,7 +81,89 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found(tmp_path):
     assert not less.ok
 
 
-def test_without_a_point_exposure_nothing_is_certified(tmp_path):
-    _, content, table = written(tmp_path, Process(), furnished=False)
+@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
+def test_the_edges_of_marks_and_labels_are_judged(third):
+    process = Process(exposure=Exposure(**BEAM, **third))
+    _, content, table = written(process)
+    found = certify(content, table, process)
+    assert found.ok  # the tolerance of the correction is what a certificate wants
+    assert set(found.edges.layer.tolist()) == {3, 4}
+    labels = sorted(k for k in table if k[0] == 4)
+    label = labels[len(labels) // 2]
+    wrong = certify(content, {**table, label: 0.9 * table[label]}, process)
+    assert not wrong.ok
+    assert wrong.edges.exposure[wrong.edges.layer == 4].min() < 0.95
+    assert wrong.edges.shift_nm[wrong.edges.layer == 4].min() < -0.3
+
+
+def test_without_a_point_exposure_nothing_is_certified():
+    _, content, table = written(Process(), furnished=False)
     with pytest.raises(ProcessError, match="alpha_um, beta_um, eta"):
         certify(content, table, Process())
+
+
+def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
+    boxes = np.array([[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]])  # left, bottom, right, top
+    corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
+    polygons = Polygons(corners, np.array([1.3, 0.7]), np.array([3, 3]))
+    points = np.random.default_rng(0).uniform(-1, 4, (40, 2))
+    points[:3] = [[1.1, 0.0], [3.0, 0.4], [3.0, 0.8]]  # on an edge, on a shared edge, on a corner
+    terms = [(0.4, 0.6), (1.1, 0.3)]
+    want = np.zeros(len(points))
+    for (l, b, r, t), dose in zip(boxes, polygons.dose, strict=True):
+        for a, w in terms:
+            across = (erf((r - points[:, 0]) / a) - erf((l - points[:, 0]) / a)) / 2
+            want += dose * w * across * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a)) / 2
+    assert outlines.exposure(points, polygons, terms) == pytest.approx(want, abs=1e-9)
+
+
+def test_samples_lie_on_the_outline_of_the_union_away_from_corners():
+    boxes = [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
+    corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
+    found = outlines.samples(Polygons(corners, np.ones(2), np.array([3, 3])), 0.1)
+    x, y = found.at_um.T
+    inner = (np.abs(x - 3.0) < 1e-9) & (y < 0.8)
+    assert not inner.any()  # the shared side is no edge
+    bottom = np.abs(y) < 1e-9
+    assert (found.normal[bottom] == (0.0, -1.0)).all()
+    assert x[bottom].min() > 0.2
+    assert x[bottom].max() < 3.5
+    assert len(x[bottom]) == 3  # 3.7 um less four ranges, a sample each um
+    assert {(round(a), round(b)) for a, b in found.normal} == {(0, -1), (1, 0), (0, 1), (-1, 0)}
+
+
+def test_the_raster_of_a_large_polygon_carries_its_mass():
+    shape = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]])
+    x, y, mass = outlines.spots(Polygons([shape], np.array([1.7]), np.array([3])), 0.5)
+    assert mass.sum() == pytest.approx(1.7 * 23.0, rel=1e-12)
+    assert (mass * x).sum() / mass.sum() == pytest.approx((18 * 4.5 + 5 * 0.5) / 23, rel=0.02)
+    assert (mass * y).sum() / mass.sum() == pytest.approx((18 * 1.0 + 5 * 4.5) / 23, rel=0.02)
+
+
+def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
+    process = Process(exposure=Exposure(**BEAM), bias=Bias(isolated_nm=-12.0), etch=Etch(sidewall_deg=1.0))
+    source = lens_map()
+    _, content, table = written(process)
+    found = certify(content, table, process, height_um=0.7)
+    lens = found.layer == 1
+    made = found.made_nm[lens]
+    size = source.diameter_um.shape[0]
+    column, row = (np.rint(v[lens] / 0.4 + (size - 1) / 2).astype(int) for v in (found.x_um, found.y_um))
+    off = made - 1e3 * source.diameter_um[row, column]
+    # step of 2 nm, 1 nm of exposure, isolation of a Gaussian on pixels beside sums over sites
+    assert np.abs(off).max() < 2.5
+    assert np.abs(off).mean() < 0.8
+    assert found.lean_nm == pytest.approx(700 * np.tan(np.deg2rad(1.0)), rel=1e-12)
+    assert found.foot_nm - found.top_nm == pytest.approx(2 * found.lean_nm, rel=1e-4)
+
+
+def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
+    process = Process(exposure=Exposure(**BEAM))
+    plan, content, table = written(process)
+    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    designed = Lens(lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
+    made = as_made(designed, plan, certify(content, table, process))
+    d, want = made.diameters.diameter_um, designed.diameters.diameter_um
+    assert np.array_equal(d > 0, want > 0)
+    assert np.abs(d - want)[want > 0].max() < 2.1e-3  # 1 nm of the step, 1 nm of the exposure
+    assert made.profile == "as-written"

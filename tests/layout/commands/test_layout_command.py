@@ -13,7 +13,7 @@ from layout.rules import markers
 from layout.shapes import polygon
 from metalens import cli, lens
 from metalens.cell.record import Cell
-from metalens.ground.errors import ProcessError
+from metalens.ground.errors import MaskFileError, ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -127,12 +127,35 @@ def test_dxf_of_a_window_reads_in_klayout(plan, tmp_path):
     options = db.LoadLayoutOptions()
     options.dxf_dbu = 0.001
     options.dxf_polyline_mode = 3  # closed polylines are polygons
+    pytest.importorskip("ezdxf")
     read.read(str(tmp_path / "m.dxf"), options)
     layer = next(i for i in read.layer_indexes() if read.get_info(i).name == "PILLAR")
     region = db.Region(read.top_cell().begin_shapes_rec(layer))
     assert region.count() == count
     area = sum(polygon.twice_area(plan.classes[k - 1].outline) for _, _, k in inside) / 2
     assert region.area() == area
+
+
+def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path):
+    ezdxf = pytest.importorskip("ezdxf")
+    window, path = dxf.Window(-2.0, 1.0, 4.0), tmp_path / "m.dxf"
+    layout.write_dxf(plan, path, window=window)
+    drawing = ezdxf.readfile(path)
+    assert drawing.units == 13  # micrometres, in the table of $INSUNITS
+    assert {"PILLAR": "1/0", "MARKS": "3/0"}.items() <= {e.dxf.name: e.description for e in drawing.layers}.items()
+    assert dxf.differences(plan, path, window=window) == ()
+    layout.write_dxf(plan, tmp_path / "again.dxf", window=window)
+    assert path.read_bytes() == (tmp_path / "again.dxf").read_bytes()
+    first = drawing.modelspace().query('LWPOLYLINE[layer=="PILLAR"]')[0]
+    first.set_points([(x + 0.001, y) for x, y in first.get_points("xy")], format="xy")
+    drawing.units = ezdxf.units.MM
+    drawing.saveas(path)
+    found = dxf.differences(plan, path, window=window)
+    assert found[0].startswith("unit 4, planned 13")
+    assert found[1:] == ("layer PILLAR: 1 polygons missing", "layer PILLAR: 1 polygons not planned")
+    path.write_text("no drawing")
+    with pytest.raises(MaskFileError, match=r"m\.dxf: cannot be read"):
+        dxf.differences(plan, path, window=window)
 
 
 def test_dxf_beyond_its_limit_is_refused(plan, tmp_path, monkeypatch):

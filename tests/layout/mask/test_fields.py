@@ -49,7 +49,7 @@ def test_no_border_cuts_a_pillar_and_every_pillar_has_one_field(n, m, size, mode
     rows, columns = np.nonzero(d)
     for positions, borders, index in ((diameters.x_um, plan.x_um, columns), (diameters.y_um, plan.y_um, rows)):
         away = abs(positions[index][:, None] - borders)
-        assert (away - d[rows, columns][:, None] / 2).min() >= plan.clearance_um - 1e-9
+        assert (away - d[rows, columns][:, None] / 2).min() >= plan.clearance_um - 0.51e-3  # half a step, halved
         assert plan.clearance_um > 0
         assert np.diff(borders).max() <= size + 1e-9
     number = plan.of(rows, columns)
@@ -155,4 +155,4 @@ def test_the_clearance_is_that_of_what_is_drawn():
     plan = fields.split(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
     drawn_um = float(bias.written_diameter_nm(250.0)) * 1e-3
     assert drawn_um > 0.269  # drawn wider by what the process takes
-    assert plan.clearance_um == pytest.approx((0.4 - drawn_um) / 2, abs=1e-12)
+    assert plan.clearance_um == pytest.approx((0.4 - drawn_um) / 2, abs=0.5e-3)  # half a diameter step, halved

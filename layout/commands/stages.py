@@ -1,0 +1,72 @@
+"""Stages of a command: how long each took, and a line now and then while one takes longer than two seconds."""
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from layout.mask import Lattice, MaskPlan
+from metalens.ground.arrays import Array
+
+_FIRST_S, _NEXT_S = 2.0, 10.0
+
+
+class Rows:
+    """How far down the lens the stage is that works on it."""
+
+    def __init__(self) -> None:
+        self.end, self.total, self.start = 0, 0, 0.0
+
+    def watched(self, plan: MaskPlan) -> MaskPlan:
+        """``plan``, whose first lattice tells when blocks of its rows are taken."""
+        lens = plan.lattices[0]
+        self.total = lens.rows
+
+        def source(first: int, end: int) -> Array:
+            if first < self.end or not self.end:  # another pass
+                self.start = time.monotonic()
+            self.end = end
+            return lens.source(first, end)
+
+        lattice: Lattice = dataclasses.replace(lens, source=source)
+        return plan.replace(lattices=(lattice, *plan.lattices[1:]))
+
+    @property
+    def text(self) -> str:
+        """Share of the rows and time left; empty before the first."""
+        if not 0 < self.end < self.total:
+            return ""
+        spent = time.monotonic() - self.start
+        left = spent * (self.total - self.end) / self.end
+        rate = self.end / max(spent, 1e-9)
+        return f", {100 * self.end / self.total:.0f} % of the rows, {rate:.3g} rows/s, {left:.0f} s left"
+
+
+class Stages:
+    """Times of the stages; ``say`` hears of those that last."""
+
+    def __init__(self, say: Callable[[str], None], *, first_s: float = _FIRST_S, next_s: float = _NEXT_S) -> None:
+        self.seconds: dict[str, float] = {}
+        self.rows = Rows()
+        self._say, self._waits = say, (first_s, next_s)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time what happens inside as ``stage``."""
+        start, over = time.perf_counter(), threading.Event()
+        self.rows.end = 0
+        ticker = threading.Thread(target=self._tick, args=(stage, start, over), daemon=True)
+        ticker.start()
+        try:
+            yield
+        finally:
+            over.set()
+            ticker.join()
+            self.seconds[stage] = time.perf_counter() - start
+
+    def _tick(self, stage: str, start: float, over: threading.Event) -> None:
+        wait, then = self._waits
+        while not over.wait(wait):
+            self._say(f"{stage}: {time.perf_counter() - start:.0f} s{self.rows.text}")
+            wait = then

@@ -1,0 +1,66 @@
+"""Long stages say where they are; short ones say nothing; compilation is told once."""
+
+import threading
+
+import numba
+import numpy as np
+import pytest
+
+from layout.commands.stages import Rows, Stages
+from layout.process import noticed
+
+
+def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
+    said, heard = [], threading.Event()
+
+    def say(text):
+        said.append(text)
+        heard.set()
+
+    stages = Stages(say, first_s=0.02, next_s=60.0)
+    watched = stages.rows.watched(plan)
+    lens = plan.lattices[0]
+    with stages("write"):
+        assert np.array_equal(watched.lattices[0].source(0, 9), lens.source(0, 9))
+        assert heard.wait(10)
+    assert said[0].startswith("write: ")
+    assert f"{100 * 9 / lens.rows:.0f} % of the rows" in said[0]
+    with Stages(said.append)("short"):
+        pass
+    assert len(said) == 1
+    assert set(stages.seconds) == {"write"}
+
+
+def test_an_error_ends_the_stage():
+    stages = Stages(lambda text: None)
+    with pytest.raises(ZeroDivisionError), stages("broken"):
+        _ = 1 / 0
+    assert "broken" in stages.seconds
+    assert threading.active_count() < 40
+
+
+def test_the_time_left_is_of_the_pass_that_runs(plan):
+    rows = Rows()
+    source = rows.watched(plan).lattices[0].source
+    assert rows.text == ""
+    source(0, 11)
+    first = rows.start
+    source(11, 17)
+    assert rows.start == first
+    source(0, 11)
+    assert rows.start > first
+    source(11, plan.lattices[0].rows)
+    assert rows.text == ""
+
+
+def test_compilation_is_told_once_and_not_what_is_compiled_already():
+    loop = numba.njit(lambda x: x + 3)
+    said = []
+    with noticed(said.append):
+        assert loop(2) == 5
+        assert loop(2.5) == 5.5
+    assert len(said) == 1
+    assert "compiling" in said[0]
+    with noticed(said.append):
+        assert loop(4) == 7
+    assert len(said) == 1
