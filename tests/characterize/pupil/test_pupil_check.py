@@ -1,0 +1,76 @@
+"""What a pupil fit is judged by, against formulas: agreement, light missed beyond noise, order of the planes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from characterize.inference.leastsquares import Data
+from characterize.pupil import check
+from characterize.pupil.fit import agree
+
+RNG = np.random.default_rng(9)
+
+
+def data(images, usable=None, saturated=None):
+    everywhere = np.ones(images.shape, bool)
+    return Data(
+        images,
+        everywhere if usable is None else usable,
+        ~everywhere if saturated is None else saturated,
+        np.full(images.shape, 4.0),
+        np.ones(images.shape),
+    )
+
+
+def test_agreement_counts_light_above_the_background_in_pixels_that_count():
+    seen, told = RNG.uniform(20, 90, (3, 6, 7)), RNG.uniform(20, 90, (3, 6, 7))
+    usable, saturated = RNG.uniform(size=seen.shape) > 0.2, RNG.uniform(size=seen.shape) > 0.9
+    got = agree(told, data(seen, usable, saturated), 17.0)
+    keep = usable & ~saturated
+    a, b = told[keep], seen[keep]
+    centred = (a - a.mean()) @ (b - b.mean()) / math.sqrt(((a - a.mean()) ** 2).sum() * ((b - b.mean()) ** 2).sum())
+    assert got.ncc == pytest.approx(centred, rel=1e-12)
+    assert got.nrmse == pytest.approx(math.sqrt(((a - b) ** 2).sum() / ((b - 17.0) ** 2).sum()), rel=1e-12)
+    planes = [np.corrcoef(told[k][keep[k]], seen[k][keep[k]])[0, 1] for k in range(3)]
+    assert got.plane_ncc == pytest.approx(np.mean(planes), rel=1e-12)
+
+
+def test_what_noise_explains_is_not_missed():
+    """Frames that are the same but for noise of 3: a prediction that errs by noise alone misses nothing."""
+    light = np.zeros((9, 30, 32))
+    light[:, 12:15, 9:20] = 400.0
+    noisy = light + 11.0 + RNG.normal(0, 3.0, light.shape)
+    length = math.sqrt((light**2).sum() + light.size * 9.0)
+    by_noise = 3.0 * math.sqrt(light.size) / length
+    for beyond in (0.05, 0.2):
+        nrmse = math.hypot(by_noise, beyond)
+        assert check.missed(nrmse, data(noisy), 11.0) == pytest.approx(beyond, rel=0.15)  # the noise to 1 %
+    assert check.missed(0.9 * by_noise, data(noisy), 11.0) == 0.0
+
+
+def waves(order):
+    """Planes that turn slowly from one picture into another; ``order`` is theirs in the stack."""
+    one, other = RNG.uniform(size=(2, 12, 13))
+    turn = np.linspace(0, math.pi / 2, 12)[:, None, None]
+    return (np.cos(turn) * one + np.sin(turn) * other)[order]
+
+
+def test_planes_in_order_score_one_and_shuffled_ones_nothing():
+    assert check.order_score(data(waves(np.arange(12)))) == pytest.approx(1.0, abs=0.1)
+    scores = [check.order_score(data(waves(RNG.permutation(12)))) for _ in range(40)]
+    assert abs(np.mean(scores)) < 0.15  # one shuffle scatters by 0.3
+    assert math.isnan(check.order_score(data(waves(np.arange(12))[:5])))
+    assert math.isnan(check.order_score(data(np.tile(RNG.uniform(size=(1, 9, 9)), (8, 1, 1)))))
+
+
+def test_order_is_the_share_of_likeness_that_neighbours_have():
+    """By its definition, with every correlation from numpy."""
+    planes = waves(RNG.permutation(12)) + RNG.normal(0, 0.02, (12, 12, 13))
+    flat = planes.reshape(12, -1)
+    alike = np.corrcoef(flat - np.median(flat, axis=1, keepdims=True))
+    pairs = [alike[i, j] for i in range(12) for j in range(12) if i != j]
+    follow = np.mean([alike[i, i + 1] for i in range(11)])
+    best = np.mean([np.sort(np.delete(row, i))[-2:] for i, row in enumerate(alike)])
+    want = (follow - np.mean(pairs)) / (best - np.mean(pairs))
+    assert check.order_score(data(planes)) == pytest.approx(want, rel=1e-9)

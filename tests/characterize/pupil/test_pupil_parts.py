@@ -1,0 +1,104 @@
+"""Pieces of the pupil fit with known answers: stage zero, background tilt, start, and what is known beforehand."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference.leastsquares import Data
+from characterize.pupil import fit as pupilfit
+from characterize.pupil.record import PupilModel, PupilSpec
+
+RNG = np.random.default_rng(4)
+SPEC = PupilSpec(0.3, 0.5, 0.4, window=16, phase_order=5, amplitude_order=2, drift_order=1, model_error=0.0)
+Z = np.array([-8.0, -3.0, 1.0, 6.0])
+
+
+def model(spec=SPEC, position=Z):
+    return PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+
+
+def capture(peaks, stated):
+    frames = np.full((len(peaks), 6, 7), 10.0)
+    frames[:, 2, 3] += peaks
+    return SimpleNamespace(frames=frames, position_um=np.asarray(stated, float))
+
+
+def test_positions_are_about_the_centre_of_what_is_sharper_than_half():
+    peaks = np.array([10.0, 60.0, 100.0, 70.0, 20.0])
+    stated = np.array([3.0, 4.0, 6.0, 7.0, 9.0])
+    zero = (10 * 4.0 + 50 * 6.0 + 20 * 7.0) / 80
+    assert pupilfit._positions(capture(peaks, stated), SPEC) == pytest.approx(stated - zero)
+    step = PupilSpec(0.3, 0.5, 0.4, step_um=-0.7)
+    zero = -0.7 * (10 * 1 + 50 * 2 + 20 * 3) / 80
+    assert pupilfit._positions(capture(peaks, stated), step) == pytest.approx(-0.7 * np.arange(5) - zero)
+
+
+def test_tilt_of_the_background_is_read_from_the_rim():
+    y, x = np.mgrid[-1:1:31j, -1:1:41j]
+    frames = 50 + 3.0 * x - 1.7 * y + RNG.normal(0, 0.2, (9, 31, 41))
+    frames[:, 13:18, 17:24] += 900.0  # the bead
+    frames[:, 0, 5:9] += 400.0  # another at the rim
+    frames[:, 30, 40] = np.nan
+    assert np.abs(pupilfit._plane(frames) - (3.0 * x - 1.7 * y)).max() < 0.05  # 0.2 / 3 over 450 pixels, at corners
+
+
+def test_offset_of_the_bead_from_the_middle():
+    y, x = np.mgrid[:20, :24]
+    for row, column, want in ((10 + 6, 12 - 4, (6, -4)), (10 + 1, 12 + 1, (0, 0))):
+        light = 30 + 500 * np.exp(-((y - row) ** 2 + (x - column) ** 2) / 4.0)
+        stack = np.tile(light, (3, 1, 1))
+        seen = Data(stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack)
+        assert tuple(pupilfit._offset(seen)) == want
+
+
+def test_more_orders_begin_at_zero_and_the_rest_stays():
+    small = PupilModel(SPEC, Z, phase_order=4, amplitude_order=0)
+    large = model()
+    value = RNG.normal(size=small.layout().size)
+    grown = large.layout().split(pupilfit._grow(value, small, large))
+    before = small.layout().split(value)
+    assert grown[0][: len(before[0])] == pytest.approx(before[0])
+    assert not grown[0][len(before[0]) :].any()
+    assert not grown[1][len(before[1]) :].any()
+    for one, other in zip(grown[2:], before[2:], strict=True):
+        assert one == pytest.approx(other)
+
+
+def test_what_is_known_of_a_pupil_beforehand():
+    """3 rad for orders to 4, then falling with the cube; 0.5 / n; 10 pixels of drift; gains to 30 %; the rest free."""
+    pupil = model()
+    layout = pupil.layout()
+    start = RNG.normal(size=layout.size)
+    prior = pupilfit._prior(pupil, start)
+    phase, amplitude, dx, dy, blur, gain, level = layout.split(prior.sigma)
+    assert phase == pytest.approx([3.0 * min(1.0, (4 / n) ** 3) for n, _ in pupil.phase_indices])
+    assert amplitude == pytest.approx([0.5 / n for n, _ in pupil.amplitude_indices])
+    assert np.concatenate([dx, dy]) == pytest.approx(np.full(2 * layout.drift, 4.0))
+    assert math.isinf(blur)
+    assert gain == pytest.approx(np.full(4, 0.3))
+    assert np.isinf(level).all()
+    means, begun = layout.split(prior.mean), layout.split(start)
+    assert not means[0].any()
+    assert not means[1].any()
+    for one, other in zip(means[2:], begun[2:], strict=True):
+        assert one == pytest.approx(other)
+    low, high = layout.split(prior.low), layout.split(prior.high)
+    assert (low[4], high[4]) == pytest.approx((0.02, 1.6))
+    assert np.isinf(np.delete(prior.low, layout.size - 9)).all()
+
+
+def test_a_start_takes_light_and_level_from_the_frames():
+    stack = np.full((4, 16, 16), 12.0)
+    stack[:, 5:9, 6:11] += np.array([40.0, 90.0, 70.0, 30.0])[:, None, None]
+    seen = Data(stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack)
+    pupil = model()
+    phase, amplitude, dx, dy, blur, gain, level = pupil.layout().split(pupilfit._start(pupil, seen, 0.8))
+    assert phase[pupil.phase_indices.index((4, 0))] == 0.8
+    assert np.count_nonzero(phase) == 1
+    assert not amplitude.any()
+    assert blur == pytest.approx(0.2)
+    assert gain == pytest.approx(np.full(4, math.log(90.0 * 20)))
+    assert level == pytest.approx(np.full(4, 12.0))
+    assert not np.concatenate([dx, dy]).any()
