@@ -136,9 +136,11 @@ def main(words: list[str]) -> int:
 
 
 def _survivors() -> list[rules.Mutant]:
-    """Those of the kept result, found again in the source as it is now."""
+    """Those of the kept result that have no reason, found again in the source as it is now."""
     kept = json.loads(RESULT.read_text(encoding="utf-8"))["mutants"]
-    left = {(row["path"], row["text"], row["was"], row["became"]) for row in kept if row["outcome"] == "survived"}
+    reasons = json.loads(REASONS.read_text(encoding="utf-8"))
+    open_ = (r for r in kept if r["outcome"] == "survived" and _reasoned(r) not in reasons)
+    left = {(row["path"], row["text"], row["was"], row["became"]) for row in open_}
     found = []
     for path in sorted({row[0] for row in left}):
         for mutant in rules.mutants(ROOT, ROOT / path):
@@ -182,13 +184,18 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
         words = f"python -m benchmarks.mutation {words}".strip()
     for row in rows:
         row.pop("reason", None)
-        reason = reasons.get(f"{row['path']}: {row['was']} -> {row['became']}")
+        reason = reasons.get(_reasoned(row))
         if reason and row["outcome"] != "killed":
             row["reason"] = reason
     RESULT.write_text(json.dumps({"command": words, "mutants": rows}, indent=1) + "\n", encoding="utf-8")
     RESULT.with_suffix(".md").write_text(table.markdown(rows, words), encoding="utf-8")
     print(table.summary(rows))
     return int(any(row["outcome"] in ("survived", "no test") and "reason" not in row for row in rows))
+
+
+def _reasoned(row: dict[str, object]) -> str:
+    """What a mutant is called in the file of reasons."""
+    return f"{row['path']}: {row['was']} -> {row['became']}"
 
 
 def _identity(row: dict[str, object]) -> tuple[object, ...]:

@@ -30,6 +30,7 @@ class Rational:
         row, column = np.nonzero(gap == 0)
         gap[row] = 1.0
         cauchy = self.weights / gap
+        cauchy[row] = 1.0  # replaced below; the weights themselves may add up to 0
         out = (cauchy @ self.values) / cauchy.sum(1)[:, None]
         out[row] = self.values[column]
         return np.asarray(out.reshape(*np.shape(x), self.values.shape[1]))
