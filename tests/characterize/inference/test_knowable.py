@@ -1,0 +1,86 @@
+"""What frames can tell: combinations and their errors by hand, in the units of each parameter."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.captures import Gain
+from characterize.inference import estimate, knowable
+from characterize.inference.asbuilt import AsBuilt
+from characterize.model import PARAMETERS, PLACE
+
+NAMES = ("bias_nm", "height_nm", "distance_um")
+SCALE = np.array([PARAMETERS[PLACE[name]].scale for name in NAMES])
+TURN = np.linalg.qr(np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.2, 1.0]]))[0]
+
+
+def test_directions_are_in_typical_units():
+    information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
+    values, vectors = knowable.directions(NAMES, information)
+    assert values == pytest.approx([4.0, 90.0, 700.0])
+    assert np.abs((vectors * TURN).sum(0)) == pytest.approx(np.ones(3))
+
+
+def test_a_combination_is_told_where_frames_halve_what_was_known():
+    """Values 4, 90 and 700 are known to 0.5, 0.105 and 0.038; a prior of 0.24 alone is halved by the latter two."""
+    information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
+    told = knowable.identifiable(NAMES, information, 0.24 * SCALE)
+    assert [line.rsplit(" to ", 1)[1] for line in told] == ["0.038", "0.11"]
+    largest = int(np.abs(TURN[:, 2]).argmax())
+    assert f"{NAMES[largest]}/{SCALE[largest]:g}" in told[0].split(" to ")[0]
+    assert len(knowable.identifiable(NAMES, information, np.full(3, np.inf))) == 3
+    assert len(knowable.identifiable(NAMES, information, 0.2 * SCALE)) == 1  # 0.105 is more than half of 0.2
+
+
+def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
+    sigma = np.array([0.3, 2.0, 5.0])
+    correlation = np.array([[1, -0.91, 0.2], [-0.91, 1, 0.89], [0.2, 0.89, 1.0]])
+    words = knowable.degeneracies(NAMES, correlation * np.outer(sigma, sigma), np.array([0.37, 2.6, np.inf]))
+    assert len(words) == 2
+    assert "(correlation -0.910)" in words[0]
+    assert "SEM" in words[0]
+    assert words[1].startswith("bias_nm comes from prior knowledge (0.37)")  # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
+
+
+def test_the_gain_s_error_is_shared_by_all_that_is_counted_in_electrons():
+    names = ("bias_nm", "log_gain", "background_e", "background_x_e")
+    own = np.diag([0.1, 2e-4, 0.5, 0.3])
+    best = SimpleNamespace(value=np.array([1.3, 9.1, 21.0, -4.0]))
+    found = SimpleNamespace(best=best, covariance=own)
+    for gain, relative in ((Gain(2.5, 0.1, 3.0), 0.04), (Gain(1.0, np.inf, 3.0, known=False), 1.0)):
+        by_gain = relative * np.array([0.0, 1.0, 21.0, -4.0])
+        want = own + by_gain[:, None] * by_gain
+        assert estimate._with_gain(names, found, gain) == pytest.approx(want, rel=1e-12)
+
+
+def asbuilt(**more):
+    """A record with the numbers of its posterior alone."""
+    found = object.__new__(AsBuilt)
+    numbers = {
+        "names": NAMES,
+        "value": np.array([1.1, -3.0, 8.0]),
+        "covariance": np.array([[0.09, -0.15, 0.0], [-0.15, 4.0, 3.0], [0.0, 3.0, 25.0]]),
+        "low": np.empty(0),
+        "high": np.empty(0),
+        "draws": np.empty((0, 0)),
+    }
+    for name, value in (numbers | more).items():
+        object.__setattr__(found, name, value)
+    return found
+
+
+def test_intervals_samples_and_correlation_of_a_posterior():
+    found = asbuilt()
+    assert found.sigma == pytest.approx([0.3, 2.0, 5.0])
+    assert found.correlation[[0, 1, 0], [1, 2, 2]] == pytest.approx([-0.25, 0.3, 0.0])
+    assert found.interval("height_nm") == pytest.approx((-3.0 - 1.959964 * 2, -3.0 + 1.959964 * 2))
+    drawn = found.samples(60_000, seed=1)
+    assert drawn.mean(0) == pytest.approx(found.value, abs=0.1)  # 5 / sqrt(6e4) = 0.02
+    error = np.abs(np.cov(drawn.T) - found.covariance) / np.outer(found.sigma, found.sigma)
+    assert error.max() < 0.03  # sqrt(2 / 6e4) = 0.006
+    bent = asbuilt(low=np.array([0.1, -9.0, 2.0]), high=np.array([1.9, 7.0, 9.0]), draws=np.arange(12.0).reshape(4, 3))
+    assert bent.interval("height_nm") == (-9.0, 7.0)
+    again = bent.samples(10, seed=2)
+    counts = [(again == row).all(1).sum() for row in bent.draws]
+    assert sorted(counts) == [2, 2, 3, 3]  # each once before any comes again
