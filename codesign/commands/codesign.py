@@ -1,7 +1,6 @@
 """RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from metalens import design, lens, library
 from metalens.commands import Common, Output
 from metalens.ground import config, report, store, transaction
 from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError, PropagationError, SceneError
+from metalens.ground.errors import ConfigError
 from metalens.image import sensor as camera
 
 CHECKPOINT, LOG, SETTINGS, RESULT = "checkpoint.safetensors", "log.jsonl", "run.toml", "result.json"
@@ -75,7 +74,7 @@ def run(options: Options) -> int:
     with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:
         rows, said = _work(options, settings, device, draft.path)
     values = {"rows": rows, "folder": str(options.output), "image": said}
-    options.console.result(values, f"{_table(rows)}\n{_of_image(said)}")
+    options.console.result(values, f"{_table(rows)}\n{formed.words(said)}")
     return 0
 
 
@@ -124,30 +123,10 @@ def _of_pitch(settings: RunConfig, limit_um: float) -> str:
 
 
 def _image(going: Run) -> dict[str, Any]:
-    """What the run's images are, and how wrong: of one PSF against the true image of this lens, relative L2."""
     settings = going.settings
-    optics, side = settings.optics, settings.scenes.pixels + 2 * settings.scenes.margin
-    given = optics, going.trainer.model.coefficients_rad.detach(), side
-    try:
-        if optics.image == "uniform":
-            error = formed.apart(*given, margin=settings.scenes.margin)
-        else:
-            error = float(getattr(formed.imager(*given, margin=settings.scenes.margin), "error", math.nan))
-    except (SceneError, PropagationError) as problem:
-        return {"kind": optics.image, "error": None, "problem": str(problem)}
-    return {"kind": optics.image, "error": error, "fwhm_nm": optics.fwhm_nm, "passed": optics.passed}
-
-
-def _of_image(said: dict[str, Any]) -> str:
-    if said["error"] is None:
-        return f"image: {said['kind']}; how far it is from the true image is not known: {said['problem']}"
-    if said["kind"] == "uniform":
-        return (
-            f"image: one PSF for the whole field, one wavelength (uniform); it differs from the true image of a "
-            f"texture by {said['error']:.2f} of its contrast; optics.image = 'true' trains on that"
-        )
-    light = f"{said['fwhm_nm']:g} nm" if said["fwhm_nm"] else "one wavelength"
-    return f"image: whole field, {light}, {100 * said['passed']:.0f} % of the light; error {said['error']:.3f}"
+    side = settings.scenes.pixels + 2 * settings.scenes.margin
+    coefficients = going.trainer.model.coefficients_rad.detach()
+    return formed.described(settings.optics, coefficients, side, margin=settings.scenes.margin)
 
 
 def _export(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:

@@ -12,6 +12,7 @@ import tyro
 from codesign.adapt import bootstrap
 from codesign.adapt import train as retraining
 from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
+from codesign.optics import formed
 from metalens.commands import Common, Output
 from metalens.ground import report, store
 from metalens.ground.errors import ConfigError
@@ -52,7 +53,7 @@ def run(options: Options) -> int:
         steps = experiment(sources, config, names=names)
         for _, found in options.console.track(steps, total=config.subjects, label="subjects"):
             results = found
-        values = summary(results, config)
+        values = summary(results, config) | {"images": images(options.runs, names)}
         pictures = {
             "samples.png": experiment_plots.samples(sources[0], config),
             "ambiguity.png": experiment_plots.ambiguity(results[0]),
@@ -61,6 +62,14 @@ def run(options: Options) -> int:
         _write(draft.path, values, pictures)
     options.console.result(values, f"{table(values)}\nopen {folder / PAGE}")
     return 0
+
+
+def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
+    """How every run's images were formed and how wrong they are, as the run itself found; None of older runs."""
+    return {
+        name: json.loads((folder / "result.json").read_text("utf-8")).get("image")
+        for name, folder in zip(names, folders, strict=True)
+    }
 
 
 def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -125,6 +134,8 @@ def table(values: dict[str, Any]) -> str:
     for r in values["ratios"]:
         low, high = r["interval"]
         lines.append(f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]")
+    for name, found in values.get("images", {}).items():
+        lines.append(f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}")
     return "\n".join(lines)
 
 

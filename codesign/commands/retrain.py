@@ -72,6 +72,7 @@ Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
 def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 0."""
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
+    retraining.check_image(source)
     result = asbuilt.load(options.asbuilt)
     design = lens.load(options.run_dir / "lens.h5")
     retraining.check_lens(design, result, insist=options.insist)

@@ -15,16 +15,16 @@ import numpy as np
 import torch
 
 from codesign.adapt import Source, network
-from codesign.batches import EXPERIMENT, EyeScenes, as_batch
+from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
 from codesign.gaze import angle_deg, personal
 from codesign.network import recalibrate
-from codesign.optics import stack as lens
+from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, read_out
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
-from metalens.image import UniformImager, image, low_snr
+from metalens.image import Imager, UniformImager, low_snr
 
 AXIAL, LATERAL = "axial", "lateral"
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
@@ -161,13 +161,14 @@ def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tupl
     return states, Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
 
 
-def through(source: Source, made: Rendered, prepared: UniformImager, *, seed: int, snr_db: float | None = None) -> Seen:
+def through(
+    source: Source, made: Rendered, prepared: UniformImager | Imager, *, seed: int, snr_db: float | None = None
+) -> Seen:
     """Rendered frames through a run's lens and sensor, with noise of a seed; dimmed with ``snr_db``."""
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
-    frames = batch.frames
-    light = image(frames, prepared, margin=margin)  # type: ignore[arg-type]
+    light = irradiance(batch.frames, prepared, margin=margin)
     noise = torch.Generator().manual_seed(seed)
     sensor, pitch = trainer.sensor, trainer.model.pitch_um
     if snr_db is not None:
@@ -227,14 +228,14 @@ def _check(sources: Sequence[Source]) -> None:
         )
 
 
-def ready(source: Source) -> UniformImager:
-    """The imager of a run's lens, its network set to the batch statistics of training frames."""
+def ready(source: Source) -> UniformImager | Imager:
+    """The imager of a run's lens, true or uniform as it trained; its network set to statistics of training frames."""
     trainer = source.run.trainer
-    made = lens.stack(trainer.optics, trainer.model.coefficients_rad)
     measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
     recalibrate(network(trainer), source.architecture, assess.parts(measured))
     size = source.settings.scenes.pixels + 2 * source.settings.scenes.margin
-    return lens.prepared(trainer.optics, made, size, margin=source.settings.scenes.margin)
+    margin = source.settings.scenes.margin
+    return formed.imager(trainer.optics, trainer.model.coefficients_rad, size, margin=margin)
 
 
 def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig) -> Result:

@@ -11,6 +11,7 @@ unbiased (:mod:`metalens.field.subset`).
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from codesign.optics import stack as lens
 from codesign.optics.lens_errors import LensError, variance_rad2
 from codesign.optics.stack import OpticsConfig, Stack
 from metalens.field import Layers, Optics, SmoothWave, blurred, normalised, surrogate, trial, with_psfs
-from metalens.ground.errors import TrainingError
+from metalens.ground.errors import PropagationError, SceneError, TrainingError
 from metalens.image import Frames, Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
 from metalens.psf import Source
@@ -165,3 +166,32 @@ def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margi
     few = Frames(*(getattr(seen, name)[..., part, part].contiguous() for name in Frames.__slots__))
     got = scene.image(few, one, margin=margin)
     return float((got - want).norm() / (want - want.mean()).norm())
+
+
+def described(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> dict[str, Any]:
+    """What the images are and how wrong, for a report: kind, error, and the source's width and filter.
+
+    error: of the uniform image, :func:`apart`; of the true image, its own estimate; None where the true image of this
+    lens cannot be formed, for the reason under ``problem``.
+    """
+    found: dict[str, Any] = {"kind": settings.image, "fwhm_nm": settings.fwhm_nm, "passed": settings.passed}
+    try:
+        if settings.image == "uniform":
+            return found | {"error": apart(settings, coefficients_rad, frame, margin=margin)}
+        made = imager(settings, coefficients_rad, frame, margin=margin)
+        return found | {"error": float(getattr(made, "error", math.nan))}
+    except (SceneError, PropagationError) as problem:
+        return found | {"error": None, "problem": str(problem)}
+
+
+def words(found: dict[str, Any]) -> str:
+    """A line of :func:`described`."""
+    if found["error"] is None:
+        return f"image: {found['kind']}; how far it is from the true image is not known: {found['problem']}"
+    if found["kind"] == "uniform":
+        return (
+            "image: one PSF for the whole field, one wavelength (uniform); it differs from the true image of a texture "
+            f"by {found['error']:.2f} of its contrast; optics.image = 'true' trains on that"
+        )
+    light = f"{found['fwhm_nm']:g} nm" if found["fwhm_nm"] else "one wavelength"
+    return f"image: whole field, {light}, {100 * found['passed']:.0f} % of the light; error {found['error']:.3f}"

@@ -174,6 +174,15 @@ def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
     retraining.check_lens(m.small(), refused, insist=True)
 
 
+def test_a_run_of_the_true_image_is_refused_by_the_name_of_its_setting(folder):
+    source = retraining.load(folder)
+    retraining.check_image(source)
+    optics = replace(source.settings.optics, image="true")
+    source.run.settings = replace(source.settings, optics=optics)
+    with pytest.raises(TrainingError, match=r"optics\.image = 'true'"):
+        retraining.check_image(source)
+
+
 def test_impossible_settings_are_refused():
     with pytest.raises(ConfigError, match="draws"):
         RetrainConfig(draws=0)

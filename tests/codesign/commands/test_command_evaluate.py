@@ -24,6 +24,14 @@ count = 3
 pixels = 64
 pitch_um = 9.0
 window_um = 72.0
+[reader]
+frames = 64
+pool = 32
+test = 32
+pixels = 32
+pitch_um = 12.0
+depths_mm = [14.0, 32.0]
+tolerance = 0.5
 """
 
 
@@ -37,9 +45,10 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 20000.0)
     (tmp_path / "o.toml").write_text(TOML)
-    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml")]
+    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml"), "--reader"]
     assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 0
     shown = capsys.readouterr().out
+    assert "Read by the reference reader: 64 frames of 32 pixels of 12 um" in shown
     assert "paper: proposed" in shown
     assert "95 % interval over the scenes" in shown
     values = json.loads((tmp_path / "out" / "optics.json").read_text())
@@ -47,6 +56,10 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     assert np.shape(values["lenses"]["b"]["information_per_mm2"]) == (2, 2, 3)
     energy = values["lenses"]["a"]["encircled_energy"][0]
     assert max(energy) > max(values["lenses"]["b"]["encircled_energy"][0])  # b is focused far behind this range
+    read = values["reader"]["lenses"]
+    assert set(read) == {"a", "b"}
+    assert all(0 <= one["covered"] <= 1 and one["axial_low_mm"] < one["axial_mm"] for one in read.values())
+    assert "90 % interval covers" in (tmp_path / "out" / "tables.txt").read_text()
     for name in ("axial.png", "slices.png", "scenes.png", "report.html"):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 
@@ -61,7 +74,9 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("bad", ["[scenes]\ncount = 0\n", "[axial]\ndepths_mm = [26.0, 16.0]\n"])
+@pytest.mark.parametrize(
+    "bad", ["[scenes]\ncount = 0\n", "[axial]\ndepths_mm = [26.0, 16.0]\n", "[reader]\nframes = 5\n"]
+)
 def test_bad_settings_are_refused(tmp_path, capsys, bad):
     made(tmp_path / "a.h5", 2000.0)
     (tmp_path / "o.toml").write_text(bad)
