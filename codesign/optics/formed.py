@@ -39,7 +39,8 @@ def source_of(settings: OpticsConfig) -> Source | None:
 
 def wave_of(settings: OpticsConfig, coefficients_rad: Tensor, error: LensError | None = None) -> SmoothWave:
     """The lens plane of these coefficients for :func:`metalens.image.imager`; differentiable in them."""
-    if settings.polynomials or settings.zones or error is not None:
+    split = settings.parts > 1 or settings.foci_mm
+    if settings.polynomials or settings.zones or split or error is not None:
         added = functools.partial(lens.phase_at, settings, coefficients_rad, error=error)
     else:
         added = None

@@ -14,6 +14,8 @@ import scipy.fft
 import torch
 from torch import Tensor
 
+from codesign.optics import families
+from codesign.optics.families import Family, Start
 from codesign.optics.lens_errors import LensError, LensErrors, variance_rad2, wave_front_rad
 from metalens.design import Focus, PhaseOf, profiles
 from metalens.ground.arrays import Array
@@ -39,8 +41,11 @@ class OpticsConfig:
 
     aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
     focus_mm: source distance that the hyperbolic part images onto the sensor.
-    polynomials: orthonormal radial-angular terms of order 2 and above that training moves; 0 for a fixed lens.
+    polynomials: orthonormal terms of order 2 and above that training moves; 0 for a fixed lens. family: of these terms:
+        "free" form, or "radial" ones alone (one of them is a focus that moves).
     zones: rings of a double helix added to the hyperbolic phase; 0 for none.
+    parts, apart_um: sectors of the aperture whose images lie on a circle of that diameter; 1 for a whole aperture.
+    foci_mm: source distances of rings of equal area, from the middle to the rim; none for one focus.
     depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at equal steps of 1/z.
     sample_um: of the PSFs; the image is formed on this grid before the pixels integrate it.
     window_samples: of the PSFs.
@@ -71,6 +76,10 @@ class OpticsConfig:
     fwhm_nm: float = 0.0
     filter_nm: float = 0.0
     image_tolerance: float = 0.03
+    family: Family = "free"
+    parts: int = 1
+    apart_um: float = 0.0
+    foci_mm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -82,6 +91,7 @@ class OpticsConfig:
             raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")
         if not abs(self.angle_deg) <= 40:
             raise ConfigError(f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees")
+        Start(self.focus, 1.0, self.zones, self.parts, self.apart_um, self.foci_mm)
         if not (self.fwhm_nm >= 0 and self.filter_nm >= 0 and 0 < self.image_tolerance < 1):
             raise ConfigError(
                 f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, image_tolerance = {self.image_tolerance}: "
@@ -103,6 +113,12 @@ class OpticsConfig:
         pupil = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
         need = math.ceil(self.sample_um / (pupil.field_step_um / 2))
         return need + 1 - need % 2
+
+    @property
+    def start(self) -> Start:
+        """The fixed phase on top of the focus."""
+        foci = tuple(f * 1e3 for f in self.foci_mm)
+        return Start(self.focus, self.aperture_mm * 500, self.zones, self.parts, self.apart_um, foci)
 
     @property
     def passed(self) -> float:
@@ -178,7 +194,7 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: LensError 
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
-    """(nodes, nodes) phase on top of the hyperbolic focus: vortices of the double helix, and the polynomials."""
+    """(nodes, nodes) phase on top of the hyperbolic focus: what the lens starts from, and the polynomials."""
     phase = _vortices(settings)
     if settings.polynomials:
         phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), _modes(settings))
@@ -187,20 +203,18 @@ def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
 
 def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     """The trained phase as a function of pillar positions, for :func:`metalens.design.make`."""
-    mix = _polynomials(settings.pupil, settings.polynomials)[1] if settings.polynomials else torch.zeros(0, 0)
+    count, family = settings.polynomials, settings.family
+    mix = _polynomials(settings.pupil, count, family)[1] if count else torch.zeros(0, 0)
     weights = (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).numpy() if len(mix) else np.zeros(0)
     rim = settings.aperture_mm * 500
 
     def phase(x_um: Array, y_um: Array) -> Array:
         x, y = x_um, y_um[:, None]
-        if settings.zones:
-            shape = profiles.DoubleHelix(settings.zones)
-            total = profiles.double_helix(x, y, settings.focus, shape, radius_um=rim)
-        else:
-            total = profiles.hyperbolic(x, y, settings.focus)
-        for weight, term in zip(weights, _terms(x / rim, y / rim, len(weights)), strict=True):
+        places = torch.from_numpy(np.asarray(x, float)), torch.from_numpy(np.asarray(y, float))
+        total = profiles.hyperbolic(x, y, settings.focus) + settings.start.phase_rad(*places).numpy()
+        for weight, term in zip(weights, families.terms(x / rim, y / rim, len(weights), family), strict=True):
             total = total + weight * term
-        return total
+        return np.asarray(total)
 
     return phase
 
@@ -210,23 +224,11 @@ def prepared(settings: OpticsConfig, made: Stack, frame: int, *, margin: int) ->
     return uniform_imager(made.basis(settings.tolerance), (frame, frame), margin=margin)
 
 
-def _terms(x: Array, y: Array, count: int) -> list[Array]:
-    """rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n: the first ``count``."""
-    rho, theta = np.hypot(x, y), np.arctan2(y, x)
-    terms: list[Array] = []
-    order = 2
-    while len(terms) < count:
-        for m in range(-order, order + 1, 2):
-            terms.append(rho**order * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta)))
-        order += 1
-    return terms[:count]
-
-
 @functools.lru_cache(maxsize=8)
-def _polynomials(pupil: Pupil, count: int) -> tuple[Tensor, Tensor]:
-    """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of :func:`_terms`."""
+def _polynomials(pupil: Pupil, count: int, family: Family) -> tuple[Tensor, Tensor]:
+    """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of the plain ones."""
     x, y = (c.numpy() / pupil.radius_um for c in coordinates(pupil))
-    raw = torch.from_numpy(np.stack(_terms(x, y, count)))
+    raw = torch.from_numpy(np.stack(families.terms(x, y, count, family)))
     inside = radius(pupil) <= pupil.radius_um
     samples = raw[:, inside]
     _, upper = torch.linalg.qr(samples.T)
@@ -237,25 +239,18 @@ def _polynomials(pupil: Pupil, count: int) -> tuple[Tensor, Tensor]:
 @functools.lru_cache(maxsize=8)
 def _modes(settings: OpticsConfig) -> Tensor:
     """(polynomials, nodes, nodes) terms where the rays of the nodes leave the lens."""
-    terms, mix = _polynomials(settings.pupil, settings.polynomials)
+    terms, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
     if not settings.angle_deg:
         return terms
     seen, rim = _seen(settings), settings.pupil.radius_um
-    raw = torch.from_numpy(np.stack(_terms((seen.x_um / rim).numpy(), (seen.y_um / rim).numpy(), len(mix))))
+    place = (seen.x_um / rim).numpy(), (seen.y_um / rim).numpy()
+    raw = torch.from_numpy(np.stack(families.terms(*place, len(mix), settings.family)))
     return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
 
 
 @functools.lru_cache(maxsize=8)
 def _vortices(settings: OpticsConfig) -> Tensor:
-    return _helix(settings, _seen(settings).x_um, _seen(settings).y_um)
-
-
-def _helix(settings: OpticsConfig, x: Tensor, y: Tensor) -> Tensor:
-    if not settings.zones:
-        return torch.zeros_like(x)
-    fraction = torch.hypot(x, y) / settings.pupil.radius_um
-    ring = torch.ceil(settings.zones * fraction**2).clamp(1, settings.zones)
-    return (2 * ring - 1) * torch.atan2(y, x)
+    return settings.start.phase_rad(_seen(settings).x_um, _seen(settings).y_um)
 
 
 def _field(settings: OpticsConfig) -> Field:
@@ -306,10 +301,10 @@ def phase_at(
 ) -> Tensor:
     """Phase on top of the hyperbolic focus at any places, float64; differentiable in the coefficients."""
     rim = settings.aperture_mm * 500
-    total = _helix(settings, x_um, y_um)
+    total = settings.start.phase_rad(x_um, y_um)
     if settings.polynomials:
-        weights = _polynomials(settings.pupil, settings.polynomials)[1].mT @ coefficients_rad.double()
-        terms = _terms((x_um / rim).numpy(), (y_um / rim).numpy(), settings.polynomials)
+        weights = _polynomials(settings.pupil, settings.polynomials, settings.family)[1].mT @ coefficients_rad.double()
+        terms = families.terms((x_um / rim).numpy(), (y_um / rim).numpy(), settings.polynomials, settings.family)
         total = total + torch.einsum("n,nyx->yx", weights, torch.from_numpy(np.stack(terms)))
     return total if error is None else total + _wave_front(settings, error, x_um / rim, y_um / rim)
 
