@@ -44,7 +44,7 @@ class Start:
 
     def phase_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
         """The phase at any places of the lens, float64."""
-        x, y = torch.broadcast_tensors(x_um, y_um)
+        x, y = x_um + torch.zeros_like(y_um), y_um + torch.zeros_like(x_um)
         total = torch.zeros(x.shape, dtype=torch.float64)
         if not (self.zones or self.foci_um or (self.parts > 1 and self.apart_um)):
             return total
