@@ -225,7 +225,7 @@ def prepared(settings: OpticsConfig, made: Stack, frame: int, *, margin: int) ->
 
 
 @functools.lru_cache(maxsize=8)
-def _polynomials(pupil: Pupil, count: int, family: Family) -> tuple[Tensor, Tensor]:
+def _polynomials(pupil: Pupil, count: int, family: Family = "free") -> tuple[Tensor, Tensor]:
     """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of the plain ones."""
     x, y = (c.numpy() / pupil.radius_um for c in coordinates(pupil))
     raw = torch.from_numpy(np.stack(families.terms(x, y, count, family)))
