@@ -2,359 +2,132 @@
 
     python -m benchmarks hardness                                        # small: some minutes on two quiet cores
     python -m benchmarks.hardness --kills 2000 --writers 200 --disks 200 --mutations 1000000
+    python -m benchmarks.hardness --kills 40 --verbs design scene        # one part alone; the others keep their rows
 
-The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes. Two sets
-of different size take turns, so that a result made of both would show.
+The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes; each is
+printed with what it needs to be had again.
 """
 
 import argparse
 import dataclasses
-import hashlib
-import io
 import json
-import math
 import os
-import random
-import resource
-import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 
-from benchmarks import Row
+from benchmarks import Row, _hardness_files, _hardness_runs, _hardness_values
 from benchmarks.__main__ import table
-from characterize.bench import Truth
-from characterize.captures import capture as captures
-from characterize.commands.fit import Metrology
-from characterize.pupil import PupilSpec
-from codesign.budget import PlanConfig
-from codesign.commands.scene import Scene
-from metalens import lens, library, psf
-from metalens.commands.design import Design
-from metalens.commands.library import CellFile
-from metalens.commands.psf import Settings
-from metalens.ground import config, executor
-from metalens.ground.errors import MetalensError, WorkerError
+from metalens import psf
 
-SEED = 5
-TOLD = ("manifest.json", "layout.json", "report.html")  # hold times and commands: no part of what is compared
-KILLS, WRITERS, DISKS, MUTATIONS = 12, 4, 6, 4000
-RECORDS = (Design, CellFile, Settings, Truth, Metrology, PupilSpec, PlanConfig, Scene)
-BAD = (-1, -1.5, 0, 10**30, 1e20, math.inf, -math.inf, math.nan, "", "\0", True, [], [[]], {}, {"a": {}}, "x" * 9999)
-MOST_MEMORY = 1 << 30
-DESIGNS = ("aperture_mm = 0.02\nlibrary = 'library.h5'\n", "aperture_mm = 0.03\nlibrary = 'library.h5'\n")
-CELL = "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n[sweep]\nwavelengths_um = [0.85]\nsamples = 40\ntolerance = 0.05\n"
-FRAME = "frames = 1\npixels = {}\npitch_um = 60.0\n"
-# verb: words for each of two settings, and the output
-VERBS = {
-    "design": ("design design{}.toml -o out.h5 --skip-focus-check", "out.h5"),
-    "psf": ("psf lens{}.h5 --config psf.toml -o out.h5", "out.h5"),
-    "layout": ("layout lens{}.h5 -o out", "out"),
-    "scene": ("scene scene{}.toml -o out", "out"),
-}
+KILLS, WRITERS, DISKS, MUTATIONS = 18, 9, 9, 9000
+RESULT = Path(__file__).parent / "results" / "hardness.json"
 
 
 def rows() -> list[Row]:
     """All parts at their small size."""
-    return measured(KILLS, WRITERS, DISKS, MUTATIONS)
+    return [*runs(KILLS, WRITERS, DISKS), mutations(MUTATIONS), bad_values(), threads()]
 
 
-def measured(kills: int, writers: int, disks: int, mutations: int) -> list[Row]:
-    """A row a part."""
+def runs(kills: int, writers: int, disks: int, verbs: Sequence[str] = ()) -> list[Row]:
+    """Commands that are killed, run twice at once, or out of room."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        _prepare(folder)
-        known = {verb: _known(folder, verb) for verb in VERBS}
-        return [
-            _timed(f"{kills} kills", lambda: _kills(folder, known, kills), "mixed, lost, or scratch left"),
-            _timed(f"{writers} pairs of writers", lambda: _pairs(folder, known, writers), "mixed, or none succeeded"),
-            _timed(f"{disks} full disks", lambda: _disks(folder, known, disks), "crash, loss, or scratch left"),
-            _timed(f"{mutations} damaged files", lambda: _mutations(folder, mutations), "untyped ends and crashes"),
-            _timed("bad values of every key", _bad_values, "untyped ends"),
-            _timed("psf on 1, 2, 8 threads", lambda: _threads(folder), "results that differ"),
+        bench = _hardness_runs.Bench(Path(name), tuple(verbs) or tuple(sorted(_hardness_runs.VERBS)))
+        bench.prepare()
+        over = f"over {', '.join(bench.verbs)}"
+        parts = [
+            (f"{kills} kills", kills, bench.kill, "mixed, lost, or scratch left"),
+            (f"{writers} pairs of writers", writers, bench.pair, "mixed, or none succeeded"),
+            (f"{disks} full disks", disks, bench.fill, "crash, part of a result, or scratch left"),
         ]
-
-
-def _timed(case: str, part: Callable[[], int], against: str) -> Row:
-    start = time.perf_counter()
-    failures = part()
-    goal = f"0: {'met' if failures == 0 else 'missed'}"
-    return Row(case, "as it comes", time.perf_counter() - start, float(failures), against, goal=goal)
-
-
-def _start(folder: Path, words: str, **more: Any) -> "subprocess.Popen[bytes]":
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    return subprocess.Popen([sys.executable, "-m", "metalens", *words.split()], cwd=folder, **(quiet | more))
-
-
-def _run(folder: Path, words: str, **more: Any) -> tuple[int, str]:
-    child = _start(folder, words, **more)
-    told = child.communicate()[1].decode("utf-8", "replace")
-    return child.returncode, told
-
-
-def _prepare(folder: Path) -> None:
-    texts = {"cell.toml": CELL, "psf.toml": "depths_mm = [16.0, 18.0, 1.0]\nangles_deg = [0.0]\nsamples = 32\n"}
-    texts |= {f"design{i}.toml": text for i, text in enumerate(DESIGNS)}
-    texts |= {f"scene{i}.toml": FRAME.format(n) for i, n in enumerate((24, 32))}
-    for name, text in texts.items():
-        (folder / name).write_text(text)
-    for words in ("library cell.toml -o library.h5", *(f"design design{i}.toml -o lens{i}.h5" for i in (0, 1))):
-        status, told = _run(folder, words)
-        if status not in (0, 1):
-            raise RuntimeError(f"{words}: {told}")
-
-
-def _state(folder: Path, output: str) -> dict[str, str]:
-    """{name: SHA-256} of an output and what lies beside it; times and commands are no part of it."""
-    stem = Path(output).stem
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if (
-            path.is_file()
-            and name.startswith(stem)
-            and path.name not in ("manifest.json", "layout.json", "report.html")
-        ):
-            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        found = [
+            _timed(case, over, lambda work=work, count=count: work(count), against)
+            for case, count, work, against in parts
+            if count
+        ]
+    print("\n".join(bench.failures))
     return found
 
 
-def _clear(folder: Path, output: str) -> None:
-    for name in _state(folder, output):
-        (folder / name).unlink()
-    for path in sorted(folder.glob("out*"), reverse=True):
-        subprocess.run(["rm", "-rf", str(path)], check=True)
-
-
-def _known(folder: Path, verb: str) -> list[dict[str, str]]:
-    """The two whole results of a verb; the second is left standing."""
-    words, output = VERBS[verb]
-    states = []
-    for i in (0, 1):
-        _clear(folder, output)
-        status, told = _run(folder, words.format(i))
-        if status not in (0, 1):
-            raise RuntimeError(f"{verb}: {told}")
-        states.append(_state(folder, output))
-    return states
-
-
-def _whole(state: dict[str, str], known: list[dict[str, str]], output: str) -> bool:
-    """Whether a state is one result: all of it, or a file whose pictures are not there yet."""
-    named = any(name == output or name.startswith(output + "/") for name in state)
-    return named and any(
-        state.items() <= one.items() and (Path(output).suffix != "" or state.keys() == one.keys()) for one in known
-    )
-
-
-def _scratch(folder: Path) -> int:
-    return sum(1 for p in folder.iterdir() if p.name.startswith(".") or p.name.endswith(".unfinished"))
-
-
-def _kills(folder: Path, known: dict[str, list[dict[str, str]]], count: int) -> int:
-    chance, failures = random.Random(SEED), 0
-    for turn in range(count):
-        verb = sorted(VERBS)[turn % len(VERBS)]
-        words, output = VERBS[verb]
-        if turn < len(VERBS) or not _whole(_state(folder, output), known[verb], output):
-            _clear(folder, output)
+def mutations(copies: int) -> Row:
+    """Damaged copies of every kind of file."""
+    with tempfile.TemporaryDirectory() as name:
         start = time.perf_counter()
-        _run(folder, words.format(0) + " --force")
-        lasts = time.perf_counter() - start
-        child = _start(folder, words.format(1) + " --force")
-        time.sleep(lasts * chance.uniform(0.3, 1.0))
-        child.send_signal(chance.choice([signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP]))
-        child.communicate()
-        failures += not _whole(_state(folder, output), known[verb], output)
-        status, _ = _run(folder, words.format(1) + " --force")
-        failures += status not in (0, 1) or _state(folder, output) != known[verb][1] or _scratch(folder) > 0
-        _clear(folder, output)
-    return failures
+        counts = list(_hardness_files.counted(Path(name), copies))
+        seconds = time.perf_counter() - start
+    print(_hardness_files.summary(counts))
+    refused, done = sum(c.refused for c in counts), sum(c.copies for c in counts)
+    case = f"{done} damaged files of {len(counts)} kinds"
+    failures = sum(len(c.failures) for c in counts)
+    return _row(case, f"{refused} refused", seconds, failures, "untyped, crash, over 1 GB or 5 s")
 
 
-def _pairs(folder: Path, known: dict[str, list[dict[str, str]]], count: int) -> int:
-    failures = 0
-    for turn in range(count):
-        verb = sorted(VERBS)[turn % len(VERBS)]
-        words, output = VERBS[verb]
-        _clear(folder, output)
-        pair = [_start(folder, words.format(i)) for i in (0, 1)]
-        ends = sorted((child.communicate(), child.returncode)[1] for child in pair)
-        failures += ends[0] > 1 or ends[1] > 2 or _state(folder, output) not in known[verb] or _scratch(folder) > 0
-        _clear(folder, output)
-    return failures
+def bad_values() -> Row:
+    """The matrix of bad values: failures are untyped ends and refusals that name neither file nor key."""
+    start = time.perf_counter()
+    found = list(_hardness_values.trials())
+    failures = [t for t in found if not t.typed or (t.said and not t.names_it)]
+    print("\n".join(f"{t.settings} {t.key} = {t.value}: {t.said[:200]}" for t in failures[:20]))
+    refused = sum(bool(t.said) for t in found)
+    case, seconds = f"{len(found)} bad values of every key", time.perf_counter() - start
+    return _row(case, f"{refused} refused", seconds, len(failures), "untyped, or key not named")
 
 
-def _disks(folder: Path, known: dict[str, list[dict[str, str]]], count: int) -> int:
-    """A limit on the size of a file stands for a full disk: no right to mount one is needed."""
-    chance, failures = random.Random(SEED), 0
-    for turn in range(count):
-        verb = sorted(VERBS)[turn % len(VERBS)]
-        words, output = VERBS[verb]
-        _clear(folder, output)
-        most = int(10 ** chance.uniform(2, 5))
-        limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))  # noqa: B023, E731
-        status, told = _run(folder, words.format(0), preexec_fn=limit)
-        state = _state(folder, output)
-        failures += status not in (0, 1, 2) or "Traceback" in told or _scratch(folder) > 0
-        failures += bool(state) and state != known[verb][0]
-        _clear(folder, output)
-    return failures
+def threads() -> Row:
+    """Results of one command that differ with the number of threads."""
+    found, start = set(), time.perf_counter()
+    with tempfile.TemporaryDirectory() as name:
+        bench = _hardness_runs.Bench(Path(name), ())
+        bench.prepare()
+        for count in (1, 2, 8):
+            told = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(count))
+            status, words = bench.run("psf lens0.h5 --config psf.toml -o out.h5", env=os.environ | told)
+            if status not in (0, 1):
+                raise RuntimeError(words)
+            found.add(np.asarray(psf.load(bench.folder / "out.h5").intensity).tobytes())
+            bench.clear("out.h5")
+    return _row("psf on 1, 2, 8 threads", "as it comes", time.perf_counter() - start, len(found) - 1, "other bytes")
 
 
-def _mutations(folder: Path, count: int) -> int:
-    """In workers that may die: every death, untyped error and read of more than a gigabyte or 5 s counts."""
-    files = [str(folder / name) for name in ("library.h5", "lens0.h5", "cell.toml", "design0.toml", "psf.toml")]
-    (folder / "page.tif").write_bytes(_tiff())
-    files.append(str(folder / "page.tif"))
-    each = 50
-    tasks = [(files[k % len(files)], SEED + k, each) for k in range(max(1, count // each))]
-    try:
-        return sum(failures for _, failures in executor.run(mutate, tasks))
-    except WorkerError:
-        return len(tasks)
+def _timed(case: str, method: str, part: Callable[[], int], against: str) -> Row:
+    start = time.perf_counter()
+    failures = part()
+    return _row(case, method, time.perf_counter() - start, failures, against)
 
 
-def _tiff() -> bytes:
-    import tifffile
-
-    out = io.BytesIO()
-    tifffile.imwrite(out, np.arange(3 * 12 * 16, dtype=np.uint16).reshape(3, 12, 16), photometric="minisblack")
-    return out.getvalue()
+def _row(case: str, method: str, seconds: float, failures: int, against: str) -> Row:
+    return Row(case, method, seconds, float(failures), against, goal=f"0: {'met' if failures == 0 else 'missed'}")
 
 
-def mutate(task: tuple[str, int, int]) -> int:
-    """Failures of a reader on so many damaged copies of a file."""
-    name, seed, count = task
-    chance, whole, failures = random.Random(seed), Path(name).read_bytes(), 0
-    resource.setrlimit(resource.RLIMIT_AS, (8 * MOST_MEMORY, resource.RLIM_INFINITY))
-    readers = {".toml": _read_toml, ".tif": captures.load, ".h5": lens.load if "lens" in name else library.load}
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place) / Path(name).name
-        for _ in range(count):
-            path.write_bytes(_damaged(whole, chance))
-            if path.suffix == ".h5" and chance.random() < 0.7:
-                path.write_bytes(whole)
-                _edit(path, chance)
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-            start = time.perf_counter()
-            try:
-                readers[path.suffix](path)
-            except MetalensError:
-                pass
-            except Exception as error:  # noqa: BLE001 (what is counted)
-                sys.stderr.write(f"{path.name} {type(error).__name__}: {error}\n")
-                failures += 1
-            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
-            failures += time.perf_counter() - start > 5 or grown > MOST_MEMORY
-    return failures
-
-
-def _read_toml(path: Path) -> object:
-    kinds = {"cell": CellFile, "psf": Settings}
-    return config.load(path, kinds.get(path.stem, Design))
-
-
-def _damaged(whole: bytes, chance: random.Random) -> bytes:
-    data = bytearray(whole)
-    for _ in range(chance.randint(1, 4)):
-        at = chance.randrange(max(1, len(data)))
-        how = chance.randrange(4)
-        if how == 0:
-            data = data[:at]
-        elif how == 1:
-            data[at : at + 1] = bytes([chance.randrange(256)])
-        elif how == 2:
-            data[at:at] = data[at : at + chance.randint(1, 64)] * chance.randint(1, 4)
-        else:
-            data[at : at + 4] = chance.choice([b"\xff" * 4, b"\0" * 4, b"\x7f\xff\xff\xff", b"1e99"])
-    return bytes(data)
-
-
-def _edit(path: Path, chance: random.Random) -> None:
-    """Put something of the wrong kind into an HDF5 file, with good checksums."""
-    values: tuple[Any, ...] = (
-        -1,
-        math.nan,
-        "x",
-        b"\xff",
-        [1.0, 2.0],
-        np.zeros((2, 2)),
-        10**18,
-        np.array(["a"], "S1"),
-        1j,
-    )
-    with h5py.File(path, "r+") as file:
-        names: list[str] = []
-        file.visit(names.append)
-        if chance.random() < 0.5:
-            file.attrs[chance.choice(sorted(file.attrs))] = chance.choice(values)
-            return
-        name = chance.choice(names)
-        del file[name]
-        if chance.random() < 0.8:
-            file[name] = chance.choice(values)
-
-
-def _bad_values() -> int:
-    """Every key of every record with every bad value: refused by type, or fit for that key."""
-    failures = 0
-    for record in RECORDS:
-        for keys in _keys(record):
-            for value in BAD:
-                entry: Any = value
-                for key in reversed(keys):
-                    entry = {key: entry}
-                try:
-                    config.from_table(entry, record)
-                except MetalensError:
-                    continue
-                except Exception as error:  # noqa: BLE001 (what is counted)
-                    sys.stderr.write(f"{record.__name__} {'.'.join(keys)} = {value!r:.40}: {error!r}\n")
-                    failures += 1
-    return failures
-
-
-def _keys(record: Any, depth: int = 0) -> Iterator[tuple[str, ...]]:
-    for entry in dataclasses.fields(record):
-        yield (entry.name,)
-        nested = entry.default if dataclasses.is_dataclass(entry.default) else None
-        if entry.default_factory is not dataclasses.MISSING and dataclasses.is_dataclass(entry.default_factory):
-            nested = entry.default_factory
-        if nested is not None and depth < 3:
-            kind = nested if isinstance(nested, type) else type(nested)
-            yield from ((entry.name, *keys) for keys in _keys(kind, depth + 1))
-
-
-def _threads(folder: Path) -> int:
-    found = set()
-    for count in (1, 2, 8):
-        told = {name: str(count) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
-        _clear(folder, "out.h5")
-        status, words = _run(folder, "psf lens0.h5 --config psf.toml -o out.h5", env=os.environ | told)
-        if status not in (0, 1):
-            raise RuntimeError(words)
-        found.add(np.asarray(psf.load(folder / "out.h5").intensity).tobytes())
-    return len(found) - 1
+def keep(found: list[Row]) -> None:
+    """Put rows into the result, in place of those of the same parts."""
+    held = json.loads(RESULT.read_text("utf-8"))["rows"] if RESULT.is_file() else []
+    new = [dataclasses.asdict(row) for row in found]
+    parts = {row["against"] for row in new}
+    kept = [row for row in held if row["against"] not in parts]
+    RESULT.write_text(json.dumps({"rows": kept + new}, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
-    """Parts at other sizes."""
+    """The parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, value in (("kills", KILLS), ("writers", WRITERS), ("disks", DISKS), ("mutations", MUTATIONS)):
-        parser.add_argument(f"--{name}", type=int, default=value)
-    found = measured(**vars(parser.parse_args()))
+    for name in ("kills", "writers", "disks", "mutations"):
+        parser.add_argument(f"--{name}", type=int, default=0)
+    for name in ("values", "threads"):
+        parser.add_argument(f"--{name}", action="store_true")
+    parser.add_argument("--verbs", nargs="*", choices=sorted(_hardness_runs.VERBS), default=())
+    asked = parser.parse_args()
+    found = []
+    if asked.kills or asked.writers or asked.disks:
+        found += runs(asked.kills, asked.writers, asked.disks, asked.verbs)
+    found += [mutations(asked.mutations)] if asked.mutations else []
+    found += [bad_values()] if asked.values else []
+    found += [threads()] if asked.threads else []
     print(table(found))
-    target = Path(__file__).parent / "results" / "hardness.json"
-    target.write_text(json.dumps({"rows": [dataclasses.asdict(row) for row in found]}, indent=1) + "\n")
+    keep(found)
 
 
 if __name__ == "__main__":

@@ -5,15 +5,20 @@ import errno
 import fcntl
 import json
 import os
+import signal
 import socket
+import threading
 from collections.abc import Iterator
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 
 from metalens.ground.errors import OutputError
 
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")  # words of the command line, for locks and manifests
 _open: set[int] = set()
+_SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, s))
 
 
 @contextlib.contextmanager
@@ -64,6 +69,33 @@ def free(path: Path) -> bool:
     finally:
         os.close(handle)
     return True
+
+
+@dataclass(eq=False)
+class _Heard:
+    """Signals that came while they could not be answered."""
+
+    numbers: list[int] = field(default_factory=list)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.numbers.append(number)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Answer signals only after the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard, numbers = _Heard(), [getattr(signal, name) for name in _SIGNALS]
+    before = {number: signal.signal(number, heard) for number in numbers if signal.getsignal(number) is not None}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in heard.numbers:
+            signal.raise_signal(number)
 
 
 def _taken(path: Path, target: Path) -> int:

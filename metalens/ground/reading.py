@@ -5,6 +5,7 @@ The HDF5 library ends its process on some damaged files. So a forked child with 
 
 import contextlib
 import dataclasses
+import faulthandler
 import functools
 import os
 import resource
@@ -16,10 +17,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from metalens.ground import errors
 from metalens.ground.errors import DAMAGE, MetalensError, StoreError
 
 Made = TypeVar("Made")
-_ROOM, _SECONDS = 2 << 30, 60  # address space beyond what this process has, time of the processor, for a probe
+_ROOM, _SECONDS = 600 << 20, 60  # address space beyond what this process has, time of the processor, for a probe
+_DENSEST = 1100  # more of it for a byte of the file: what deflate can do at best, and copies
+_MOST_WORDS = 4000
 _WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
 
 
@@ -64,10 +68,12 @@ def _check_types(record: Any) -> None:
 def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
     """What ``read`` makes of an open HDF5 file, after a child process with limits has done the same and lived.
 
-    Of a file above 64 MB the child reads every header, and the corners of the arrays.
+    What the child raised is raised here, without reading: a damaged file takes the child's memory alone. Of a file
+    above 64 MB the child reads every header, and the corners of the arrays.
 
     Raises:
-        StoreError: the child died, as this process would have. Whatever ``read`` raises.
+        StoreError: the child died, as this process would have; or what ``read`` refuses (a MetalensError as it is,
+            anything else as a RuntimeError).
     """
     import h5py
 
@@ -75,15 +81,17 @@ def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
         with h5py.File(path, "r") as file:
             return work(file)
 
-    small = os.path.isfile(path) and os.path.getsize(path) <= _WHOLE
-    _probe(path, lambda: opened(read if small else _read_through))
+    size = os.path.getsize(path) if os.path.isfile(path) else 0
+    _probe(path, lambda: opened(read if size <= _WHOLE else _read_through), _ROOM + _DENSEST * size)
     made: Made = opened(read)
     return made
 
 
-def _probe(path: str | Path, read: Callable[[], object]) -> None:
+def _probe(path: str | Path, read: Callable[[], object], room: int) -> None:
+    """Call ``read`` in a forked child and raise what it raised."""
     from h5py._objects import phil
 
+    out, into = os.pipe()
     try:
         with (
             phil,
@@ -92,28 +100,41 @@ def _probe(path: str | Path, read: Callable[[], object]) -> None:
             warnings.simplefilter("ignore", DeprecationWarning)
             child = os.fork()
     except OSError:  # no room for another process
+        os.close(out)
+        os.close(into)
         return
     if child == 0:
-        try:
-            _limit()
-            read()
-        except BaseException:  # noqa: BLE001 (the child tells nothing but that it lives)
-            os._exit(0)
-        os._exit(0)
+        _child(read, room, into)
+    os.close(into)
+    with open(out, "rb") as pipe:
+        told = pipe.read()
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status < 0:
         raise StoreError(f"{path}: damaged: reading it ended the reader with signal {-status}; make it again")
+    if told:
+        name, _, words = told.decode().partition("\n")
+        raise getattr(errors, name, RuntimeError)(words)
 
 
-def _limit() -> None:
+def _child(read: Callable[[], object], room: int, into: int) -> None:
+    """Read with limits, tell what was raised, and end."""
+    try:
+        _limit(room)
+        read()
+    except BaseException as error:  # noqa: BLE001 (told to the parent)
+        os.write(into, f"{type(error).__name__}\n{error}".encode("utf-8", "backslashreplace")[:_MOST_WORDS])
+    finally:
+        os._exit(0)
+
+
+def _limit(room: int) -> None:
     """Of the child: memory, time, no core file, no words."""
-    have = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    faulthandler.disable()
+    told = Path("/proc/self/statm")  # of Linux
+    have = int(told.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if told.is_file() else room
     used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-    for kind, most in (
-        (resource.RLIMIT_AS, have + _ROOM),
-        (resource.RLIMIT_CPU, int(used) + _SECONDS),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    limits = {resource.RLIMIT_AS: have + room, resource.RLIMIT_CPU: int(used) + _SECONDS, resource.RLIMIT_CORE: 0}
+    for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

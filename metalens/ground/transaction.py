@@ -12,14 +12,11 @@ import contextlib
 import ctypes
 import os
 import shutil
-import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from metalens.ground import lock, manifest, store
 from metalens.ground.errors import OutputError
@@ -27,7 +24,6 @@ from metalens.ground.errors import OutputError
 ROOM = 1 << 22  # bytes that every output may need
 UNFINISHED = ".unfinished"
 _READY, _EXCHANGE, _HERE = "ready", 2, -100
-_SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +212,7 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
     old.mkdir()
     made = sorted(p.name for p in new.iterdir())
     _sync(new)
-    with _undisturbed(), lock.folder(target.parent):
+    with lock.undisturbed(), lock.folder(target.parent):
         others = {*beside, *made} - {target.name}
         _refuse(target, others, terms, is_folder=False)
         (scratch / _READY).touch()
@@ -235,7 +231,7 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
     """Give the folder its manifest and exchange it with what stands."""
     manifest.write(new, lock.COMMAND.get())
     _sync(new)
-    with _undisturbed(), lock.folder(target.parent):
+    with lock.undisturbed(), lock.folder(target.parent):
         if not whoever:
             _refuse(target, (), terms, is_folder=True)
         (scratch / _READY).write_text(f"{new.stat().st_ino}", encoding="ascii")
@@ -329,30 +325,3 @@ def _sync(folder: Path) -> None:
 
 def _sync_folder(folder: Path) -> None:
     store.sync_folder(folder)
-
-
-@dataclass(eq=False)
-class _Heard:
-    """Signals that came while they could not be answered."""
-
-    numbers: list[int] = field(default_factory=list)
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.numbers.append(number)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Answer signals only after the block."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    heard, numbers = _Heard(), [getattr(signal, name) for name in _SIGNALS]
-    before = {number: signal.signal(number, heard) for number in numbers if signal.getsignal(number) is not None}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for number in heard.numbers:
-            signal.raise_signal(number)

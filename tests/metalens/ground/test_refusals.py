@@ -95,8 +95,10 @@ def test_a_file_that_ends_its_reader_ends_a_child_alone(tmp_path):
     with pytest.raises(StoreError, match=r"f\.h5: damaged: reading it ended the reader with signal 11"):
         reading.survived(tmp_path / "f.h5", read)
     assert reading.survived(tmp_path / "f.h5", lambda file: file["x"][2]) == 2.0
-    with pytest.raises(KeyError):
+    with pytest.raises(RuntimeError, match="y"):
         reading.survived(tmp_path / "f.h5", lambda file: file["y"])
+    with pytest.raises(RuntimeError, match="allocate"):  # the child's limit; here that would succeed
+        reading.survived(tmp_path / "f.h5", lambda file: np.zeros(1 << 27))
 
 
 def test_an_array_that_lies_in_another_file_is_refused(tmp_path):

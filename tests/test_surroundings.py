@@ -1,0 +1,89 @@
+"""A read-only installation without a home, a lost terminal, an ASCII locale, a folder with its manifest."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from metalens import cli
+from metalens.cli import BAD_INPUT, SUCCESS, main
+from metalens.ground import transaction
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_without_a_place_to_write_compiled_loops_go_to_temporary_files(monkeypatch):
+    """Where neither the installation nor the home can be written; where one can, numba's own choice stands."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(cli.os, "access", lambda path, mode: False)
+    assert main(["info", "absent.h5"]) == BAD_INPUT
+    chosen = Path(os.environ["NUMBA_CACHE_DIR"])
+    assert chosen.is_dir()
+    chosen.rmdir()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setattr(cli.os, "access", lambda path, mode: path == os.path.expanduser("~"))
+    main(["info", "absent.h5"])
+    assert "NUMBA_CACHE_DIR" not in os.environ
+
+
+def test_compiled_loops_of_a_read_only_copy_run_without_a_home(tmp_path):
+    """A copy that cannot be written, a home that does not exist; root may write anywhere, so it is skipped there."""
+    if os.geteuid() == 0:
+        pytest.skip("root may write into a read-only folder")
+    loops = tmp_path / "loops.py"
+    loops.write_text("import numba\n@numba.njit(cache=True)\ndef one(x):\n    return x + 1\n")
+    tmp_path.chmod(0o555)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from metalens import cli; cli.main(['info', 'x.h5'])"
+    code += "; import loops; print(loops.one(2))"
+    words = {"PATH": os.environ["PATH"], "HOME": "/nonexistent", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=words, check=False)
+    tmp_path.chmod(0o755)
+    assert done.stdout.split()[-1:] == ["3"], done.stderr
+
+
+def test_a_lost_terminal_ends_a_command_and_leaves_nothing(tmp_path):
+    (tmp_path / "study.toml").write_text("pitches_um = [0.3]\nheights_um = [0.7]\n")
+    words = [sys.executable, "-m", "metalens", "study", "study.toml", "-o", "out"]
+    child = subprocess.Popen(words, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    for _ in range(1200):
+        if child.poll() is not None or list(tmp_path.glob(".out.part-*")):
+            break
+        time.sleep(0.05)
+    child.send_signal(signal.SIGHUP)
+    told = child.communicate()[1]
+    assert child.returncode == 130, told
+    assert "interrupted; the output is as it was before" in told
+    assert os.listdir(tmp_path) == ["study.toml"]
+
+
+def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
+    ascii_only = {
+        **os.environ,
+        "LC_ALL": "C",
+        "PYTHONUTF8": "0",
+        "PYTHONCOERCECLOCALE": "0",
+        "PYTHONIOENCODING": "ascii",
+    }
+    words = [sys.executable, "-m", "metalens", "info", "größe.h5"]
+    done = subprocess.run(words, cwd=tmp_path, env=ascii_only, capture_output=True, check=False)
+    assert done.returncode == BAD_INPUT
+    assert b"Traceback" not in done.stderr
+    assert b"no such file" in done.stderr
+
+
+def test_info_shows_what_a_folder_holds_and_refuses_a_changed_one(tmp_path, capsys):
+    with transaction.folder(tmp_path / "out") as draft:
+        (draft.path / "a.txt").write_text("first")
+    assert main(["info", str(tmp_path / "out"), "--json"]) == SUCCESS
+    told = json.loads(capsys.readouterr().out)
+    assert told["files"]["a.txt"]["bytes"] == 5
+    assert main(["info", str(tmp_path / "out")]) == SUCCESS
+    assert "1 files, each as it was written" in capsys.readouterr().out
+    (tmp_path / "out" / "a.txt").write_text("other")
+    assert main(["info", str(tmp_path / "out")]) == BAD_INPUT
+    assert "SHA-256 differs" in capsys.readouterr().err
