@@ -102,9 +102,10 @@ def test_what_is_known_is_an_interval_within_the_usual_uncertainty():
     from characterize.model import PARAMETERS, PLACE
 
     scales = [PARAMETERS[PLACE[name]].scale for name in names]
-    low, high = np.array([-1.0, 2.0, 0.0]), np.array([-1.0 + 3.9 * scales[0], 2.0 + 4.0 * scales[1], 1.0])
+    low = np.array([50.0, -1.9 * scales[1], 0.0])
+    high = np.array([50.0 + 3.9 * scales[0], 2.1 * scales[1], 1.0])
     words = verdict.process_verdict(names, low, high, np.array([0.2, 0.69, 0.9]))
     assert f"known to bias_nm +- {3.9 * scales[0] / 3.92:.2g}" in words
-    assert f"loosely: height_nm 2 to {high[1]:.3g}" in words
+    assert f"loosely: height_nm {low[1]:.3g} to {high[1]:.3g}" in words
     assert "prior" not in words
     assert "from prior knowledge only: height_nm" in verdict.process_verdict(names, low, high, np.array([0.2, 0.71, 0]))
