@@ -188,7 +188,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
             return _refuse(f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}")
         module = importlib.import_module(parts[meant][0])
         verb, words = f"{verb} {meant}", words[words[0] in parts :]
-    if verb == "design":
+    if verb in ("design", "study"):
         module.OBJECTIVES.update(OBJECTIVES)
     if verb == "psf":
         module.SOURCES.update(PSF_SOURCES)

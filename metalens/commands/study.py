@@ -1,14 +1,19 @@
 """Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure."""
 
-from dataclasses import dataclass
+import importlib
+import itertools
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
 
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config
+from metalens.ground.units import nm
 from metalens.pillars import Study, study_plots
 from metalens.pillars import study as cell_study
+
+OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 
 
 @dataclass(frozen=True)
@@ -16,11 +21,14 @@ class Options(Distributed):
     """Options of ``metalens study``.
 
     Attributes:
-        config: STUDY.toml with pitches, heights, wavelengths, material and limits; the project's own without it.
+        config: STUDY.toml with pitches, heights, wavelengths, material or cell, and limits; the project's own without.
+        process: PROCESS.toml whose printable pillars and gaps, the strictest of all pitches and heights, take the place
+            of min_diameter_um and min_gap_um (worked out for round pillars).
         output: folder for README.md, cell_study.json and cell_study.png.
     """
 
     config: tyro.conf.Positional[Path | None] = None
+    process: Path | None = None
     output: Output = Path("cell_study")
 
 
@@ -28,6 +36,9 @@ def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
     study = Study() if options.config is None else config.load(options.config, Study)
     given = "" if options.config is None else f" {options.config.name}"
+    if options.process is not None:
+        study = _printable(options.process, study)
+        given += f" --process {options.process.name}"
     command = f"metalens study{given} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.workers():
         verdicts = cell_study.run(study, options.console)
@@ -39,3 +50,12 @@ def run(options: Options) -> int:
         text = f"{len(verdicts)} cells; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
     options.console.result(values, f"{options.output}: {text}")
     return 0 if best else 1
+
+
+def _printable(path: Path, study: Study) -> Study:
+    """The study with the limits of a process file, through a package above this one that the command line names."""
+    module = importlib.import_module(OBJECTIVES["process"])
+    shapes = itertools.product(study.pitches_um, study.heights_um)
+    found = [module.printable(path, pitch_um=pitch, height_um=height) for pitch, height in shapes]
+    thinnest, gap = (max(values) for values in zip(*found, strict=True))
+    return replace(study, min_diameter_um=thinnest * nm, min_gap_um=gap * nm)

@@ -6,8 +6,8 @@ wavenumbers squared is a property of the mesh and of how much of the cell the di
 finer meshes; the solution knows how much it moves for it (``drift``). The factors were calibrated on more than three
 hundred pillars (index 1.8 to 4, with and without absorption, up to 20 degrees, 5 to 98 % of the pitch; drawn at
 cutoffs and resonances, nearly touching, thin, tall) against finer meshes, all of which they cover; a slow test and the
-benchmark ``hard_cells`` hold them against pillars drawn anew. Where an order is near its cutoff both forms err alike, so that
-more than their difference is told; around a thin disc they err apart, and less than half of it is.
+benchmark ``hard_cells`` hold them against pillars drawn anew. Where an order is near its cutoff both forms err alike,
+so that more than their difference is told; around a thin disc they err apart, and less than half of it is.
 """
 
 from dataclasses import dataclass

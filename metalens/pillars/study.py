@@ -3,14 +3,14 @@
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from metalens.cell import Blend, Cell, Material, check_subwavelength, index
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError
+from metalens.ground.errors import CellError, ConfigError
 from metalens.pillars import curve as reduced
 from metalens.pillars import engines, workers
 from metalens.pillars.curve import Curve, Nodes
@@ -27,7 +27,9 @@ class Study:
     """What is compared.
 
     pitches_um, heights_um, wavelengths_um: every combination.
-    pillar: material of the pillars; substrate and cover are those of :class:`metalens.cell.Cell`.
+    pillar: material of the pillars, on the substrate and under the cover of :class:`metalens.cell.Cell`.
+    cell: any cell in its place: substrate, cover, shape, lattice, films, wall and material of every pillar; its pitch
+        and height are those compared, and "diameter" is the size of its shape.
     min_diameter_um, min_gap_um: what can be printed.
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
@@ -45,13 +47,30 @@ class Study:
     least_half_width_um: float = 0.005
     tolerance: float = field(default=3e-3, metadata={"above": 0})
     others: tuple[str, ...] = ("a-Si",)
+    cell: Cell | None = None
 
     def __post_init__(self) -> None:
+        if self.cell is not None and self.pillar != PLAIN:
+            raise ConfigError("pillar and cell are both given: a cell has its own material; give pillar inside cell")
         if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
             raise ConfigError(
                 f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
                 f"{self.min_gap_um} um"
             )
+
+    @property
+    def material(self) -> Material:
+        """Of the pillars."""
+        return self.pillar if self.cell is None else self.cell.pillar
+
+    def made(self, pitch_um: float, height_um: float, pillar: Material | None = None) -> Cell:
+        """One cell of the study, or the same of another material.
+
+        Raises:
+            CellError: layers that do not add up to the height.
+        """
+        base = self.cell or Cell(pitch_um)
+        return replace(base, pitch_um=pitch_um, height_um=height_um, pillar=pillar or self.material)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +106,14 @@ def run(study: Study, console: Console | None = None) -> list[Verdict]:
         CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none.
     """
     for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
-        check_subwavelength(Cell(pitch, pillar=study.pillar), wavelength)
+        check_subwavelength(study.made(pitch, study.heights_um[0]), wavelength)
     shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
-    cases = [(Cell(pitch, height, study.pillar), wavelength) for wavelength, height, pitch in shapes]
+    cases = [(study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes]
     verdicts = _judged(study, cases, console or Console(quiet=True))
     best = choice(study, verdicts)
     if best is None:
         return verdicts
-    cells = [Cell(*best, other) for other in study.others]
+    cells = [study.made(*best, other) for other in study.others]
     return verdicts + _judged(study, [(c, w) for c in cells for w in study.wavelengths_um], Console(quiet=True))
 
 
@@ -102,11 +121,26 @@ def _judged(study: Study, cases: list[tuple[Cell, float]], console: Console) -> 
     """One rational curve t(D) a case, on all cores."""
     tasks = []
     for cell, wavelength in cases:
-        span = (study.min_diameter_um, cell.pitch_um - study.min_gap_um)
+        span = _span(study, cell)
         engine = engines.choose(cell)
         tasks.append(workers.curve_task(cell, Light(wavelength), span, tolerance=study.tolerance, engine=engine))
     found = dict(console.track(workers.run(tasks), total=len(tasks), label="cells"))
     return [judge(study, *case, curve_of(found[i], study.tolerance)) for i, case in enumerate(cases)]
+
+
+def _span(study: Study, cell: Cell) -> tuple[float, float]:
+    """(least, largest) printable size.
+
+    Raises:
+        CellError: there is none.
+    """
+    low, high = study.min_diameter_um, cell.widest_um(study.min_gap_um)
+    if low >= high:
+        raise CellError(
+            f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "
+            f"{high:g} um, below min_diameter_um = {low:g}"
+        )
+    return low, high
 
 
 def curve_of(result: workers.Result, tolerance: float) -> Curve:
@@ -148,8 +182,9 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
 
 
 def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
-    """Angle of incidence in air up to which no order propagates: sin = wavelength / pitch - n of the substrate."""
-    sine = wavelength_um / cell.pitch_um - index(cell.substrate, wavelength_um).real
+    """Angle of incidence in air up to which no order propagates: sin = wavelength / spacing of rows - largest n."""
+    n = max(index(material, wavelength_um).real for material in (cell.substrate, cell.cover))
+    sine = cell.lattice.least_order * wavelength_um / cell.pitch_um - n
     return math.degrees(math.asin(min(1.0, max(0.0, sine))))
 
 
@@ -170,7 +205,7 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
     lines = [
         "# Cell study",
         "",
-        f"Round pillars of {named(study.pillar)} on fused silica in air. Printable: diameter from "
+        f"{_subject(study)}. Printable: diameter from "
         f"{1e3 * study.min_diameter_um:g} nm to the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, "
         "in turns, that the longest stretch of diameters covers on which the phase rises, |t| >= "
         f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
@@ -190,6 +225,14 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
     return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
 
 
+def _subject(study: Study) -> str:
+    """What the pillars are, in words."""
+    if study.cell is None:
+        return f"Round pillars of {named(study.pillar)} on fused silica in air"
+    substrate, cover = named(study.cell.substrate), named(study.cell.cover)
+    return f"Pillars of {named(study.material)} on {substrate} under {cover}: {study.cell.described}"
+
+
 def named(material: Material) -> str:
     """A material in words."""
     if isinstance(material, Blend):
@@ -199,7 +242,7 @@ def named(material: Material) -> str:
 
 
 def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    return [v for v in verdicts if v.pillar == named(study.pillar)]
+    return [v for v in verdicts if v.pillar == named(study.material)]
 
 
 def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:

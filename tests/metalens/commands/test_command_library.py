@@ -145,3 +145,37 @@ def test_study(tmp_path, capsys):
     path.write_text(STUDY)
     assert main(["study", str(path), "-o", str(tmp_path / "no" / "study")]) == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+ANY_CELL = """
+pitches_um = [0.62]
+heights_um = [0.9]
+wavelengths_um = [1.55]
+min_diameter_um = 0.3
+min_gap_um = 0.24
+tolerance = 1e-1
+[cell]
+pitch_um = 1.0
+pillar = "Si-infrared"
+substrate = "sapphire"
+"""
+
+
+def test_study_of_any_cell_within_a_process(tmp_path, capsys):
+    path, process, out = tmp_path / "study.toml", tmp_path / "process.toml", tmp_path / "study"
+    path.write_text(ANY_CELL)
+    process.write_text("[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n")
+    assert main(["study", str(path), "--process", str(process), "-o", str(out), "--json"]) == 1  # a stretch this short
+    page = (out / "README.md").read_text()
+    assert "Pillars of Si-infrared on sapphire under air: circle on a square lattice" in page
+    found = json.loads((out / "cell_study.json").read_text())
+    assert found["study"]["min_diameter_um"] >= 0.31
+    assert 0.23 <= found["study"]["min_gap_um"] < 0.24  # 0.24 between drawn polygons, whose flats lie inside the circle
+    verdict = found["verdicts"][0]
+    assert verdict["pitch_um"] == 0.62
+    assert verdict["pillar"] == "Si-infrared"
+    assert verdict["max_angle_deg"] == pytest.approx(48.9, abs=0.4)  # sin = 1.55/0.62 - 1.7462
+    capsys.readouterr()
+    path.write_text(ANY_CELL.replace("[cell]", 'pillar = "Si"\n[cell]'))
+    assert main(["study", str(path), "-o", str(out), "--force"]) == 2
+    assert "give pillar inside cell" in capsys.readouterr().err
