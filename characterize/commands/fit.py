@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from characterize.bench import Truth
 from characterize.captures import capture as captures
 from characterize.commands import report
 from characterize.inference import AsBuilt, asbuilt, fit
@@ -37,6 +38,7 @@ class Options(Common):
         design: lens file of the metalens that was captured.
         metrology: TOML of other measurements (``[[known]]`` name, value, sigma) and of what to fit beyond the usual.
         pupil: TOML of what is known of a generic lens (numerical_aperture, wavelength_um, pixel_um, step_um ...).
+        truth: TOML of a virtual bench (that of ``capture --truth``): its hidden values are drawn in the report.
         insist: write a result that fails its checks too (exit 1, problems listed).
         output: file to write; a report lies beside it as .html.
     """
@@ -46,6 +48,7 @@ class Options(Common):
     design: Path | None = None
     metrology: Path | None = None
     pupil: Path | None = None
+    truth: Path | None = None
     insist: bool = False
 
 
@@ -56,6 +59,8 @@ def run(options: Options) -> int:
         raise ConfigError(f"{target}: need a name that ends in .h5")
     if (options.design is None) == (options.pupil is None):
         raise ConfigError("give either --design lens.h5 (a metalens) or --pupil pupil.toml (any other lens)")
+    if options.truth is not None and options.pupil is not None:
+        raise ConfigError("--truth is of a virtual bench of a metalens: it goes with --design, not with --pupil")
     if options.pupil is not None:
         return _run_pupil(options, options.pupil, target)
     return _run_lens(options, options.design or Path(), target)
@@ -65,10 +70,12 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     lens, shots = lenses.load(design), captures.load(options.capture)
     told = config.load(options.metrology, Metrology) if options.metrology else Metrology()
     choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
+    truth = config.load(options.truth, Truth) if options.truth else None
+    hidden = {k.name: k.value for k in truth.parameter} if truth else None
     with options.claim(target, beside=report.BESIDE) as draft:
         result = dataclasses.replace(fit(shots, lens, choice), provenance=_provenance(options, design))
         asbuilt.save(draft.path, result)
-        report.asbuilt_report(draft.path.with_suffix(".html"), result)
+        report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
     options.console.result(_lens_values(result), _lens_text(result, target))
     return 0 if result.trusted else 1
 

@@ -1,17 +1,17 @@
 """One page on a fit: pictures of measured, predicted and residual, parameters with intervals, cautions in words."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from characterize.inference import AsBuilt, invert
+from characterize.inference import AsBuilt, invert, posterior
 from characterize.model import PARAMETERS, PLACE
 from characterize.pupil import PupilFit
 from metalens.ground import report, store
 from metalens.ground.arrays import Array
 
-BESIDE = (".html", "_frames.png", "_parameters.png")  # endings of what lies beside a fit
+BESIDE = (".html", "_frames.png", "_parameters.png", "_posterior.png")  # endings of what lies beside a fit
 
 
 def pupil_report(path: Path, fit: PupilFit) -> None:
@@ -39,10 +39,11 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
     report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
 
 
-def asbuilt_report(path: Path, result: AsBuilt) -> None:
-    """Write the page of an as-built lens, and its two pictures beside it (``_frames.png``, ``_parameters.png``).
+def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | None = None) -> None:
+    """Write the page of an as-built lens, and its pictures beside it: frames, parameters, posterior (``_NAME.png``).
 
-    As designed, measured, built and residual of every frame; intervals; correlations; what to measure next.
+    As designed, measured, built and residual of every frame; intervals; the posterior of each parameter as a curve;
+    correlations; what to measure next. ``truth``: hidden values by name, where they are known, drawn beside the fit.
     """
     sure = float(np.mean([s < 0.5 * scale(name) for name, s in zip(result.names, result.sigma, strict=True)]))
     keys = [
@@ -52,6 +53,7 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
         report.KeyFigure("parameters", f"{len(result.names)}, {sure:.0%} well known"),
     ]
     pictures = {"frames": _every_frame(result), "parameters": _intervals(result)}
+    pictures |= {"posterior": _posterior(result, truth or {})} if result.curves else {}
     for name, picture in pictures.items():
         store.write_bytes(path.with_name(f"{path.stem}_{name}.png"), picture)
     seen = (
@@ -66,6 +68,7 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
         report.Section("What is known", "\n\n".join(result.verdicts)),
         report.Section("Frames", result.reason + ".", [report.Figure(pictures["frames"], seen, wide=True)]),
         report.Section("Parameters", "", [report.Figure(pictures["parameters"], bars, wide=True), _parameters(result)]),
+        *_curves(pictures, truth),
         report.Section("What goes together", "", [correlated]),
         report.Section("What the frames fix", "\n\n".join(result.identifiable)),
         report.Section(
@@ -77,6 +80,54 @@ def asbuilt_report(path: Path, result: AsBuilt) -> None:
         sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
     lead = "The lens that was really made, from what the bench saw: how it differs from the design, and how surely."
     report.write(path, "The lens as built", sections, lead=lead, key_figures=keys)
+
+
+def _curves(pictures: dict[str, bytes], truth: Mapping[str, float] | None) -> list[report.Section]:
+    if "posterior" not in pictures:
+        return []
+    caption = (
+        "What the frames and prior knowledge leave open about each parameter, the 95 % interval shaded. Grey bars: "
+    )
+    caption += "draws, where the posterior is bent or double. Grey line: the design."
+    caption += " Red line: the hidden truth." if truth is not None else ""
+    return [
+        report.Section("Posterior of each parameter", "", [report.Figure(pictures["posterior"], caption, wide=True)])
+    ]
+
+
+def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
+    """Small curves, four in a row: density by profile, draws where there are any, interval, design and truth."""
+    from matplotlib.figure import Figure
+
+    names = [name for name in result.names if name in result.curves]
+    rows = -(-len(names) // 4)
+    figure = Figure(figsize=(9, 1.35 * rows + 0.2))
+    axes = figure.subplots(rows, 4, squeeze=False, gridspec_kw={"hspace": 0.9, "wspace": 0.12}).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, name in zip(axes, names, strict=False):
+        low, high = result.interval(name)
+        hidden = [truth[name]] if name in truth else []
+        reach = 0.4 * (high - low)
+        ends = min([low - reach, *hidden]), max([high + reach, *hidden])
+        at = np.linspace(ends[0] - 0.02 * reach, ends[1] + 0.02 * reach, 300)
+        curve = posterior.density(result.curves[name], at)
+        axis.set_axis_on()
+        axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
+        axis.plot(at, curve, color="#1f6feb", linewidth=1.2)
+        if len(result.draws):
+            drawn = result.draws[:, result.names.index(name)]
+            axis.hist(drawn, bins=24, range=(at[0], at[-1]), density=True, color="#999", alpha=0.5)
+        if at[0] < 0 < at[-1]:
+            axis.axvline(0, color="#888", linewidth=0.7)
+        for value in hidden:
+            axis.axvline(value, color="#d1242f", linewidth=1.2)
+        axis.set_title(name, fontsize=7, pad=2)
+        axis.set_yticks([])
+        axis.tick_params(labelsize=6)
+        for side in ("top", "right", "left"):
+            axis.spines[side].set_visible(False)
+    return report.png(figure)
 
 
 def _parameters(result: AsBuilt) -> report.Table:

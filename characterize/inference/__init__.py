@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from characterize.inference import asbuilt as asbuilt
     from characterize.inference import leastsquares as leastsquares
+    from characterize.inference import posterior as posterior
     from characterize.inference.asbuilt import AsBuilt as AsBuilt
     from characterize.inference.estimate import Options as Options
     from characterize.inference.estimate import fit as fit
@@ -29,5 +30,6 @@ __getattr__, __dir__, __all__ = attach(
         "fit": "estimate",
         "invert": "leastsquares",
         "leastsquares": "",
+        "posterior": "",
     },
 )

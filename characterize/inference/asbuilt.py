@@ -55,6 +55,7 @@ class AsBuilt:
     residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty where none was kept.
     low, high: (p,) 95 % intervals by profile over all valleys; draws: (m, p) of the posterior where it is no parabola.
     verdicts: how well the PSF is known, and how well the process, in words.
+    curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there with all others fitted.
     psf: of the lens as built at the true depths of the captures, (angle, depth, y, x); None before it is computed.
     """
 
@@ -84,6 +85,7 @@ class AsBuilt:
     high: Array = field(default_factory=lambda: np.empty(0))
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
     verdicts: tuple[str, ...] = ()
+    curves: dict[str, Array] = field(default_factory=dict)
     psf: PsfStack | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -204,6 +206,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
             arrays[name] = getattr(result, name)
     if len(result.residual_modes):
         arrays["residual_modes"] = result.residual_modes
+    arrays |= {f"curves/{name}": curve for name, curve in result.curves.items()}
     arrays |= {"response/coefficients": result.response.coefficients}
     if result.response.solved is not None:
         solved = result.response.solved
@@ -245,6 +248,7 @@ def load(path: str | Path) -> AsBuilt:
         response=_response(a, about),
         psf=_psf(a),
         residual_modes=a.get("residual_modes", np.empty(0)),
+        curves={name.removeprefix("curves/"): a[name] for name in a if name.startswith("curves/")},
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],
         chi2_per_dof=about["chi2_per_dof"],

@@ -188,6 +188,7 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
         high=np.maximum(found.high, solution.value + explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
         draws=found.draws,
+        curves={name: np.stack([one.value, one.rise]) for name, one in found.profiles.items()},
         verdicts=(
             _psf_verdict(captured, between, unseen),
             verdict.process_verdict(names, found.low, found.high, _told(task, found)),

@@ -143,6 +143,23 @@ def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile
     return Profile(ends[0], ends[1], value, rise, plain), better
 
 
+def density(curve: Array, at: Array) -> Array:
+    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its profile (2, points) by value.
+
+    The signed root of the rise, straight where the valley is a parabola, runs linearly between the points and beyond.
+    """
+    value, keep = np.unique(curve[0], return_index=True)
+    root = np.sqrt(np.maximum(curve[1][keep], 0.0))
+    root = np.where(np.arange(len(value)) < int(np.argmin(root)), -root, root)
+    ends = (root[1] - root[0]) / (value[1] - value[0]), (root[-1] - root[-2]) / (value[-1] - value[-2])
+    seen = np.interp(at, value, root)
+    seen = np.where(at < value[0], root[0] + ends[0] * (at - value[0]), seen)
+    seen = np.where(at > value[-1], root[-1] + ends[1] * (at - value[-1]), seen)
+    fine = np.linspace(value[0], value[-1], 2001)
+    whole = np.trapezoid(np.exp(-(np.interp(fine, value, root) ** 2) / 2), fine)
+    return np.asarray(np.exp(-(seen**2) / 2) / whole)
+
+
 def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tuple[float, float]], Array | None]:
     """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
     mode, sigma, along = valley.mode, float(valley.sigma[i]), sign * valley.along(i)

@@ -199,10 +199,11 @@ def _bench(files: ChainFiles) -> Iterator[Stage]:
     yield Stage(
         "The lens as built",
         "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
-        ("fit", "captures", "--design", measured, *metrology, "-o", "asbuilt.h5"),
+        ("fit", "captures", "--design", measured, "--truth", "bench_truth.toml", *metrology, "-o", "asbuilt.h5"),
         ("chi2_per_dof", "chi² per degree of freedom, 1 where model and noise explain the frames"),
         (
             ("asbuilt_frames.png", "As designed, measured, as built, and the residual in standard deviations."),
+            ("asbuilt_posterior.png", "Posterior of each parameter, its 95 % interval, and in red the hidden truth."),
             ("asbuilt_parameters.png", "Fitted parameters with their 95 % intervals."),
         ),
     )

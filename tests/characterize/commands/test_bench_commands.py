@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -12,6 +13,7 @@ import bench_lens as b
 import characterize
 from characterize.inference import asbuilt
 from metalens import lens as lenses
+from metalens import psf
 from metalens.cli import main
 from metalens.ground import store
 
@@ -61,15 +63,38 @@ def test_capture_then_fit(bench, capsys):
     (bench / "told.toml").write_text('scan_um = 60.0\n[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n')
     capsys.readouterr()
     words = ["fit", str(bench / "shots"), "--design", str(bench / "lens.h5"), "--metrology", str(bench / "told.toml")]
+    words += ["--truth", str(bench / "truth.toml")]
     assert main([*words, "-o", str(bench / "as.h5"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     value, sigma = found["parameters"]["bias_nm"]
     assert abs(value - 3.0) < 4 * sigma
     assert asbuilt.load(bench / "as.h5").trusted
     assert (bench / "as.html").stat().st_size > 20000
+    assert (bench / "as_posterior.png").stat().st_size > 10000
+    page = (bench / "as.html").read_text(encoding="utf-8")
+    assert "the hidden truth" in page
+    the_psfs_are_those_of_the_made_lens(bench)
     for shown, title in (("shots", "Frames"), ("as.h5", "Captured less fitted")):
         assert main(["view", str(bench / shown), "-o", str(bench / "page.html"), "--force", "--quiet"]) == 0
         assert f'"title": "{title}"' in (bench / "page.html").read_text(encoding="utf-8")
+
+
+def the_psfs_are_those_of_the_made_lens(bench):
+    """``metalens psf`` of an as-built file: the record's own PSFs, and not those of the design."""
+    (bench / "psf.toml").write_text(
+        "depths_mm = [0.5, 0.7, 0.2]\nangles_deg = [0.0]\nwindow_um = 24.0\nsamples = 32\ntolerance = 1e-3\n"
+    )
+    for source in ("as", "lens"):
+        words = ["psf", str(bench / f"{source}.h5"), "--config", str(bench / "psf.toml"), "--quiet"]
+        assert main([*words, "-o", str(bench / f"{source}_psf.h5")]) == 0
+    built, design = (psf.load(bench / f"{name}_psf.h5").intensity for name in ("as", "lens"))
+    want = (
+        asbuilt.load(bench / "as.h5")
+        .psf_stack(psf.View((500.0, 700.0), ((0.0, 0.0),), 24.0, 32), tolerance=1e-3)
+        .intensity
+    )
+    assert np.array_equal(built, want)
+    assert np.abs(design / design.max() - want / want.max()).max() > 0.02
 
 
 def test_bad_words_end_with_2_and_leave_nothing(bench):

@@ -1,10 +1,12 @@
 """Profiles and draws where the answer is a formula: a straight model, a bent one, and one with two lenses alike."""
 
+import math
+
 import numpy as np
 import pytest
 
 from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import REACH, Valley, draws, profile, shares
+from characterize.inference.posterior import REACH, Valley, density, draws, profile, shares
 
 NOISE = 0.7
 SHAPES = np.random.default_rng(0).standard_normal((2, 3, 11, 13))
@@ -111,3 +113,16 @@ def test_a_profile_that_falls_below_its_mode_says_where():
     place, misfit = valley.descend(wrong)
     assert misfit < valley.least - 5
     assert place[0] + 0.25 * place[0] ** 2 == pytest.approx(amplitude[0], abs=0.02)
+
+
+def test_the_density_of_a_parabola_is_the_normal_one_and_of_a_bent_profile_two_halves():
+    at, z = np.linspace(2.0, 6.0, 41), np.array([-2.5, -1.0, 0.0, 1.0, 2.5])
+    want = np.exp(-(((at - 4.1) / 0.7) ** 2) / 2) / (0.7 * math.sqrt(2 * math.pi))
+    assert density(np.array([4.1 + 0.7 * z, z**2]), at) == pytest.approx(
+        want, rel=0.014
+    )  # tails beyond 2.5 sigma: 1.2 %
+    bent = np.array([4.1 + np.where(z > 0, 1.1, 0.3) * z, z**2])
+    left, middle, right = density(bent, np.array([4.1 - 0.6, 4.1, 4.1 + 2.2]))
+    assert left == pytest.approx(right, rel=1e-12)  # two sigma of its own side each
+    assert left / middle == pytest.approx(math.exp(-2), rel=1e-12)
+    assert middle == pytest.approx(2 / (1.4 * math.sqrt(2 * math.pi)), rel=0.014)
