@@ -6,17 +6,35 @@ covariance in typical units (A), then exchanged one by one as long as that helps
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from characterize.inference import invert
+from characterize.inference import invert, posterior
 from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
 from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
+from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
 from metalens.made import Sensitivity
+
+REACH = posterior.REACH
+_DEFOCUS_WAVES = 0.5  # at the rim: below, images are those of the focus, in which even errors act in second order
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """An interval that the session is to give: half of the 95 % interval of a parameter, in its unit."""
+
+    name: str
+    within: float
+
+    def __post_init__(self) -> None:
+        if self.name not in PLACE:
+            raise FitError(f"wanted {self.name!r}: no such parameter{nearest(self.name, NAMES)}")
+        if not (self.within > 0 and math.isfinite(self.within)):
+            raise FitError(f"wanted {self.name}: within = {self.within}; need a finite number above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +47,7 @@ class Protocol:
     peak_e: electrons in the brightest pixel of all candidates at exposure 1. full_well_e, read_noise_e: of the sensor.
     pixel_um, pixels: of the sensor and of the window about the image.
     free, known: as in the metrology of ``metalens fit``.
+    wanted: intervals (name, within): no more frames are taken than they need, and what falls short is said.
     """
 
     depths_um: tuple[float, float]
@@ -44,6 +63,7 @@ class Protocol:
     pixels: int = field(default=32, metadata={"above": 0})
     free: tuple[str, ...] = ()
     known: tuple[Known, ...] = ()
+    wanted: tuple[Wanted, ...] = ()
 
     def __post_init__(self) -> None:
         near, far = self.depths_um
@@ -63,6 +83,7 @@ class Plan:
     depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,) expected standard errors with them.
     even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and the first angle.
     gain: (n,) criterion after each frame, relative to the last (1 at the end).
+    warnings: what these frames will not tell, in words.
     """
 
     depth_um: Array
@@ -72,6 +93,7 @@ class Plan:
     sigma: Array
     even_sigma: Array
     gain: Array
+    warnings: tuple[str, ...] = ()
 
 
 def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
@@ -85,12 +107,67 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     names, prior = _parameters(protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
     chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names)
-    even = _even(candidates, protocol)
+    chosen = chosen[: _needed(information, prior, chosen, names, protocol.wanted)]
+    even = _even(candidates, protocol, len(chosen))
     values = [score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names) for i in range(len(chosen))]
     covariances = [invert(prior + information[pick].sum(0)) for pick in (chosen, even)]
     sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
     depth, angle, exposure = candidates[chosen].T
-    return Plan(depth, angle, exposure, names, sigma, even_sigma, np.array(values) / values[-1])
+    words = (*_short(names, sigma, protocol.wanted, len(chosen)), *_blind(lens, protocol, depth))
+    return Plan(depth, angle, exposure, names, sigma, even_sigma, np.array(values) / values[-1], words)
+
+
+def _needed(
+    information: Array, prior: Array, chosen: list[int], names: tuple[str, ...], wanted: Sequence[Wanted]
+) -> int:
+    """How many of the chosen frames, in their order, give all intervals that are wanted; all of them where none do."""
+    places = [(names.index(w.name), w.within) for w in wanted if w.name in names]
+    if not places:
+        return len(chosen)
+    for count in range(1, len(chosen)):
+        sigma = np.sqrt(np.diag(invert(prior + information[chosen[:count]].sum(0))))
+        if all(REACH * sigma[i] <= within for i, within in places):
+            return count
+    return len(chosen)
+
+
+def _short(names: tuple[str, ...], sigma: Array, wanted: Sequence[Wanted], count: int) -> list[str]:
+    """Intervals that are wanted and not reached, with the light that they would take."""
+    words = []
+    for one in wanted:
+        if one.name not in names:
+            words.append(f"{one.name} is held, not fitted: no frame changes its interval")
+            continue
+        reach = REACH * float(sigma[names.index(one.name)])
+        if reach > one.within * (1 + 1e-9):
+            more = (reach / one.within) ** 2
+            words.append(
+                f"{one.name} will be known to +- {reach:.2g}, wanted +- {one.within:.2g}: {more:.1f} times the light "
+                f"({math.ceil(count * more)} such frames), other depths or angles, or an independent measurement"
+            )
+    return words
+
+
+def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
+    """Ranges of depth whose images hide what is to be found: all in focus, or on one side of it."""
+    focus = lens.source_distance_um
+    if not (math.isfinite(focus) and focus > 0):
+        return []
+    ends = np.array([*protocol.depths_um, chosen_um.min(), chosen_um.max()])
+    waves = lens.diameters.radius_um**2 / 2 * np.abs(1 / ends - 1 / focus) / lens.wavelength_um
+    words = []
+    if waves.max() < _DEFOCUS_WAVES:
+        words.append(
+            f"all depths are in focus (defocus of {waves.max():.2g} waves at most): a symmetric lens in focus fixes "
+            "its bias, height and even aberrations poorly; go on to half a wave or more on both sides"
+        )
+    elif chosen_um.min() > focus or chosen_um.max() < focus:
+        side = "farther" if chosen_um.min() > focus else "nearer"
+        words.append(
+            f"all frames are {side} than the focus at {focus:.4g} um: the signs of astigmatism, of spherical "
+            "aberration and of the bias hang on defocus alone; take some on the other side"
+        )
+    return words
 
 
 def candidate_information(
@@ -156,6 +233,6 @@ def _parameters(protocol: Protocol) -> tuple[tuple[str, ...], Array]:
     return names, np.diag([s**-2.0 for s in sigma])
 
 
-def _even(candidates: Array, protocol: Protocol) -> list[int]:
+def _even(candidates: Array, protocol: Protocol, count: int) -> list[int]:
     usual = np.flatnonzero((candidates[:, 1] == protocol.angles_deg[0]) & (candidates[:, 2] == protocol.exposures[0]))
-    return [int(usual[i]) for i in np.linspace(0, len(usual) - 1, protocol.frames).round().astype(int)]
+    return [int(usual[i]) for i in np.linspace(0, len(usual) - 1, count).round().astype(int)]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -24,13 +25,14 @@ class Options(Common):
         output: folder of captures to write; with --protocol the stage.csv of the frames to take.
         truth: TOML of the hidden as-built lens and of its captures (depths_um, parameter, camera ...).
         protocol: TOML of what a real bench can do (depths_um, angles_deg, exposures, frames, peak_e ...): nothing is
-            captured, the frames that tell most about the lens are listed, with the errors to expect.
+            captured, the frames that tell most about the lens are listed, with the errors to expect; only as many as
+            the intervals that it wants ([[wanted]] name, within) need. --plan is the same.
     """
 
     lens: tyro.conf.Positional[Path]
     output: Output
     truth: Path | None = None
-    protocol: Path | None = None
+    protocol: Annotated[Path | None, tyro.conf.arg(aliases=["--plan"])] = None
 
 
 def run(options: Options) -> int:
@@ -50,10 +52,12 @@ def _plan(options: Options, path: Path) -> int:
     rows = _rows(found)
     values = {"file": str(target), "frames": rows, "gain": found.gain.tolist()}
     values |= {"sigma": dict(zip(found.names, found.sigma.tolist(), strict=True))}
+    values |= {"warnings": list(found.warnings)}
     values |= {"even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))}
     told = [f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}" for z, angle, time in rows]
     table = zip(found.names, found.sigma, found.even_sigma, strict=True)
     told += [f"  {n:<24} +- {s:.2g}  (evenly spread: {even:.2g})" for n, s, even in table]
+    told += [f"  note: {words}" for words in found.warnings]
     options.console.result(values, "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]))
     return 0
 

@@ -18,7 +18,8 @@ WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
 _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ALONG_NM = 9.0  # bias by which starts are moved along the valley
-_PROMISING, _MOST, _ROUGH = 40.0, 2, 5e-3
+_REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
+_PROMISING, _MOST, _ROUGH, _AGAIN = 40.0, 2, 5e-3, 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,7 +73,37 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
             break
         if all(_apart(one.value, end) > 2.0 for end in ends):
             ends.append(_long(task, one.value))
-    return distinct(ends)
+    return _mirrored(task, distinct(ends))
+
+
+def _mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
+    """The ends, and where their biases reversed lead: frames near focus look much alike with a gradient of either sign.
+
+    A few steps on all frames from each; what promises as much as the best is fitted to the end. Again from a new best.
+    """
+    settings = Settings(iterations=6, step_tolerance=0.5, secant=True, finish=False)
+    for _ in range(_AGAIN):
+        best = ends[0]
+        begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
+        tries = [leastsquares.fit(task.problem(), task.data, b, prior=task.prior, settings=settings) for b in begins]
+        close = [t for t in tries if t.merit < best.merit + _PROMISING and all(_apart(t.value, e) > 2.0 for e in ends)]
+        ends = distinct([*ends, *(_long(task, t.value) for t in close)])
+        if ends[0].merit > best.merit - 1:
+            break
+    return ends
+
+
+def reversals(task: Task, best: Solution) -> list[Array]:
+    """Starts with the sign of some biases turned round, all other parameters going along as the parabola says."""
+    places = [task.names.index(name) for name in _REVERSED if name in task.names]
+    sigma = np.sqrt(np.diag(best.covariance))
+    far = [i for i in places if abs(best.value[i]) > sigma[i]]
+    out = []
+    for some in [*([i] for i in far), *([far] if len(far) > 1 else [])]:
+        block = np.linalg.solve(best.covariance[np.ix_(some, some)], -2 * best.value[some])
+        moved = best.value + best.covariance[:, some] @ block
+        out.append(np.clip(moved, task.prior.low, task.prior.high))
+    return out
 
 
 def refine(task: Task, value: Array) -> Solution:

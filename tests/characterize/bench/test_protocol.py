@@ -1,5 +1,6 @@
 """Optimal design: against every possible choice, against evenly spread frames, and on the command line."""
 
+import dataclasses
 import itertools
 import json
 import sys
@@ -12,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import protocol
-from characterize.bench.protocol import Protocol
+from characterize.bench.protocol import Protocol, Wanted
 from metalens import lens as lenses
 from metalens.cli import main
 from metalens.ground.errors import FitError
@@ -69,6 +70,7 @@ def test_protocol_on_the_command_line(tmp_path, capsys):
     values = json.loads(capsys.readouterr().out)
     assert len(values["frames"]) == 2
     assert values["sigma"]["bias_nm"] > 0
+    assert "in focus" in values["warnings"][0]  # 0.23 waves
     lines = (tmp_path / "stage.csv").read_text().splitlines()
     assert lines[0] == "file,depth_um,angle_deg,exposure_s"
     assert len(lines) == 3
@@ -78,3 +80,29 @@ def test_protocol_on_the_command_line(tmp_path, capsys):
 def test_impossible_protocols_are_refused():
     with pytest.raises(FitError, match="nearest < farthest"):
         Protocol((2.0, 1.0))
+
+
+def test_no_more_frames_are_taken_than_the_wanted_intervals_need():
+    """The bound of one measurement repeated: with ten like frames of sigma 1, four give 0.5, 95 % within 0.98."""
+    same = np.full((3, 1, 1), 1.0)
+    prior, chosen = np.zeros((1, 1)), [0] * 10
+    for within, frames in ((1.95997 / 2, 4), (1.95995 / 2, 5), (1.9, 2), (0.1, 10)):
+        wanted = (Wanted("bias_nm", within),)
+        assert protocol._needed(same, prior, chosen, ("bias_nm",), wanted) == frames
+    words = protocol._short(("bias_nm",), np.array([0.5]), (Wanted("bias_nm", 0.49),), 4)
+    assert "4.0 times the light (16 such frames)" in words[0]
+
+
+def test_a_plan_in_focus_or_on_one_side_of_it_is_warned_of():
+    """R = 19.8 um, focus at 600 um: 196 um² (1 / 300 - 1 / 600) / 0.85 um = 0.38 waves, and 0.54 from 250 um."""
+    lens, both = b.lens(), np.array([250.0, 1150.0])
+    near = dataclasses.replace(WANTED, depths_um=(300.0, 1150.0))
+    words = protocol._blind(lens, near, np.array([300.0, 1150.0]))[0]
+    assert "0.38 waves" in words
+    assert "fixes its bias" in words
+    wide = dataclasses.replace(WANTED, depths_um=(250.0, 1150.0))
+    assert not protocol._blind(lens, wide, both)
+    assert "nearer than the focus at 600 um" in protocol._blind(lens, wide, np.array([250.0, 590.0]))[0]
+    assert "farther than the focus" in protocol._blind(lens, wide, np.array([610.0, 1100.0]))[0]
+    with pytest.raises(FitError, match="no such parameter"):
+        Wanted("bias", 1.0)
