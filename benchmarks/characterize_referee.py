@@ -60,6 +60,12 @@ FAULTS: dict[str, dict[str, float]] = {
     "illumination 15 % uneven": {"gradient": 0.15},
     "source of 8 um": {"source_um": 8.0},
 }
+DECLARED = {
+    "cover": "plate of glass",
+    "stitching": "write field",
+    "pixel": "pixel pitch",
+    "illumination": "illumination",
+}
 
 
 @functools.cache
@@ -94,6 +100,7 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
             inside[name] = bool(low <= values[name] <= high)
             error[name] = float((found.value[i] - values[name]) / math.sqrt(found.covariance[i, i]))
     words = [w for w in found.cautions if "residuals" in w or "left out" in w or "fitted too" in w or "phase of" in w]
+    declared = [w for w in found.degeneracies if "is not fitted" in w]
     return {
         "seed": seed,
         "seconds": seconds,
@@ -103,6 +110,7 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
         "chi2_per_dof": found.chi2_per_dof,
         "problems": list(found.problems),
         "words": words,
+        "declared": declared,
         "verdicts": list(found.verdicts),
     }
 
@@ -136,11 +144,13 @@ def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:
 
 
 def _fault_row(name: str, run: dict[str, Any]) -> Row:
-    """Share of the parameters outside their intervals; none where the fault was found or the fit refused."""
+    """Share of the parameters outside their intervals, and what is said: found, or that it would not be seen."""
     if "inside" not in run or run["problems"]:
         return Row(f"fault: {name}", "refused", run["seconds"], 0.0, "truth", goal="found, inside, or refused")
     outside = 1 - float(np.mean(list(run["inside"].values())))
-    told = "spoken of" if run["words"] else "silent"
+    cause = DECLARED.get(name.split(" ")[0], name)
+    said = any(cause in words for words in run.get("declared", ()))
+    told = "found" if run["words"] else "said to be taken for others" if said else "silent"
     return Row(f"fault: {name}", told, run["seconds"], outside, "truth", goal="found, inside, or refused")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import stage, tiff_tags
+from characterize.captures import colour, stage, tiff_tags
 from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, MetalensError
@@ -96,11 +96,14 @@ def load(path: str | Path) -> Capture:
         raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
 
 
-def read_images(path: Path) -> Array:
+def read_images(path: Path, channel: object = None) -> Array:
     """(n, y, x) images of one file, in its own number type.
 
+    Args:
+        channel: of colour images, "red", "green" or "blue"; what capture.toml says as ``channel``.
+
     Raises:
-        CaptureError: unknown, lossy, truncated or non-finite.
+        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or an unknown one.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY:
@@ -110,9 +113,9 @@ def read_images(path: Path) -> Array:
     if reader is None:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
     images = reader(path)
-    images = images[None] if images.ndim == 2 else images
-    if images.ndim != 3 or images.size == 0:
-        raise CaptureError(f"{path}: images of shape {images.shape}; need grey frames (n, y, x), not colour, not empty")
+    images = colour.pick(images[None] if images.ndim == 2 else images, channel, path)
+    if images.size == 0:
+        raise CaptureError(f"{path}: images of shape {images.shape} are empty")
     _check_values(images, path)
     return images
 
@@ -150,13 +153,15 @@ def right_align(images: Array, bits: int | None, where: str) -> tuple[Array, int
 
 
 def _load_file(path: Path) -> Capture:
-    about, images = stage.read_beside(path), read_images(path)
+    about = stage.read_beside(path)
+    channel = about.pop("channel", None)
+    images = read_images(path, channel)
     tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
     images, bits, note = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
     step = about.get("step_um", math.nan)
     position = np.arange(n) * step if math.isfinite(step) else tags.position_um
-    notes = [note, *tags.notes]
+    notes = [note, *tags.notes, *colour.notes(channel)]
     return Capture(
         images,
         position if len(position) == n else np.full(n, np.nan),
@@ -178,12 +183,13 @@ def _load_folder(folder: Path) -> Capture:
     files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
+    channel = about.pop("channel", None)
     if rows is None:
-        names, frames = _all_frames(files, folder)
+        names, frames = _all_frames(files, folder, channel)
         rows = stage.Rows.unknown(names)
     else:
-        frames = _listed_frames(folder, rows)
-    stacks = {name: read_images(p) for name, p in special.items()}
+        frames = _listed_frames(folder, rows, channel)
+    stacks = {name: read_images(p, channel) for name, p in special.items()}
     bits = about.pop("bits", None)
     frames, depth, note = right_align(frames, bits, str(folder))
     if "step_um" in about and not np.isfinite(rows.position_um).any():
@@ -201,23 +207,23 @@ def _load_folder(folder: Path) -> Capture:
         dark=extra.get("dark"),
         flat=extra.get("flat"),
         about=about,
-        corrections=(note,),
+        corrections=(note, *colour.notes(channel)),
     )
 
 
-def _all_frames(files: Sequence[Path], folder: Path) -> tuple[tuple[str, ...], Array]:
+def _all_frames(files: Sequence[Path], folder: Path, channel: object) -> tuple[tuple[str, ...], Array]:
     if not files:
         raise CaptureError(f"{folder}: no frames; need TIFF, PNG or HDF5 images in it")
     names: list[str] = []
     stacks = []
     for path in files:
-        images = read_images(path)
+        images = read_images(path, channel)
         names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
         stacks.append(images)
     return tuple(names), _join(stacks, files)
 
 
-def _listed_frames(folder: Path, rows: stage.Rows) -> Array:
+def _listed_frames(folder: Path, rows: stage.Rows, channel: object) -> Array:
     """The frames that the stage file names, in its order; pages of a stack where it names one file for all."""
     stacks: dict[str, Array] = {}
     images = []
@@ -225,7 +231,8 @@ def _listed_frames(folder: Path, rows: stage.Rows) -> Array:
         path = folder / name
         if not path.is_file():
             raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
-        stack = stacks.setdefault(name, read_images(path))
+        stack = stacks[name] if name in stacks else read_images(path, channel)
+        stacks[name] = stack
         if not 0 <= page < len(stack):
             raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
         images.append(stack[page][None])
@@ -290,8 +297,8 @@ def _read_png(path: Path) -> Array:
         raise CaptureError(f"{path}: not a readable PNG file ({error.err})") from None
     if image is None:
         raise CaptureError(f"{path}: truncated or not a PNG file")
-    if image.ndim != 2:
-        raise CaptureError(f"{path}: a colour image of shape {image.shape}; need grey frames, straight from the sensor")
+    if image.ndim == 3:  # blue comes first
+        return np.asarray(image[None][..., [2, 1, 0, 3][: image.shape[-1]]])
     return np.asarray(image)
 
 

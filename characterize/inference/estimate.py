@@ -157,7 +157,6 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
     model, data, solution, names = task.model, task.data, found.best, task.names
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
     bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
-    captured, between = explore.predicted_error(task, found)
     unseen = explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
     absent = missing.leans(task, solution) if gain.known else []
@@ -190,7 +189,7 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         draws=found.draws,
         curves={name: np.stack([one.value, one.rise]) for name, one in found.profiles.items()},
         verdicts=(
-            _psf_verdict(captured, between, unseen),
+            _psf_verdict(explore.predicted_error(task, found), unseen),
             verdict.process_verdict(names, found.low, found.high, _told(task, found)),
         ),
     )
@@ -219,7 +218,8 @@ def _told(task: Task, found: Posterior) -> Array:
     return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
 
 
-def _psf_verdict(captured: float, between: float, unseen: float) -> str:
+def _psf_verdict(known: tuple[float, float], unseen: float) -> str:
+    captured, between = known
     tested = "" if np.isnan(unseen) else f"; frames left out agree within {unseen:.2f} times their noise"
     return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them{tested}"
 

@@ -126,6 +126,30 @@ def test_colour_and_foreign_files_are_refused(tmp_path):
         capture.load(tmp_path / "b.tif")
 
 
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+@pytest.mark.parametrize(("channel", "place"), [("red", 0), ("green", 1), ("blue", 2)])
+def test_one_channel_of_colour_frames_is_taken_where_it_is_named(tmp_path, suffix, channel, place):
+    colours = np.random.default_rng(7).integers(0, 900, (2, 9, 14, 3)).astype(np.uint16) * np.array(
+        [1, 2, 4], np.uint16
+    )
+    for i, image in enumerate(colours):
+        path = tmp_path / f"frame_{i}.{suffix}"
+        if suffix == "png":
+            cv2.imwrite(str(path), image[..., ::-1])
+        else:
+            tifffile.imwrite(path, image, photometric="rgb")
+    (tmp_path / "capture.toml").write_text(f'bits = 12\nchannel = "{channel}"\n')
+    found = capture.load(tmp_path)
+    assert np.array_equal(found.frames, colours[..., place])
+    assert any(f"channel {channel}" in words for words in found.corrections)
+    (tmp_path / "capture.toml").write_text('channel = "infrared"\n')
+    with pytest.raises(CaptureError, match="channel = 'infrared'"):
+        capture.load(tmp_path)
+    (tmp_path / "capture.toml").write_text("bits = 12\n")
+    with pytest.raises(CaptureError, match='channel = "green"'):
+        capture.load(tmp_path)
+
+
 def test_imagej_tags_tell_pixel_and_step(tmp_path):
     frames = np.random.default_rng(0).integers(0, 900, (5, 20, 31), dtype=np.uint16)
     about = {"spacing": 0.25, "unit": "um", "axes": "ZYX"}
