@@ -1,7 +1,8 @@
 """lens.h5 or asbuilt.h5 to psf.h5: PSFs over depth, field angle and wavelength to a stated error, with plots."""
 
 import importlib
-from dataclasses import dataclass, replace
+import math
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Figure, KeyFigure, Section, Table, write
 from metalens.ground.store import Provenance, write_bytes
+from metalens.lens import Layers
 from metalens.psf import export as psf_export
 from metalens.psf import plots as psf_plots
 from metalens.psf import spectrum
@@ -25,6 +27,10 @@ CAPTIONS = {
     "information": "I(z) of Eq. 11 under two normalisations and three binnings; the normalisation decides the ranking.",
 }
 MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
+BUDGET_WORDS = (
+    "What computation and model are wrong by, each alone, the worst over angles: the terms of the model are those "
+    "of a perfect lens of the same aperture."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +42,11 @@ class Settings:
     window_um, samples: of the square window that follows the chief ray.
     led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
     tolerance: relative L2 error of the PSFs.
+    polarisation: ``scalar``, ``vector`` (Ex, Ey, Ez of both polarisations), or ``auto``: the scalar where its error is
+        below the tolerance.
+    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose product is the spectrum (LED,
+        filter, sensor).
+    layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
     """
 
     depths_mm: tuple[float, float, float] = (16.0, 26.0, 0.5)
@@ -45,6 +56,9 @@ class Settings:
     samples: int = 192
     led_fwhm_nm: float = 0.0
     tolerance: float = 1e-4
+    polarisation: psf.Polarisation = "scalar"
+    spectrum: tuple[Path, ...] = ()
+    layers: Layers | None = None
 
     def __post_init__(self) -> None:
         near, far, step = self.depths_mm
@@ -69,6 +83,8 @@ class Settings:
             raise ConfigError(
                 f"tolerance = {self.tolerance}, led_fwhm_nm = {self.led_fwhm_nm}: need 0 < tolerance < 1, width >= 0"
             )
+        if self.spectrum and self.led_fwhm_nm:
+            raise ConfigError("spectrum and led_fwhm_nm are both given: a measured spectrum holds the diode; give one")
 
     @property
     def view(self) -> psf.View:
@@ -89,8 +105,9 @@ class Options(Common):
         lens: lens.h5, or asbuilt.h5 for the lens that was made (its process and wave front included).
         output: the PSF file to write, .h5 (which all other commands read), .tif or .mat; plots are written beside it as
             NAME_xz.png and so on.
-        config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance; without
-            it 16 to 26 mm in steps of 0.5 mm at 0, 10 and 20 degrees.
+        config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance,
+            polarisation, spectrum, [[layers.front]] and [[layers.behind]]; without it 16 to 26 mm in steps of 0.5 mm at
+            0, 10 and 20 degrees.
         tolerance: relative L2 error, in place of the one in the settings.
         report: also write NAME.html.
     """
@@ -115,7 +132,7 @@ def run(options: Options) -> int:
         stack = _make(options, settings, draft.path)
     shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
-    text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}"
+    text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
     options.console.result(_summary(stack), text)
     return 0 if stack.converged else 1
 
@@ -136,30 +153,47 @@ def _stack(path: Path, settings: Settings) -> psf.PsfStack:
     """PSFs of a lens file, or of another kind of file that the command line knows a source for."""
     kind, provenance = store.load(path).kind, Provenance(config.dumps(settings), {path.name: store.sha256(path)})
     if kind in SOURCES:
-        if settings.led_fwhm_nm:
-            raise ConfigError(
-                f"{path}: led_fwhm_nm is for a design; this {kind} file has the wavelength that was fitted"
-            )
+        for name in ("led_fwhm_nm", "spectrum", "layers"):
+            if getattr(settings, name):
+                raise ConfigError(
+                    f"{path}: {name} is for a design; this {kind} file has the wavelength and layers that were fitted"
+                )
+        if settings.polarisation == "vector":
+            raise ConfigError(f"{path}: polarisation = 'vector' is for a design; a {kind} file is one scalar")
         found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
         return replace(found, provenance=provenance)
     made = lens.load(path)
-    nodes = _spectrum(made, settings)
-    return psf.from_lens(made, settings.view, tolerance=settings.tolerance, spectrum=nodes, provenance=provenance)
+    if settings.layers is not None:
+        made = replace(made, layers=settings.layers)
+    inputs = dict(provenance.inputs) | {file.name: store.sha256(file) for file in settings.spectrum if file.is_file()}
+    return psf.from_lens(
+        made,
+        settings.view,
+        tolerance=settings.tolerance,
+        spectrum=_spectrum(made, settings),
+        provenance=replace(provenance, inputs=inputs),
+        polarisation=settings.polarisation,
+    )
 
 
 def _spectrum(made: lens.Lens, settings: Settings) -> spectrum.Nodes | None:
     """Wavelengths of the diode, no more than the tolerance needs; None for one wavelength."""
-    if settings.led_fwhm_nm == 0:
+    if settings.led_fwhm_nm == 0 and not settings.spectrum:
         return None
     near = settings.depths_mm[0] * 1e3
     path = spectrum.path_span(made.diameters.radius_um, made.sensor_distance_um, near)
-    source = spectrum.Source(made.wavelength_um * 1e3, settings.led_fwhm_nm)
-    return spectrum.nodes(source, path_um=path, tolerance=max(settings.tolerance, 1e-4))
+    source: spectrum.Source | spectrum.Measured
+    if settings.spectrum:
+        source = spectrum.measured(settings.spectrum, within_um=made.proxy.wavelengths_um)
+    else:
+        source = spectrum.Source(made.wavelength_um * 1e3, settings.led_fwhm_nm)
+    return spectrum.nodes(source, path_um=path, tolerance=settings.tolerance / 2)
 
 
 def _summary(stack: psf.PsfStack) -> dict[str, object]:
     return {
         "error": stack.error,
+        "budget": {name: None if math.isnan(v) else v for name, v in asdict(_budget(stack)).items()},
         "tolerance": stack.tolerance,
         "converged": stack.converged,
         "reason": stack.reason,
@@ -167,6 +201,19 @@ def _summary(stack: psf.PsfStack) -> dict[str, object]:
         "angles_rad": stack.angles_rad.tolist(),
         "wavelengths_um": stack.wavelengths_um.tolist(),
     }
+
+
+def _budget(stack: psf.PsfStack) -> psf.Budget:
+    return stack.budget or psf.Budget(stack.error)
+
+
+def _budget_table(stack: psf.PsfStack) -> Table:
+    found = _budget(stack)
+    rows = [[name, "not known" if math.isnan(v) else f"{v:.2g}"] for name, v in asdict(found).items()]
+    rows += [["computed", f"{found.computed:.2g}"], ["of the device", f"{found.total:.2g}"]]
+    return Table(
+        ("cause", "relative L2"), rows, "The tolerance is about what is computed; outside is a share of light."
+    )
 
 
 def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None:
@@ -183,6 +230,10 @@ def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None
     write(
         path,
         "Point spread functions",
-        [Section("Pictures", items=figures), Section("Energy", f"Method: {stack.reason}.", [table])],
+        [
+            Section("Pictures", items=figures),
+            Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
+            Section("Energy", f"Method: {stack.reason}.", [table]),
+        ],
         key_figures=[KeyFigure("relative error", f"{stack.error:.2g}", stack.converged)],
     )

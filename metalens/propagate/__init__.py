@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from metalens.propagate.geometry import check_aperture as check_aperture
     from metalens.propagate.kernels import kernel as kernel
     from metalens.propagate.paths import chief_path as chief_path
+    from metalens.propagate.paths import cosines as cosines
     from metalens.propagate.verbs import angles as angles
     from metalens.propagate.verbs import angular_spectrum as angular_spectrum
     from metalens.propagate.verbs import case as case
@@ -51,6 +52,7 @@ __getattr__, __dir__, __all__ = attach(
         "check_aperture": "geometry",
         "chief_path": "paths",
         "choose": "choice",
+        "cosines": "paths",
         "draw": "estimate",
         "exact": "verbs",
         "field_at": "direct",

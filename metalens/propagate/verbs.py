@@ -160,14 +160,20 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
         (depth, y, x) complex, of the kind that came in.
 
     Raises:
-        PropagationError: the window is too large for the method; otherwise as :func:`exact`.
+        PropagationError: the window is too large for the method, a tolerance that is not above 0; otherwise as
+            :func:`exact`.
+
+    Sums are in float64 whatever comes in, so that a tighter tolerance is not lost in rounding.
     """
     import torch
 
     from metalens.propagate.window import field_windowed, plan
 
+    if not tolerance > 0:
+        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
-    made = plan(case(phase.shape, **geometry), tolerance, phase.dtype, phase.device)
-    field, _, _ = field_windowed(phase, level, made)
+    made = plan(case(phase.shape, **geometry), tolerance, torch.float64, phase.device)
+    field, _, _ = field_windowed(phase.double(), level.double(), made)
+    field = field.to(torch.complex(phase.new_zeros(()), phase.new_zeros(())).dtype)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from metalens.psf import export as export
     from metalens.psf import plots as plots
     from metalens.psf import spectrum as spectrum
+    from metalens.psf.budget import Budget as Budget
+    from metalens.psf.budget import scalar_error as scalar_error
+    from metalens.psf.of_lens import Polarisation as Polarisation
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import depth_samples as depth_samples
     from metalens.psf.of_lens import from_lens as from_lens
@@ -26,7 +29,9 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Budget": "budget",
         "Nodes": "spectrum",
+        "Polarisation": "of_lens",
         "PsfStack": "record",
         "Source": "spectrum",
         "View": "of_lens",
@@ -38,6 +43,7 @@ __getattr__, __dir__, __all__ = attach(
         "plots": "",
         "psf_stack": "stack",
         "save": "record",
+        "scalar_error": "budget",
         "spectrum": "",
     },
 )

@@ -23,6 +23,7 @@ from metalens.propagate import (
     relative_error,
 )
 
+MOVING = 1000  # by which the setting is tighter where the geometry carries gradients
 FINEST = 1e-12  # setting below which float64 has nothing left to give
 ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
@@ -31,11 +32,17 @@ KEPT = {torch.float32: 4e-8, torch.float64: 0.0}  # of intensities brought back 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Result:
-    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped."""
+    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped.
+
+    power: sum of squares of the transmission over the pillars, wavelengths weighted. sampling: error of an integration
+        over cells.
+    """
 
     intensity: torch.Tensor
     error: float
     reason: str
+    power: float
+    sampling: float = 0.0
 
 
 def intensity(
@@ -64,6 +71,8 @@ def intensity(
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
     # gradients see the kernel's error pillar by pillar, and at a focus their parts nearly cancel
     start = max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
+    if moving is not None:  # parts of a derivative in the geometry exceed it some hundred times
+        start, first = tolerance / MOVING, torch.float64
     tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
     for setting, dtype in tries:
         result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, max(setting, FINEST), moving)
@@ -71,14 +80,15 @@ def intensity(
         if error <= tolerance:
             break
     error = math.hypot(error, KEPT[phase.dtype])
-    return Result(result.intensity.to(phase.dtype), error, result.reason)
+    return Result(result.intensity.to(phase.dtype), error, result.reason, result.power)
 
 
 def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights: list[float], reason: str) -> Result:
     arrays = [np.abs(field_exact(p.numpy(), t.numpy(), c)) ** 2 for p, t, c in zip(phase, level, cases, strict=True)]
     total = sum(w * a for w, a in zip(weights, arrays, strict=True))
     error = 1e-12 if phase.dtype == torch.float64 else 1e-7
-    return Result(torch.as_tensor(total).to(phase.dtype), error, reason)
+    power = sum(w * float((t.double() ** 2).sum()) for w, t in zip(weights, level, strict=True))
+    return Result(torch.as_tensor(total).to(phase.dtype), error, reason, power)
 
 
 def _windowed(
@@ -88,6 +98,7 @@ def _windowed(
     choice = choose(cases[0], tolerance, differentiable=True)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
     total: Any = 0
+    light = 0.0
     for p, t, case, weight in zip(*maps, cases, weights, strict=True):
         rows, index = [], 0
         for row in _windows(case, choice, tolerance):
@@ -102,11 +113,12 @@ def _windowed(
                 parts.append(field)
                 index += 1
             rows.append(torch.cat(parts, -1))
+        light += weight * power
         field = torch.cat(rows, -2)
         total = total + weight * (field.real**2 + field.imag**2)
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
         raise PropagationError("no light reaches the window at some depth; move or widen the window")
-    return Result(total, relative_error(samples), choice.reason)
+    return Result(total, relative_error(samples), choice.reason, light)
 
 
 def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:

@@ -1,8 +1,9 @@
 """PSF stack of a lens file: pillars through the proxy at every wavelength and angle."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -10,10 +11,14 @@ import torch
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
-from metalens.lens import Lens
+from metalens.lens import Lens, media
+from metalens.psf.budget import Budget, scalar_error, with_model, worst
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
+
+Polarisation = Literal["scalar", "vector", "auto"]
+AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,21 +41,26 @@ def from_lens(
     tolerance: float = 1e-4,
     spectrum: Nodes | None = None,
     provenance: Provenance | None = None,
+    polarisation: Polarisation = "scalar",
 ) -> PsfStack:
     """PSFs of a lens, (angle, depth, y, x), float32 where the tolerance allows it.
 
-    The proxy is asked at the angle of every direction where its library has angles, else at normal incidence. Light is
-    unpolarised: at an angle the proxy holds the mean of both polarisations, at normal incidence they are alike.
+    The proxy is asked at the angle of every direction where its library has angles, else at normal incidence, which
+    ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the proxy holds the mean of both
+    polarisations, at normal incidence they are alike. The lens' films and cover are gone through.
 
     Args:
-        spectrum: wavelengths and weights; by default the design wavelength alone.
+        spectrum: wavelengths and weights; by default the design wavelength alone. Its error is in the budget.
+        polarisation: one scalar, Ex, Ey, Ez of both polarisations, or ``auto``: the scalar where its error
+            (:func:`metalens.psf.scalar_error`) is below the tolerance.
 
     Raises:
         DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`.
     """
     nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
-    parts = []
+    share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
+    budgets, parts = [], []
     for angle in view.angles_rad:
         maps = [pillar_maps(lens, float(w), angle) for w in nodes.wavelengths_um]
         phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in maps]) for i in (0, 1))
@@ -66,11 +76,45 @@ def from_lens(
                 angle_rad=[list(angle)],
                 window_um=view.window_um,
                 samples=view.samples,
-                tolerance=tolerance,
+                tolerance=share,
                 layers=lens.layers,
+                vector=_vectorial(lens, angle, polarisation, tolerance),
             ).numpy()
         )
-    return _joined(parts, provenance or Provenance())
+        budgets.append(_budget(lens, angle, parts[-1], nodes, _vectorial(lens, angle, polarisation, tolerance)))
+    stack = _joined(parts, provenance or Provenance())
+    found = worst(budgets)
+    words = stack.reason if not found.angle else f"{stack.reason}; {AT_NORMAL}"
+    return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
+
+
+def _budget(lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, vector: bool) -> Budget:
+    """Of one direction: what was computed, and what the model of a lens leaves out."""
+    made = stack.budget or Budget(stack.error)
+    return with_model(
+        dataclasses.replace(made, spectrum=nodes.error),
+        aperture=aperture(lens, angle),
+        vector=vector,
+        incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
+        has_angles=lens.proxy.max_angle_rad > 0,
+        ghost=lens.layers.ghost(lens.wavelength_um),
+    )
+
+
+def _vectorial(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> bool:
+    if polarisation == "auto":
+        return scalar_error(aperture(lens, angle)) > tolerance
+    return polarisation == "vector"
+
+
+def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
+    """Half the spread in sin θ of the rays from the lens to the chief ray's place on the sensor."""
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
+    centre = float(media.reach(after, sine))
+    edges = centre + np.array([-1.0, 1.0]) * (lens.diameters.radius_um + lens.diameters.pitch_um / 2)
+    p = np.sign(edges) * media.direction(after, np.abs(edges))
+    return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
 def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:
@@ -116,5 +160,5 @@ def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
         n: np.concatenate([getattr(p, n) for p in parts])
         for n in ("intensity", "energy_um2", "angles_rad", "centres_um")
     }
-    worst = max(parts, key=lambda p: p.error)
-    return dataclasses.replace(parts[0], **join, error=worst.error, reason=worst.reason, provenance=provenance)
+    least = max(parts, key=lambda p: p.error)
+    return dataclasses.replace(parts[0], **join, error=least.error, reason=least.reason, provenance=provenance)

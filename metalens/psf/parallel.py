@@ -15,6 +15,7 @@ import torch
 import torch.distributed as dist
 
 from metalens.ground.errors import PropagationError
+from metalens.psf.budget import Budget
 from metalens.psf.record import PsfStack
 from metalens.psf.stack import psf_stack
 
@@ -176,4 +177,5 @@ def _completed(stack: PsfStack, found: dict[str, Any], axis: Axis, arguments: di
         for name in ("angles_rad", "centres_um"):
             part = torch.as_tensor(getattr(stack, name), device=stack.intensity.device)
             found[name] = gather(part, len(arguments["angle_rad"])).cpu().numpy()
-    return dataclasses.replace(stack, **found, error=float(worst))
+    budget = dataclasses.replace(stack.budget or Budget(float(worst)), numerical=float(worst))
+    return dataclasses.replace(stack, **found, error=float(worst), budget=budget)

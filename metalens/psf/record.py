@@ -13,6 +13,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.propagate import axis
+from metalens.psf.budget import Budget
 
 
 @functools.lru_cache(maxsize=1)
@@ -31,7 +32,8 @@ class PsfStack:
     depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are; wavelengths are summed with the weights.
     step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a row per angle.
     sensor_distance_um: lens to sensor. tolerance: that was asked for.
-    error: estimated relative L2 error of the intensity, the worst over angles and lenses; reason: method, and why.
+    error: estimated relative L2 error of the intensity as computed, the worst over angles and lenses, which the
+        tolerance is about. budget: the same by cause, with what the model leaves out. reason: method, and why.
     """
 
     intensity: Any
@@ -47,6 +49,20 @@ class PsfStack:
     error: float
     reason: str
     provenance: Provenance = field(default_factory=_made_here)
+    budget: Budget | None = None
+
+    def __post_init__(self) -> None:
+        if self.budget is None:
+            object.__setattr__(self, "budget", Budget(self.error))
+
+    @property
+    def irradiance_per_um2(self) -> Array:
+        """(angle, depth) irradiance on the lens plane from a point source of intensity 1 per steradian: cos³θ / z².
+
+        ``energy_um2`` times it is the power in the window: energies of angles and depths then compare. 0 at infinity.
+        """
+        steep = 1 + (np.tan(np.asarray(self.angles_rad)) ** 2).sum(-1, keepdims=True)
+        return np.asarray(steep**-1.5 / np.asarray(self.depths_um) ** 2)
 
     @property
     def x_um(self) -> Array:
@@ -81,6 +97,7 @@ def save(path: str | Path, stack: PsfStack) -> None:
     plain = stack.numpy()
     arrays = {name: np.asarray(getattr(plain, name)) for name in ("intensity", "energy_um2", *_AXES)}
     about = {name: getattr(plain, name) for name in _NUMBERS}
+    about |= {f"budget_{name}": value for name, value in dataclasses.asdict(_budget(plain)).items()}
     store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
 
 
@@ -93,4 +110,10 @@ def load(path: str | Path) -> PsfStack:
     """
     stored = store.load(path, "psf")
     fields: dict[str, Any] = {name: stored.attributes[name] for name in _NUMBERS} | stored.arrays
-    return PsfStack(**fields, provenance=stored.provenance)
+    terms = {f.name: stored.attributes.get(f"budget_{f.name}") for f in dataclasses.fields(Budget)}
+    budget = Budget(**{n: float(v) for n, v in terms.items() if v is not None}) if terms["numerical"] else None
+    return PsfStack(**fields, provenance=stored.provenance, budget=budget)
+
+
+def _budget(stack: PsfStack) -> Budget:
+    return stack.budget or Budget(stack.error)

@@ -1,6 +1,8 @@
 """LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -58,7 +60,69 @@ def weight(source: Source) -> tuple[Array, Array]:
     return um, value / value.sum()
 
 
-def nodes(source: Source, *, path_um: float, tolerance: float) -> Nodes:
+@dataclass(frozen=True, eq=False, slots=True)
+class Measured:
+    """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1."""
+
+    wavelengths_um: Array
+    share: Array
+
+
+def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measured:
+    """Product of measured curves (LED, filter, sensor), every 0.25 nm where all of them are known.
+
+    A file has two columns, wavelength in nm and value, parted by commas, semicolons or blanks; lines that start with #
+    or with a word are skipped. Values are interpolated linearly; a constant factor of each drops out.
+
+    Raises:
+        PropagationError: a file that is missing or no such table, curves without a common range, or light outside
+            ``within_um``, which the pillars are known for.
+    """
+    curves = [_curve(file) for file in files]
+    low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
+    if low >= high:
+        raise PropagationError(f"spectrum: {', '.join(map(str, files))} share no wavelength")
+    nm = np.arange(low, high + 1e-9, 0.25)
+    value = np.prod([np.interp(nm, c[:, 0], c[:, 1]) for c in curves], axis=0)
+    if not value.sum() > 0:
+        raise PropagationError(f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere")
+    share = value / value.sum()
+    lit = np.flatnonzero(share > 1e-4 * share.max())
+    nm, share = nm[lit[0] : lit[-1] + 1], share[lit[0] : lit[-1] + 1]
+    if within_um[1] > within_um[0] and not (
+        within_um[0] - 1e-6 <= nm[0] * 1e-3 and nm[-1] * 1e-3 <= within_um[1] + 1e-6
+    ):
+        raise PropagationError(
+            f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known from {within_um[0] * 1e3:g} to "
+            f"{within_um[1] * 1e3:g} nm: sweep a library over the spectrum"
+        )
+    return Measured(nm * 1e-3, share / share.sum())
+
+
+def _curve(file: Path) -> Array:
+    """(n, [nm, value]) of a file, ascending."""
+    rows = []
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PropagationError(f"{file}: cannot be read as a table of wavelength and value: {error}") from None
+    for number, line in enumerate(lines, 1):
+        words = line.replace(",", " ").replace(";", " ").split()
+        if not words or words[0][0] in "#\"'" or words[0][0].isalpha():
+            continue
+        try:
+            rows.append([float(words[0]), float(words[1])])
+        except (ValueError, IndexError):
+            raise PropagationError(f"{file}: line {number} is {line[:60]!r}, need wavelength in nm and value") from None
+    table = np.array(sorted(rows))
+    if len(rows) < 2 or not np.isfinite(table).all() or table[0, 0] < 100 or (table[:, 1] < 0).any():
+        raise PropagationError(f"{file}: need two rows or more of wavelength in nm (100 or more) and value (0 or more)")
+    if (np.diff(table[:, 0]) <= 0).any():
+        raise PropagationError(f"{file}: a wavelength stands twice; need one value for each")
+    return table
+
+
+def nodes(source: Source | Measured, *, path_um: float, tolerance: float) -> Nodes:
     """As few wavelengths as meet the tolerance.
 
     Args:
@@ -69,7 +133,7 @@ def nodes(source: Source, *, path_um: float, tolerance: float) -> Nodes:
     Raises:
         PropagationError: more than 64 wavelengths would be needed.
     """
-    um, share = weight(source)
+    um, share = (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
     paths = np.linspace(0, path_um, 65)[:, None]
     want = np.exp(2j * np.pi * paths / um) @ share
     for count in range(1, MOST_NODES + 1):
@@ -78,8 +142,8 @@ def nodes(source: Source, *, path_um: float, tolerance: float) -> Nodes:
         if error <= tolerance:
             return Nodes(x, w, error)
     raise PropagationError(
-        f"more than {MOST_NODES} wavelengths needed for paths of {path_um:.3g} um under a line of {source.fwhm_nm} nm; "
-        "raise the tolerance or narrow the line"
+        f"more than {MOST_NODES} wavelengths needed for paths of {path_um:.3g} um under a line from "
+        f"{um[0] * 1e3:.1f} to {um[-1] * 1e3:.1f} nm; raise the tolerance or narrow the line"
     )
 
 

@@ -1,6 +1,7 @@
 """PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,10 +11,13 @@ import torch
 from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.lens import Layers
+from metalens.lens import Layers, media
 from metalens.propagate import Case, Moving
+from metalens.psf.budget import Budget
+from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
 from metalens.psf.compute import Result, intensity
 from metalens.psf.record import PsfStack
+from metalens.psf.vector import expanded
 
 
 def psf_stack(
@@ -31,6 +35,8 @@ def psf_stack(
     weights: Sequence[float] | None = None,
     offset_um: Any = (0.0, 0.0),
     layers: Layers | None = None,
+    vector: bool = False,
+    integrate: bool = True,
 ) -> PsfStack:
     """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
 
@@ -45,6 +51,9 @@ def psf_stack(
         offset_um: (x, y) of the window from the chief ray.
         layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
             that in air, and what the sensor distance gains is cover.
+        integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
+        vector: Ex, Ey and Ez of both polarisations in place of one scalar (:mod:`metalens.psf.vector`); six times the
+            work.
 
     Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
     window moves with the chief ray, and so do the derivatives.
@@ -53,10 +62,15 @@ def psf_stack(
         PsfStack with intensity (…, [angle,] depth, y, x) of the kind and dtype that came in.
 
     Raises:
-        PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window.
+        PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window, a
+            tolerance that is not above 0.
 
-    Accuracy: ``error`` of the record, 1 to 3 times the true error.
+    A step too coarse for samples of |U|² (:func:`metalens.psf.cells.nyquist_um`) gives the mean over each cell.
+
+    Accuracy: ``error`` of the record, 1 to 3 times the true error; ``budget`` has its parts.
     """
+    if not tolerance > 0:
+        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
@@ -65,30 +79,68 @@ def psf_stack(
     cases, found = [], []
     for angle in angle_rad if several else [angle_rad]:
         seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
-        main = seen[int(share.argmax())]  # all wavelengths share its window
-        cases.append([dataclasses.replace(one, centre_um=main.centre_um) for one in seen])
-        moving = _moving(angle, depths_um, sensor_distance_um, offset_um, main)
-        found.append(_direction(maps, cases[-1], share.tolist(), tolerance, moving))
+        cases.append(seen[int(share.argmax())])  # all wavelengths share its window
+        moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
+        alike = [dataclasses.replace(one, centre_um=cases[-1].centre_um) for one in seen]
+        found.append(_direction((maps, alike, share.tolist()), tolerance, moving, vector=vector, integrate=integrate))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
     axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
-    stack = _record(light, [row[0] for row in cases], axes, worst, tolerance)
+    stack = _record(light, cases, axes, worst, tolerance)
+    budget = _budget(stack, worst, torch.stack([row[2] for row in found], -1) * pitch_um**2, several=several)
+    stack = dataclasses.replace(stack, budget=budget)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
+def _budget(stack: PsfStack, worst: Result, given_um2: torch.Tensor, *, several: bool) -> Budget:
+    """By cause; given_um2: (…, angle) light that leaves the pillars towards the sensor for unit irradiance."""
+    whole = given_um2[..., None] if several else given_um2
+    share = (stack.energy_um2.detach().cpu().double() / whole).min()
+    return Budget(worst.error, sampling=worst.sampling, outside=max(0.0, 1 - float(share)))
+
+
+def _passed(case: Case) -> float:
+    """Power that the faces behind the lens let through along the chief ray."""
+    if case.behind is None:
+        return 1.0
+    steep = 1 + case.tangents[0] ** 2 + case.tangents[1] ** 2
+    return float(media.passed_at(case.behind.order, 1 - 1 / steep))
+
+
 def _direction(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    cases: list[Case],
-    weights: list[float],
+    given: tuple[tuple[torch.Tensor, torch.Tensor], list[Case], list[float]],
     tolerance: float,
     moving: Moving | None,
-) -> tuple[torch.Tensor, list[Result]]:
-    """(…, depth, y, x) intensity of every lens in one direction, and the results it is made of."""
+    *,
+    vector: bool,
+    integrate: bool,
+) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
+    """(…, depth, y, x) intensity of every lens in one direction, the results it is made of, and (…) the sum of squares
+    of what its pillars let through the faces behind them.
+
+    given: maps, cases and weights of the wavelengths.
+    """
+    maps, cases, weights = given
+    if vector:
+        maps, cases, weights = expanded(maps, cases, weights)
     shape = maps[0].shape
     lenses = [m.reshape(-1, *shape[-3:]) for m in maps]
-    found = [intensity(p, t, cases, weights, tolerance=tolerance, moving=moving) for p, t in zip(*lenses, strict=True)]
-    light = torch.stack([result.intensity for result in found])
-    return light.view(*shape[:-3], *light.shape[1:]), found
+    shortest = min(cases, key=lambda case: case.wavelength_um)
+    for finer in FINER:
+        fine = cells(shortest, finer) if integrate else Cells(1, shortest)
+        seen = [dataclasses.replace(c, step_um=fine.case.step_um, samples=fine.case.samples) for c in cases]
+        each = zip(*lenses, strict=True)
+        found = [intensity(p, t, seen, weights, tolerance=tolerance, moving=moving) for p, t in each]
+        light, sampling = torch.stack([result.intensity for result in found]), 0.0
+        if fine.points > 1:
+            light, sampling = integrated(light, fine)
+        if sampling <= tolerance / 2 or max(fine.case.samples) > MOST / 2:
+            break
+    if fine.points > 1:
+        why = f"; light integrated over cells of {fine.points} x {fine.points} points"
+        found = [dataclasses.replace(r, sampling=sampling, reason=r.reason + why) for r in found]
+    power = torch.tensor([result.power for result in found], dtype=torch.float64).view(shape[:-3]) * _passed(cases[0])
+    return light.view(*shape[:-3], *light.shape[1:]), found, power
 
 
 def _record(
@@ -107,7 +159,7 @@ def _record(
         centres_um=np.array([c.centre_um for c in cases]),
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
-        error=worst.error,
+        error=math.hypot(worst.error, worst.sampling),
         reason=worst.reason,
     )
 

@@ -48,7 +48,8 @@ def compare(phase, level, *, dtype=torch.float64, tolerance=1e-6, **geometry):
     """(stack, true relative error); maps carry gradients so that the exact sum is never chosen."""
     arguments = GEOMETRY | geometry
     given = torch.tensor(phase, dtype=dtype, requires_grad=True)
-    stack = psf.psf_stack(given, torch.tensor(level, dtype=dtype), tolerance=tolerance, **arguments)
+    maps = given, torch.tensor(level, dtype=dtype)
+    stack = psf.psf_stack(*maps, tolerance=tolerance, integrate=False, **arguments)
     (stack.intensity**2).sum().backward()
     assert torch.isfinite(stack.intensity).all()
     assert torch.isfinite(given.grad).all()

@@ -1,0 +1,153 @@
+"""The parts of a PSF's error: cells against fine samples, polarisations against plane waves, light left outside."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from metalens import propagate, psf
+from metalens.ground import store
+from metalens.ground.errors import PropagationError
+from metalens.psf import spectrum
+from metalens.psf.cells import nyquist_um
+from tests.referees import vectorial
+
+WAVELENGTH, PITCH = 0.85, 0.3
+
+
+def lens(distance, count=150, radius=21.0, bend=0.0):
+    """Maps that focus collimated light at ``distance``; ``bend`` adds coma."""
+    axis = (np.arange(count) - (count - 1) / 2) * PITCH
+    x, y = axis, axis[:, None]
+    r2 = x**2 + y**2
+    phase = -2 * np.pi / WAVELENGTH * r2 / (np.sqrt(r2 + distance**2) + distance) + bend * x * r2 / radius**3
+    return phase, (np.hypot(x + 0.4, y) < radius).astype(float)
+
+
+def geometry(distance, **more):
+    about = dict(pitch_um=PITCH, wavelength_um=WAVELENGTH, sensor_distance_um=distance, depths_um=[np.inf])
+    return about | dict(window_um=12.0, samples=16, tolerance=1e-5) | more
+
+
+def test_a_coarse_window_gives_the_light_on_its_cells():
+    """NA 0.55 on steps of 0.75 um: against 9 x 9 samples of the exact sum in every cell (midpoint rule: 3e-3)."""
+    maps, about = lens(32.0, bend=4.0), geometry(32.0, tolerance=1e-3, window_um=6.0, samples=8)
+    stack = psf.psf_stack(*maps, **about)
+    exact_about = {n: v for n, v in about.items() if n != "tolerance"} | dict(samples=8 * 9)
+    fine = np.abs(propagate.exact(*maps, **exact_about)[0]) ** 2
+    cells = fine.reshape(8, 9, 8, 9).mean((1, 3))
+    assert "cells of" in stack.reason
+    assert stack.energy_um2[0] == pytest.approx(cells.sum() * 0.75**2, rel=2e-3)
+    error = np.linalg.norm(stack.intensity[0] - cells / cells.sum()) / np.linalg.norm(cells / cells.sum())
+    assert error < stack.budget.sampling + 3e-3
+    assert stack.budget.sampling <= 5e-4
+    assert stack.error == pytest.approx(math.hypot(stack.budget.numerical, stack.budget.sampling))
+    assert stack.converged
+    plain = psf.psf_stack(*maps, **about, integrate=False)
+    assert np.abs(plain.intensity[0] * plain.energy_um2[0] / 0.75**2 - fine[4::9, 4::9]).max() < 1e-3 * fine.max()
+
+
+def test_a_window_within_nyquist_is_sampled_as_it_was():
+    case = propagate.case((150, 150), **{n: v for n, v in geometry(90.0).items() if n != "tolerance"})
+    sine = math.sin(math.atan(149 * PITCH / 2 / 90.0))
+    assert nyquist_um(case) == pytest.approx(WAVELENGTH / 4 / sine, rel=1e-9)
+    stack = psf.psf_stack(*lens(90.0), **geometry(90.0))
+    assert stack.budget.sampling == 0
+    assert "cells" not in stack.reason
+
+
+@pytest.mark.parametrize("distance", [60.0, 24.0])
+def test_both_polarisations_are_those_of_plane_waves(distance):
+    """NA 0.33 and 0.66; the direction of a ray is that to the window's middle: 12 um / distance of second order."""
+    phase, level = lens(distance, bend=2.0)
+    about = geometry(distance, window_um=31 * PITCH, samples=31)
+    stack = psf.psf_stack(phase, level, **about, vector=True, integrate=False)
+    axis = (np.arange(150) - 74.5) * PITCH
+    field = level * np.exp(1j * phase) * vectorial.turned(axis, axis[:, None], distance)
+    half = PITCH / 2  # an odd window on an even lattice: the referee's samples lie half a pitch beside
+    image = vectorial.image(field, step=PITCH, wavelength=WAVELENGTH, distance=distance, count=720)
+    want = image[60:91, 60:91]
+    shifted = psf.psf_stack(phase, level, **about, vector=True, integrate=False, offset_um=(half, half))
+    got = shifted.intensity[0] / np.linalg.norm(shifted.intensity[0])
+    scalar = psf.psf_stack(phase, level, **about, integrate=False, offset_um=(half, half)).intensity[0]
+    want = want / np.linalg.norm(want)
+    error, without = (np.linalg.norm(g - want) for g in (got, scalar / np.linalg.norm(scalar)))
+    assert error < 0.15 * without
+    assert without == pytest.approx(psf.scalar_error(math.sin(math.atan(21.0 / distance))), rel=0.5)
+    assert stack.energy_um2.shape == (1,)
+
+
+def test_the_scalar_error_is_known_in_two_limits():
+    """Small apertures: it falls as NA²; and Richards and Wolf's peak at NA 0.8 is 25 % lower, wider along Ez."""
+    assert psf.scalar_error(0.1) / psf.scalar_error(0.05) == pytest.approx(4, rel=0.01)
+    assert 0.2 < psf.scalar_error(0.8) < 0.3
+
+
+def test_light_beside_the_window_is_said():
+    """A window as wide as the first dark ring of a sharp round pupil holds 0.838 of the light (Airy)."""
+    distance, radius = 400.0, 21.0
+    sine = math.sin(math.atan(radius / distance))
+    ring = 0.6098 * WAVELENGTH / sine
+    about = geometry(distance, window_um=2 * ring, samples=40, tolerance=1e-4)
+    stack = psf.psf_stack(*lens(distance), **about)
+    axis = (np.arange(40) - 19.5) / 20
+    inside = np.hypot(axis, axis[:, None]) <= 1
+    energy = stack.energy_um2[0] * stack.intensity[0][inside].sum()
+    # Airy on axis for a lens some 5 zones deep: 1 %; cells at the border of the disc: 1 %
+    assert energy / (np.pi * radius**2) == pytest.approx(0.838, abs=0.02)
+    assert stack.budget.outside == pytest.approx(1 - stack.energy_um2[0] / (np.pi * radius**2), abs=5e-3)
+
+
+def test_the_budget_is_kept_in_the_file_and_older_files_read_as_before(tmp_path):
+    stack = psf.psf_stack(*lens(90.0), **geometry(90.0))
+    made = dataclasses.replace(stack.budget, spectrum=3e-3, polarisation=0.02, glass=0.001)
+    stack = dataclasses.replace(stack, budget=made)
+    psf.save(tmp_path / "psf.h5", stack)
+    back = psf.load(tmp_path / "psf.h5").budget
+    assert (back.spectrum, back.polarisation, back.outside) == (3e-3, 0.02, stack.budget.outside)
+    assert math.isnan(back.neighbours)
+    assert back.total == pytest.approx(math.hypot(back.numerical, 3e-3, 0.02, 0.001))
+    stored = store.load(tmp_path / "psf.h5", "psf")
+    about = {name: value for name, value in stored.attributes.items() if not name.startswith("budget_")}
+    kept = {n: about[n] for n in ("step_um", "sensor_distance_um", "tolerance", "error", "reason")}
+    store.save(tmp_path / "old.h5", "psf", stored.arrays, attributes=kept)
+    assert psf.load(tmp_path / "old.h5").budget.numerical == stack.error
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1e-4, math.nan])
+def test_a_tolerance_that_is_not_above_0_is_refused(tolerance):
+    for engine in (psf.psf_stack, propagate.windowed):
+        with pytest.raises(PropagationError, match="tolerance is"):
+            engine(*lens(90.0), **geometry(90.0) | dict(tolerance=tolerance))
+
+
+def test_energies_of_directions_and_depths_compare_through_the_irradiance_of_a_source():
+    about = geometry(90.0, depths_um=[700.0, 1500.0], angle_rad=[[0.3, -0.2], [0.0, 0.0]], tolerance=1e-3)
+    stack = psf.psf_stack(*lens(90.0), **about)
+    place = np.array([-700 * np.tan(0.3), 700 * np.tan(0.2), -700.0])
+    away = np.linalg.norm(place)
+    assert stack.irradiance_per_um2.shape == stack.energy_um2.shape
+    assert stack.irradiance_per_um2[0, 0] == pytest.approx(700.0 / away / away**2, rel=1e-12)
+    assert stack.irradiance_per_um2[1, 1] == pytest.approx(1500.0**-2, rel=1e-12)
+
+
+def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
+    (tmp_path / "led.csv").write_text("# LED\nwavelength_nm,power\n830,0.0\n848,7.0\n871,0.0\n")
+    (tmp_path / "filter.csv").write_text("840;0\n841;3\n860;3\n861;0\n")
+    files = [tmp_path / "led.csv", tmp_path / "filter.csv"]
+    found = spectrum.measured(files, within_um=(0.8, 0.9))
+    nm = found.wavelengths_um * 1e3
+    assert (nm.min(), nm.max()) == pytest.approx((840.25, 860.75), abs=0.26)
+    fine = np.arange(840, 861, 1e-3)
+    line = np.interp(fine, [830, 848, 871], [0, 7, 0]) * np.interp(fine, [840, 841, 860, 861], [0, 3, 3, 0])
+    assert found.share @ nm == pytest.approx((line * fine).sum() / line.sum(), abs=0.02)
+    rule = spectrum.nodes(found, path_um=50.0, tolerance=1e-4)
+    assert rule.weights @ rule.wavelengths_um * 1e3 == pytest.approx(found.share @ nm, rel=1e-9)
+    with pytest.raises(PropagationError, match="pillars are known from 845 to 850"):
+        spectrum.measured(files, within_um=(0.845, 0.85))
+    (tmp_path / "bad.csv").write_text("840,1\n850,x\n")
+    with pytest.raises(PropagationError, match=r"bad\.csv: line 2"):
+        spectrum.measured([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
+    with pytest.raises(PropagationError, match=r"none\.csv: cannot be read"):
+        spectrum.measured([tmp_path / "none.csv"], within_um=(0.8, 0.9))

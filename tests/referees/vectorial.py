@@ -1,0 +1,35 @@
+"""Both polarisations of a lens in float64, plane wave by plane wave: judges the vector PSF, shares no code with it.
+
+The transverse field behind the lens on a fine lattice; its plane waves are transverse, so that Ez = -(p Ex + q Ey)/s of
+each; their sum on the sensor is |Ex|² + |Ey|² + |Ez|², the mean of both polarisations of the source.
+"""
+
+import numpy as np
+
+
+def image(light, *, step, wavelength, distance, count):
+    """(count, count) intensity on the lattice of a field (2 polarisations, x and y component, rows, columns)."""
+    f = np.fft.fftfreq(count, step) * wavelength
+    p, q = np.meshgrid(f, f)
+    runs = p**2 + q**2 < 0.998
+    s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
+    move = runs * np.exp(2j * np.pi / wavelength * distance * s)
+    total = np.zeros((count, count))
+    for ex, ey in light:
+        waves = [np.fft.fft2(np.pad(e, [(0, count - n) for n in e.shape])) * move for e in (ex, ey)]
+        waves.append(-(p * waves[0] + q * waves[1]) / s)
+        total += sum(np.abs(np.fft.ifft2(w)) ** 2 for w in waves) / 2
+    return total
+
+
+def turned(x, y, distance):
+    """(2, 2, …) transverse field of x and y light whose rays a lens turns from its axis to a point on it.
+
+    Along the plane of the ray the field is turned with it, across it stays; its power along z is kept.
+    """
+    azimuth = np.arctan2(-y, -x)
+    cosine = distance / np.sqrt(x**2 + y**2 + distance**2)
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    along, across = np.sqrt(cosine), 1 / np.sqrt(cosine)
+    mixed = (along - across) * s * c
+    return np.array([[along * c**2 + across * s**2, mixed], [mixed, along * s**2 + across * c**2]])
