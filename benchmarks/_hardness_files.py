@@ -31,7 +31,8 @@ MUTATORS: dict[str, Mutator] = {
     ".png": damage.png, ".oas": damage.oasis, ".safetensors": damage.safetensors, ".h5": damage.hdf5,
     ".tif": damage.head, ".npy": damage.head, ".mat": damage.head, ".gds": damage.plain,
 }  # fmt: skip
-SLOW = {"mat5": 200}  # kinds whose reader is a process of its own: one copy for so many of the others
+# kinds whose reader has a process of its own: one copy for so many of the others
+SLOW = {"mat5": 200} | {kind: 3 for kind, (name, _) in samples.READERS.items() if name.endswith(".h5")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,10 @@ def counted(folder: Path, copies: int, kinds: Sequence[str] = ()) -> Iterator[Co
         name, read = samples.READERS[kind]
         read(folder / kind / name)  # what it imports is inherited by all children
     for kind in kinds:
-        yield _kind(folder, kind, max(1, round(copies * weight[kind] / total)))
+        found = _kind(folder, kind, max(1, round(copies * weight[kind] / total)))
+        for failure in found.failures:
+            print(f"{kind}: {failure}", flush=True)
+        yield found
 
 
 def _kind(folder: Path, kind: str, copies: int) -> Count:

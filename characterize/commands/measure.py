@@ -51,13 +51,15 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Measure and write; exit 0, or 1 where no pillar could be measured."""
-    target = options.output
-    if options.pixel_nm is None and options.bar_nm is None:
-        return _frames(options, target)
-    return _micrograph(options, target)
+    of_frames = options.pixel_nm is None and options.bar_nm is None
+    with options.claim_folder(options.output) as draft:
+        values, text, good = (_frames if of_frames else _micrograph)(options, draft.path)
+    options.console.result(values, text)
+    return 0 if good else 1
 
 
-def _frames(options: Options, target: Path) -> int:
+def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
+    """Measure captures into the folder: numbers, text, and that all is well."""
     shots = captures.load(options.source)
     design = lenses.load(options.design) if options.design else None
     found = frames.measure(shots, design=design, reference_e=options.reference_e)
@@ -68,11 +70,10 @@ def _frames(options: Options, target: Path) -> int:
         "distortion": found.distortion,
         "notes": list(found.notes),
     }
-    with options.claim_folder(target) as draft:
-        store.write_text(draft.path / "frames.csv", _table(rows))
-        store.write_text(draft.path / "measure.json", _json(values))
-        measure_page.frames_page(draft.path / "measure.html", found)
-    lines = [f"{target}: {len(rows)} frames"]
+    store.write_text(folder / "frames.csv", _table(rows))
+    store.write_text(folder / "measure.json", _json(values))
+    measure_page.frames_page(folder / "measure.html", found)
+    lines = [f"{options.output}: {len(rows)} frames"]
     lines += [
         f"  {r.name}: FWHM {r.spot.fwhm_um:.3g} um, EE80 {r.spot.ee80_um:.3g} um, MTF50 {r.mtf50_x_per_um:.3g} / "
         f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
@@ -80,11 +81,11 @@ def _frames(options: Options, target: Path) -> int:
     ]
     lines += [f"  sharpest at {angle:g} deg: {z:.5g} um" for angle, z in found.best_depth_um.items()]
     lines += [f"  distortion at {angle:g} deg: {d:+.3%}" for angle, d in found.distortion.items()]
-    options.console.result(values, "\n".join(lines))
-    return 0
+    return values, "\n".join(lines), True
 
 
-def _micrograph(options: Options, target: Path) -> int:
+def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
+    """Measure a picture of pillars into the folder: numbers, text, and whether any pillar was measured."""
     pictures = captures.read_images(options.source)
     if len(pictures) != 1:
         raise CaptureError(f"{options.source}: {len(pictures)} pictures; a micrograph is one")
@@ -99,15 +100,14 @@ def _micrograph(options: Options, target: Path) -> int:
         table = overlay.bias_table(laid)
         found = overlay.numbered(found, laid)
     values = _summary(found, laid, table, pixel)
-    with options.claim_folder(target) as draft:
-        store.write_text(draft.path / "pillars.csv", _table(_pillars(found, laid)))
-        store.write_text(draft.path / "measure.json", _json(values))
-        if table:
-            pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
-            store.write_text(draft.path / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
-        measure_page.micrograph_page(draft.path / "measure.html", image, found, laid, table, pixel_nm=pixel)
-    options.console.result(values, _words(found, laid, table, target))
-    return 0 if np.isfinite(found.diameter_nm).any() else 1
+    store.write_text(folder / "pillars.csv", _table(_pillars(found, laid)))
+    store.write_text(folder / "measure.json", _json(values))
+    if table:
+        pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
+        store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
+    measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
+    good = bool(np.isfinite(found.diameter_nm).any())
+    return values, _words(found, laid, table, options.output), good
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:

@@ -1,5 +1,6 @@
 """Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid; violations as markers for KLayout."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,11 +39,12 @@ def run(options: Options) -> int:
     process = processes.Process() if options.process is None else processes.load(options.process)
     if not options.mask.is_file():
         raise MaskFileError(f"{options.mask}: no such file; need a GDSII or OASIS mask")
-    content = read(options.mask)
-    skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
-    found = foreign.check(content, process.rules, skip=skip)
-    if options.output is not None:
-        with options.claim(options.output) as draft:
+    output = options.claim(options.output) if options.output is not None else contextlib.nullcontext()
+    with output as draft:
+        content = read(options.mask)
+        skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
+        found = foreign.check(content, process.rules, skip=skip)
+        if draft is not None:
             markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
     options.console.result(_values(found), _text(options.mask, found))
     return 0 if found.ok else 1

@@ -124,6 +124,7 @@ def _read(wanted: Design, where: Path) -> list[Path]:
 def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusCheck | None, "_Judged | None"]:
     """Design, check and write the lens with its pictures."""
     cell, proxy, inputs = _pillars(wanted, options.config, options.console)
+    proxy.at(wanted.focus.wavelength_um)  # outside the library it is refused here, not after the search for a phase
     if options.process is not None:
         wanted = replace(wanted, limits=_printable(options.process, cell))
         inputs[options.process.name] = store.sha256(options.process)
