@@ -106,3 +106,62 @@ def test_a_plan_in_focus_or_on_one_side_of_it_is_warned_of():
     assert "farther than the focus" in protocol._blind(lens, wide, np.array([610.0, 1100.0]))[0]
     with pytest.raises(FitError, match="no such parameter"):
         Wanted("bias", 1.0)
+
+
+def test_information_of_a_frame_is_its_slopes_over_its_noise(monkeypatch):
+    """Light and slopes times the exposure, over photons and read noise; what reaches the full well says nothing."""
+    random = np.random.default_rng(5)
+    light = random.uniform(50, 900, (6, 4, 4))
+    slopes = random.standard_normal((2, 6, 4, 4))
+    scale = []
+
+    class Straight:
+        def __init__(self, lens, setting, response):
+            assert setting.depth_um == pytest.approx(np.tile(1 / np.linspace(1 / 400, 1 / 900, 3), 2))
+            assert setting.angle_rad == pytest.approx(np.stack([np.repeat([0.0, np.radians(7)], 3), np.zeros(6)], 1))
+
+        def images(self, x, names=None):
+            scale.append(x[protocol.PLACE["log_gain"]])
+            return light, None if names is None else slopes
+
+    monkeypatch.setattr(protocol, "ForwardModel", Straight)
+    wanted = Protocol(
+        (400.0, 900.0), depth_count=3, angles_deg=(0.0, 7.0), exposures=(0.7, 1.6), full_well_e=1100.0, read_noise_e=3.3
+    )
+    rows, found = protocol.candidate_information(None, wanted, None, ("bias_nm", "distance_um"))
+    assert scale == [0.0, pytest.approx(np.log(8000.0 / light.max()))]
+    assert rows[:, 2].tolist() == [0.7] * 6 + [1.6] * 6
+    for place, (exposure, frame) in ((2, (0.7, 2)), (10, (1.6, 4))):
+        want = np.zeros((2, 2))
+        for y, x in itertools.product(range(4), range(4)):
+            seen, slope = light[frame, y, x] * exposure, slopes[:, frame, y, x] * exposure
+            if seen < 1100:
+                want += np.outer(slope, slope) / (seen + 3.3**2)
+        assert found[place] == pytest.approx(want, rel=1e-9)
+
+
+def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
+    random = np.random.default_rng(6)
+    slopes = random.standard_normal((6, 2, 9)) * [[3.0], [0.2]]
+    information = slopes @ slopes.transpose(0, 2, 1)
+    rows = np.column_stack([np.linspace(400, 900, 6), np.zeros(6), np.ones(6)])
+    names, prior = ("bias_nm", "distance_um"), np.diag([0.5**-2, 30.0**-2])
+    monkeypatch.setattr(protocol, "_parameters", lambda wanted: (names, prior))
+    monkeypatch.setattr(protocol, "candidate_information", lambda *words: (rows, information))
+    made = protocol.plan(b.lens(), Protocol((400.0, 900.0), frames=3), None)
+    chosen = [int(np.flatnonzero(rows[:, 0] == d)[0]) for d in made.depth_um]
+    for sigma, pick in ((made.sigma, chosen), (made.even_sigma, [0, 2, 5])):
+        total = prior + sum(information[i] for i in pick)
+        assert sigma == pytest.approx(np.sqrt(np.diag(np.linalg.inv(total))), rel=1e-9)
+    assert made.gain[-1] == 1.0
+    assert (np.diff(made.gain) > 0).all()
+
+
+def test_what_is_known_of_the_bench_is_information_and_what_is_certain_is_not_fitted():
+    known = (protocol.Known("height_nm", 3.0, 2.5), protocol.Known("distance_um", 0.0, 0.0))
+    names, prior = protocol._parameters(Protocol((400.0, 900.0), known=known, free=("tilt_x_deg",)))
+    assert "distance_um" not in names
+    assert "tilt_x_deg" in names
+    assert prior[names.index("height_nm")][names.index("height_nm")] == pytest.approx(2.5**-2)
+    wide = protocol.PARAMETERS[protocol.PLACE["tilt_x_deg"]].sigma
+    assert prior[names.index("tilt_x_deg")][names.index("tilt_x_deg")] == pytest.approx(wide**-2)
