@@ -8,7 +8,7 @@ import tyro
 
 from layout.certify import Certificate
 from layout.commands.stages import Stages
-from layout.files import Window, verify
+from layout.files import Window, handover, verify
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
@@ -98,6 +98,11 @@ class Job:
             ]
         broken = ", ".join(f"{count} {rule}" for rule, count in self.drc.counts.items() if count)
         return found + ([f"design rules broken: {broken}"] if broken else [])
+
+    @property
+    def sheet(self) -> str:
+        """The job sheet."""
+        return handover.job_sheet(self.plan, self.process, self.fields, self.written, self.verdict)
 
     @property
     def ok(self) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from layout.certify import as_made, certify
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
-from layout.files import MaskContent, doses, dxf, verify
+from layout.files import MaskContent, doses, dxf, handover, verify
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
 from layout.mask import MaskPlan, build, fields, with_fields
@@ -130,6 +130,8 @@ def _accompany(job: Job, target: Path) -> None:
     markers.write_lyp(job.plan, target / "mask.lyp")
     markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
+    handover.write_fields(job.fields, target / "fields.csv")
+    store.write_text(target / "job.txt", job.sheet)
     if job.certified:
         lenses.save(target / "made.h5", as_made(job.source, job.plan, next(iter(job.certified.values()))))
     page.write(job, target)

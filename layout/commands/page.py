@@ -6,11 +6,13 @@ import numpy as np
 
 from layout.commands import pictures
 from layout.commands.job import Job
-from layout.files import Window
+from layout.files import Window, handover
 from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.report import Figure, KeyFigure, Section, Table
 from metalens.ground.units import nm
+
+_LISTED = 40  # write fields in the report
 
 
 def write(job: Job, target: Path) -> None:
@@ -203,9 +205,22 @@ def _fields(job: Job) -> Section:
     text = (
         f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm "
         f"at most; no border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis "
-        f"would have cut {split.cut_before:,} pillars."
+        f"would have cut {split.cut_before:,} pillars. fields.csv lists them in the order of writing, row by row and "
+        f"back; job.txt is the sheet for the operator, with currents left open."
     )
-    return Section("Write fields", text)
+    steps = handover.sequence(split)
+    rows = [
+        [s.sequence, f"{s.x_um:.3f}", f"{s.y_um:.3f}", f"{s.width_um:.3f}", f"{s.height_um:.3f}", f"{s.pillars:,}"]
+        for s in steps[:_LISTED]
+    ]
+    fields = Table(handover.FIELD_HEAD, rows, f"The first {len(rows)} of {len(steps)} fields.")
+    charges = [
+        [step, f"{charge:.4g}", f"{charge * 1e3 / 3600:.3g}"]
+        for step, charge in handover.charge_uC(job.plan, job.process).items()
+    ]
+    charge = Table(("step", "charge / µC", "hours at 1 nA"), charges, "Without stage and settling times.")
+    marks = Table(("x / µm", "y / µm", "width / µm", "height / µm"), handover.marks_um(job.plan), "Marks.", digits=6)
+    return Section("Job sheet", text, [charge, fields, marks])
 
 
 def _files(job: Job) -> Section:

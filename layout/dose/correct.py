@@ -26,7 +26,7 @@ from metalens.lens import DiameterMap
 
 _UNIT_UM = 1e-4  # resolution of the diameters in the table
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
-_PIECES = 24  # of a rectangle, along the narrowest far Gaussian
+_PIECES = 16  # of a rectangle, along the narrowest far Gaussian
 _SPOTS = 10  # of a piece on the nodes, along the same
 
 
@@ -92,7 +92,7 @@ def solve(
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
         diameter_um, goal: (entries,) of the table, entry 0 for none.
-        cut: rectangles, none with a side beyond a 24th of the narrowest far Gaussian (:func:`piece_um`).
+        cut: rectangles, none with a side beyond a sixteenth of the narrowest far Gaussian (:func:`piece_um`).
 
     Raises:
         ProcessError: as :func:`correct`.

@@ -21,8 +21,9 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     piece: list[int] = []
     for group in np.unique(rects.group):
         members = np.flatnonzero(rects.group == group)
-        boxes = rects.box_um[members]
-        for n, box in zip(members.tolist(), boxes, strict=True):
+        around = _around(rects.box_um[members], near)
+        for n, box, beside in zip(members.tolist(), rects.box_um[members], around, strict=True):
+            boxes = rects.box_um[members[beside]]
             edge = _outer(box, boxes)
             inside = not len(edge)
             at = np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]) if inside else edge
@@ -30,6 +31,16 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
             points.extend(at)
             piece.extend([n] * len(at))
     return exposure, np.array(points).reshape(-1, 2), np.array(piece, np.int64)
+
+
+def _around(boxes: Array, near: PointExposure) -> list[list[int]]:
+    """For each box, those that touch it or lie within six widths (exp(-36)) of it."""
+    from scipy.spatial import cKDTree
+
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    across = float(np.hypot(*(boxes[:, 2:] - boxes[:, :2]).T).max())
+    reach = across + 6 * float(near.widths_um.max(initial=0.0)) + _OUTSIDE_UM
+    return list(cKDTree(middle).query_ball_point(middle, reach))
 
 
 def _outer(box: Array, boxes: Array) -> Array:

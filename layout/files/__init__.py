@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from layout.files import doses as doses
     from layout.files import dxf as dxf
     from layout.files import flat as flat
+    from layout.files import handover as handover
     from layout.files import paths as paths
     from layout.files import verify as verify
     from layout.files.content import NOTHING as NOTHING
@@ -45,6 +46,7 @@ __getattr__, __dir__, __all__ = attach(
         "dxf": "",
         "flat": "",
         "forget": "content",
+        "handover": "",
         "mapped": "content",
         "paths": "",
         "placements": "read_loops",

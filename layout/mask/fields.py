@@ -28,7 +28,7 @@ class FieldPlan:
         before the first site and end after the last.
     shape: (y, x) sites; pitch_um: lattice constant.
     mode: ``floating`` or ``shift``, see :class:`layout.process.process.WriteField`.
-    used: fields that hold pillars.
+    pillars: (y fields, x fields) pillars in each.
     cut_before: pillars that the same raster, left where the axis of the lens is a field corner, would cut.
     clearance_um: least distance from a border to the edge of a pillar as it is drawn.
     """
@@ -38,9 +38,14 @@ class FieldPlan:
     shape: tuple[int, int]
     pitch_um: float
     mode: Literal["shift", "floating"]
-    used: int
+    pillars: Array
     cut_before: int
     clearance_um: float
+
+    @property
+    def used(self) -> int:
+        """Fields that hold pillars."""
+        return int(np.count_nonzero(self.pillars))
 
     @property
     def x_um(self) -> Array:
@@ -90,7 +95,7 @@ def split(diameters: DiameterMap, process: Process, *, drawn: Cells | None = Non
     rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, sites)
     clearance = (pitch - float(made.diameters_nm[-1]) * nm) / 2
     return FieldPlan(
-        rows, columns, made.sites.shape, pitch, settings.mode, _used(made, rows, columns), seen.cut, clearance
+        rows, columns, made.sites.shape, pitch, settings.mode, _counted(made, rows, columns), seen.cut, clearance
     )
 
 
@@ -119,18 +124,17 @@ class _Seen:
         return found
 
 
-def _used(made: Cells, rows: Array, columns: Array) -> int:
-    """Fields that hold pillars."""
-    down, across = (
-        np.clip(edges, 0, most).tolist() for edges, most in zip((rows, columns), made.sites.shape, strict=True)
-    )
-    step, total = max(1, _BLOCK_SITES // max(1, made.sites.shape[1])), 0
-    for first, end in itertools.pairwise(down):
-        held = np.zeros(made.sites.shape[1], bool)
+def _counted(made: Cells, rows: Array, columns: Array) -> Array:
+    """(y fields, x fields) pillars in each field."""
+    down, across = np.clip(rows, 0, made.sites.shape[0]).tolist(), np.clip(columns, 0, made.sites.shape[1]).tolist()
+    step = max(1, _BLOCK_SITES // max(1, made.sites.shape[1]))
+    found = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
+    for i, (first, end) in enumerate(itertools.pairwise(down)):
+        held = np.zeros(made.sites.shape[1], np.int64)
         for begin in range(first, end, step):
-            held |= made.sites.source(begin, min(begin + step, end)).any(0)
-        total += sum(bool(held[a:b].any()) for a, b in itertools.pairwise(across))
-    return total
+            held += np.count_nonzero(made.sites.source(begin, min(begin + step, end)), axis=0)
+        found[i] = [held[a:b].sum() for a, b in itertools.pairwise(across)]
+    return found
 
 
 def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:

@@ -1,0 +1,125 @@
+"""What the writer's operator gets beside the mask: the write fields in their order, and a job sheet as text.
+
+Fields go in rows from the lower left, every other row backwards, so that the stage moves least. Beam current, resist
+and file format of the machine are left open: the sheet says the charge, from which any current gives the time.
+"""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from layout.mask import FieldPlan, MaskPlan
+from layout.process import LayerNumber, Process
+from layout.shapes import polygon, region
+from metalens.ground import store
+from metalens.ground.units import nm
+
+FIELD_HEAD = ("sequence", "x_um", "y_um", "width_um", "height_um", "pillars")
+_OPEN = "________"
+
+
+@dataclass(frozen=True, slots=True)
+class WriteStep:
+    """One write field, in the order of writing: middle and sides (lens axis at 0, +y up), pillars in it."""
+
+    sequence: int
+    x_um: float
+    y_um: float
+    width_um: float
+    height_um: float
+    pillars: int
+
+
+def sequence(split: FieldPlan) -> list[WriteStep]:
+    """All fields that hold pillars."""
+    x, y = split.x_um.tolist(), split.y_um.tolist()
+    made: list[WriteStep] = []
+    for i, row in enumerate(split.pillars):
+        held = np.flatnonzero(row)
+        for j in (held if i % 2 == 0 else held[::-1]).tolist():
+            middle_x, middle_y = (x[j] + x[j + 1]) / 2, (y[i] + y[i + 1]) / 2
+            wide, high = x[j + 1] - x[j], y[i + 1] - y[i]
+            made.append(WriteStep(len(made) + 1, middle_x, middle_y, wide, high, int(row[j])))
+    return made
+
+
+def write_fields(split: FieldPlan, path: str | Path) -> None:
+    """The fields in their order, as CSV."""
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(FIELD_HEAD)
+    for step in sequence(split):
+        sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
+        out.writerow([step.sequence, *(f"{v:.4f}" for v in sizes), step.pillars])
+    store.write_text(path, text.getvalue())
+
+
+def areas_um2(plan: MaskPlan) -> dict[LayerNumber, float]:
+    """{layer: area of all that is written on it}."""
+    unit, found = (plan.unit_nm * nm) ** 2, dict.fromkeys(plan.doses, 0.0)
+    for made, count in zip(plan.classes, plan.counts()[1:].tolist(), strict=True):
+        each = sum(abs(polygon.twice_area(shape)) / 2 for shape in made.polygons)
+        found[made.layer] = found.get(made.layer, 0.0) + count * each * unit
+    for figure in plan.figures:
+        for layer, shapes in figure.polygons.items():
+            total = sum(abs(polygon.twice_area(shape)) / 2 for shape in shapes)
+            found[layer] = found.get(layer, 0.0) + total * unit
+    return found
+
+
+def charge_uC(plan: MaskPlan, process: Process) -> dict[str, float]:
+    """{step: charge} of the two steps, base dose times relative dose times area."""
+    areas, found = areas_um2(plan), {"pillars": 0.0, "aperture": 0.0}
+    for layer, dose in plan.doses.items():
+        step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
+        found[step] += areas[layer] * 1e-8 * dose * process.exposure.base_uC_cm2
+    return found
+
+
+def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
+    """(x, y, width, height) of each mark, from the lower left on."""
+    source = plan if plan.standing is None else plan.standing
+    shapes = [p for f in source.figures if f.name == "MARKS" for drawn in f.polygons.values() for p in drawn]
+    boxes = [(c.min(0), c.max(0)) for c in region.union(shapes) if polygon.twice_area(c) > 0] if shapes else []
+    scale = plan.unit_nm * nm
+    found = [(*((a + b) / 2 * scale).tolist(), *((b - a) * scale).tolist()) for a, b in boxes]
+    return sorted(found, key=lambda m: (round(m[1]), round(m[0])))
+
+
+def job_sheet(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[str, int], verdict: str) -> str:
+    """Everything that an operator needs to set up the job, as text; what the machine decides is left open."""
+    return "\n".join(_lines(plan, process, split, files, verdict)) + "\n"
+
+
+def _lines(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[str, int], verdict: str) -> Iterator[str]:
+    yield f"JOB SHEET  mask {plan.name}  process {process.name!r}  tone {process.tone}"
+    yield verdict
+    yield ""
+    yield "Files (top cell, database unit):"
+    for name, size in sorted(files.items()):
+        yield f"  {name:<16} {size:>14,} bytes"
+    yield f"  top cell {plan.name}, {plan.unit_nm:g} nm; coordinates in um below: lens axis at (0, 0), +y up"
+    yield ""
+    yield f"Writer {_OPEN}   resist {_OPEN}   base dose {process.exposure.base_uC_cm2:g} uC/cm2"
+    for step, charge in charge_uC(plan, process).items():
+        hours = charge * 1e3 / 3600  # at 1 nA
+        yield f"Step {step}: charge {charge:.4g} uC ({hours:.3g} h at 1 nA, without the stage); beam current {_OPEN}"
+    yield ""
+    yield "Doses (layer/datatype, relative, uC/cm2, area um2, name); the same in doses.csv:"
+    areas = areas_um2(plan)
+    for layer, dose in sorted(plan.doses.items()):
+        absolute, name = dose * process.exposure.base_uC_cm2, plan.layer_names.get(layer, "")
+        yield f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} {areas[layer]:>14.1f}  {name}"
+    yield ""
+    steps = sequence(split)
+    yield f"Write fields: {len(steps)} ({split.mode}), in the order of fields.csv"
+    yield f"  at most {split.size_um[0]:.3f} x {split.size_um[1]:.3f} um"
+    yield f"  no border cuts a pillar; least distance {split.clearance_um / nm:.1f} nm"
+    yield ""
+    yield "Marks (middle x, y; width x height):"
+    for x, y, wide, high in marks_um(plan):
+        yield f"  ({x:.3f}, {y:.3f}); {wide:.3f} x {high:.3f}"
