@@ -14,7 +14,7 @@ from pathlib import Path
 import benchmarks
 from benchmarks import Row, figures
 
-LONG = ("hardness", "hard_cells", "limits", "plan", "scene_referee")
+LONG = ("install", "hardness", "hard_cells", "limits", "plan", "scene_referee")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 
