@@ -33,7 +33,7 @@ EXTRAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "codesign": (("OCP",), ("scene -o scene",)),
     "cad": (("torch",), ("design design.toml -o lens.h5", "layout lens.h5 -o mask --step")),
 }
-CELL = "[sweep]\nwavelengths_um = [0.85]\ntolerance = 1e-2\n[cell]\n"
+CELL = "[cell]\npitch_um = 0.30\npillar = { n = 3.6 }\n[sweep]\nwavelengths_um = [0.85]\ntolerance = 1e-2\n"
 DESIGN = (
     'profile = "hyperbolic"\naperture_mm = 0.02\nwavelength_nm = 850.0\n'
     "sensor_distance_mm = 0.2\nsource_distance_mm = 20.0\n"

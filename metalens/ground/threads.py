@@ -1,9 +1,10 @@
-"""Threads for compiled loops that release the interpreter lock: as many as torch uses, safe after a fork."""
+"""Threads for compiled loops that release the interpreter lock: torch's number where it runs; safe after a fork."""
 
 import contextlib
 import functools
 import itertools
 import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,10 +12,8 @@ from threadpoolctl import ThreadpoolController
 
 
 def split(count: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(start, stop)`` over [0, count) in as many parts as torch has threads."""
-    import torch
-
-    parts = min(torch.get_num_threads(), count)
+    """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads (see :func:`threads`)."""
+    parts = min(threads(), count)
     if parts <= 1:
         work(0, count)
         return
@@ -23,6 +22,15 @@ def split(count: int, work: Callable[[int, int], object]) -> None:
     work(edges[0], edges[1])
     for job in jobs:
         job.result()
+
+
+def threads() -> int:
+    """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this process."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        return int(torch.get_num_threads())
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(told)) if told.isdigit() else len(os.sched_getaffinity(0))
 
 
 @functools.lru_cache(maxsize=2)

@@ -1,0 +1,54 @@
+"""Compiled loops use the threads that are theirs, with torch and without it."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.ground import threads
+
+# a mask shop has no torch: a lens is designed and its focus checked all the same
+WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None
+import numpy as np
+from metalens.cell import Cell, Index
+from metalens.design import check_focus, make
+from metalens.ground.threads import threads
+from metalens.profiles import Focus
+from metalens.proxy import Proxy
+
+phase = np.polynomial.Chebyshev.interpolate(lambda d: 55 * d, 2, domain=[0.08, 0.21]).coef[None]
+proxy = Proxy(phase, np.array([[0.83]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+focus = Focus(0.85, 60.0, 900.0)
+flat = lambda x, y: -np.pi / 0.85 * (1 / 60 + 1 / 900) * (x**2 + y[:, None] ** 2)
+lens, _ = make(flat, focus, aperture_um=17.0, cell=Cell(pitch_um=0.30, pillar=Index(3.6)), proxy=proxy)
+print(threads(), check_focus(lens).strehl > 0.9)
+"""
+
+
+@pytest.mark.parametrize(("told", "count"), [("3", 3), ("0", 1), ("", len(os.sched_getaffinity(0)))])
+def test_a_lens_is_designed_and_checked_where_there_is_no_torch(told, count):
+    told_here = {**os.environ, "OMP_NUM_THREADS": told}
+    words = [sys.executable, "-c", WITHOUT_TORCH]
+    done = subprocess.run(words, capture_output=True, text=True, env=told_here, check=False)
+    assert done.stdout.split() == [str(count), "True"], done.stderr[-2000:]
+
+
+def test_every_part_is_done_once_by_torchs_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert threads.threads() == 3
+        seen = np.zeros(11, int)
+
+        def work(start, stop):
+            seen[start:stop] += 1
+
+        threads.split(11, work)
+    finally:
+        torch.set_num_threads(before)
+    assert seen.tolist() == [1] * 11
