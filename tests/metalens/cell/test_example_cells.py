@@ -1,5 +1,6 @@
 """The example cells: they read, propagate no order, fit their lattice, and do what their heads say."""
 
+import json
 import math
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from metalens import library, rcwa
 from metalens.cell.orders import check_subwavelength
+from metalens.cli import main
 from metalens.commands.library import CellFile
 from metalens.design import Limits, printable
 from metalens.ground import config
@@ -46,3 +48,35 @@ def test_widest_pillar_leaves_the_gap():
     size = wanted.cell.widest_um(0.06)
     assert size == pytest.approx(0.42 - 0.06, abs=0.004)  # rows of rectangles along x are the nearest
     assert math.isclose(config.load(FOLDER / "tio2_532.toml", CellFile).cell.widest_um(0.05), 0.27)
+
+
+def chained(folder, name, library, capsys):
+    """The commands in the head of a lens file, on a library of five per cent; what ``metalens design`` says."""
+    lines = (FOLDER / f"{name}.toml").read_text().splitlines()
+    cell = "\n".join(line for line in lines if not line.startswith("tolerance"))
+    (folder / "cell.toml").write_text(cell.replace("[sweep]", "[sweep]\nsamples = 40\ntolerance = 5e-2"))
+    (folder / "lens.toml").write_text((FOLDER.parent / "lenses" / f"{name}.toml").read_text())
+    words = ["--accept-partial-turn", "--quiet"]
+    assert main(["library", str(folder / "cell.toml"), "-o", str(folder / library), *words]) == 0
+    capsys.readouterr()
+    assert main(["design", str(folder / "lens.toml"), "-o", str(folder / "lens.h5"), *words[:1], "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert main(["layout", str(folder / "lens.h5"), "-o", str(folder / "mask"), "--gds", "--quiet"]) == 0
+    assert (folder / "mask" / "mask.gds").stat().st_size > 10_000
+    return found
+
+
+@pytest.mark.slow
+def test_silicon_on_sapphire_from_toml_to_mask(tmp_path, capsys):
+    found = chained(tmp_path, "si_on_sapphire_1550", "si.h5", capsys)
+    assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(15 / 50)), rel=0.01)
+    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+    assert found["focus_passed"]
+
+
+@pytest.mark.slow
+def test_titania_lens_from_toml_to_mask(tmp_path, capsys):
+    found = chained(tmp_path, "tio2_532", "tio2.h5", capsys)
+    assert found["numerical_aperture"] == pytest.approx(0.8, abs=0.01)
+    assert 0.7 < found["efficiency"] <= found["transmission"] <= 1
+    assert found["turns"] < 1
