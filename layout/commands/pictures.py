@@ -164,13 +164,15 @@ def _draw_figures(axes: Any, plan: MaskPlan) -> None:
 
     scale = plan.unit_nm * 1e-3
     edges = ("#d1495b", "#355070", "#1f6feb", "#888", "#2a9d8f")
-    layers = sorted({layer for figure in plan.figures for layer in figure.polygons})
-    for n, layer in enumerate(layers):
-        shapes = [p * scale for figure in plan.figures for p in figure.polygons.get(layer, ())]
-        name = plan.layer_names.get(layer, str(layer))
+    layers = sorted({layer[0] for figure in plan.figures for layer in figure.polygons})
+    for n, layer in enumerate(layers):  # all doses of a layer number together
+        drawn = [(one, p) for figure in plan.figures for one, ps in figure.polygons.items() for p in ps]
+        shapes = [p * scale for one, p in drawn if one[0] == layer]
+        first = min(one for one, _ in drawn if one[0] == layer)
+        name = plan.layer_names.get(first, f"layer {layer}").split("_dose_")[0]
         colour = edges[n % len(edges)]
         fill, edge = (colour, "none") if name in _FILLED else ("none", colour)
         axes.add_collection(PolyCollection(shapes, facecolors=fill, edgecolors=edge, linewidths=0.8))
-        axes.plot([], [], color=colour, label=f"{name} {layer[0]}/{layer[1]}")
+        axes.plot([], [], color=colour, label=f"{name} {layer}")
     if layers:
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09), ncols=5, frameon=False, fontsize=8)

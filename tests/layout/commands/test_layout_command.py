@@ -51,6 +51,20 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
+def test_a_corrected_mask_is_certified_and_hands_on_its_lens(lens_file, tmp_path, capsys):
+    process = tmp_path / "process.toml"
+    process.write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 40.0\neta = 0.7\n")
+    target = tmp_path / "mask"
+    assert run(lens_file, "--process", process, "-o", target, "--oasis", "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["failures"] == []
+    assert values["exposure"]["mask.oas"]["edges"] > 100
+    made, designed = (lens.load(path).diameters.diameter_um for path in (target / "made.h5", lens_file))
+    assert np.abs(made - designed).max() < 2.1e-3  # half a step of 2 nm, and 1 nm of the exposure
+    assert (target / "fields.csv").read_text().startswith("sequence,")
+    assert "The mask passes its own checks." in (target / "job.txt").read_text()
+
+
 def test_same_input_gives_the_same_masks(lens_file, tmp_path):
     for name in ("a", "b"):
         assert run(lens_file, "-o", tmp_path / name, "--quiet") == 0
