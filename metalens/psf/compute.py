@@ -23,25 +23,31 @@ from metalens.propagate import (
     relative_error,
 )
 
+FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
+BRIGHT = 30.0  # times the light of random phases below which float32 loses what is left of the sum
 MOVING = 1000  # by which the setting is tighter where the geometry carries gradients
 FINEST = 1e-12  # setting below which float64 has nothing left to give
 ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
-KEPT = {torch.float32: 4e-8, torch.float64: 0.0}  # of intensities brought back to the caller's type
+KEPT = {
+    torch.float32: 1.5e-7,
+    torch.float64: 0.0,
+}  # of intensities brought back to the caller's type and normalised in it
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Result:
     """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped.
 
-    power: sum of squares of the transmission over the pillars, wavelengths weighted. sampling: error of an integration
-        over cells.
+    power: sum of squares of the transmission over the pillars, wavelengths weighted. brightness: mean of the window at
+        the darkest depth, against pillars of random phases. sampling: error of an integration over cells.
     """
 
     intensity: torch.Tensor
     error: float
     reason: str
     power: float
+    brightness: float = math.inf
     sampling: float = 0.0
 
 
@@ -62,22 +68,28 @@ def intensity(
         moving: :class:`Moving` or None.
 
     The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
-    tolerance; the result of the last try is returned with its estimate in any case.
+    tolerance; the result of the last try is returned with its estimate in any case. Dim and tiny windows are summed in
+    float64, since the estimate knows rounding as noise of a mean size only.
     """
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
     choices = [choose(case, tolerance, differentiable=needs_grad) for case in cases]
     if all(choice.method == "exact" for choice in choices) and phase.device.type == "cpu":
         return _exact(phase, level, cases, weights, choices[0].reason)
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
+    if cases[0].samples[0] * cases[0].samples[1] < FEW:
+        first = torch.float64
     # gradients see the kernel's error pillar by pillar, and at a focus their parts nearly cancel
     start = max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
     if moving is not None:  # parts of a derivative in the geometry exceed it some hundred times
         start, first = tolerance / MOVING, torch.float64
     tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
-    for setting, dtype in tries:
+    dim = False
+    for setting, kind in tries:
+        dtype = torch.float64 if dim else kind
         result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, max(setting, FINEST), moving)
         error = math.hypot(result.error, OUTPUT[dtype])
-        if error <= tolerance:
+        dim = dtype != torch.float64 and result.brightness < BRIGHT
+        if error <= tolerance and not dim:
             break
     error = math.hypot(error, KEPT[phase.dtype])
     return Result(result.intensity.to(phase.dtype), error, result.reason, result.power)
@@ -118,7 +130,11 @@ def _windowed(
         total = total + weight * (field.real**2 + field.imag**2)
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
         raise PropagationError("no light reaches the window at some depth; move or widen the window")
-    return Result(total, relative_error(samples), choice.reason, light)
+    lit = total.detach().mean((-1, -2)).min()
+    brightness = float(lit) / sum(
+        weight * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
+    )
+    return Result(total, relative_error(samples), choice.reason, light, brightness=brightness / max(light, 1e-300))
 
 
 def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:

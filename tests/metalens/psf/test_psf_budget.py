@@ -1,10 +1,12 @@
 """The parts of a PSF's error: cells against fine samples, polarisations against plane waves, light left outside."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
 import pytest
+import torch
 
 from metalens import propagate, psf
 from metalens.ground import store
@@ -151,3 +153,31 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
         spectrum.measured([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
     with pytest.raises(PropagationError, match=r"none\.csv: cannot be read"):
         spectrum.measured([tmp_path / "none.csv"], within_um=(0.8, 0.9))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_estimate_holds_in_single_precision_where_windows_are_dim_or_tiny(seed):
+    """Random phases, windows of 1 to 20 samples beside the light, tolerances down to 1e-6: never below the truth."""
+    draw = np.random.default_rng(seed)
+    phase = draw.uniform(-np.pi, np.pi, (61, 74)).astype(np.float32)
+    level = draw.uniform(0.5, 1, phase.shape).astype(np.float32)
+    samples = int(draw.integers(1, 20))
+    about = geometry(draw.uniform(60, 300), window_um=draw.uniform(1, 9), samples=samples, depths_um=[700.0, 2000.0])
+    about |= dict(offset_um=tuple(draw.uniform(-20, 20, 2)), tolerance=10 ** draw.uniform(-6, -3))
+    maps = torch.tensor(phase, requires_grad=True), torch.tensor(level)
+    stack = psf.psf_stack(*maps, **about, integrate=False)
+    exact_about = {name: value for name, value in about.items() if name != "tolerance"}
+    want = np.abs(propagate.exact(phase.astype(float), level.astype(float), **exact_about)) ** 2
+    want /= want.sum((-1, -2), keepdims=True)
+    assert np.linalg.norm(stack.numpy().intensity - want) <= stack.error * np.linalg.norm(want)
+
+
+def test_a_tighter_tolerance_is_no_worse_in_single_precision():
+    maps = tuple(np.float32(m) for m in lens(90.0, bend=3.0))
+    about = geometry(90.0, window_um=6.0, offset_um=(9.0, -4.0))
+    del about["tolerance"]
+    want = propagate.exact(*(m.astype(float) for m in maps), **about)
+    errors = [np.linalg.norm(propagate.windowed(*maps, tolerance=t, **about) - want) for t in (1e-2, 1e-4, 1e-6, 1e-8)]
+    floor = 1e-7 * np.linalg.norm(want)  # of what is returned in single precision
+    assert all(after <= before + floor for before, after in itertools.pairwise(errors))
+    assert errors[-1] <= floor
