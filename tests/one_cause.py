@@ -114,12 +114,14 @@ def training():
 
     from characterize.model import state, vector
     from codesign.optics import LensError, LensErrors, MadeLens, stack
+    from codesign.optics.lens_errors import variance_rad2
     from metalens.made import transmission
 
     small = dataclasses.replace(m.OPTICS, spread=LensErrors(lean_nm=8.0, absorption=1e-3))
     assert set(small.spread.draw(torch.Generator().manual_seed(1)).amounts) >= {"lean_nm", "absorption"}
     plain = stack.stack(small, torch.zeros(0)).intensity.sum((1, 2))
-    bent = stack._hazy(small, stack.stack(small, torch.zeros(0)).intensity, LensError({"lean_nm": 30.0}))
+    variance = variance_rad2(LensError({"lean_nm": 30.0}).state())
+    bent = stack.hazy(small, stack.stack(small, torch.zeros(0)).intensity, variance)
     lost = 1 - math.exp(-7.797e-4 * 900 / 8)
     window = (small.window_samples * small.sample_um) ** 2 / (math.pi * 60.0**2)
     torch.testing.assert_close(bent.sum((1, 2)), (1 - lost) * plain + lost * window, rtol=3e-4, atol=0)

@@ -112,7 +112,7 @@ def _probe(path: str | Path, read: Callable[[], object], room: int) -> None:
     if status < 0:
         raise StoreError(f"{path}: damaged: reading it ended the reader with signal {-status}; make it again")
     if told:
-        name, _, words = told.decode().partition("\n")
+        name, _, words = told.decode("utf-8", "replace").partition("\n")
         raise getattr(errors, name, RuntimeError)(words)
 
 

@@ -38,10 +38,9 @@ def test_tilt_and_astigmatism_are_waves_at_the_rim():
     assert torch.allclose(got, -2 * math.pi * 0.2 * (x**2 - y**2))
 
 
-def test_haze_takes_the_share_of_marechal_and_spreads_it_over_the_shadow(monkeypatch):
-    monkeypatch.setattr(optics, "variance_rad2", lambda state: 0.31)
+def test_haze_takes_the_share_of_marechal_and_spreads_it_over_the_shadow():
     light = torch.rand(2, 5, 5, dtype=torch.float64)
-    got = optics._hazy(SETTINGS, light, LensError({}))
+    got = optics.hazy(SETTINGS, light, 0.31)
     kept = math.exp(-0.31)
     haze = (1 - kept) * SETTINGS.sample_um**2 / (math.pi * (1e3 * SETTINGS.aperture_mm / 2) ** 2)
     assert torch.allclose(got, kept * light + haze)
