@@ -1,5 +1,7 @@
 """Exposure by rectangles: marks, labels, verniers and boxes, cut into pieces small enough for one dose each."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from layout.dose.bodies import Rects
@@ -7,6 +9,7 @@ from layout.dose.exposure import PointExposure
 from metalens.ground.arrays import Array
 
 _OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
+_CORNER = 4.0  # widths of the core: edges that short are round
 
 
 def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
@@ -19,12 +22,13 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     exposure = np.zeros(len(rects.box_um))
     points: list[Array] = []
     piece: list[int] = []
+    corner_um = _CORNER * float(near.widths_um.min(initial=0.0))
     for group in np.unique(rects.group):
         members = np.flatnonzero(rects.group == group)
         around = _around(rects.box_um[members], near)
         for n, box, beside in zip(members.tolist(), rects.box_um[members], around, strict=True):
             boxes = rects.box_um[members[beside]]
-            edge = _outer(box, boxes)
+            edge = _outer(box, boxes, corner_um)
             inside = not len(edge)
             at = np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]) if inside else edge
             exposure[n] = of_boxes(at, boxes, near).mean() / (2 if inside else 1)
@@ -43,14 +47,32 @@ def _around(boxes: Array, near: PointExposure) -> list[list[int]]:
     return list(cKDTree(middle).query_ball_point(middle, reach))
 
 
-def _outer(box: Array, boxes: Array) -> Array:
-    """Middles of the sides of a piece that no other piece of the shape covers."""
-    left, bottom, right, top = box
-    x, y = (left + right) / 2, (bottom + top) / 2
-    sides = np.array([[left, y], [right, y], [x, bottom], [x, top]])
-    outside = sides + _OUTSIDE_UM * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
-    within = (outside[:, None] >= boxes[:, :2]) & (outside[:, None] <= boxes[:, 2:])
-    return np.asarray(sides[~within.all(-1).any(-1)])
+def _outer(box: Array, boxes: Array, least_um: float) -> Array:
+    """Middles of those parts of the sides of a piece that no other piece of the shape covers.
+
+    Parts up to ``least_um`` long, which lie in a corner, are left out.
+    """
+    found: list[tuple[float, float]] = []
+    for across in (0, 1):
+        low, high = float(box[1 - across]), float(box[3 - across])
+        for at, step in ((float(box[across]), -_OUTSIDE_UM), (float(box[across + 2]), _OUTSIDE_UM)):
+            beyond = boxes[(boxes[:, across] <= at + step) & (boxes[:, across + 2] >= at + step)]
+            for start, end in _free(low, high, beyond[:, [1 - across, 3 - across]]):
+                if end - start > least_um:
+                    along = (start + end) / 2
+                    found.append((along, at) if across else (at, along))
+    return np.array(found).reshape(-1, 2)
+
+
+def _free(low: float, high: float, covered: Array) -> Iterator[tuple[float, float]]:
+    """Parts of an interval that none of some others (n, 2) covers."""
+    for start, end in sorted(covered.tolist()):
+        if start > low:
+            yield low, min(start, high)
+        low = max(low, end)
+        if low >= high:
+            return
+    yield low, high
 
 
 def of_boxes(points_um: Array, boxes_um: Array, point: PointExposure) -> Array:

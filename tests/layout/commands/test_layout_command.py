@@ -53,7 +53,7 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
 
 def test_a_corrected_mask_is_certified_and_hands_on_its_lens(lens_file, tmp_path, capsys):
     process = tmp_path / "process.toml"
-    process.write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 30.0\neta = 0.7\n")
+    process.write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 40.0\neta = 0.7\n")
     target = tmp_path / "mask"
     assert run(lens_file, "--process", process, "-o", target, "--oasis", "--json") == 0
     values = json.loads(capsys.readouterr().out)

@@ -1,0 +1,48 @@
+"""Pieces of marks and letters: doses for their outer edges, against the convolution of a raster."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from layout.dose import rects
+from layout.dose.bodies import Rects
+from layout.dose.exposure import PointExposure
+from layout.shapes import rectilinear
+
+ALPHA_UM = 0.05
+PIXEL_UM = 0.005
+# rows of a letter from the bottom: in pieces of 1.2 um the second ends 10 nm beside the middle of a piece
+ROWS = [[0, 0, 3600, 1200], [610, 1200, 3010, 2400], [600, 2400, 1500, 3600], [2100, 2400, 3300, 3600]]
+
+
+def test_edges_of_letters_are_even_where_rows_end_over_a_piece():
+    boxes, _ = rectilinear.cut(np.array(ROWS), 1200, 1)
+    cut = Rects(boxes * 1e-3, np.zeros(len(boxes), int), np.ones(len(boxes)))
+    own, points, piece = rects.own(cut, PointExposure(np.array([ALPHA_UM]), np.array([1.0])))
+    assert set(piece.tolist()) == set(range(len(boxes)))
+    assert len(points) == len(piece)
+    margin = 100  # pixels around the raster: 10 ranges
+    image = np.zeros((720 + 2 * margin, 720 + 2 * margin))
+    for (left, bottom, right, top), exposure in zip(boxes // 5 + margin, own, strict=True):
+        image[bottom:top, left:right] = 0.5 / exposure
+    field = gaussian_filter(image, ALPHA_UM / np.sqrt(2) / PIXEL_UM, truncate=8)
+    inside = image > 0
+    corner = int(4 * ALPHA_UM / PIXEL_UM)  # edges that run straight for four ranges to both sides
+    seen = 0
+    for flip in (False, True):
+        drawn, value = (v.T if flip else v for v in (inside, field))
+        edge = drawn[1:] != drawn[:-1]
+        straight = np.all([np.roll(edge, k, axis=1) for k in range(-corner, corner + 1)], axis=0)
+        between = ((value[1:] + value[:-1]) / 2)[straight]  # an edge lies between two pixels
+        seen += len(between)
+        assert between == pytest.approx(0.5, abs=0.002)  # points lie within 4 ranges of corners: erfc(4), and raster
+    assert seen > 2000
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-12, -1e-12])
+def test_a_row_that_ends_over_the_middle_of_a_side_leaves_its_free_half(off):
+    boxes = np.array([[0.1, 0.2, 1.3, 0.9], [0.7 + off, 0.9, 2.0, 1.5], [1.3, 0.2, 2.0, 0.9]])
+    cut = Rects(boxes, np.zeros(3, int), np.ones(3))
+    _, points, piece = rects.own(cut, PointExposure(np.array([0.02]), np.array([1.0])))
+    first = sorted(map(tuple, points[piece == 0].round(9).tolist()))
+    assert first == [(0.1, 0.55), (0.4, 0.9), (0.7, 0.2)]
