@@ -87,7 +87,9 @@ def sampling(optics: Optics, window: Window, wavelength_um: float) -> Sampling:
     harmonics = math.floor(2 * period / window.step_um)
     half = window.samples * window.step_um / 2
     beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * edge * half), 0.5)
-    return Sampling(period, nodes, scipy.fft.next_fast_len(nodes + harmonics + 1), harmonics, beyond)
+    # neither the autocorrelation nor the harmonics that are kept of it may wrap round
+    size = max(nodes + harmonics + 1, 2 * harmonics + 2)
+    return Sampling(period, nodes, scipy.fft.next_fast_len(size), harmonics, beyond)
 
 
 def psfs(

@@ -107,6 +107,20 @@ def test_films_behind_the_lens_are_in_the_image():
     assert float(relative(bare.double(), want)) > 0.02
 
 
+def test_a_slow_lens_whose_blur_is_many_samples_wide():
+    """NA 0.025: fewer nodes across the pupil than harmonics of the window, so that both decide the transform's size."""
+    window, far = Window(31, STEP), 2000.0
+    optics = Optics(SmoothWave(Focus(0.85, far, FOCUS), RADIUS), Layers(), far)
+    place, depth = (130.0, -71.0), 5200.0
+    at = torch.tensor([place], dtype=torch.float64)
+    got = psfs(optics, at, depths_um=torch.tensor([depth]), wavelength_um=0.85, window=window)[0, 0].double()
+    slow = Referee(radius=RADIUS, distance=far, focus=FOCUS, design_wavelength=0.85, fine=0.6, count=512)
+    want = torch.from_numpy(slow.sampled(slow.intensity(place, depth, 0.85), STEP, window.samples).copy())
+    # what the sharp rim bends beyond the window folds back: 4√2 / (π² k p h) of the light, here 4 %
+    beyond = 4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / 0.85 * RADIUS / math.hypot(far, RADIUS) * 15.5 * STEP)
+    assert float(relative(got * (want.sum() / got.sum()), want)) < beyond
+
+
 def test_films_thicker_than_the_gap_are_refused():
     layers = Layers(behind=(Film(Index(1.5), 300.0),))
     with pytest.raises(PropagationError, match="300 um in the 240 um from lens to sensor"):
