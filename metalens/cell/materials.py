@@ -98,6 +98,14 @@ _PAGES = {  # deposited films where the database has them, bulk else; o and e: o
     "Si-infrared": "Si_Li-293K",
 }
 NAMES = tuple(sorted((*_TABLES, *_FORMULAS, *_PAGES)))
+_WORDS = """
+vacuum=air silicon=Si amorphous-silicon=a-Si crystalline-silicon=c-Si germanium=Ge bk7=N-BK7 glass=N-BK7 acrylic=PMMA
+silica=SiO2 fused-silica=SiO2 quartz=SiO2 silicon-dioxide=SiO2 silicon-nitride=Si3N4 gallium-nitride=GaN
+titania=TiO2 titanium-dioxide=TiO2 titanium-nitride=TiN hafnia=HfO2 niobia=Nb2O5 tantala=Ta2O5 alumina=Al2O3
+gallium-arsenide=GaAs gallium-phosphide=GaP aluminium-nitride=AlN aluminum-nitride=AlN
+gold=Au silver=Ag aluminium=Al aluminum=Al chromium=Cr chrome=Cr
+"""
+SPOKEN = dict(pair.split("=") for pair in _WORDS.split())  # what people type and no spelling leads from: its name
 
 
 def index(material: cell.Material | Material, wavelength_um: float) -> complex:
@@ -144,10 +152,11 @@ def material(name: str) -> Material:
 
 
 def _hint(name: str) -> str:
-    """The same name in another case, one that it begins with, or the nearest."""
-    lower = name.lower().replace(" ", "").replace("_", "-")
-    same = [known for known in NAMES if known.lower() == lower]
-    return f"; did you mean {same[0]!r}?" if same else nearest(name, NAMES)
+    """What the word means, the same name in another case, or the nearest."""
+    lower = name.lower().strip().replace("_", "-")
+    same = [known for known in NAMES if known.lower() == lower.replace(" ", "")]
+    meant = next(iter(same), SPOKEN.get("-".join(lower.split())))
+    return f"; did you mean {meant!r}?" if meant else nearest(name, NAMES)
 
 
 def read_yaml(path: str | Path) -> Material:

@@ -19,17 +19,19 @@ from metalens.modal.mesh import MeshPlan
 @dataclass(frozen=True, slots=True)
 class Choice:
     """A mesh for discs up to ``up_to`` pitches wide, and the relative error of transverse wavenumbers squared that
-    both forms share on it: ``thin + wide * rho**4``, and ``oblique`` more off normal incidence (sharp resonances)."""
+    both forms share on it: ``thin + wide * rho**4``, ``middle`` more for discs that are not thin, whose one guided
+    wave the forms may place alike, and ``oblique`` more off normal incidence (sharp resonances)."""
 
     plan: MeshPlan
     up_to: float
     thin: float
     wide: float = 0.0
     oblique: float = 0.0
+    middle: float = 0.0
 
     def shared(self, rho: float, bloch: float) -> float:
         """The error shared by both forms at this diameter in pitches and half Bloch phase."""
-        return self.thin + self.wide * rho**4 + (self.oblique if bloch else 0.0)
+        return self.thin + self.wide * rho**4 + self.oblique * (bloch > 0) + self.middle * (rho > MIDDLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,7 @@ class Measured(Protocol):
 
 
 NARROW, GAP = 0.9, 3.0  # from this diameter in pitches, the safety factor times this, the shared error times its half
+MIDDLE = 0.4  # above this diameter in pitches, ``Choice.middle`` counts
 THIN, SMALL = 0.25, 0.2  # below this diameter in pitches the forms err mostly apart; share of the shared error
 GRAZING = 0.15  # of the change that exact cutoffs make: it bounds nothing by itself, but the forms err alike there
 UNSEEN = 0.02  # of the usual estimate: plane waves in a layer without contrast err a little that nothing shows
@@ -113,29 +116,29 @@ RUNGS = (
     Rung(
         "coarse",
         (
-            Choice(MeshPlan(3, 3, 2, STEEPER, core=0.45), 0.7, 5e-6, 8e-5),
-            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 0.0, 7e-5, oblique=1.5e-5),
+            Choice(MeshPlan(3, 3, 2, STEEPER, core=0.45), 0.7, 6e-6, 3e-5, oblique=1e-5, middle=3.5e-5),
+            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 1e-5, 7e-5, oblique=2.5e-5),
         ),
         1.2,
         2e-3,
-        at_cutoff=4.2,
+        at_cutoff=4.6,
         thin=0.3,
     ),
     Rung(
         "fair",
         (
-            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 2e-6, 2.5e-5),
+            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 3e-6, 5e-6, oblique=3e-6, middle=1.2e-5),
             Choice(MeshPlan(4, 4, 3, STEEPER, core=0.55), 1.0, 0.0, 3e-5, oblique=1e-5),
         ),
         1.2,
         4e-4,
-        at_cutoff=4.0,
+        at_cutoff=4.6,
         thin=0.5,
     ),
     Rung(
         "even",
         (
-            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 1e-6, 1.5e-5),
+            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 1e-6, 1.5e-5, oblique=2e-6, middle=2e-6),
             Choice(MeshPlan(5, 5, 5, BOTH), 1.0, 1.5e-7, oblique=3e-7),
         ),
         0.6,

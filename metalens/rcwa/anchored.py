@@ -9,8 +9,7 @@ without films is known from the modal method, so
 is solved at a few diameters between foot and top, and every cross-section of the wall is taken as wide as (1) says. The
 answers of four truncations then lie closer together by one order of magnitude, on both sides of the limit; their mean
 is the answer. Its error estimate: the farthest of the four from it, half of what (1) leaves unexplained, the error
-of the modal solves, and that of the collocation along the wall. (Round pillars of index 3.5 and 2 with walls up to 0.05
-rad: the estimate with 4 to 7 orders was never below the distance to 8 to 11.)
+of the modal solves, and that of the collocation along the wall.
 """
 
 import dataclasses
