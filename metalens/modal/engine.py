@@ -173,7 +173,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         CellError: a disc so thin or so wide that the matrices of its elements are singular.
     """
     try:
-        first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
+        with np.errstate(invalid="ignore"):  # of degenerate elements: refused below
+            first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
     except np.linalg.LinAlgError as singular:
         raise CellError(
             f"a diameter of {case.rho:.3g} pitches: the elements that follow the disc degenerate ({singular}); "

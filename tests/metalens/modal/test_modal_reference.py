@@ -10,6 +10,10 @@ import pytest
 import metalens
 from metalens import modal, rcwa
 from metalens.cell.record import Cell, Index
+from metalens.ground.errors import CellError
+from metalens.modal import RUNGS
+from metalens.modal.case import case_of
+from metalens.modal.engine import evaluate
 
 FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
 ENTRIES = json.loads(FILE.read_text(encoding="utf-8"))["entries"]
@@ -66,6 +70,52 @@ def test_error_estimate_holds_oblique(entry):
     """With the dark mode near 272 nm, p, which only a broken symmetry sees."""
     got = solve(entry, 1e-2)
     assert abs(got.t - complex(*entry["t"])) <= got.t_error + entry["uncertainty"]
+
+
+def held_against(rung, where, **light):
+    """Bar and error of t: the finer mesh is known by its own estimate, which counts against the bar."""
+    case = case_of(*where, light.get("angle_rad", 0.0), 0.0, light.get("polarization", "x"))
+    solution = evaluate(case, rung.choice(case.rho).plan)
+    return complex(solution.matrix[1, 0]), rung.error(solution, case.rho)
+
+
+ALIKE = [  # pitch, height, indices of pillar, substrate, cover, between; diameter, wavelength
+    ((0.4364, 1.8514), (2.9316, 1.302, 1.0744, 1.1737), (0.2165, 0.8488)),
+    ((0.4472, 1.6471), (2.932, 1.4258, 1.0872, 1.2877), (0.2382, 0.9113)),
+    ((0.4259, 2.3275), (3.2234, 1.4864, 1.265, 1.0788), (0.187, 0.8666)),
+]
+
+
+@pytest.mark.parametrize(("size", "media", "where"), ALIKE)
+def test_one_guided_wave_that_both_forms_place_alike(size, media, where):
+    """Tall discs of middle size: the wavenumbers of the forms cross there, so that their difference tells nothing.
+
+    Half the difference of the forms is 2 to 8 times below the error.
+    """
+    where = Cell(*size, *map(Index, media)), *where
+    case = case_of(*where, 0.0, 0.0, "x")
+    want, doubt = held_against(RUNGS[3], where)
+    for rung in RUNGS[:2]:
+        got = evaluate(case, rung.choice(case.rho).plan)
+        error = abs(got.matrix[1, 0] - want)
+        assert 1.5 * got.spread < error <= rung.error(got, case.rho) + doubt
+
+
+def test_error_estimate_holds_below_an_oblique_cutoff():
+    """0.02 degrees before an order of the substrate appears, where 1/kz of that order is large."""
+    where = Cell(pitch_um=0.45), 0.2, 0.85
+    light = {"angle_rad": math.asin(0.85 / 0.45 - 1.4525) - math.radians(0.02), "polarization": "p"}
+    got = modal.solve(*where, **light, tolerance=1e-2)
+    want, doubt = held_against(RUNGS[3], where, **light)
+    assert abs(got.t - want) <= got.t_error + doubt
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("diameter", [1e-6, 1e-12])
+def test_a_diameter_that_elements_cannot_follow_is_refused_by_name(diameter):
+    """A picometre on a pitch of 0.4 um: no error of the linear algebra, no warning, a way out."""
+    with pytest.raises(CellError, match=r"pitches: the elements .* degenerate .* use metalens\.rcwa"):
+        modal.solve(Cell(pitch_um=0.4), diameter, 0.85)
 
 
 @pytest.mark.parametrize(
