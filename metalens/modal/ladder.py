@@ -104,7 +104,7 @@ class Measured(Protocol):
 
 
 NARROW, GAP = 0.9, 3.0  # from this diameter in pitches, the safety factor times this, the shared error times its half
-MIDDLE = 0.4  # above this diameter in pitches, ``Choice.middle`` counts
+MIDDLE = 0.3  # above this diameter in pitches, ``Choice.middle`` counts
 THIN, SMALL = 0.25, 0.2  # below this diameter in pitches the forms err mostly apart; share of the shared error
 GRAZING = 0.15  # of the change that exact cutoffs make: it bounds nothing by itself, but the forms err alike there
 UNSEEN = 0.02  # of the usual estimate: plane waves in a layer without contrast err a little that nothing shows
@@ -129,7 +129,7 @@ RUNGS = (
     Rung(
         "fair",
         (
-            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 3e-6, 5e-6, oblique=3e-6, middle=1.2e-5),
+            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 3e-6, 5e-6, oblique=3e-6, middle=1.5e-5),
             Choice(MeshPlan(4, 4, 3, STEEPER, core=0.55), 1.0, 0.0, 3e-5, oblique=1e-5),
         ),
         1.2,
