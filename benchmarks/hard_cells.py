@@ -116,7 +116,7 @@ def judged(kind: str, count: int, tolerance: float, seed: int, *, other_solver: 
     text += f", {open_} that no mesh decides" if open_ else ""
     text += f", {apart} outside both bars of RCWA" if other_solver else ""
     return Row(
-        case=f"cells {kind}, tolerance {tolerance:g}: {text}",
+        case=f"cells {kind}, tolerance {tolerance:g}, seed {seed}: {text}",
         method="modal",
         seconds=seconds / max(1, len(ratios)),
         error=1 / min(ratios, default=math.inf),
