@@ -16,6 +16,8 @@ from layout.rules import DrcReport, foreign, markers
 from metalens.commands import Common, MaybeOutput
 from metalens.ground.errors import MaskFileError
 
+_EACH_BYTE = 2  # placements more that a byte of the file may stand for
+
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -26,12 +28,14 @@ class Options(Common):
         process: PROCESS.toml with the rules; left out: the defaults.
         output: marker database to write (.lyrdb for KLayout); left out: none.
         ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
+        most_shapes: shapes that the mask may hold when its arrays are taken apart; some 150 bytes of memory for each.
     """
 
     mask: tyro.conf.Positional[Path]
     process: Path | None = None
     output: MaybeOutput = None
     ignore: tuple[int, ...] = ()
+    most_shapes: int = foreign.MOST_SHAPES
 
 
 def run(options: Options) -> int:
@@ -41,19 +45,24 @@ def run(options: Options) -> int:
         raise MaskFileError(f"{options.mask}: no such file; need a GDSII or OASIS mask")
     output = options.claim(options.output) if options.output is not None else contextlib.nullcontext()
     with output as draft:
-        content = read(options.mask)
+        content = read(options.mask, options.most_shapes)
         skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
-        found = foreign.check(content, process.rules, skip=skip)
+        found = foreign.check(content, process.rules, skip=skip, most=options.most_shapes)
         if draft is not None:
             markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
     options.console.result(_values(found), _text(options.mask, found))
     return 0 if found.ok else 1
 
 
-def read(path: Path) -> MaskContent:
-    """A mask of either format."""
+def read(path: Path, most: int = foreign.MOST_SHAPES) -> MaskContent:
+    """A mask of either format; more placements than ``most``, and two for each byte of the file, are not taken apart.
+
+    Raises:
+        MaskFileError: more than these, or a file that cannot be read.
+    """
     is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
-    return oasis_read.read(path) if is_oasis else gdsii_read.read(path)
+    limit = most + _EACH_BYTE * path.stat().st_size
+    return (oasis_read.read if is_oasis else gdsii_read.read)(path, limit=limit)
 
 
 def _values(found: DrcReport) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from layout.commands.check import read
 from layout.files import MaskContent, doses, flat
 from layout.process import LayerNumber
+from layout.rules import foreign
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 from metalens.view import Drawing, Numbers, Outline, Panel
@@ -30,6 +31,7 @@ def panels(path: Path) -> list[Panel]:
     if found is None:
         raise MaskFileError(f"{path}: no mask file ({', '.join(SUFFIXES)}) in it")
     content = read(found)
+    flat.refuse_beyond(content, foreign.MOST_SHAPES)
     table = found.with_name("doses.csv")
     dose = doses.read(table) if table.is_file() else {}
     outlines = [_outline(content, shape, dose) for top in content.tops for shape in _gathered(content, top)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +69,40 @@ def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
                 yield Stack(name, layer, _turned(np.stack(group).astype(np.int64), turn), x, y)
 
 
+def refuse_beyond(content: MaskContent, most: int) -> None:
+    """Count what the hierarchy would draw when taken apart, by products alone.
+
+    Raises:
+        MaskFileError: more than ``most`` shapes (placements that draw nothing count as one), with the number; a cell
+            that places itself or is missing.
+    """
+    known: dict[str, int] = {}
+    for name in content.cells:  # those below no top cell too: they place each other
+        _number(content, name, known, ())
+    total = sum(known[top] for top in content.tops)
+    if total > most:
+        raise MaskFileError(
+            f"the mask draws {total:,} shapes when its arrays are taken apart, at most {most:,} are taken "
+            "(metalens check --most-shapes sets another limit, at some 150 bytes of memory for each)"
+        )
+
+
+def _number(content: MaskContent, name: str, known: dict[str, int], above: tuple[str, ...]) -> int:
+    if name in known:
+        return known[name]
+    if name not in content.cells:
+        raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
+    if name in above or len(above) > _DEEPEST:
+        raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
+    cell = content.cells[name]
+    total = sum(map(len, cell.polygons.values())) + sum(map(len, cell.circles.values()))
+    placed = cell.kept()
+    for child, count in zip(placed.children, np.bincount(placed.child, minlength=len(placed.children)), strict=True):
+        total += int(count) * max(1, _number(content, child, known, (*above, name)))
+    known[name] = total
+    return total
+
+
 def _circle(x: int, y: int, radius: int) -> Array:
     angle = 2 * np.pi * (np.arange(_CIRCLE) + 0.5) / _CIRCLE
     reach = radius * np.sqrt(2 * np.pi / _CIRCLE / np.sin(2 * np.pi / _CIRCLE))
@@ -96,12 +131,17 @@ def _cells(
     if not len(placed.child):
         return
     px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
-    px, py = px + at[0], py + at[1]
-    if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
+    px += at[0]
+    py += at[1]
+    if max(px.max(), py.max(), -px.min(), -py.min()) > 2**31 - 1:
         raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
-    key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
-    order = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
-    kinds, first = np.unique(key[order], return_index=True)
+    px, py = px.astype(np.int32), py.astype(np.int32)
+    small: type[np.integer[Any]] = np.uint16 if len(placed.children) * len(placed.turns) < 1 << 16 else np.int64
+    key = np.asarray(placed.child, small) * len(placed.turns) + np.asarray(placed.turn, small)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    kinds = key[first]
     for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
         child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])
         if child in content.cells and not len(content.cells[child].kept().child):

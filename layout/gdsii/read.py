@@ -1,6 +1,7 @@
 """GDSII reader: every record is checked; what is wrong is named with its byte offset."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from metalens.ground.errors import MaskFileError
 _HEADS = {0x00, 0x05} | {0x1F, 0x20, 0x22, 0x36, 0x23, 0x39}  # header records that libraries may add
 _SHAPES = {gds.BOUNDARY, gds.BOX, gds.PATH, gds.TEXT, gds.NODE, gds.SREF, gds.AREF}
 LIMIT = 2**29
+_AT_ONCE = 1 << 20  # copies of an array
 
 
 @dataclass(eq=False, slots=True)
@@ -85,6 +87,7 @@ class _Reader:
     def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
         self.path, self.data, self.at, self.limit, self.keep = path, data, 0, limit, keep
         self.begin = 0  # of the latest record
+        self.placed = 0
 
     def fail(self, text: str, at: int | None = None) -> MaskFileError:
         return MaskFileError(f"{self.path}: byte {self.begin if at is None else at}: {text}")
@@ -175,9 +178,9 @@ class _Reader:
             self.count(len(child))
 
     def count(self, more: int) -> None:
-        self.limit -= more
-        if self.limit < 0:
-            raise self.fail("more placements than the limit that was set")
+        self.placed += more
+        if self.placed > self.limit:
+            raise self.fail(f"{self.placed:,} placements up to here, at most {self.limit:,} are read")
 
     def fields(self) -> dict[int, bytes]:
         """{kind: data} up to ENDEL."""
@@ -217,24 +220,32 @@ class _Reader:
         turn = self.turn(found, start)
         xy = self.numbers(found, gds.XY, 2 if kind == gds.SREF else 6)
         if kind == gds.SREF:
-            x, y = xy[:1], xy[1:]
-        else:
-            columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
-            if columns < 1 or rows < 1:
-                raise self.fail(f"array of {columns} x {rows}", start)
-            self.count(columns * rows)
-            across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
-            if (across % columns).any() or (along % rows).any():
-                raise self.fail(
-                    f"array of {columns} x {rows} over {across.tolist()} and {along.tolist()} units: its steps are no "
-                    "whole units; place the copies one by one, or on the grid",
-                    start,
-                )
-            i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
-            x, y = (xy[k] + i * (across[k] // columns) + j * (along[k] // rows) for k in (0, 1))
-            if max(np.abs(x).max(), np.abs(y).max()) > FARTHEST:
-                raise self.fail("array that reaches beyond 32 bits", start)
-        batch.add(np.full(len(x), number), x, y, turn)
+            batch.add(np.full(1, number), xy[:1], xy[1:], turn)
+            return
+        for x, y in self.array(found, xy, start):
+            batch.add(np.full(len(x), number, np.int32), x, y, turn)
+
+    def array(self, found: dict[int, bytes], xy: Array, start: int) -> Iterator[tuple[Array, Array]]:
+        """Places of an array of references, some rows at a time, so that no memory is taken before it is counted."""
+        columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
+        if columns < 1 or rows < 1:
+            raise self.fail(f"array of {columns} x {rows}", start)
+        self.count(columns * rows)
+        across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
+        if (across % columns).any() or (along % rows).any():
+            raise self.fail(
+                f"array of {columns} x {rows} over {across.tolist()} and {along.tolist()} units: its steps are no "
+                "whole units; place the copies one by one, or on the grid",
+                start,
+            )
+        step, down = across // columns, along // rows
+        ends = xy[:2] + np.array([[i, j] for i in (0, columns - 1) for j in (0, rows - 1)]) @ np.array([step, down])
+        if np.abs(ends).max() > FARTHEST:
+            raise self.fail("array that reaches beyond 32 bits", start)
+        i = np.arange(columns)
+        for part in np.array_split(np.arange(rows), -(-columns * rows // _AT_ONCE)):
+            x, y = (xy[k] + (part[:, None] * down[k] + i * step[k]).ravel() for k in (0, 1))
+            yield x, y
 
     def turn(self, found: dict[int, bytes], start: int) -> Turn:
         flags = found.get(gds.STRANS, b"\0\0")

@@ -15,6 +15,20 @@ from metalens.ground.arrays import Array
 Child = int | str  # reference number, or name
 Value = TypeVar("Value")
 _BATCH = 1 << 18
+_DRAWN = 8  # placements that take as much memory as a polygon without its corners
+
+
+@dataclass(slots=True)
+class Budget:
+    """Placements and copies of a whole file: at most ``limit``, ``used`` so far."""
+
+    limit: int
+    used: int = 0
+
+    @property
+    def left(self) -> int:
+        """How many more may come."""
+        return self.limit - self.used
 
 
 @dataclass(eq=False, slots=True)
@@ -83,8 +97,8 @@ class OpenCell:
 class CellReader:
     """Reads the records of one cell."""
 
-    def __init__(self, cell: OpenCell, limit: int) -> None:
-        self.cell, self.limit, self.modal = cell, limit, Modal()
+    def __init__(self, cell: OpenCell, budget: Budget) -> None:
+        self.cell, self.budget, self.modal = cell, budget, Modal()
 
     def record(self, c: Cursor, kind: int) -> bool:
         """Read the record of this kind that stands at the cursor; False where cells hold no such record."""
@@ -132,9 +146,12 @@ class CellReader:
         self.cell.held.add(child, x, y, turn)
 
     def _count(self, c: Cursor, more: int) -> None:
-        self.limit -= more
-        if self.limit < 0:
-            raise c.fail("more placements and copies than the limit that was set")
+        self.budget.used += more
+        if self.budget.used > self.budget.limit:
+            raise c.fail(
+                f"{self.budget.used:,} placements and copies up to here (a drawn copy counts as {_DRAWN} and its "
+                f"corners), at most {self.budget.limit:,} are read"
+            )
 
     def _need(self, c: Cursor, value: Value | None, what: str) -> Value:
         if value is None:
@@ -152,11 +169,12 @@ class CellReader:
     def _repeated(self, c: Cursor, info: int, bit: int, x: int, y: int) -> tuple[Array, Array]:
         if not info & bit:
             return np.array([x]), np.array([y])
-        self.modal.repetition = c.repetition(self.modal.repetition, self.limit)
-        at_x, at_y = self.modal.repetition.x + x, self.modal.repetition.y + y
-        c.within(int(np.abs(at_x).max()))
-        c.within(int(np.abs(at_y).max()))
-        return at_x, at_y
+        self.modal.repetition = c.repetition(self.modal.repetition, self.budget.left)
+        moved = self.modal.repetition
+        for offsets, start in ((moved.x, x), (moved.y, y)):
+            c.within(int(offsets.max()) + start)
+            c.within(int(offsets.min()) + start)
+        return moved.x + moved.x.dtype.type(x), moved.y + moved.y.dtype.type(y)
 
     def _placement(self, c: Cursor, kind: int) -> None:
         info, m = c.byte(), self.modal
@@ -184,16 +202,16 @@ class CellReader:
         if info & 2:
             self.modal.datatype = c.unsigned()
 
-    def _place(self, c: Cursor, info: int) -> tuple[tuple[int, int], Array, Array]:
+    def _place(self, c: Cursor, info: int, corners: int) -> tuple[tuple[int, int], Array, Array]:
         """Layer and positions of a shape, from the end of its record."""
         m = self.modal
         m.x, m.y = self._position(c, info, (0x10, 8), (m.x, m.y))
         x, y = self._repeated(c, info, 4, m.x, m.y)
-        self._count(c, len(x))
+        self._count(c, len(x) * (_DRAWN + corners))
         return (self._need(c, m.layer, "layer"), self._need(c, m.datatype, "datatype")), x, y
 
     def _polygons(self, c: Cursor, info: int, points: Array) -> None:
-        layer, x, y = self._place(c, info)
+        layer, x, y = self._place(c, info, len(points))
         c.within(int(np.abs(points).max()) + max(abs(self.modal.x), abs(self.modal.y)))
         shapes = self.cell.polygons.setdefault(layer, [])
         shapes.extend(points + np.array(place) for place in zip(x.tolist(), y.tolist(), strict=True))
@@ -279,7 +297,7 @@ class CellReader:
         if info & 0x20:
             m.radius = c.within(c.unsigned())
         radius = self._need(c, m.radius, "radius")
-        layer, x, y = self._place(c, info)
+        layer, x, y = self._place(c, info, 1)
         shapes = self.cell.circles.setdefault(layer, [])
         shapes.extend((px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True))
 

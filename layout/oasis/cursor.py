@@ -10,12 +10,13 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 MOST_BYTES = 9  # of one integer
+MOST_COPIES = 1 << 24  # of one regular repetition, which take memory at once
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Repetition:
-    """Offsets of all copies from the first, which is (0, 0): (n,) x and y."""
+    """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32 bits."""
 
     x: Array
     y: Array
@@ -195,9 +196,11 @@ class Cursor:
         return self._grid(first, second, along, self.delta() if form == 8 else (0, 0), limit)
 
     def _grid(self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int) -> Repetition:
-        if n * m > limit:
-            raise self.fail(f"repetition of {n} x {m} copies, more than the limit of {limit}")
+        if n * m > min(limit, MOST_COPIES):
+            most = min(limit, MOST_COPIES)
+            raise self.fail(f"repetition of {n} x {m} = {n * m:,} copies, at most {most:,} more are read")
         for i in (0, 1):
             self.within(abs(n * a[i]) + abs(m * b[i]))
-        along, across = (v.ravel() for v in np.meshgrid(np.arange(n), np.arange(m)))
-        return Repetition(along * a[0] + across * b[0], along * a[1] + across * b[1])
+        along, across = np.arange(n), np.arange(m)[:, None]
+        x, y = ((along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32) for k in (0, 1))
+        return Repetition(x.ravel(), y.ravel())

@@ -11,11 +11,12 @@ import numpy as np
 
 from layout.files import CellContent, Gathered, MaskContent, mapped
 from layout.oasis import bytes as oasis
-from layout.oasis.cells import CellReader, Child, OpenCell
+from layout.oasis.cells import Budget, CellReader, Child, OpenCell
 from layout.oasis.cursor import Cursor
 from metalens.ground.arrays import Array
 
 LIMIT = 2**29
+_BYTES_EACH = 16  # of a compressed block, for each placement that may be read
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 
@@ -44,7 +45,7 @@ class _Reader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
     def __init__(self, cursor: Cursor, limit: int, keep: int | None) -> None:
-        self.file, self.limit, self.keep = cursor, limit, keep
+        self.file, self.budget, self.keep = cursor, Budget(limit), keep
         self.cell: CellReader | None = None
         self.cells: list[OpenCell] = []
         self.names: dict[int, str] = {}
@@ -117,10 +118,8 @@ class _Reader:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
 
     def _begin_cell(self, key: Child) -> None:
-        if self.cell is not None:
-            self.limit = self.cell.limit
         self.cells.append(OpenCell(key, held=Gathered(self.keep)))
-        self.cell = CellReader(self.cells[-1], self.limit)
+        self.cell = CellReader(self.cells[-1], self.budget)
 
     def _block(self, c: Cursor) -> None:
         if c is not self.file:
@@ -130,6 +129,9 @@ class _Reader:
         size, packed = c.unsigned(), c.unsigned()
         if packed > c.left or size > packed * _LARGEST_RATIO + 64:
             raise c.fail(f"compressed block of {packed} bytes for {size}, with {c.left} left in the file")
+        if size > _BYTES_EACH * self.budget.limit:
+            most = _BYTES_EACH * self.budget.limit
+            raise c.fail(f"compressed block of {size:,} bytes, at most {most:,} are unpacked")
         try:
             engine = zlib.decompressobj(-15)
             raw = engine.decompress(c.take(packed), size + 1)

@@ -5,7 +5,7 @@ polygon, those that can be near each other found through a tree of their places;
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,10 @@ from layout.shapes import convex, region
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-_MOST_SHAPES = 40_000_000
+MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB
+_MOST_PAIRS = 1 << 22
+_STRIP = 1 << 16  # shapes whose neighbours are looked for at once
+_AT_ONCE = 1 << 20  # corners
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,17 +55,20 @@ class _Layer:
         return left, bottom, right, top
 
 
-def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = ()) -> DrcReport:
+def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most: int = MOST_SHAPES) -> DrcReport:
     """Gap, feature and grid of every shape below the top cells, each layer number (all its datatypes) by itself.
 
     Args:
         skip: layer numbers that are not drawn in the resist (outlines, write fields).
+        most: shapes that are taken apart.
 
     Raises:
-        MaskFileError: no top cell, a hierarchy that is broken, more than 4e7 shapes.
+        MaskFileError: no top cell, a hierarchy that is broken, more than ``most`` shapes or 4e6
+            pairs of shapes that can be closer than the rule.
     """
     if not content.tops:
         raise MaskFileError("the mask has no top cell: its cells place each other in a circle")
+    flat.refuse_beyond(content, most)
     report = DrcReport.empty(content, rules)
     for number, layer in sorted(_layers(content, skip).items()):
         report.pillars += len(layer.kind)
@@ -73,21 +79,17 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = ()) -> Dr
 
 def _layers(content: MaskContent, skip: Sequence[int]) -> Mapping[int, _Layer]:
     found: dict[int, tuple[dict[bytes, int], list[Array], list[str], list[Array], list[Array]]] = {}
-    total = 0
     for top in content.tops:
         for shape in flat.shapes(content, top):
             if shape.layer[0] in skip:
                 continue
-            total += len(shape.x)
-            if total > _MOST_SHAPES:
-                raise MaskFileError(f"more than {_MOST_SHAPES:,} shapes; check a part of the mask")
             known, outlines, cells, kinds, places = found.setdefault(shape.layer[0], ({}, [], [], [], []))
             key = np.ascontiguousarray(shape.outline, np.int64).tobytes()
             if key not in known:
                 known[key] = len(outlines)
                 outlines.append(_plain(np.asarray(shape.outline, np.int64)))
                 cells.append(shape.cell)
-            kinds.append(np.full(len(shape.x), known[key]))
+            kinds.append(np.full(len(shape.x), known[key], np.int32))
             places.append(np.column_stack([shape.x, shape.y]))
     return {
         number: _Layer(outlines, cells, np.concatenate(kinds), np.concatenate(places))
@@ -147,17 +149,21 @@ def _near(layer: _Layer, gap: float) -> tuple[Array, Array, Array]:
     twos: list[Array] = [np.empty(0, np.int64)]
     groups = {s: np.flatnonzero(size == s) for s in np.unique(size).tolist()}
     widest = {s: float(reach[members].max()) for s, members in groups.items()}
-    trees = {s: cKDTree(centre[members]) for s, members in groups.items()}
+    trees = {s: cKDTree(centre[members]) for s, members in groups.items() if len(groups) > 1}
     for s, members in groups.items():
-        pairs = trees[s].query_pairs(2 * widest[s] + gap, output_type="ndarray")
-        ones.append(members[pairs[:, 0]])
-        twos.append(members[pairs[:, 1]])
+        for pairs in _alike(centre[members], 2 * widest[s] + gap):
+            kept = _close(centre, reach, *members[pairs.T]) < gap
+            ones.append(members[pairs[kept, 0]])
+            twos.append(members[pairs[kept, 1]])
+            _refuse_many(sum(map(len, ones)))
         for t in (t for t in groups if t < s):
-            found = trees[t].query_ball_point(centre[members], widest[s] + widest[t] + gap)
+            far = widest[s] + widest[t] + gap
+            _refuse_many(int(trees[t].count_neighbors(trees[s], far)))
+            found = trees[t].query_ball_point(centre[members], far)
             twos.append(groups[t][np.concatenate([np.asarray(f, np.int64) for f in found])])
             ones.append(np.repeat(members, [len(f) for f in found]))
     one, two = np.concatenate(ones), np.concatenate(twos)
-    kept = np.hypot(*(centre[one] - centre[two]).T) - reach[one] - reach[two] < gap
+    kept = _close(centre, reach, one, two) < gap
     one, two = one[kept], two[kept]
     hulls = [o if _is_convex(o) else _hull(o) for o in layer.outlines]
     moves = layer.xy[two] - layer.xy[one]
@@ -168,6 +174,39 @@ def _near(layer: _Layer, gap: float) -> tuple[Array, Array, Array]:
             known[key] = convex.gap(hulls[key[0]], hulls[key[1]], key[2], key[3])
         apart[n] = known[key]
     return one, two, apart
+
+
+def _close(centre: Array, reach: Array, one: Array, two: Array) -> Array:
+    """(n,) distance of the circles around two shapes."""
+    return np.asarray(np.hypot(*(centre[one] - centre[two]).T) - reach[one] - reach[two])
+
+
+def _alike(centre: Array, far: float) -> Iterator[Array]:
+    """(n, 2) pairs of places not farther than ``far`` apart, each once, strip by strip in bounded memory.
+
+    Raises:
+        MaskFileError: so many in one strip that shapes must lie on each other.
+    """
+    from scipy.spatial import cKDTree
+
+    order = np.argsort(centre[:, 1], kind="stable")
+    y = centre[order, 1]
+    for first in range(0, len(order), _STRIP):
+        last = min(first + _STRIP, len(order))
+        end = int(np.searchsorted(y, y[last - 1] + far, side="right"))
+        own, all_of = order[first:last], order[first:end]
+        tree = cKDTree(centre[all_of])
+        _refuse_many(int(cKDTree(centre[own]).count_neighbors(tree, far)) // 2)
+        pairs = np.sort(tree.query_pairs(far, output_type="ndarray"), axis=1)
+        yield all_of[pairs[pairs[:, 0] < last - first]]
+
+
+def _refuse_many(count: int) -> None:
+    if count > _MOST_PAIRS:
+        raise MaskFileError(
+            f"{count:,} pairs of shapes can be closer than the rule, at most {_MOST_PAIRS:,} are measured; shapes lie "
+            "on each other, or the rule's gap is far wider than they are"
+        )
 
 
 def _hull(points: Array) -> Array:
@@ -224,8 +263,8 @@ def _off_grid(layer: _Layer, rules: Rules, unit_nm: float, report: DrcReport) ->
     places = np.mod(layer.xy, step)
     for kind, outline in enumerate(layer.outlines):
         at = np.flatnonzero(layer.kind == kind)
-        off = np.mod(outline[None] + places[at][:, None], step)
-        wrong = at[(np.minimum(off, step - off) > 1e-6).any((1, 2))] if len(at) * len(outline) < 2e8 else at[:0]
-        for n in wrong.tolist():
-            violation = Violation("off-grid", layer.box(n), 0.0, float(rules.grid_nm), layer.cells[kind])
-            report.add("off-grid", 1, violation)
+        for some in np.array_split(at, -(-len(at) * len(outline) // _AT_ONCE)):
+            off = np.mod(outline[None] + places[some][:, None], step)
+            for n in some[(np.minimum(off, step - off) > 1e-6).any((1, 2))].tolist():
+                violation = Violation("off-grid", layer.box(n), 0.0, float(rules.grid_nm), layer.cells[kind])
+                report.add("off-grid", 1, violation)

@@ -70,16 +70,37 @@ def _overlaps(outline: Array, xy: Array, zone: Box) -> Array:
 
 def structures_apart(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
     """Lattices, marks and labels keep the minimum gap, box to box (outlines and apertures lie over them)."""
-    boxes = [(lattice.name, _lattice_box(plan, lattice)) for lattice in plan.lattices]
+    groups: dict[str, list[Box]] = {}
+    for lattice in plan.lattices:
+        groups.setdefault(lattice.name, []).append(_lattice_box(plan, lattice))
     for figure in plan.figures:
         if figure.name in ("MARKS", "LABEL"):
-            shapes = [np.asarray(s) for s in itertools.chain.from_iterable(figure.polygons.values())]
-            boxes += [(figure.name, _box(s)) for s in shapes]
-    for (one, a), (two, b) in itertools.combinations(boxes, 2):
-        gap = math.hypot(max(a[0] - b[2], b[0] - a[2], 0), max(a[1] - b[3], b[1] - a[3], 0)) * plan.unit_nm
-        if gap < rules.minimum_gap_nm and one != two:
-            box = (int(min(a[0], b[0])), int(min(a[1], b[1])), int(max(a[2], b[2])), int(max(a[3], b[3])))
-            report.add("structures", 1, Violation("structures", box, gap, rules.minimum_gap_nm, f"{one} to {two}"))
+            shapes = itertools.chain.from_iterable(figure.polygons.values())
+            groups.setdefault(figure.name, []).extend(_box(np.asarray(shape)) for shape in shapes)
+    limit = rules.minimum_gap_nm / plan.unit_nm
+    boxes = [(name, np.array(some)) for name, some in groups.items() if some]
+    for (one, first), (two, second) in itertools.combinations(boxes, 2):
+        near = first[_apart(first, _around(second)) < limit]  # of many pieces those that can matter
+        others = second[_apart(second, _around(near)) < limit] if len(near) else near
+        for a in near if len(others) else near[:0]:
+            gaps = _apart(others, a)
+            for b, gap in zip(others[gaps < limit], (gaps[gaps < limit] * plan.unit_nm).tolist(), strict=True):
+                left, bottom, right, top = (int(v) for v in _around(np.stack([a, b])))
+                shown = Violation(
+                    "structures", (left, bottom, right, top), gap, rules.minimum_gap_nm, f"{one} to {two}"
+                )
+                report.add("structures", 1, shown)
+
+
+def _around(boxes: Array) -> Array:
+    """(4,) the box around boxes (n, 4)."""
+    return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
+
+
+def _apart(boxes: Array, box: Array) -> Array:
+    """(n,) distances of boxes (n, 4) from one."""
+    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
+    return np.asarray(np.hypot(*across.T))
 
 
 def _lattice_box(plan: MaskPlan, lattice: Lattice) -> Box:

@@ -1,0 +1,149 @@
+"""Tiny files that claim millions of shapes: counted before memory is taken, refused with the number."""
+
+import re
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from layout.commands import check
+from layout.files import flat
+from layout.gdsii import bytes as gds
+from layout.gdsii import read as gdsii_read
+from layout.oasis import bytes as oasis
+from layout.oasis import read as oasis_read
+from layout.process import Rules
+from layout.rules import foreign
+from metalens import cli
+from metalens.ground.errors import MaskFileError
+
+MOST_BYTES = 60e6  # of Python and numpy; the limits of the test itself are small
+
+
+def structure(name, *elements):
+    return gds.shorts(gds.BGNSTR, *[0] * 12) + gds.text(gds.STRNAME, name) + b"".join(elements) + gds.record(gds.ENDSTR)
+
+
+def array(child, columns, rows, step=(1000, 900)):
+    corners = np.array([[0, 0], [columns * step[0], 0], [0, rows * step[1]]])
+    body = gds.record(gds.AREF) + gds.text(gds.SNAME, child) + gds.shorts(gds.COLROW, columns, rows)
+    return body + gds.points(corners) + gds.record(gds.ENDEL)
+
+
+def gdsii(*structures):
+    head = gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *[0] * 12) + gds.text(gds.LIBNAME, "L")
+    head += gds.record(gds.UNITS, gds.real(1e-3) + gds.real(1e-9))
+    leaf = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, 7) + gds.shorts(gds.DATATYPE, 3)
+    leaf += gds.points(np.array([[0, 0], [500, 0], [0, 600], [0, 0]])) + gds.record(gds.ENDEL)
+    return head + structure("A", leaf) + b"".join(structures) + gds.record(gds.ENDLIB)
+
+
+def grid(columns, rows, step):
+    return b"".join(map(oasis.unsigned, (1, columns - 2, rows - 2, step, step)))
+
+
+def placement(child, repetition):
+    return bytes([oasis.PLACEMENT, 0xC8, child]) + repetition
+
+
+def rectangle(repetition):
+    return bytes([oasis.RECTANGLE, 0x67, 7, 3]) + oasis.unsigned(60) + oasis.unsigned(50) + repetition
+
+
+def oasis_file(*cells):
+    body = oasis.start(1.0) + b"".join(bytes([oasis.CELLNAME]) + oasis.string(f"C{n}") for n in range(len(cells)))
+    body += b"".join(bytes([oasis.CELL_REF, n]) + records for n, records in enumerate(cells))
+    return body + oasis.end((0,) * 6, zlib.crc32(body))
+
+
+def block(records):
+    engine = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = engine.compress(records) + engine.flush()
+    return bytes([34, 0]) + oasis.unsigned(len(records)) + oasis.unsigned(len(packed)) + packed
+
+
+BOMBS = {
+    "one.gds": (gdsii(structure("TOP", array("A", 23000, 23000))), r"529,000,000 placements.*at most 4,0"),
+    "many.gds": (gdsii(structure("TOP", *[array("A", 1250, 1000)] * 4)), r"5,000,000 placements"),
+    "nested.gds": (
+        gdsii(structure("B", array("A", 900, 800)), structure("TOP", array("B", 7, 30))),
+        "151,200,000 sh",
+    ),
+    "circle.gds": (gdsii(structure("B", array("C", 2, 2)), structure("C", array("B", 3, 2))), "places itself through"),
+    "grid.oas": (oasis_file(b"", placement(0, grid(20000, 20000, 100))), r"20000 x 20000 = 400,000,000 copies"),
+    "cells.oas": (
+        oasis_file(b"", *[placement(0, grid(1250, 1000, 100))] * 4),
+        r"1,250,000 copies, at most 250,\d+ more",
+    ),
+    "again.oas": (
+        oasis_file(b"", placement(0, grid(2500, 1500, 9)) + placement(0, b"\0") * 5),
+        r"7,500,000 placements and copies",
+    ),
+    "boxes.oas": (oasis_file(rectangle(grid(2000, 1000, 70))), r"24,000,000 placements and copies"),
+    "packed.oas": (oasis_file(block(bytes(200_000_000))), r"block of 200,000,000 bytes"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_tiny_files_of_millions_are_refused_with_the_number(name, tmp_path, capsys):
+    data, match = BOMBS[name]
+    path = tmp_path / name
+    path.write_bytes(data)
+    assert len(data) < 300_000
+    assert cli.main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert re.search(match, said), said
+
+
+def test_memory_is_not_taken_before_the_count(tmp_path):
+    tracemalloc.start()
+    try:
+        for name, (data, _) in BOMBS.items():
+            if name in ("packed.oas", "circle.gds", "nested.gds"):
+                continue
+            read = gdsii_read.parse if name.endswith("gds") else oasis_read.parse
+            with pytest.raises(MaskFileError, match="at most"):
+                read(np.frombuffer(data, np.uint8), limit=100_000)
+        assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_arrays_are_summed_in_bounded_memory():
+    data = np.frombuffer(gdsii(structure("TOP", array("A", 4000, 3000, (7, -5)))), np.uint8)
+    tracemalloc.start()
+    try:
+        sums = gdsii_read.parse(data, keep=1000).cells["TOP"].sums
+        assert tracemalloc.get_traced_memory()[1] < 150e6  # a twelfth of the copies at once, 13 to 60 bytes each
+    finally:
+        tracemalloc.stop()
+    (count,), (x,), (y,) = sums.count, sums.x, sums.y
+    assert count == 12_000_000
+    assert x == 7 * 3000 * (4000 * 3999 // 2)
+    assert y == -5 * 4000 * (3000 * 2999 // 2)
+
+
+def test_the_number_of_shapes_is_the_product_of_the_arrays():
+    content = gdsii_read.parse(
+        np.frombuffer(gdsii(structure("B", array("A", 9, 8)), structure("TOP", array("B", 7, 3))), np.uint8)
+    )
+    flat.refuse_beyond(content, 9 * 8 * 7 * 3)
+    with pytest.raises(MaskFileError, match=r"1,512 shapes.*at most 1,511"):
+        flat.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
+
+
+def test_shapes_on_each_other_are_refused_before_they_are_paired():
+    data = gdsii(structure("TOP", array("A", 3000, 10, (0, 0))))
+    with pytest.raises(MaskFileError, match=r"pairs of shapes.*lie on each other"):
+        foreign.check(gdsii_read.parse(np.frombuffer(data, np.uint8)), Rules())
+
+
+def test_neighbours_are_found_across_strips(monkeypatch, tmp_path):
+    path = tmp_path / "a.gds"
+    path.write_bytes(gdsii(structure("TOP", array("A", 17, 13, (530, 640)))))
+    whole = foreign.check(check.read(path), Rules(minimum_gap_nm=70))
+    monkeypatch.setattr(foreign, "_STRIP", 20)
+    strips = foreign.check(check.read(path), Rules(minimum_gap_nm=70))
+    assert whole.counts == strips.counts
+    assert whole.counts["gap"] >= 16 * 13 + 17 * 12  # each to the right and each above stands too close
