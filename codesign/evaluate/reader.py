@@ -9,7 +9,7 @@ texture ranks lenses that readers cannot tell apart; what is read of them does n
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -58,7 +58,7 @@ class ReaderConfig:
     electrons: float = 2000.0
     fwhm_nm: float = 0.0
     depths_mm: tuple[float, float] = (12.0, 50.0)
-    tolerance: float = 0.03
+    tolerance: float = field(default=0.03, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         if min(self.frames, self.pool, self.test) < BATCH or self.frames % BATCH or self.test % BATCH:
