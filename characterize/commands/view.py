@@ -52,9 +52,7 @@ def asbuilt(path: Path) -> list[Panel]:
         Images("Captured less fitted", made.residual_sigma, axis, made.pixel_um, "sigma", signed=True),
         Numbers("What is known", ("", "in words"), _words(made)),
     ]
-    if made.psf is not None:
-        panels.append(_psf(made.psf))
-    return panels
+    return [*panels, _psf(made.psf())]
 
 
 def _psf(stack: PsfStack) -> Panel:

@@ -8,7 +8,7 @@ For those who build on it (retraining, mask correction)::
     built.lens()                                   # Lens with the as-built diameters, wavelength and distance
     built.diameters                                # its DiameterMap
     built.pillars()                                # (y, x) complex t of every pillar: process and wave front too
-    built.psf                                      # PsfStack at the depths and angles of the captures
+    built.psf()                                    # PsfStack at the depths and angles of the captures
     built.psf_stack(View(depths_um, angles_rad, window_um, samples))   # PsfStack anywhere else
     draws = built.samples(16, seed=0)              # (16, p) from the posterior
     built.psf_stack(view, draws[3])                # ... and the lens, pillars and PSFs of each:
@@ -20,11 +20,11 @@ PSFs hold all that belongs to the lens (pillars, process, aberrations, distance,
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from characterize.model import PLACE, made, vector
+from characterize.model import PLACE, Setting, made, oversampling, true_depth, vector
 from metalens import lens as lenses
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -32,10 +32,7 @@ from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
 from metalens.made import Sensitivity, Solved
-from metalens.psf import PsfStack
-
-if TYPE_CHECKING:
-    from metalens.psf import View
+from metalens.psf import PsfStack, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -56,7 +53,6 @@ class AsBuilt:
     low, high: (p,) 95 % intervals by profile over all valleys; draws: (m, p) of the posterior where it is no parabola.
     verdicts: how well the PSF is known, and how well the process, in words.
     curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there with all others fitted.
-    psf: of the lens as built at the true depths of the captures, (angle, depth, y, x); None before it is computed.
     """
 
     design: Lens
@@ -86,7 +82,6 @@ class AsBuilt:
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
     verdicts: tuple[str, ...] = ()
     curves: dict[str, Array] = field(default_factory=dict)
-    psf: PsfStack | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
     @property
@@ -145,7 +140,20 @@ class AsBuilt:
         """(y, x) complex transmission of every as-built pillar at normal incidence, wave-front errors included."""
         return made.pillars(self.design, self.response, self.parameters(value), modes=self.residual_modes)
 
-    def psf_stack(self, view: "View", value: Array | None = None, *, tolerance: float = 1e-4) -> PsfStack:
+    def psf(self) -> PsfStack:
+        """PSFs (angle, depth, y, x) at the true depths of the captures, as fine as the light, on the fitted window.
+
+        Computed anew by each call: seconds for a lens of a millimetre.
+        """
+        side = max(self.measured.shape[1:])
+        setting = Setting(self.depth_um, self.angle_rad, np.ones(len(self.depth_um)), self.pixel_um, side, side)
+        depths = np.unique(np.round(true_depth(self.parameters(), setting, float(self.depth_um.mean())), 3))
+        angles = tuple((float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0))
+        samples = side * oversampling(self.design, self.pixel_um)
+        view = View(tuple(depths.tolist()), angles, side * self.pixel_um, samples)
+        return self.psf_stack(view, tolerance=1e-3)
+
+    def psf_stack(self, view: View, value: Array | None = None, *, tolerance: float = 1e-4) -> PsfStack:
         """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of :meth:`samples`.
 
         Windows are centred on the chief ray of the best fit. A draw's own is moved by the difference of the two
@@ -181,17 +189,6 @@ _ARRAYS = (
     "nominal",
     "residual_sigma",
 )
-_PSF_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error")
-_PSF = (
-    "intensity",
-    "energy_um2",
-    "depths_um",
-    "angles_rad",
-    "wavelengths_um",
-    "weights",
-    "centres_um",
-    *_PSF_NUMBERS,
-)
 _WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts")
 
 
@@ -212,8 +209,6 @@ def save(path: str | Path, result: AsBuilt) -> None:
         solved = result.response.solved
         arrays |= {"response/diameter_um": solved.diameter_um, "response/powers": solved.powers}
         arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
-    if result.psf is not None:
-        arrays |= {f"psf/{name}": np.asarray(getattr(result.psf, name)) for name in _PSF}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
     design, about = lenses.parts(result.design, group="design/")
     arrays |= design | {"design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)}
@@ -246,7 +241,6 @@ def load(path: str | Path) -> AsBuilt:
     return AsBuilt(
         design=design,
         response=_response(a, about),
-        psf=_psf(a),
         residual_modes=a.get("residual_modes", np.empty(0)),
         curves={name.removeprefix("curves/"): a[name] for name in a if name.startswith("curves/")},
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
@@ -268,14 +262,6 @@ def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
     return Sensitivity(
         arrays["response/coefficients"], about["response_center_um"], about["response_error"], *ends, solved
     )
-
-
-def _psf(arrays: dict[str, Array]) -> PsfStack | None:
-    if "psf/intensity" not in arrays:
-        return None
-    fields: dict[str, Any] = {name: arrays[f"psf/{name}"] for name in _PSF}
-    fields |= {name: fields[name].item() for name in _PSF_NUMBERS}
-    return PsfStack(**fields, reason="as built, at the depths of the captures")
 
 
 def _text(array: Array) -> list[str]:

@@ -20,17 +20,14 @@ from characterize.model import (
     PLACE,
     ForwardModel,
     Known,
-    made,
     slopes,
     thinplate,
-    true_depth,
     vector,
 )
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitRefused
 from metalens.lens import Lens
 from metalens.made import Sensitivity
-from metalens.psf import PsfStack, View
 
 LIKENESS = 0.45
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
@@ -163,7 +160,6 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
     return AsBuilt(
         design=model.lens,
         response=model.response,
-        psf=_psf(model.lens, model, task.all_of(solution.value)),
         names=names,
         value=solution.value,
         covariance=covariance,
@@ -233,17 +229,6 @@ def _problems(task: Task, solution: Solution, gain: Gain) -> list[str]:
     if left > residual.MOST_RAD:
         problems.append(f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens")
     return problems
-
-
-def _psf(lens: Lens, model: ForwardModel, x: Array) -> PsfStack:
-    """PSFs of the as-built lens at the true depths of the frames, as fine as the light is, on the fitted window."""
-    s = model.setting
-    depths = np.unique(np.round(true_depth(x, s, model.stage_centre_um), 3))
-    side = max(s.rows, s.columns)
-    samples = side * model.grid.oversample
-    angles = tuple((float(a[0]), float(a[1])) for a in np.unique(s.angle_rad, axis=0))
-    view = View(tuple(depths.tolist()), angles, side * s.pixel_um, samples)
-    return made.psf_stack(lens, model.response, x, view, modes=model.modes, tolerance=1e-3)
 
 
 def _with_gain(names: tuple[str, ...], found: Posterior, gain: Gain) -> Array:

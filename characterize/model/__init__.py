@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from characterize.model import made as made
     from characterize.model import thinplate as thinplate
     from characterize.model.forward import ForwardModel as ForwardModel
+    from characterize.model.forward import oversampling as oversampling
     from characterize.model.glass import extra_path as extra_path
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
@@ -40,6 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "extra_path": "glass",
         "incidence_rad": "pillars",
         "made": "",
+        "oversampling": "forward",
         "prior_rad": "thinplate",
         "slopes": "pillar_slopes",
         "spectrum": "setting",

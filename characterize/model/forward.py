@@ -63,6 +63,12 @@ class _Group:
         return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
 
 
+def oversampling(lens: Lens, pixel_um: float) -> int:
+    """Samples along a pixel's side that are fine enough for the light of a lens."""
+    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
+    return detector.fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
+
+
 class ForwardModel:
     """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
 
@@ -78,8 +84,7 @@ class ForwardModel:
             )
         self.lens, self.setting = lens, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
-        sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
-        over = detector.fine_enough(setting.pixel_um, 2 * sine / lens.wavelength_um)
+        over = oversampling(lens, setting.pixel_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
         self.response, self._span, self._cut = response, span, 0.0
         self.modes = np.empty(0)

@@ -147,22 +147,23 @@ def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
 
 
 def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
-    """The stored stack, through the pixels, is what the fit predicts; a draw of the posterior gives another one."""
+    """The PSFs of a file are those of the fit, and of the hidden lens; a draw of the posterior gives others."""
     fitted.save(tmp_path / "a.h5")
     again = AsBuilt.load(tmp_path / "a.h5")
-    assert np.array_equal(again.psf.intensity, fitted.psf.intensity)
+    stack = again.psf()
+    assert np.array_equal(stack.intensity, fitted.psf().intensity)
     true = b.truth().vector()
     want = psf.psf_stack(
         *(f(made.pillars(b.lens(), b.RESPONSE, true)) for f in (np.angle, np.abs)),
         pitch_um=0.4,
         wavelength_um=0.85 + 0.4e-3,
         sensor_distance_um=112.0,
-        depths_um=again.psf.depths_um,
+        depths_um=stack.depths_um,
         window_um=24.0,
-        samples=again.psf.intensity.shape[-1],
+        samples=stack.intensity.shape[-1],
         offset_um=[b.VALUES[n] - fitted.value[fitted.names.index(n)] for n in ("decentre_x_um", "decentre_y_um")],
     )
-    found = again.psf.intensity[0]
+    found = stack.intensity[0]
     assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(want.intensity)  # intervals of the fit
     view = View((600.0,), ((0.0, 0.0), (0.05, 0.0)), 24.0, 48)
     draw = again.psf_stack(view, again.samples(1, seed=2)[0])
