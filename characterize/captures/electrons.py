@@ -35,6 +35,9 @@ class Frames:
     variance_e2: (n, y, x) variance at zero light: read noise, quantisation, dark subtraction.
     scale: (n, y, x) or (1, 1, 1): electrons counted for each electron given here (flat field), for the shot noise.
     corrections: every step in words.
+    common_floor: share of ``variance_e2`` that is the same error in all frames, that of the dark level.
+    common_light: relative error of a pixel's light that is the same in all frames, that of the flat (not in the
+        variance).
     """
 
     electrons: Array
@@ -44,6 +47,8 @@ class Frames:
     scale: Array
     gain: Gain
     corrections: tuple[str, ...]
+    common_floor: float = 0.0
+    common_light: float = 0.0
 
 
 def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
@@ -68,10 +73,11 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
     pairs = [(flat[a], flat[b]) for a, b in zip(order[:-1:2], order[1::2], strict=False)]
     mean = np.array([(_middle(a) + _middle(b)) / 2 - offset for a, b in pairs])
     variance = np.array([_pair_variance(np.stack(pair)) for pair in pairs])
-    spread = variance * math.sqrt(2 / flat[0].size)
     if not (variance > 0).all() or not (mean > 0).all():
         raise CaptureError("photon transfer: flats without noise or light; take them anew, evenly lit to half the well")
-    inverse, sigma, floor = _line(mean, variance, spread, floor)
+    base = floor or 0.0
+    expected = base + mean * (variance - base).sum() / mean.sum()  # of the variance: its own would favour low ones
+    inverse, sigma, floor = _line(mean, variance, np.abs(expected) * math.sqrt(2 / flat[0].size), floor)
     if inverse <= 0:
         raise CaptureError("photon transfer: the noise does not grow with light; the flats are saturated or processed")
     gain = 1 / inverse
@@ -92,7 +98,7 @@ def clean(capture: Capture, *, gain: Gain | None = None) -> Frames:
     raw = np.asarray(capture.frames, float)
     gain = gain or _gain(capture, notes)
     dark = _dark_level(capture, notes)
-    flat = _flat_field(capture, dark, notes)
+    flat, flat_error = _flat_field(capture, dark, notes)
     bad = bad_pixels(capture)
     notes.append(f"{int(bad.sum())} of {bad.size} pixels hot, dead or in a dead row: masked")
     top = saturation_level(capture)
@@ -111,6 +117,8 @@ def clean(capture: Capture, *, gain: Gain | None = None) -> Frames:
         np.broadcast_to(flat, raw.shape),
         gain,
         tuple(notes),
+        common_floor=1 / (1 + repeats),
+        common_light=flat_error,
     )
 
 
@@ -169,7 +177,8 @@ def merge_brackets(frames: Frames, exposure_s: Array, group: Array) -> tuple[Fra
     value, usable, saturated, floor, scale = (np.stack(part) for part in zip(*merged, strict=True))
     note = f"{len(group)} exposures merged to {len(kinds)} frames by inverse variance"
     notes = (*frames.corrections, note) if len(kinds) < len(group) else frames.corrections
-    return Frames(value, usable, saturated, floor, scale, frames.gain, notes), np.sort(first)
+    common = frames.common_floor, frames.common_light
+    return Frames(value, usable, saturated, floor, scale, frames.gain, notes, *common), np.sort(first)
 
 
 def _merge(frames: Frames, index: Array, exposure_s: Array) -> list[Array]:
@@ -217,9 +226,10 @@ def _dark_level(capture: Capture, notes: list[str]) -> Array | float:
     return np.asarray(np.mean(capture.dark, axis=0))
 
 
-def _flat_field(capture: Capture, dark: Array | float, notes: list[str]) -> Array:
+def _flat_field(capture: Capture, dark: Array | float, notes: list[str]) -> tuple[Array, float]:
+    """(flat, relative error of one of its pixels); ones where there is none to divide by."""
     if capture.flat is None:
-        return np.ones((1, 1))
+        return np.ones((1, 1)), 0.0
     level = np.mean(capture.flat, axis=0) - dark
     flat = level / np.median(level)
     noise = math.inf
@@ -227,9 +237,9 @@ def _flat_field(capture: Capture, dark: Array | float, notes: list[str]) -> Arra
         noise = math.sqrt(_pair_variance(capture.flat) / len(capture.flat)) / float(np.median(level))
     if _robust_sigma(flat) < 1.2 * noise:
         notes.append("flat is a single frame, or even to within its noise: not divided by")
-        return np.ones((1, 1))
+        return np.ones((1, 1)), 0.0
     notes.append(f"divided by the flat, {_robust_sigma(flat):.2%} robust spread")
-    return np.where((flat > 0.3) & (flat < 3), flat, 1.0)
+    return np.where((flat > 0.3) & (flat < 3), flat, 1.0), noise
 
 
 def _lonely(frames: Array) -> Array:
@@ -247,7 +257,7 @@ def _pair_variance(frames: Array) -> float:
     steps = np.diff(np.asarray(frames, float), axis=0) / math.sqrt(2)
     steps = steps - steps.mean((1, 2), keepdims=True)
     keep = np.abs(steps) <= 6 * max(_robust_sigma(steps), 0.5)
-    return float(np.mean(steps[keep] ** 2))
+    return float(np.mean(steps[keep] ** 2)) * frames[0].size / max(frames[0].size - 1, 1)
 
 
 def _line(mean: Array, variance: Array, spread: Array, floor: float | None) -> tuple[float, float, float]:

@@ -46,7 +46,10 @@ class Posterior:
 
 
 def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
-    """Profiles from every valley; one that falls below its mode is followed to a better one first."""
+    """Profiles from every valley; one that falls below its mode is followed to a better one first.
+
+    Intervals, curves, draws and covariance hold the errors of dark and flat too, which all frames have in common.
+    """
     modes = list(ends)
     for _ in range(_RESTARTS):
         valleys = [_valley(task, mode) for mode in modes]
@@ -81,6 +84,7 @@ def _profiles(task: Task, valley: Valley, mode: Solution) -> tuple[dict[str, Pro
 def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: dict[str, Profile]) -> Posterior:
     best, names = modes[0], task.names
     spread = max(1.0, best.chi2_per_dof)
+    calibration = valleys[0].calibration()
     sigma = valleys[0].sigma * np.sqrt(spread)
     low, high = best.value - posterior.REACH * sigma, best.value + posterior.REACH * sigma
     parabolic = np.ones(len(names), bool)
@@ -92,13 +96,24 @@ def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: 
         if room > 0:
             reach = room * posterior.REACH * valley.sigma * np.sqrt(spread)
             low, high = np.minimum(low, mode.value - reach), np.maximum(high, mode.value + reach)
+    wider = np.sqrt(1 + np.maximum(np.diag(calibration), 0.0) / sigma**2)
+    low = np.maximum(best.value + wider * (low - best.value), task.prior.low)
+    high = np.minimum(best.value + wider * (high - best.value), task.prior.high)
+    profiles = {name: _widened(one, best.value, wider, names.index(name)) for name, one in profiles.items()}
     share = posterior.shares(valleys)
-    covariance = valleys[0].covariance * spread
+    covariance = valleys[0].covariance * spread + calibration
     draws = np.empty((0, len(names)))
     if not parabolic.all() or share[0] < 0.99:
-        draws = posterior.draws(valleys)
+        shift = np.random.default_rng(1).multivariate_normal(np.zeros(len(names)), calibration, posterior.DRAWS)
+        draws = np.clip(posterior.draws(valleys) + shift, task.prior.low, task.prior.high)
         covariance = _covariance(draws, valleys[0], (high - low) / (2 * posterior.REACH))
     return Posterior(tuple(modes), share, low, high, parabolic, draws, profiles, covariance)
+
+
+def _widened(one: Profile, best: Array, wider: Array, i: int) -> Profile:
+    """A profile stretched about its mode by errors that its likelihood does not know: those of the calibration."""
+    ends, value = (best[i] + wider[i] * (part - best[i]) for part in (np.array([one.low, one.high]), one.value))
+    return dataclasses.replace(one, low=float(ends[0]), high=float(ends[1]), value=value)
 
 
 def _covariance(draws: Array, valley: Valley, sigma: Array) -> Array:

@@ -26,6 +26,8 @@ class Data:
     """What is fitted, in electrons: images, masks, variance at zero light, shot-noise scale.
 
     model_error: standard deviation of the model itself, as a share of the light in a pixel; added to the noise.
+    common_floor: share of ``variance_e2`` that is one error in all frames. common_light: relative error of the light of
+        a pixel that is one in all frames, not in the variance. Neither weighs; both widen intervals.
     """
 
     electrons: Array
@@ -34,6 +36,8 @@ class Data:
     variance_e2: Array
     scale: Array
     model_error: float = 0.0
+    common_floor: float = 0.0
+    common_light: float = 0.0
 
     def variance(self, image: Array) -> Array:
         """(n, y, x) variance of a pixel whose expected light is ``image``."""
@@ -43,7 +47,8 @@ class Data:
     def planes(self, index: Array) -> "Data":
         """Some of the frames."""
         part = [a[index] for a in (self.electrons, self.usable, self.saturated, self.variance_e2, self.scale)]
-        return Data(part[0], part[1], part[2], part[3], part[4], self.model_error)
+        common = self.common_floor, self.common_light
+        return Data(part[0], part[1], part[2], part[3], part[4], self.model_error, *common)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -45,6 +45,7 @@ class Valley:
         self._root = np.where(data.usable, 1 / noise, 0.0).ravel()
         first = np.abs(self._pixels(image))
         self._root *= np.sqrt(np.minimum(1, _HUBER / np.maximum(first, _HUBER)))
+        self._image = image
         silent = (data.saturated & (image >= data.electrons)).ravel()
         self._pull = np.where(np.isfinite(prior.sigma), 1 / prior.sigma, 0.0)
         columns = (np.asarray(jacobian).reshape(len(mode), -1) * (self._root * ~silent)).T
@@ -60,6 +61,21 @@ class Valley:
     def sigma(self) -> Array:
         """(p,) of the parabola."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def calibration(self) -> Array:
+        """(p, p) covariance by what all frames have in common beyond the noise of each: errors of dark and flat.
+
+        C AᵀW S W A C with S the covariance of the pixels by them, less what of it is in the noise already.
+        """
+        data, p = self._data, len(self.mode)
+        slopes = self.slopes[:-p].reshape(*self._image.shape, p)
+        root = self._root.reshape(self._image.shape)
+        light = data.common_light * np.maximum(self._image, 0) * root
+        dark = np.sqrt(data.common_floor * data.variance_e2) * root
+        flat, floor = ((slopes * c[..., None]).sum(0).reshape(-1, p) for c in (light, dark))
+        counted = (slopes * dark[..., None]).reshape(-1, p)
+        spread = flat.T @ flat + floor.T @ floor - counted.T @ counted
+        return np.asarray(self.covariance @ spread @ self.covariance)
 
     def along(self, i: int) -> Array:
         """(p,) how all parameters go when one is moved by one sigma and the rest are fitted, by the parabola."""

@@ -83,7 +83,8 @@ def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
     shape = frames.electrons.shape
     cut = (slice(None), *window)
     floor, scale = (np.broadcast_to(a, shape)[cut] for a in (frames.variance_e2, frames.scale))
-    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale)
+    common = {"common_floor": frames.common_floor, "common_light": frames.common_light}
+    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale, **common)
 
 
 def check_enough(data: Data, names: Sequence[str]) -> None:

@@ -1,5 +1,6 @@
 """Profiles and draws where the answer is a formula: a straight model, a bent one, and one with two lenses alike."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -53,6 +54,20 @@ def test_a_straight_model_has_the_parabola_s_interval():
     assert found.parabolic
     assert found.low == pytest.approx(mode[1] - reach, rel=1e-9)
     assert found.high == pytest.approx(mode[1] + reach, rel=1e-9)
+
+
+def test_errors_of_dark_and_flat_spread_the_estimate_as_the_whole_covariance_of_the_pixels_says():
+    """C AᵀW (noise + common errors) W A C with the dense matrix of all pixels, against the sums over frames."""
+    x, floor, light = np.array([1.3, -0.4]), 0.21, 0.17
+    images = 3.0 + straight(x, False)[0]
+    seen = dataclasses.replace(data(images), common_floor=floor, common_light=light)
+    valley = Valley(lambda x, j: (3.0 + straight(x, j)[0], SHAPES), seen, x, Prior.none(x))
+    n = images[0].size
+    alike = np.kron(np.ones((3, 3)), np.eye(n))
+    lit = np.maximum(images, 0).ravel()
+    common = floor * NOISE**2 * (alike - np.eye(3 * n)) + light**2 * np.outer(lit, lit) * alike
+    gain = valley.covariance @ SHAPES.reshape(2, -1) / NOISE**2
+    assert valley.calibration() == pytest.approx(gain @ common @ gain.T, rel=1e-6)
 
 
 def test_a_prior_narrows_the_interval_as_information_adds():
