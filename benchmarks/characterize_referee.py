@@ -63,6 +63,7 @@ FAULTS: dict[str, dict[str, float]] = {
 DECLARED = {
     "cover": "plate of glass",
     "stitching": "write field",
+    "side": "side wall",
     "pixel": "pixel pitch",
     "illumination": "illumination",
 }

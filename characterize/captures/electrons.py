@@ -257,7 +257,7 @@ def _pair_variance(frames: Array) -> float:
     steps = np.diff(np.asarray(frames, float), axis=0) / math.sqrt(2)
     steps = steps - steps.mean((1, 2), keepdims=True)
     keep = np.abs(steps) <= 6 * max(_robust_sigma(steps), 0.5)
-    return float(np.mean(steps[keep] ** 2)) * frames[0].size / max(frames[0].size - 1, 1)
+    return float(np.mean(steps[keep] ** 2) * frames[0].size / max(frames[0].size - 1, 1))
 
 
 def _line(mean: Array, variance: Array, spread: Array, floor: float | None) -> tuple[float, float, float]:

@@ -146,8 +146,9 @@ def _arranged_words(found: Arrangement) -> list[str]:
 
 
 def _rearranged(data: Data, found: Arrangement) -> Data:
-    arrays = ("electrons", "usable", "saturated", "variance_e2", "scale")
-    return dataclasses.replace(data, **{name: rearranged(getattr(data, name), found) for name in arrays})
+    part = [rearranged(a, found) for a in (data.electrons, data.usable, data.saturated, data.variance_e2, data.scale)]
+    common = {"common_floor": data.common_floor, "common_light": data.common_light}
+    return Data(part[0], part[1], part[2], part[3], part[4], **common)
 
 
 def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain) -> AsBuilt:

@@ -25,6 +25,7 @@ from metalens.lens import Lens
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _STITCH_UM = 0.05
+_WALL_DEG = 1.5
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
@@ -147,6 +148,10 @@ def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> It
             with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows
                 first = model.images(before)[0] if base else image
                 yield cause, amount, name + " {:.3g}", (model.images(after)[0] - first)[None]
+    leaning = model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
+    if "sidewall_deg" not in task.names:
+        told = "an angle whose square is {:.3g} deg²"
+        yield "a side wall that leans about half height", _WALL_DEG**2, told, leaning[None]
     for along, name in enumerate(("x", "y")):
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image

@@ -86,7 +86,7 @@ class ForwardModel:
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
         over = oversampling(lens, setting.pixel_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
-        self.response, self._span, self._cut = response, span, 0.0
+        self.response, self._span, self._cut, self._lean_um = response, span, 0.0, 0.0
         self.modes = np.empty(0)
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
@@ -126,6 +126,12 @@ class ForwardModel:
         """The same model with fields to a relative ``tolerance``: quick enough to scan with."""
         part = copy.copy(self)
         part._cut = tolerance
+        return part
+
+    def with_walls(self, angle_rad: float) -> "ForwardModel":
+        """The same lens with side walls that lean by an angle about half height; its derivatives are those without."""
+        part = copy.copy(self)
+        part._lean_um = math.tan(angle_rad) * self.lens.cell.height_um
         return part
 
     def with_residual(self, modes: Array, basis: Callable[[Array, Array, int], Array]) -> "ForwardModel":
@@ -258,7 +264,7 @@ class ForwardModel:
         weight, rate = group.pillars.weights(np.clip(bias, -reach, reach))
         gathered = group.reduced.gathered
         r, b, shape = len(gathered), len(weight), gathered.shape[1:]
-        values = group.pillars.coefficients(change(x))
+        values = group.pillars.coefficients(change(x), self._lean_um)
 
         def combine(w: Array, c: Array) -> Array:
             return np.asarray(((c.T @ w.reshape(b, -1)).reshape(r, *shape) * gathered).sum(0))

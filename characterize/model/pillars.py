@@ -89,9 +89,20 @@ class Pillars:
         wave = self.lens.wavelength_um + change.wavelength_um
         return transmission(self.lens.proxy, self.response, d, wave, np.array(change.answers), angle_rad=self.angle_rad)
 
-    def coefficients(self, change: Change) -> Array:
-        """(b, r) coefficients of t in the basis, as Chebyshev series of the bias."""
-        return np.asarray(self._to_series @ (self._at_nodes(change) @ self.basis.T))
+    def coefficients(self, change: Change, lean_um: float = 0.0) -> Array:
+        """(b, r) coefficients of t in the basis, as Chebyshev series of the bias.
+
+        lean_um: diameter at the foot of the pillars less that at half height, which is that at half height less that at
+        the top. The mean of ln t over the height, by Gauss's two points.
+        """
+        t = self._at_nodes(change)
+        if lean_um:
+            off = lean_um / math.sqrt(3)
+            reach = max(self.span.bias_um - off, 0.0)
+            bias = np.clip(self.nodes_um, -reach, reach)[:, None]
+            low, middle, high = (self.exact(bias + step, Change()) for step in (-off, 0.0, off))
+            t = t * np.sqrt(low * high / middle**2)
+        return np.asarray(self._to_series @ (t @ self.basis.T))
 
     def slopes(self, change: Change) -> Array:
         """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering causes, in base units."""

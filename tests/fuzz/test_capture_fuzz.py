@@ -18,7 +18,7 @@ LIMITS = dict(max_examples=60)
 FRAMES = (np.arange(2 * 6 * 5).reshape(2, 6, 5) * 37 % 1000).astype(np.uint16)
 STAGE = "file,page,depth_mm,angle_deg,exposure_s\nf.tif,0,18.0,0.0,0.01\nf.tif,1,22.5,1.5,0.01\n"
 ABOUT = 'pixel_um = 3.0\nwavelength_um = 0.85\nbits = 10\ncamera = "x"\n'
-DOSE = b"radius_um,energy\n0.0,10.0\n0.1,4.0\n0.3,1.0\n1.0,0.3\n3.0,0.1\n10.0,0.01\n"
+DOSE = b"radius_um,energy\n0.05,10.0\n0.1,4.0\n0.3,1.0\n1.0,0.3\n3.0,0.1\n10.0,0.01\n"
 ODD = ("nan", "inf", "-1", "1e400", "", '"', "f.tif", "99999999999999999999", "\x00", "0x10", "1;2", "ä")
 
 
@@ -56,6 +56,15 @@ def test_the_capture_itself_is_good(tmp_path):
     found = capture.load(tmp_path)
     assert np.array_equal(found.frames, FRAMES)
     assert found.position_um.tolist() == [18e3, 22.5e3]
+
+
+def test_the_exposure_table_itself_is_good(tmp_path):
+    """Its density falls from the first radius to the last, as the table does."""
+    path = tmp_path / "dose.csv"
+    path.write_bytes(DOSE)
+    found = exposure.point_exposure(Exposure(csv=path)).density(np.array([0.05, 0.3, 3.0, 10.0]))
+    assert (found > 0).all()
+    assert (np.diff(found) < 0).all()
 
 
 @pytest.mark.parametrize("name", ["f.tif", "stage.csv", "capture.toml"])

@@ -41,9 +41,10 @@ def task(model, data=None, names=NAMED):
     return SimpleNamespace(model=model, data=data, names=names, prior=prior, start=START)
 
 
-def valley(sigma, rho, least):
+def valley(sigma, rho, least, common=0.0):
     covariance = np.array([[1, rho], [rho, 1]]) * np.outer(sigma, sigma)
-    return SimpleNamespace(sigma=np.array(sigma), covariance=covariance, least=least)
+    shared = common * covariance
+    return SimpleNamespace(sigma=np.array(sigma), covariance=covariance, least=least, calibration=lambda: shared)
 
 
 def test_a_mode_is_as_probable_as_its_depth_and_its_volume():
@@ -66,19 +67,24 @@ def test_a_second_valley_widens_the_intervals_by_what_its_misfit_leaves():
     best = SimpleNamespace(value=np.array([1.0, 2.0]), merit=50.0, chi2_per_dof=1.44)
     other = SimpleNamespace(value=np.array([1.6, -9.0]), merit=51.7, chi2_per_dof=1.44)
     valleys = [valley((0.7, 2.1), 0.6, 0.0), valley((0.9, 0.5), 0.2, 30.0)]
-    found = explore._joined(SimpleNamespace(names=("bias_nm", "background_e")), [best, other], valleys, {})
+    prior = SimpleNamespace(low=np.array([-50.0, -99.0]), high=np.array([99.0, 99.0]))
+    about = SimpleNamespace(names=("bias_nm", "background_e"), prior=prior)
+    found = explore._joined(about, [best, other], valleys, {})
     wide = REACH * 1.2 * np.array([0.7, 2.1])
     reach = np.sqrt(1 - 1.7 / (REACH**2 * 1.44)) * REACH * 1.2 * np.array([0.9, 0.5])
     assert found.low == pytest.approx(np.minimum(best.value - wide, other.value - reach), rel=1e-12)
     assert found.high == pytest.approx(np.maximum(best.value + wide, other.value + reach), rel=1e-12)
     assert found.covariance == pytest.approx(1.44 * valleys[0].covariance, rel=1e-12)
     profile = posterior.Profile(-0.4, 3.1, np.zeros(1), np.zeros(1), parabolic=True)
-    found = explore._joined(
-        SimpleNamespace(names=("bias_nm", "background_e")), [best], valleys[:1], {"bias_nm": profile}
-    )
-    assert (found.low[0], found.high[0]) == (-0.4, 3.1)
+    found = explore._joined(about, [best], valleys[:1], {"bias_nm": profile})
+    assert (found.low[0], found.high[0]) == pytest.approx((-0.4, 3.1))
     assert found.low[1] == pytest.approx(2.0 - wide[1])
     assert not len(found.draws)
+    shared = valley((0.7, 2.1), 0.6, 0.0, common=0.81)  # of dark and flat, beside the 1.44 of each frame: 1.25 as wide
+    found = explore._joined(about, [best], [shared], {"bias_nm": profile})
+    assert (found.low[0], found.high[0]) == pytest.approx((1.0 - 1.25 * 1.4, 1.0 + 1.25 * 2.1))
+    assert found.high[1] == pytest.approx(2.0 + 1.25 * wide[1])
+    assert found.covariance == pytest.approx(2.25 * shared.covariance)
 
 
 def test_predicted_error_is_the_sine_between_the_images():

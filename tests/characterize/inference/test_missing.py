@@ -108,5 +108,7 @@ def test_faults_of_a_bench_are_named(cause):
 def test_a_clean_bench_is_called_clean_and_glass_is_declared():
     found = lean_of(b.electrons(), 5)
     assert not words(found)
+    wall = next(one for one in found if one.cause.startswith("a side wall"))
+    assert wall.chi2 < 16
     glass = next(one for one in untold(found) if "plate of glass" in one)
     assert "distance_um" in glass or "stage_zero_um" in glass
