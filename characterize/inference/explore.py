@@ -104,7 +104,9 @@ def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: 
     covariance = valleys[0].covariance * spread + calibration
     draws = np.empty((0, len(names)))
     if not parabolic.all() or share[0] < 0.99:
-        shift = np.random.default_rng(1).multivariate_normal(np.zeros(len(names)), calibration, posterior.DRAWS)
+        size, vectors = np.linalg.eigh(calibration)
+        normal = np.random.default_rng(1).standard_normal((posterior.DRAWS, len(names)))
+        shift = normal * np.sqrt(np.maximum(size, 0)) @ vectors.T
         draws = np.clip(posterior.draws(valleys) + shift, task.prior.low, task.prior.high)
         covariance = _covariance(draws, valleys[0], (high - low) / (2 * posterior.REACH))
     return Posterior(tuple(modes), share, low, high, parabolic, draws, profiles, covariance)
