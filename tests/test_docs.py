@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from characterize.captures.stage import read_about
+from characterize.model import PARAMETERS
 from metalens.chain.stages import ChainFiles
 from metalens.cli import VERBS
 from metalens.commands.design import Design
@@ -20,6 +22,7 @@ from metalens.ground import config
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")])
 MADE = re.compile(r"(\.\./)?reference/(\w+)\.md")  # pages that the site makes from the code
+OF_A_CAPTURE = {"pixel_um", "wavelength_um", "wavelength_sigma_nm", "bits", "gain_e", "channel"}
 TEXTS = [*PAGES, ROOT / "README.md", ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]
 
 
@@ -85,11 +88,15 @@ def test_python_of_a_page_runs_from_top_to_bottom(page, tmp_path):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
-def test_settings_of_a_page_are_accepted(page):
+def test_settings_of_a_page_are_accepted(page, tmp_path):
     for text in _blocks(page, "toml"):
         name = text.splitlines()[0].removeprefix("# ")
         if name == "RUN.toml":
             continue  # read over its preset, by its own tests
+        if name == "capture.toml":
+            (tmp_path / name).write_text(text, encoding="utf-8")
+            assert read_about(tmp_path).keys() <= OF_A_CAPTURE | {p.name for p in PARAMETERS}
+            continue
         config.loads(text, _records()[name], where=f"{page.name}: {name}")
 
 

@@ -21,6 +21,7 @@ CASES = {
     "study": ("-o out", "out"),
     "design": ("design.toml -o out.h5", "out.h5"),
     "psf": ("lens.h5 -o out.h5", "out.h5"),
+    "export": ("lens.h5 -o out.npz", "out.npz"),
     "scene": ("scene.toml -o out", "out"),
     "layout": ("lens.h5 -o out", "out"),
     "capture": ("lens.h5 --truth truth.toml -o out", "out"),

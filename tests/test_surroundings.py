@@ -46,10 +46,16 @@ def test_compiled_loops_of_a_read_only_copy_run_without_a_home(tmp_path):
     assert done.stdout.split()[-1:] == ["3"], done.stderr
 
 
+def _heard():
+    """A child of tests that run under nohup hears of a lost terminal all the same."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 def test_a_lost_terminal_ends_a_command_and_leaves_nothing(tmp_path):
     (tmp_path / "study.toml").write_text("pitches_um = [0.3]\nheights_um = [0.7]\n")
     words = [sys.executable, "-m", "metalens", "study", "study.toml", "-o", "out"]
-    child = subprocess.Popen(words, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    quiet = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    child = subprocess.Popen(words, cwd=tmp_path, preexec_fn=_heard, **quiet)
     for _ in range(1200):
         if child.poll() is not None or list(tmp_path.glob(".out.part-*")):
             break

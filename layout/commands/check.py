@@ -16,8 +16,6 @@ from layout.rules import DrcReport, foreign, markers
 from metalens.commands import Common, MaybeOutput
 from metalens.ground.errors import MaskFileError
 
-_EACH_BYTE = 2  # placements more that a byte of the file may stand for
-
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -28,14 +26,15 @@ class Options(Common):
         process: PROCESS.toml with the rules; left out: the defaults.
         output: marker database to write (.lyrdb for KLayout); left out: none.
         ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
-        most_shapes: shapes that the mask may hold when its arrays are taken apart; some 150 bytes of memory for each.
+        most_shapes: shapes that the mask may hold when its arrays are taken apart, some 150 bytes of memory for each;
+            left out: 4 million, and four more for each byte of the file.
     """
 
     mask: tyro.conf.Positional[Path]
     process: Path | None = None
     output: MaybeOutput = None
     ignore: tuple[int, ...] = ()
-    most_shapes: int = foreign.MOST_SHAPES
+    most_shapes: int | None = None
 
 
 def run(options: Options) -> int:
@@ -45,24 +44,24 @@ def run(options: Options) -> int:
         raise MaskFileError(f"{options.mask}: no such file; need a GDSII or OASIS mask")
     output = options.claim(options.output) if options.output is not None else contextlib.nullcontext()
     with output as draft:
-        content = read(options.mask, options.most_shapes)
+        most = foreign.most_of(options.mask) if options.most_shapes is None else options.most_shapes
+        content = read(options.mask, most)
         skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
-        found = foreign.check(content, process.rules, skip=skip, most=options.most_shapes)
+        found = foreign.check(content, process.rules, skip=skip, most=most)
         if draft is not None:
             markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
     options.console.result(_values(found), _text(options.mask, found))
     return 0 if found.ok else 1
 
 
-def read(path: Path, most: int = foreign.MOST_SHAPES) -> MaskContent:
-    """A mask of either format; more placements than ``most``, and two for each byte of the file, are not taken apart.
+def read(path: Path, most: int) -> MaskContent:
+    """A mask of either format; more placements than ``most`` are not taken apart.
 
     Raises:
         MaskFileError: more than these, or a file that cannot be read.
     """
     is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
-    limit = most + _EACH_BYTE * path.stat().st_size
-    return (oasis_read.read if is_oasis else gdsii_read.read)(path, limit=limit)
+    return (oasis_read.read if is_oasis else gdsii_read.read)(path, limit=most)
 
 
 def _values(found: DrcReport) -> dict[str, Any]:

@@ -30,8 +30,9 @@ def panels(path: Path) -> list[Panel]:
     found = mask_of(path) if path.is_dir() else path
     if found is None:
         raise MaskFileError(f"{path}: no mask file ({', '.join(SUFFIXES)}) in it")
-    content = read(found)
-    flat.refuse_beyond(content, foreign.MOST_SHAPES)
+    most = foreign.most_of(found)
+    content = read(found, most)
+    flat.refuse_beyond(content, most)
     table = found.with_name("doses.csv")
     dose = doses.read(table) if table.is_file() else {}
     outlines = [_outline(content, shape, dose) for top in content.tops for shape in _gathered(content, top)]

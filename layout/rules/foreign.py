@@ -7,6 +7,7 @@ polygon, those that can be near each other found through a tree of their places;
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from layout.shapes import convex, region
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB
+MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
+_EACH_BYTE = 4  # more of them for each byte: our densest masks, pillars of few sizes as OASIS arrays, hold 3.8
 _MOST_PAIRS = 1 << 22
 _STRIP = 1 << 16  # shapes whose neighbours are looked for at once
 _AT_ONCE = 1 << 20  # corners
@@ -53,6 +55,11 @@ class _Layer:
         corners = np.concatenate([self.points(n) for n in members])
         (left, bottom), (right, top) = corners.min(0).tolist(), corners.max(0).tolist()
         return left, bottom, right, top
+
+
+def most_of(path: Path) -> int:
+    """Shapes that a mask file is taken apart to, where its user sets no other limit."""
+    return MOST_SHAPES + _EACH_BYTE * path.stat().st_size
 
 
 def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most: int = MOST_SHAPES) -> DrcReport:

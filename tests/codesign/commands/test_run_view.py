@@ -18,9 +18,10 @@ def test_a_run_that_goes_on_shows_what_its_log_holds_so_far(tmp_path):
     birth = json.dumps({"kind": "birth", "step": 3})
     (tmp_path / "log.jsonl").write_text("\n".join([line(1, 0.7), line(3, 0.5), birth, line(4, 0.3), '{"kind": "st']))
     panels = view.panels(tmp_path)
-    assert [panel.title for panel in panels] == ["Training: loss", "Training: depth error mm"]  # the seed stands still
+    # the seed stands still
+    assert [panel.title for panel in panels] == ["Training: loss", "Training: depth error / mm"]
     assert panels[1].x.tolist() == [1, 3, 4]
-    assert np.allclose(panels[1].lines["depth error mm"], [1.4, 1.0, 0.6], rtol=1e-15)
+    assert np.allclose(panels[1].lines["depth error / mm"], [1.4, 1.0, 0.6], rtol=1e-15)
     assert cli.main(["view", str(tmp_path), "-o", str(tmp_path / "page.html"), "--quiet"]) == 0
 
 
@@ -28,7 +29,7 @@ def test_networks_are_a_row_each(tmp_path):
     rows = [{"budget_mmacs": 3.5, "axial_mm": 0.61}, {"budget_mmacs": None, "axial_mm": 0.48}]
     (tmp_path / "result.json").write_text(json.dumps({"rows": rows}))
     (table,) = view.panels(tmp_path)
-    assert table.head == ["axial mm", "budget mmacs"]
+    assert table.head == ["axial / mm", "budget / million MACs"]
     assert table.rows == [[0.61, 3.5], [0.48, None]]
     (tmp_path / "result.json").write_text("[1]")
     with pytest.raises(StoreError, match=r"result.json: need a table of names and values, found list"):

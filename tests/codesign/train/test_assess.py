@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from codesign.network import Prediction
 from codesign.train import assess
 from codesign.train.assess import Assessment, Seen
 
@@ -19,7 +20,7 @@ class Typed(torch.nn.Module):
     def forward(self, frames, architecture):
         part = slice(self.at, self.at + len(frames))
         self.at += len(frames)
-        return SimpleNamespace(slip=self.slip[part], mask_logits=self.logits[part], centre=self.slip[part, :2])
+        return Prediction(self.logits[part], self.slip[part, :2], self.slip[part])
 
 
 def test_architectures_are_chosen_by_the_mean_of_three_axes():

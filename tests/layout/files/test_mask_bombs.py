@@ -74,7 +74,7 @@ BOMBS = {
     "grid.oas": (oasis_file(b"", placement(0, grid(20000, 20000, 100))), r"20000 x 20000 = 400,000,000 copies"),
     "cells.oas": (
         oasis_file(b"", *[placement(0, grid(1250, 1000, 100))] * 4),
-        r"1,250,000 copies, at most 250,\d+ more",
+        r"1,250,000 copies, at most 25\d,\d+ more",
     ),
     "again.oas": (
         oasis_file(b"", placement(0, grid(2500, 1500, 9)) + placement(0, b"\0") * 5),
@@ -142,8 +142,8 @@ def test_shapes_on_each_other_are_refused_before_they_are_paired():
 def test_neighbours_are_found_across_strips(monkeypatch, tmp_path):
     path = tmp_path / "a.gds"
     path.write_bytes(gdsii(structure("TOP", array("A", 17, 13, (530, 640)))))
-    whole = foreign.check(check.read(path), Rules(minimum_gap_nm=70))
+    whole = foreign.check(check.read(path, 1000), Rules(minimum_gap_nm=70))
     monkeypatch.setattr(foreign, "_STRIP", 20)
-    strips = foreign.check(check.read(path), Rules(minimum_gap_nm=70))
+    strips = foreign.check(check.read(path, 1000), Rules(minimum_gap_nm=70))
     assert whole.counts == strips.counts
     assert whole.counts["gap"] >= 16 * 13 + 17 * 12  # each to the right and each above stands too close
