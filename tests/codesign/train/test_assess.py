@@ -32,10 +32,10 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     truth = torch.tensor([[0.3, -0.2, 1.1], [-0.6, 0.4, 0.2], [0.1, 0.9, -1.5]])
     off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.2, 0.1]])
     scale = torch.tensor([0.5, 2.0, 4.0])
-    logits, mask = -torch.ones(3, 4, 5), torch.zeros(3, 4, 5)
+    logits, mask = -torch.ones(3, 5, 5), torch.zeros(3, 5, 5)
     logits[0, :2], mask[0, 1:3] = 1.0, 1.0  # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[1, 0], mask[1, 0] = 1.0, 1.0
-    seen = Seen(torch.zeros(3, 1, 4, 5), mask, truth, batch=2)
+    seen = Seen(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
     net = Typed((truth + off) / scale, logits)
     inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
     got = assess.assess(net, None, seen, inner)
