@@ -54,14 +54,16 @@ def run(options: Options) -> int:
     return 0 if found.ok else 1
 
 
-def read(path: Path, most: int) -> MaskContent:
-    """A mask of either format; more placements than ``most`` are not taken apart.
+def read(path: Path, most: int | None = None) -> MaskContent:
+    """A mask of either format; more placements than ``most`` (by default what its size allows) are not taken apart.
 
     Raises:
         MaskFileError: more than these, or a file that cannot be read.
     """
     is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
-    return (oasis_read.read if is_oasis else gdsii_read.read)(path, limit=most)
+    return (oasis_read.read if is_oasis else gdsii_read.read)(
+        path, limit=foreign.most_of(path) if most is None else most
+    )
 
 
 def _values(found: DrcReport) -> dict[str, Any]:
