@@ -119,10 +119,11 @@ def _klayout(folder: Path, pillars: int) -> tuple[float, float]:
             cell = layout.cell(index)
             for instance in cell.each_inst():
                 times[instance.cell_index] = times.get(instance.cell_index, 0) + times[index] * instance.size()
-            if re.fullmatch(r"D\d{3}(X\d+)?", cell.name):
+            named = re.fullmatch(r"D(\d+)(?:[A-Z]\d+)?", cell.name)  # diameter in nm, number of the dose class
+            if named:
                 found += times[index]
                 shapes = [shape for layer in layout.layer_indexes() for shape in cell.each_shape(layer)]
                 drawn = sum(shape.polygon.area() for shape in shapes)
-                worst = max(worst, abs(drawn / (math.pi / 4 * int(cell.name[1:4]) ** 2) - 1))
+                worst = max(worst, abs(drawn / (math.pi / 4 * int(named[1]) ** 2) - 1))
         missing = max(missing, abs(pillars - found))
     return worst, missing
