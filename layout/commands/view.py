@@ -9,16 +9,15 @@ from layout.commands.check import read
 from layout.files import MaskContent, doses, flat
 from layout.process import LayerNumber
 from layout.rules import foreign
-from metalens.ground.arrays import Array
+from layout.shapes import polygon
+from metalens.commands import MASKS
 from metalens.ground.errors import MaskFileError
 from metalens.view import Drawing, Numbers, Outline, Panel
-
-SUFFIXES = (".oas", ".gds", ".oasis", ".gdsii")
 
 
 def mask_of(folder: Path) -> Path | None:
     """The mask file of a folder, OASIS before GDSII."""
-    return next((p for end in SUFFIXES for p in sorted(folder.glob(f"*{end}"))), None)
+    return next((p for end in MASKS for p in sorted(folder.glob(f"*{end}"))), None)
 
 
 def panels(path: Path) -> list[Panel]:
@@ -29,7 +28,7 @@ def panels(path: Path) -> list[Panel]:
     """
     found = mask_of(path) if path.is_dir() else path
     if found is None:
-        raise MaskFileError(f"{path}: no mask file ({', '.join(SUFFIXES)}) in it")
+        raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
     most = foreign.most_of(found)
     content = read(found, most)
     flat.refuse_beyond(content, most)
@@ -87,15 +86,10 @@ def _layers(content: MaskContent, outlines: list[Outline], dose: dict[LayerNumbe
     for layer in sorted({layer for cell in content.cells.values() for layer in (*cell.polygons, *cell.circles)}):
         number = "/".join(map(str, layer))
         some = [o for o in outlines if o.notes["layer"] == number]
-        area = sum(len(o.places) * _area(o.corners) for o in some) * (1e-3 * content.unit_nm) ** 2
+        area = sum(len(o.places) * abs(polygon.twice_area(o.corners)) / 2 for o in some) * (1e-3 * content.unit_nm) ** 2
         name = content.layer_names.get(layer, "")
         rows.append((number, name, sum(len(o.places) for o in some), area, dose.get(layer, "none stated")))
     return Numbers("Layers", ("layer/datatype", "name", "shapes", "area / um²", "relative dose"), rows)
-
-
-def _area(corners: Array) -> float:
-    after = np.roll(corners, -1, axis=0).astype(float)
-    return float(abs((corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]).sum()) / 2)
 
 
 def _marks(path: Path) -> list[tuple[float, float, str]]:

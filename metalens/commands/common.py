@@ -14,6 +14,7 @@ from metalens.ground.console import Console
 from metalens.ground.transaction import Draft, Terms
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+MASKS = (".oas", ".oasis", ".gds", ".gdsii")  # endings of mask files, OASIS before GDSII
 MaybeOutput = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 
 

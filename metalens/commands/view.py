@@ -7,13 +7,12 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands.common import Common, MaybeOutput
+from metalens.commands.common import MASKS, Common, MaybeOutput
 from metalens.ground import manifest, store
 from metalens.ground.errors import ConfigError
 from metalens.view import Panel, write
 
 VIEWS: dict[str, str] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
-MASKS = (".oas", ".oasis", ".gds", ".gdsii")
 # what tells the kind of a folder: names of files in it, any of them
 FOLDERS = {
     "mask": tuple(f"*{end}" for end in MASKS),
