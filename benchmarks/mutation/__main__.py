@@ -13,19 +13,21 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.mutation import rules, table
-from benchmarks.mutation.graph import PACKAGES, Graph
+from benchmarks.mutation.graph import Graph
+from benchmarks.mutation.reach import PACKAGES, Reach, Seen, digest
 from benchmarks.mutation.runner import Bench, copy_of, load_libraries
+from benchmarks.mutation.server import Server
 
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "benchmarks" / "results" / "mutants.json"
 REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # {"path: was -> became": why no test can tell}
-SECONDS = ROOT / "build" / "mutants" / "seconds.json"  # of each test file, as measured before the first mutant
+SEEN = ROOT / "build" / "mutants" / "reach.json"  # which tests run which lines, as seen before the first mutant
 
 
 def drawn(count: int, seed: int, only: str, bars: float) -> list[rules.Mutant]:
     """``count`` mutants, the share ``bars`` of them from lines that make error bars; modules and rules in turn."""
     generator, pools = random.Random(seed), {}
-    for package in PACKAGES[:-1]:
+    for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             if rules.numeric(path.relative_to(ROOT)) and path.relative_to(ROOT).as_posix().startswith(only):
                 pools[path] = rules.mutants(ROOT, path)
@@ -73,35 +75,41 @@ class Worker:
     """One copy of the tree in one process of the pool."""
 
     bench: Bench
+    server: Server
     graph: Graph
-    seconds: dict[str, float]
+    reach: Reach
 
     @classmethod
-    def begin(cls, trees: list[str], seconds: dict[str, float]) -> None:
+    def begin(cls, trees: list[str], reach: Reach) -> None:
         at = multiprocessing.current_process()._identity[0] - 1
-        cls.bench, cls.graph, cls.seconds = Bench(Path(trees[at % len(trees)])), Graph(ROOT), seconds
+        tree = Path(trees[at % len(trees)])
+        cls.bench, cls.server, cls.graph, cls.reach = Bench(tree), Server(tree), Graph(ROOT), reach
 
     @classmethod
-    def measure(cls, test: str) -> tuple[str, str, float]:
-        """(test file, outcome, seconds) as the tree stands; compiled loops are made on the way."""
-        outcome, spent = cls.bench.run([test], 200.0, fresh=False)
-        return test, outcome, spent
+    def measure(cls, test: str) -> tuple[str, Seen]:
+        """(test file, what its tests ran) as the tree stands; compiled loops are made on the way."""
+        return test, cls.server.seen(test)
 
     @classmethod
     def judge(cls, task: tuple[rules.Mutant, float]) -> dict[str, object]:
-        """What became of one mutant, with the tests that ran."""
+        """What became of one mutant, with the tests that ran: in memory where that can be, else from the file."""
         mutant, budget_s = task
-        path = ROOT / mutant.path
         module = mutant.path.removesuffix(".py").replace("/", ".")
-        tests = cls.graph.related(module, cls.seconds, budget_s)
+        source = mutant.applied((ROOT / mutant.path).read_text(encoding="utf-8"))
+        loops = module in cls.graph.compiled
+        tests = cls.reach.tests(ROOT, mutant.path, mutant.line, budget_s)
+        usual = sum(cls.reach.seconds[test] for test in tests)
+        answer = None
+        if tests and not loops:
+            answer = cls.server.outcome(mutant.path, source, tests, 3 * usual + 10)
+        if not tests:  # read when a module is loaded, or run by children alone
+            tests, usual = cls.graph.related(module, cls.reach.by_file(), budget_s), budget_s
         if not tests:
             return _row(mutant) | {"outcome": "no test", "seconds": 0.0, "tests": []}
-        usual = sum(cls.seconds.get(t, 10.0) for t in tests)
-        source = mutant.applied(path.read_text(encoding="utf-8"))
-        compiled = module in cls.graph.compiled
-        outcome, spent = cls.bench.outcome(mutant.path, source, tests, usual, fresh=compiled)
+        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, usual, fresh=loops)
         outcome = {"passed": "survived", "failed": "killed", "time": "killed by time"}[outcome]
-        return _row(mutant) | {"outcome": outcome, "seconds": round(spent, 1), "tests": tests}
+        files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+        return _row(mutant) | {"outcome": outcome, "seconds": round(spent, 1), "tests": files}
 
 
 def _row(mutant: rules.Mutant) -> dict[str, object]:
@@ -117,17 +125,17 @@ def main(words: list[str]) -> int:
     parser.add_argument("--only", default="", help="modules whose path starts so")
     parser.add_argument("--bars", type=float, default=1 / 3, help="share drawn from lines that make error bars")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
-    parser.add_argument("--budget", type=float, default=60.0, help="seconds of related tests for one mutant")
-    parser.add_argument("--trust", action="store_true", help="do not run the tests without a mutant first")
+    parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mutant")
+    parser.add_argument("--trust", action="store_true", help="take what tests ran at the last measurement")
     parser.add_argument("--again", action="store_true", help="judge the survivors of the kept result once more")
     asked = parser.parse_args(words)
     chosen = _survivors() if asked.again else drawn(asked.count, asked.seed, asked.only, asked.bars)
     load_libraries()
     with contextlib.ExitStack() as stack:
         trees = [str(stack.enter_context(copy_of(ROOT))) for _ in range(asked.jobs)]
-        seconds = {} if asked.trust else _measured(chosen, trees, asked.budget)
+        reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if asked.trust else _measured(trees)
         rows = []
-        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, (trees, seconds)) as pool:
+        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, (trees, reach)) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):
                 rows.append(row)
                 _say(len(rows), len(chosen), row)
@@ -149,19 +157,25 @@ def _survivors() -> list[rules.Mutant]:
     return found
 
 
-def _measured(chosen: list[rules.Mutant], trees: list[str], budget_s: float) -> dict[str, float]:
-    """Seconds of every test file that may be asked; one that is red without a mutant is left out."""
-    known: dict[str, float] = json.loads(SECONDS.read_text(encoding="utf-8")) if SECONDS.exists() else {}
-    graph = Graph(ROOT)
-    modules = {m.path.removesuffix(".py").replace("/", ".") for m in chosen}
-    needed = {t for m in modules for t in graph.related(m, known, budget_s)} - known.keys()
+def _measured(trees: list[str]) -> Reach:
+    """What every test runs; files of tests that are as they were at the last measurement are not asked again."""
+    known = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if SEEN.exists() else Reach()
+    files = {path.relative_to(ROOT).as_posix(): path for path in (ROOT / "tests").rglob("test_*.py")}
+    needed = sorted(name for name, path in files.items() if known.files.get(name) != digest(path))
     with multiprocessing.get_context("fork").Pool(len(trees), Worker.begin, (trees, known)) as pool:
-        for test, outcome, spent in pool.imap_unordered(Worker.measure, sorted(needed)):
-            known[test] = spent if outcome == "passed" else float("inf")
-            print(f"{spent:6.1f} s  {outcome}  {test}", flush=True)
-    SECONDS.parent.mkdir(parents=True, exist_ok=True)
-    SECONDS.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        for done, (test, seen) in enumerate(pool.imap_unordered(Worker.measure, needed), 1):
+            known.add(ROOT, test, seen)
+            print(
+                f"{done}/{len(needed)} {sum(s for s, _ in seen.values()):6.1f} s  {len(seen)} pass  {test}", flush=True
+            )
+            _kept(known, done % 10 == 0 or done == len(needed))
     return known
+
+
+def _kept(known: Reach, now: bool) -> None:
+    if now:
+        SEEN.parent.mkdir(parents=True, exist_ok=True)
+        SEEN.write_text(json.dumps(asdict(known)) + "\n", encoding="utf-8")
 
 
 def _say(done: int, total: int, row: dict[str, object]) -> None:

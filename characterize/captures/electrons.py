@@ -77,7 +77,7 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
         raise CaptureError("photon transfer: flats without noise or light; take them anew, evenly lit to half the well")
     base = floor or 0.0
     expected = base + mean * (variance - base).sum() / mean.sum()  # of the variance: its own would favour low ones
-    inverse, sigma, floor = _line(mean, variance, np.abs(expected) * math.sqrt(2 / flat[0].size), floor)
+    inverse, sigma, floor = _line(mean, variance, expected * math.sqrt(2 / flat[0].size), floor)
     if inverse <= 0:
         raise CaptureError("photon transfer: the noise does not grow with light; the flats are saturated or processed")
     gain = 1 / inverse
