@@ -1,93 +1,189 @@
-"""Exposure by everything around a shape: wide Gaussians on pixels by FFT, narrower ones by a sum over neighbours.
+"""Exposure by everything around a shape: wide Gaussians on pixels, narrower ones by a sum over neighbours.
 
-None of this is shared with the correction, whose doses it judges.
+Masses go to the nine pixels around them by a quadratic B-spline, a separable Gaussian blurs the pixels, and values come
+from nine pixels by the same spline. Both splines widen the Gaussian by one squared pixel: the kernel is narrower by as
+much. None of this is shared with the correction, whose doses it judges.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from layout.process import compiled
 from metalens.ground.arrays import Array
 
-_PIXELS = 8  # along the range of a wide Gaussian
+_PIXELS = 4  # along the range of a wide Gaussian
+_CUT = 4.5  # ranges at which its kernel ends: exp(-20)
 _REACH = 4.0  # ranges at which a neighbour no longer counts: exp(-16)
 
 
-def wide(x_um: Array, y_um: Array, mass: Array, at: tuple[Array, Array], range_um: float) -> Array:
-    """(m,) exposure at places by masses (area times dose) at others, through a Gaussian of 1/e radius ``range_um``.
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """Pixels for a Gaussian of 1/e radius ``range_um``: (rows, columns), the first one's middle at (left, bottom)."""
 
-    Masses go to the four pixels around them and values come from four, which widens the Gaussian by 2/3 of a squared
-    pixel: the kernel is narrower by as much.
+    range_um: float
+    left_um: float
+    bottom_um: float
+    rows: int
+    columns: int
+
+    @classmethod
+    def over(cls, box_um: tuple[float, float, float, float], range_um: float) -> "Raster":
+        """Pixels around everything between left, bottom, right and top."""
+        pixel = range_um / _PIXELS
+        left, bottom, right, top = box_um
+        rows, columns = (int((high - low) / pixel) + 5 for low, high in ((bottom, top), (left, right)))
+        return cls(range_um, left - 2 * pixel, bottom - 2 * pixel, rows, columns)
+
+    @property
+    def pixel_um(self) -> float:
+        """Side of a pixel."""
+        return self.range_um / _PIXELS
+
+    @property
+    def halo_um(self) -> float:
+        """How far beyond its rows a band must be known."""
+        return (_CUT + 3 / _PIXELS) * self.range_um
+
+    def between(self, low_um: float, high_um: float) -> "Raster":
+        """Those rows that hold everything between two heights and as far around as the kernel reaches."""
+        first = max(0, int((low_um - self.halo_um - self.bottom_um) / self.pixel_um) - 2)
+        end = min(self.rows, int((high_um + self.halo_um - self.bottom_um) / self.pixel_um) + 3)
+        bottom = self.bottom_um + first * self.pixel_um
+        return Raster(self.range_um, self.left_um, bottom, max(end - first, 3), self.columns)
+
+    def put(self, x_um: Array, y_um: Array, mass: Array, image: Array) -> None:
+        """Add masses (n,) to the pixels; what lies off them is passed over."""
+        _put(x_um, y_um, mass, self.left_um, self.bottom_um, self.pixel_um, image)
+
+    def blurred(self, image: Array) -> Array:
+        """(rows, columns) exposure on the pixels by the masses in ``image``."""
+        reach = int(_CUT * _PIXELS)
+        narrow = _PIXELS**2 - 1
+        kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / narrow)
+        kernel *= 1 / (math.sqrt(math.pi * narrow) * self.pixel_um)
+        out = np.empty_like(image)
+        _blur(image, kernel.astype(image.dtype), out)
+        return out
+
+    def take(self, x_um: Array, y_um: Array, image: Array) -> Array:
+        """(n,) values at places on the pixels."""
+        out = np.empty(len(x_um))
+        _take(x_um, y_um, self.left_um, self.bottom_um, self.pixel_um, image, out)
+        return out
+
+
+def reach_um(range_um: float) -> float:
+    """How far neighbours count through a narrow Gaussian, with room for their radii."""
+    return _REACH * (range_um + 1.0)
+
+
+def beside(at: tuple[Array, Array, Array, Array], around: tuple[Array, Array, Array, Array], range_um: float) -> Array:
+    """(n,) exposure of each rim by the other shapes within four ranges; discs as Gaussians of their second moment.
+
+    Args:
+        at, around: x, y, mass and radius of those that are looked at, and of all near them, themselves too.
     """
-    from scipy import fft
-
-    pixel = range_um / _PIXELS
-    left, bottom = (min(a.min(), b.min()) - 2 * pixel for a, b in ((x_um, at[0]), (y_um, at[1])))
-    right, top = (max(a.max(), b.max()) + 2 * pixel for a, b in ((x_um, at[0]), (y_um, at[1])))
-    shape = int((top - bottom) / pixel) + 2, int((right - left) / pixel) + 2
-    image = np.zeros(shape)
-    _put(x_um, y_um, mass, left, bottom, pixel, image)
-    size = [fft.next_fast_len(n + 5 * _PIXELS, real=True) for n in shape]
-    fy, fx = fft.fftfreq(size[0], pixel), fft.rfftfreq(size[1], pixel)
-    narrow = range_um**2 - 2 / 3 * pixel**2
-    kernel = np.exp(-(math.pi**2) * narrow * (fy[:, None] ** 2 + fx**2)) / pixel**2
-    field = fft.irfft2(fft.rfft2(image, size) * kernel, size)[: shape[0], : shape[1]]
-    out = np.empty(len(at[0]))
-    _take(*at, left, bottom, pixel, np.ascontiguousarray(field), out)
-    return out
-
-
-def beside(x_um: Array, y_um: Array, mass: Array, radius_um: Array, range_um: float) -> Array:
-    """(n,) exposure of each rim by the other shapes within four ranges; discs as Gaussians of their second moment."""
     bin_um = _REACH * range_um
-    column, row = ((v - v.min()) // bin_um for v in (x_um, y_um))
+    left, bottom = around[0].min(), around[1].min()
+    column, row = ((v - low) // bin_um for v, low in ((around[0], left), (around[1], bottom)))
     columns = int(column.max()) + 1
     cell = (row * columns + column).astype(np.int64)
     order = np.argsort(cell, kind="stable")
     starts = np.searchsorted(cell[order], np.arange((int(row.max()) + 1) * columns + 1))
-    out = np.zeros(len(x_um))
-    args = (x_um[order], y_um[order], mass[order], radius_um[order], range_um)
-    _neighbours(*args, starts, columns, cell[order], out)
-    back = np.empty_like(out)
-    back[order] = out
-    return back
+    x, y, mass, radius = (v[order] for v in around)
+    out = np.zeros(len(at[0]))
+    _neighbours(*at, x, y, mass, radius, range_um, starts, columns, left, bottom, bin_um, out)
+    return out
 
 
 @compiled
 def _put(x: Array, y: Array, mass: Array, left: float, bottom: float, pixel: float, image: Array) -> None:
+    rows, columns = image.shape
     for n in range(x.shape[0]):
         u, v = (x[n] - left) / pixel, (y[n] - bottom) / pixel
-        i, j = int(u), int(v)
+        i, j = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+        if i < 1 or j < 1 or i > columns - 2 or j > rows - 2:
+            continue
         a, b = u - i, v - j
-        image[j, i] += mass[n] * (1 - a) * (1 - b)
-        image[j, i + 1] += mass[n] * a * (1 - b)
-        image[j + 1, i] += mass[n] * (1 - a) * b
-        image[j + 1, i + 1] += mass[n] * a * b
+        wx = (0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2)
+        wy = (0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2)
+        for q in range(3):
+            for p in range(3):
+                image[j - 1 + q, i - 1 + p] += mass[n] * wy[q] * wx[p]
 
 
 @compiled
 def _take(x: Array, y: Array, left: float, bottom: float, pixel: float, image: Array, out: Array) -> None:
     for n in range(x.shape[0]):
         u, v = (x[n] - left) / pixel, (y[n] - bottom) / pixel
-        i, j = int(u), int(v)
+        i = min(max(int(np.floor(u + 0.5)), 1), image.shape[1] - 2)
+        j = min(max(int(np.floor(v + 0.5)), 1), image.shape[0] - 2)
         a, b = u - i, v - j
-        low = image[j, i] * (1 - a) + image[j, i + 1] * a
-        out[n] = low * (1 - b) + (image[j + 1, i] * (1 - a) + image[j + 1, i + 1] * a) * b
+        wx = (0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2)
+        wy = (0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2)
+        total = 0.0
+        for q in range(3):
+            for p in range(3):
+                total += image[j - 1 + q, i - 1 + p] * wy[q] * wx[p]
+        out[n] = total
+
+
+@compiled
+def _blur(image: Array, kernel: Array, out: Array) -> None:
+    """Along the rows, then across them, a ring of blurred rows at a time; zero outside."""
+    rows, columns = image.shape
+    taps = kernel.shape[0]
+    reach = taps // 2
+    ring = np.zeros((taps, columns), image.dtype)
+    for row in range(rows + reach):
+        if row < rows:
+            line = ring[row % taps]
+            line[:] = 0
+            for k in range(taps):
+                shift = k - reach
+                low, high = max(0, -shift), min(columns, columns - shift)
+                weight = kernel[k]
+                for c in range(low, high):
+                    line[c] += weight * image[row, c + shift]
+        done = row - reach
+        if done >= 0:
+            target = out[done]
+            target[:] = 0
+            for other in range(max(0, done - reach), min(rows, done + reach + 1)):
+                weight, line = kernel[other - done + reach], ring[other % taps]
+                for c in range(columns):
+                    target[c] += weight * line[c]
 
 
 @compiled
 def _neighbours(
-    x: Array, y: Array, mass: Array, radius: Array, reach: float, starts: Array, columns: int, cell: Array, out: Array
+    x: Array,
+    y: Array,
+    mass: Array,
+    radius: Array,
+    near_x: Array,
+    near_y: Array,
+    near_mass: Array,
+    near_radius: Array,
+    reach: float,
+    starts: Array,
+    columns: int,
+    left: float,
+    bottom: float,
+    bin_um: float,
+    out: Array,
 ) -> None:
     rows = (starts.shape[0] - 1) // columns
     for n in range(x.shape[0]):
-        row, column = cell[n] // columns, cell[n] % columns
+        row, column = int((y[n] - bottom) // bin_um), int((x[n] - left) // bin_um)
+        total = -mass[n] / (np.pi * (reach**2 + 1.5 * radius[n] ** 2))  # itself, which is among them
         for r in range(max(row - 1, 0), min(row + 2, rows)):
             for c in range(max(column - 1, 0), min(column + 2, columns)):
                 for k in range(starts[r * columns + c], starts[r * columns + c + 1]):
-                    if k != n:
-                        square = reach**2 + radius[k] ** 2 / 2 + radius[n] ** 2
-                        away = (x[k] - x[n]) ** 2 + (y[k] - y[n]) ** 2
-                        if away < 16 * square:
-                            out[n] += mass[k] * np.exp(-away / square) / (np.pi * square)
+                    square = reach**2 + near_radius[k] ** 2 / 2 + radius[n] ** 2
+                    away = (near_x[k] - x[n]) ** 2 + (near_y[k] - y[n]) ** 2
+                    if away < 16 * square:
+                        total += near_mass[k] * np.exp(-away / square) / (np.pi * square)
+        out[n] = total

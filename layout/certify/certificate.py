@@ -1,46 +1,23 @@
 """The exposure certified: what the written files and their dose table make, by a simulator that the correction lacks.
 
-Threshold model: the edge of a shape comes out where the exposure is half of what a wide area of dose 1 receives. The
-diameter of a pillar in the resist follows from the exposure across the edge of its own disc and its background; the
-etch adds the bias of the process, for how alone the pillar stands, and its tilted walls. Of marks, labels and any
-other shape the edges are sampled.
+See :mod:`layout.certify.exposed` for the model. Of marks, labels and any other shape the edges are sampled.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.certify import background, outlines
-from layout.certify.gathered import Pillars, Polygons, gathered
+from layout.certify import outlines
+from layout.certify.exposed import THRESHOLD, WIDE_UM, Band, Simulation, Terms
+from layout.certify.gathered import Exposed, Polygons, gathered, on_lattices
+from layout.certify.verdict import Edges, Survey, Tally
 from layout.files import MaskContent
-from layout.process import LayerNumber, Process, compiled
+from layout.mask import MaskPlan
+from layout.process import LayerNumber, Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
-
-THRESHOLD = 0.5
-_WIDE_UM = 2.0  # Gaussians from here on are summed on pixels
-_LEVELS = 256  # of the table of edges for each shape
-MOST_ERROR, MOST_NM = 0.01, 1.0  # what a sound exposure keeps
-EDGE_SHARE, EDGE_ERROR = 0.99, 0.02  # of marks: so many points keep it, and all of them this; doses step along an edge
-
-Terms = list[tuple[float, float]]  # (range, weight) of Gaussians
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Edges:
-    """Edges of marks, labels and other shapes that are no round pillars.
-
-    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,) how far outside the drawn edge it
-    comes out in the resist. layer: (n,) layer numbers.
-    """
-
-    x_um: Array
-    y_um: Array
-    exposure: Array
-    shift_nm: Array
-    layer: Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,9 +26,9 @@ class Certificate:
 
     x_um, y_um: (n,) places. drawn_nm, resist_nm, made_nm: (n,) diameters: equal-area of the polygon, in the resist,
     at half height after the etch (bias for the density around it). exposure: (n,) of the drawn edge, relative to
-    dose-to-size. lean_nm: foot less half-height diameter.
+    dose-to-size.
     layer: (n,) layer numbers. judged: (n,) false for the dose test, which is wrong on purpose.
-    edges: of the other shapes. undosed: layers with shapes and no dose.
+    survey: the verdict over all of them.
     """
 
     x_um: Array
@@ -62,9 +39,22 @@ class Certificate:
     exposure: Array
     layer: Array
     judged: Array
-    edges: Edges
-    lean_nm: float = 0.0
-    undosed: tuple[LayerNumber, ...] = ()
+    survey: Survey
+
+    @property
+    def edges(self) -> Edges:
+        """Of the other shapes."""
+        return self.survey.edges
+
+    @property
+    def undosed(self) -> tuple[LayerNumber, ...]:
+        """Layers with shapes and no dose."""
+        return self.survey.undosed
+
+    @property
+    def lean_nm(self) -> float:
+        """Foot less half-height diameter."""
+        return self.survey.lean_nm
 
     @property
     def foot_nm(self) -> Array:
@@ -79,62 +69,89 @@ class Certificate:
     @property
     def worst_exposure(self) -> float:
         """Largest |exposure - 1| of the judged pillars and of all edges."""
-        worst = np.abs(self.exposure[self.judged] - 1).max(initial=0.0)
-        return float(max(worst, np.abs(self.edges.exposure - 1).max(initial=0.0)))
+        return self.survey.worst_exposure
 
     @property
     def worst_nm(self) -> float:
         """Largest |width in the resist - drawn|: diameters, and twice the shift of an edge."""
-        worst = np.abs(self.resist_nm - self.drawn_nm)[self.judged].max(initial=0.0)
-        return float(max(worst, 2 * np.abs(self.edges.shift_nm).max(initial=0.0)))
+        return self.survey.worst_nm
 
     @property
     def ok(self) -> bool:
-        """Whether every shape has a dose and keeps 1 % of dose-to-size and 1 nm.
-
-        Along the edges of marks and labels 99 of 100 points keep the 1 %, and all of them 2 %.
-        """
-        pillars = float(np.abs(self.exposure[self.judged] - 1).max(initial=0.0))
-        off = np.abs(self.edges.exposure - 1)
-        edges = not len(off) or (float((off <= MOST_ERROR).mean()) >= EDGE_SHARE and float(off.max()) <= EDGE_ERROR)
-        return not self.undosed and pillars <= MOST_ERROR and edges and self.worst_nm <= MOST_NM
+        """As :attr:`layout.certify.Survey.ok`."""
+        return self.survey.ok
 
 
 def certify(
     content: MaskContent, doses: Mapping[LayerNumber, float], process: Process, *, height_um: float = 0.0
 ) -> Certificate:
-    """Simulate the exposure of a mask that was read back, with its dose table.
+    """Simulate the exposure of a mask that was read back, with its dose table; pillars in order of strips of height.
 
     Args:
         height_um: of the pillars, for their feet.
 
-    Accuracy: backscatter to 1e-3 of itself (pixels of an eighth of its range), edges to 0.01 nm. Edges are sampled
+    Accuracy: backscatter to 1e-3 of itself (pixels of a quarter of its range), edges to 0.01 nm. Edges are sampled
     away from corners, which round off.
 
     Raises:
         ProcessError: no double or triple Gaussian is given, or no round pillar is in the file.
     """
     terms = _terms(process)
-    fixed = (process.layers.aperture[0], process.layers.outline[0], process.layers.fields[0])
-    pillars, others, undosed = gathered(content, doses, fixed)
-    points = outlines.samples(others, max((a for a, _ in terms if a < _WIDE_UM), default=0.0))
-    far, of_edges = _background(pillars, others, points.at_um, terms)
-    exposure, resist = _developed(pillars, far, terms)
-    made = process.made_diameter_nm(resist / nm, _isolation(pillars, process))
-    top, foot = process.top_foot_nm(0.0, height_um / nm)
-    return Certificate(
-        pillars.x_um,
-        pillars.y_um,
-        (pillars.size_um / nm).astype(np.float32)[pillars.kind],
-        (resist / nm).astype(np.float32),
-        made.astype(np.float32),
-        exposure.astype(np.float32) / np.float32(THRESHOLD),
-        pillars.layer.astype(np.uint16)[pillars.kind],
-        (pillars.layer != process.layers.dose[0])[pillars.kind],
-        _edges(points, others, of_edges, terms),
-        float(foot - top) / 2,
-        undosed,
-    )
+    scene = gathered(content, doses, _fixed(process))
+    kinds, count = scene.kinds, scene.places.count
+    x, y = np.empty(count), np.empty(count)
+    resist, made, exposure = (np.empty(count, np.float32) for _ in range(3))
+    kind, end = np.empty(count, np.int32), 0
+
+    def keep(band: Band) -> None:
+        nonlocal end
+        some = slice(end, end := end + len(band.kind))
+        x[some], y[some], kind[some] = band.x_um, band.y_um, band.kind
+        resist[some], made[some], exposure[some] = band.resist_nm, band.made_nm, band.exposure
+
+    survey = _surveyed(scene, process, terms, height_um, keep)
+    drawn = (kinds.size_um / nm).astype(np.float32)[kind]
+    judged = _judged(scene, process)[kind]
+    return Certificate(x, y, drawn, resist, made, exposure, kinds.layer.astype(np.uint16)[kind], judged, survey)
+
+
+def survey(
+    content: MaskContent,
+    plan: MaskPlan,
+    doses: Mapping[LayerNumber, float],
+    process: Process,
+    *,
+    height_um: float = 0.0,
+    keep: Callable[[Band, Array], None] | None = None,
+) -> Survey:
+    """As :func:`certify`, of a file whose pillars stand exactly where ``plan`` has them, in bounded memory.
+
+    Args:
+        content: read back; sums over its placements, that agree with the plan, are enough.
+        keep: is given each band of pillars with the (n,) layer numbers of its pillars.
+
+    Raises:
+        ProcessError: no double or triple Gaussian is given, no round pillar has a dose, or a class is not round.
+    """
+    terms = _terms(process)
+    scene = on_lattices(content, plan, doses, _fixed(process))
+    layer = scene.kinds.layer
+
+    def some(band: Band) -> None:
+        if keep is not None:
+            keep(band, layer[band.kind])
+
+    return _surveyed(scene, process, terms, height_um, some)
+
+
+def _fixed(process: Process) -> tuple[int, ...]:
+    """Layer numbers that the exposure of the pillars does not see."""
+    return process.layers.aperture[0], process.layers.outline[0], process.layers.fields[0]
+
+
+def _judged(scene: Exposed, process: Process) -> Array:
+    """(kinds,) false for the dose test."""
+    return np.asarray(scene.kinds.layer != process.layers.dose[0])
 
 
 def _terms(process: Process) -> Terms:
@@ -147,91 +164,24 @@ def _terms(process: Process) -> Terms:
     return [(range_um, weight / total) for range_um, weight in found]
 
 
-def _background(pillars: Pillars, others: Polygons, at_um: Array, terms: Terms) -> tuple[Array, Array]:
-    """Exposure of each pillar's rim by everything else, and of the points by the wide Gaussians of everything."""
-    carried = pillars.area_um2 * pillars.dose
-    mass = carried[pillars.kind]
-    far, of_points = np.zeros(len(mass)), np.zeros(len(at_um))
-    for range_um, weight in terms:
-        if range_um >= _WIDE_UM:
-            x, y, more = outlines.spots(others, range_um / 8)
-            from_x, from_y = np.concatenate([pillars.x_um, x]), np.concatenate([pillars.y_um, y])
-            at = np.concatenate([pillars.x_um, at_um[:, 0]]), np.concatenate([pillars.y_um, at_um[:, 1]])
-            found = weight * background.wide(from_x, from_y, np.concatenate([mass, more]), at, range_um)
-            far += found[: len(mass)] - weight / (np.pi * range_um**2) * mass
-            of_points += found[len(mass) :]
-        elif range_um > 0.05 * float(pillars.size_um.max()):
-            radius = (pillars.size_um / 2)[pillars.kind]
-            far += weight * background.beside(pillars.x_um, pillars.y_um, mass, radius, range_um)
-    return far, of_points
-
-
-def _isolation(pillars: Pillars, process: Process) -> Array | float:
-    """How alone each pillar stands: what its neighbours lack of the densest place's, weighed by exp(-r^2 / range^2)."""
-    range_um = process.bias.range_um
-    if not process.bias.isolated_nm:
-        return 0.0
-    one = np.ones(len(pillars.kind))
-    at = pillars.x_um, pillars.y_um
-    near = np.pi * range_um**2 * background.wide(*at, one, at, range_um) - 1  # less itself
-    full = float(np.quantile(near, 0.999))
-    return np.clip(1 - near / full, 0, 1) if full > 0 else one
-
-
-def _developed(pillars: Pillars, far: Array, terms: Terms) -> tuple[Array, Array]:
-    """(n,) exposure of the drawn edge, and diameter at which the exposure is the threshold, um."""
-    sizes, which = np.unique(pillars.size_um, return_inverse=True)
-    tables = [_profile(size, terms) for size in sizes.tolist()]
-    radius, own = (np.array([table[k] for table in tables]) for k in (0, 1))
-    exposure, made = np.empty(len(far)), np.empty(len(far))
-    _develop(pillars.kind, which.astype(np.int64), pillars.dose, far, radius, own, THRESHOLD, exposure, made)
-    return exposure, made
-
-
-@compiled
-def _develop(
-    kind: Array,
-    size: Array,
-    dose: Array,
-    far: Array,
-    radius: Array,
-    own: Array,
-    threshold: float,
-    exposure: Array,
-    made: Array,
-) -> None:
-    """Interpolate in the falling ``own`` (sizes, levels); the drawn edge is its middle level."""
-    last = own.shape[1] - 1
-    for n in range(kind.shape[0]):
-        s, given = size[kind[n]], dose[kind[n]]
-        exposure[n] = given * own[s, last // 2] + far[n]
-        wanted = (threshold - far[n]) / given
-        low, high = 0, last
-        while high - low > 1:
-            middle = (low + high) // 2
-            if own[s, middle] > wanted:
-                low = middle
-            else:
-                high = middle
-        fall = own[s, low] - own[s, high]
-        share = min(max((own[s, low] - wanted) / fall, 0.0), 1.0) if fall > 0 else 0.0
-        made[n] = 2 * (radius[s, low] + share * (radius[s, high] - radius[s, low]))
-
-
-def _profile(size_um: float, terms: Terms) -> tuple[Array, Array]:
-    """(radii, exposure) of a disc of unit dose about its edge: the non-central chi-square of two degrees."""
-    from scipy.special import chndtr
-
-    core = min(a for a, _ in terms)
-    span = min(size_um / 2 * 0.9, 4 * core)
-    radius = np.linspace(size_um / 2 - span, size_um / 2 + span, 2 * _LEVELS + 1)
-    own = sum(w * chndtr(2 * (size_um / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
-    return radius, np.asarray(own)
+def _surveyed(scene: Exposed, process: Process, terms: Terms, height_um: float, keep: Callable[[Band], None]) -> Survey:
+    """Simulate all bands; ``keep`` sees each."""
+    points = outlines.samples(scene.others, max((a for a, _ in terms if a < WIDE_UM), default=0.0))
+    simulation = Simulation(scene, process, terms, points.at_um)
+    total, box, judged = Tally.empty(), scene.places.box_um, _judged(scene, process)
+    drawn = (scene.kinds.size_um / nm).astype(np.float32)
+    for band in simulation.bands():
+        values = (band.exposure, drawn[band.kind], band.resist_nm, band.made_nm)
+        total.take((band.x_um, band.y_um), judged[band.kind], values, box)
+        keep(band)
+    top, foot = process.top_foot_nm(0.0, height_um / nm)
+    edges = _edges(points, scene.others, simulation.far_of_points, terms)
+    return Survey(scene.places.count, total, box, edges, float(foot - top) / 2, scene.undosed)
 
 
 def _edges(points: outlines.Samples, others: Polygons, far: Array, terms: Terms) -> Edges:
     """Exposure at the samples, and where across each edge it is the threshold."""
-    near = [(a, w) for a, w in terms if a < _WIDE_UM]
+    near = [(a, w) for a, w in terms if a < WIDE_UM]
     every = np.concatenate([points.at_um, *outlines.slope_aside(points)])
     here, outside, inside = np.split(outlines.exposure(every, others, near), 3)
     here = here + far

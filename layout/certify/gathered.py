@@ -1,11 +1,14 @@
 """What a written mask exposes: round pillars by kind and place, every other shape as a polygon with its dose."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.files import MaskContent, flat
+from layout.certify.places import Listed, OnLattices, Places
+from layout.files import NOTHING, MaskContent, flat
+from layout.mask import MaskPlan
 from layout.process import LayerNumber
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -15,16 +18,11 @@ _ROUND = 0.85  # 4 pi area / perimeter^2 above this is a round pillar
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pillars:
-    """Round pillars.
-
-    x_um, y_um: (n,) centres. kind: (n,) index into what follows. size_um, area_um2, dose, layer: (kinds,) equal-area
-    diameter, area, relative dose, layer number.
+class Kinds:
+    """Round pillars that differ. size_um, area_um2, dose, layer: (kinds,) equal-area diameter, area, relative dose,
+    layer number.
     """
 
-    x_um: Array
-    y_um: Array
-    kind: Array
     size_um: Array
     area_um2: Array
     dose: Array
@@ -40,46 +38,116 @@ class Polygons:
     layer: Array
 
 
-def gathered(
-    content: MaskContent, doses: Mapping[LayerNumber, float], fixed: Sequence[int]
-) -> tuple[Pillars, Polygons, tuple[LayerNumber, ...]]:
-    """Everything below the top cells but the layer numbers ``fixed``; and layers with shapes and no dose.
+@dataclass(frozen=True, eq=False, slots=True)
+class Exposed:
+    """Everything that is exposed: kinds of round pillars and their places, other shapes, layers without a dose."""
+
+    kinds: Kinds
+    places: Places
+    others: Polygons
+    undosed: tuple[LayerNumber, ...]
+
+
+def gathered(content: MaskContent, doses: Mapping[LayerNumber, float], fixed: Sequence[int]) -> Exposed:
+    """Everything below the top cells but the layer numbers ``fixed``.
 
     Raises:
         ProcessError: no round pillar has a dose.
     """
-    unit = content.unit_nm * nm
-    round_ones: list[tuple[Array, Array, float, float, int]] = []
-    corners: list[Array] = []
-    others: list[tuple[float, int]] = []
-    missing: set[LayerNumber] = set()
+    found = _Found(content.unit_nm * nm, doses, fixed)
     for stack in (s for top in content.tops for s in flat.stacks(content, top)):
-        if stack.layer[0] in fixed:
-            continue
-        if stack.layer not in doses:
-            missing.add(stack.layer)
-            continue
-        outlines, x, y, dose = stack.outlines * unit, stack.x * unit, stack.y * unit, doses[stack.layer]
+        found.take(stack)
+    if not found.x:
+        raise ProcessError("the mask holds no round pillar with a dose; nothing can be certified")
+    kind = np.repeat(np.arange(len(found.x), dtype=np.int32), [len(x) for x in found.x])
+    places = Listed.of(np.concatenate(found.x), np.concatenate(found.y), kind)
+    return Exposed(found.kinds, places, found.others, tuple(sorted(found.missing)))
+
+
+def on_lattices(
+    content: MaskContent, plan: MaskPlan, doses: Mapping[LayerNumber, float], fixed: Sequence[int]
+) -> Exposed:
+    """As :func:`gathered`, of a file whose lattices hold exactly the places of ``plan`` (their sums agree).
+
+    Shapes, layers and figures come from the file, doses from the table; of the plan only the places are taken.
+
+    Raises:
+        ProcessError: no round pillar has a dose; a class that is not one round polygon.
+    """
+    found = _Found(content.unit_nm * nm, doses, fixed)
+    empty = {l.name: dataclasses.replace(content.cells[l.name], placed=NOTHING, sums=None) for l in plan.lattices}
+    bare = dataclasses.replace(content, cells={**content.cells, **empty})
+    for stack in flat.stacks(bare, plan.name):
+        found.take(stack)
+    if found.x:
+        raise ProcessError(f"{len(found.x)} round shapes beside the lattices of the plan; read all places of the file")
+    counts, kinds = plan.counts(), np.full(len(plan.classes) + 1, -1, np.int32)
+    for number in np.flatnonzero(counts[1:] > 0) + 1:
+        kinds[number] = found.single(list(flat.stacks(content, plan.classes[number - 1].name)))
+    if not found.x:
+        raise ProcessError("the mask holds no round pillar with a dose; nothing can be certified")
+    centres = np.column_stack([np.concatenate(found.x), np.concatenate(found.y)])
+    count = int(counts[1:][kinds[1:] >= 0].sum())
+    places = OnLattices.of(plan.lattices, kinds, centres, unit_nm=content.unit_nm, count=count)
+    return Exposed(found.kinds, places, found.others, tuple(sorted(found.missing)))
+
+
+class _Found:
+    """Shapes while they are gathered: (x, y) places of each kind of round pillar, and polygons."""
+
+    def __init__(self, unit_um: float, doses: Mapping[LayerNumber, float], fixed: Sequence[int]) -> None:
+        self.x: list[Array] = []
+        self.y: list[Array] = []
+        self.missing: set[LayerNumber] = set()
+        self._unit, self._doses, self._fixed = unit_um, doses, fixed
+        self._rounds: list[tuple[float, float, int]] = []
+        self._corners: list[Array] = []
+        self._others: list[tuple[float, int]] = []
+
+    def take(self, stack: flat.Stack) -> None:
+        """Take in copies of some polygons."""
+        if stack.layer[0] in self._fixed:
+            return
+        if stack.layer not in self._doses:
+            self.missing.add(stack.layer)
+            return
+        outlines, dose = stack.outlines * self._unit, self._doses[stack.layer]
         area, centre, roundness = _measured(outlines)
         is_round = roundness > _ROUND
         for k in np.flatnonzero(is_round).tolist():
-            round_ones.append((x + centre[k, 0], y + centre[k, 1], float(area[k]), dose, stack.layer[0]))
+            self.x.append(stack.x * self._unit + centre[k, 0])
+            self.y.append(stack.y * self._unit + centre[k, 1])
+            self._rounds.append((float(area[k]), dose, stack.layer[0]))
         some = outlines[~is_round]
         if len(some):
-            corners += list((some[None] + np.stack([x, y], -1)[:, None, None]).reshape(-1, *some.shape[1:]))
-            others += [(dose, stack.layer[0])] * (len(some) * len(x))
-    if not round_ones:
-        raise ProcessError("the mask holds no round pillar with a dose; nothing can be certified")
-    table = np.array(others, float).reshape(-1, 2)
-    polygons = Polygons(corners, table[:, 0], table[:, 1].astype(np.int64))
-    return _pillars(round_ones), polygons, tuple(sorted(missing))
+            places = np.stack([stack.x, stack.y], -1)[:, None, None] * self._unit
+            self._corners += list((some[None] + places).reshape(-1, *some.shape[1:]))
+            self._others += [(dose, stack.layer[0])] * (len(some) * len(stack.x))
 
+    def single(self, stacks: Sequence[flat.Stack]) -> int:
+        """Take in what one class of pillars draws; its kind, -1 where it has no dose.
 
-def _pillars(found: list[tuple[Array, Array, float, float, int]]) -> Pillars:
-    x, y = (np.concatenate([each[k] for each in found]) for k in (0, 1))
-    kind = np.repeat(np.arange(len(found), dtype=np.int32), [len(each[0]) for each in found])
-    area, dose, layer = (np.array([each[k] for each in found]) for k in (2, 3, 4))
-    return Pillars(x, y, kind, 2 * np.sqrt(area / np.pi), area, dose, layer)
+        Raises:
+            ProcessError: it is not one round polygon.
+        """
+        before, others = len(self.x), len(self._others)
+        for stack in stacks:
+            self.take(stack)
+        if len(self.x) > before + 1 or len(self._others) > others:
+            raise ProcessError("a class of pillars draws more than one round polygon; it is not certified as one")
+        return before if len(self.x) > before else -1
+
+    @property
+    def kinds(self) -> Kinds:
+        """Of the round pillars."""
+        area, dose, layer = (np.array([each[k] for each in self._rounds]) for k in range(3))
+        return Kinds(2 * np.sqrt(area / np.pi), area, dose, layer)
+
+    @property
+    def others(self) -> Polygons:
+        """All other shapes."""
+        table = np.array(self._others, float).reshape(-1, 2)
+        return Polygons(self._corners, table[:, 0], table[:, 1].astype(np.int64))
 
 
 def _measured(outlines: Array) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import tyro
 
-from layout.certify import Certificate
+from layout.certify import MadeRows, Survey
 from layout.commands.stages import Stages
 from layout.files import Window, handover, verify
 from layout.mask import FieldPlan, MaskPlan, build
@@ -59,7 +59,7 @@ class Job:
     """What a run of the command has made so far.
 
     stages: what the time went to. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
-    certified: {file name: what the file and the dose table make, by the simulator}.
+    certified: {file name: what the file and the dose table make, by the simulator}. made_rows: the lens that comes out.
     undosed: {file name: layers with shapes that the dose table lacks}.
     """
 
@@ -74,7 +74,8 @@ class Job:
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, verify.Comparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
-    certified: dict[str, Certificate] = field(default_factory=dict)
+    certified: dict[str, Survey] = field(default_factory=dict)
+    made_rows: MadeRows | None = None
 
     @property
     def seconds(self) -> dict[str, float]:

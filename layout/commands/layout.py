@@ -1,13 +1,13 @@
 """lens.h5 to a mask: quantised, dosed, checked, written, read back and compared, with report and pictures."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from layout.certify import as_made, certify
+from layout.certify import MadeRows, Survey, survey
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
 from layout.files import MaskContent, doses, dxf, handover, verify
@@ -16,7 +16,7 @@ from layout.gdsii import write as gdsii_write
 from layout.mask import MaskPlan, build, fields, with_fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
-from layout.process import noticed
+from layout.process import LayerNumber, noticed
 from layout.process import process as processes
 from layout.rules import check as drc
 from layout.rules import markers
@@ -26,7 +26,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 from metalens.lens import Lens
 
-MOST_CERTIFIED = 10_000_000  # pillars whose places are kept when a file is read back, and whose exposure is simulated
+MOST_MADE = 1 << 24  # sites of a lens whose predicted diameters are handed on as made.h5
+_KEPT = 1 << 16  # placements of a cell that are kept when a file is read back; of more only sums are
 _MOST_READ = 2**40
 
 
@@ -106,21 +107,31 @@ def _write_solids(job: Job, target: Path) -> None:
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
     with job.stages(f"read back {path.suffix[1:]}"):
-        content = read(path, limit=_MOST_READ, keep=MOST_CERTIFIED)
+        content = read(path, limit=_MOST_READ, keep=_KEPT)
         job.compared[path.name] = verify.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)
-    if _certifiable(job):
+    if _certifiable(job) and job.compared[path.name].ok:
         with job.stages(f"certify {path.suffix[1:]}"):
-            job.certified[path.name] = certify(content, table, job.process, height_um=job.source.cell.height_um)
+            job.certified[path.name] = _certified(job, content, table)
     job.written[path.name] = path.stat().st_size
 
 
 def _certifiable(job: Job) -> bool:
-    """Whether the simulator knows the point exposure (Gaussians), the tone and has room for the pillars."""
+    """Whether the simulator knows the point exposure (Gaussians) and the tone."""
     exposure = job.process.exposure
-    known = exposure.known and exposure.csv is None and job.process.tone == "positive"
-    return known and job.drc.pillars <= MOST_CERTIFIED
+    return exposure.known and exposure.csv is None and job.process.tone == "positive"
+
+
+def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float]) -> Survey:
+    """What a file makes that holds the plan's places; two files of the same polygons make the same."""
+    if job.certified and not job.options.circles:
+        return next(iter(job.certified.values()))
+    lattice = job.plan.lattices[0]
+    small = not job.certified and lattice.rows * lattice.columns <= MOST_MADE
+    job.made_rows = MadeRows(job.plan) if small else job.made_rows
+    keep = job.made_rows.take if small and job.made_rows else None
+    return survey(content, job.plan, table, job.process, height_um=job.source.cell.height_um, keep=keep)
 
 
 def _accompany(job: Job, target: Path) -> None:
@@ -132,8 +143,8 @@ def _accompany(job: Job, target: Path) -> None:
     store.write_text(target / "process.toml", config.dumps(job.process))
     handover.write_fields(job.fields, target / "fields.csv")
     store.write_text(target / "job.txt", job.sheet)
-    if job.certified:
-        lenses.save(target / "made.h5", as_made(job.source, job.plan, next(iter(job.certified.values()))))
+    if job.made_rows is not None:
+        lenses.save(target / "made.h5", job.made_rows.lens(job.source))
     page.write(job, target)
 
 
@@ -155,7 +166,7 @@ def _values(job: Job) -> dict[str, Any]:
             name: {
                 "worst_relative": c.worst_exposure,
                 "worst_diameter_nm": c.worst_nm,
-                "pillars": len(c.x_um),
+                "pillars": c.pillars,
                 "edges": len(c.edges.x_um),
             }
             for name, c in job.certified.items()

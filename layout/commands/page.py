@@ -171,11 +171,11 @@ def _certified(job: Job) -> Section | None:
     rows = [
         [
             name,
-            f"{len(c.x_um):,}",
+            f"{c.pillars:,}",
             f"{len(c.edges.x_um):,}",
             f"{100 * c.worst_exposure:.2f}",
             f"{c.worst_nm:.2f}",
-            f"{c.top_nm[c.judged].min():.0f} to {c.foot_nm[c.judged].max():.0f}",
+            f"{c.thinnest_top_nm:.0f} to {c.widest_foot_nm:.0f}",
             "yes" if c.ok else "NO",
         ]
         for name, c in job.certified.items()
@@ -193,8 +193,8 @@ def _certified(job: Job) -> Section | None:
     text = (
         "The files and doses.csv, read back and exposed again by a simulator that shares nothing with the correction: "
         "threshold at half of what a wide area receives. Pillars of lens and witness cells and the edges of marks and "
-        "labels; the dose test is predicted and not judged. made.h5 is the lens of the predicted diameters: give it to "
-        "metalens psf, or to this command with --study."
+        "labels; the dose test is predicted and not judged. made.h5 (up to 16 million sites) is the lens of "
+        "the predicted diameters: give it to metalens psf, or to this command with --study."
     )
     items: list[Figure | Table] = [Table(head, rows), Figure(picture, "Predicted less drawn diameter.", wide=True)]
     return Section("Exposure as written", text, items)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.certify import Certificate
+from layout.certify import Survey
 from layout.files import Window, sites_in
 from layout.mask import Lattice, MaskPlan
 from layout.rules import DrcReport
@@ -105,20 +105,17 @@ def margins(found: DrcReport) -> bytes:
     return report.png(figure)
 
 
-def certified(found: Certificate) -> bytes:
+def certified(found: Survey) -> bytes:
     """Where the diameters in the resist differ from the drawn ones, and how often by how much."""
-    figure, (left, right) = report.canvas(1, 2, size=(8.2, 3.6))
-    off = (found.resist_nm - found.drawn_nm)[found.judged]
-    x, y = found.x_um[found.judged], found.y_um[found.judged]
-    total, xs, ys = np.histogram2d(x, y, bins=160, weights=off)
-    count, _, _ = np.histogram2d(x, y, bins=(xs, ys))
-    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    shown = left.imshow(mean.T, origin="lower", extent=(xs[0], xs[-1], ys[0], ys[-1]), cmap="coolwarm")
-    left.grid(False)
-    left.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
-    figure.colorbar(shown, ax=left, label="resist - drawn / nm", shrink=0.8)
-    right.hist(off, bins=80)
-    right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
+    figure, (at_left, at_right) = report.canvas(1, 2, size=(8.2, 3.6))
+    left, bottom, right, top = found.box_um
+    shown = at_left.imshow(found.map_nm, origin="lower", extent=(left, right, bottom, top), cmap="coolwarm")
+    at_left.grid(False)
+    at_left.set(xlabel="x / µm", ylabel="y / µm", title="mean over a picture point")
+    figure.colorbar(shown, ax=at_left, label="resist - drawn / nm", shrink=0.8)
+    edges, pillars = found.histogram
+    at_right.stairs(pillars, edges, fill=True)
+    at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
     return report.png(figure)
 
 

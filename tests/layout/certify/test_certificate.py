@@ -9,7 +9,7 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.certify import as_made, certify, outlines
+from layout.certify import as_made, certify, exposed, outlines, places, survey
 from layout.certify.gathered import Polygons
 from layout.dose import exposure
 from layout.files import doses
@@ -94,6 +94,23 @@ def test_the_edges_of_marks_and_labels_are_judged(third):
     assert not wrong.ok
     assert wrong.edges.exposure[wrong.edges.layer == 4].min() < 0.95
     assert wrong.edges.shift_nm[wrong.edges.layer == 4].min() < -0.3
+
+
+@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
+def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(third, monkeypatch):
+    process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
+    plan, content, table = written(process)
+    whole = certify(content, table, process, height_um=0.7).survey
+    monkeypatch.setattr(exposed, "_MOST_PIXELS", 0)  # bands of pixels, as a large mask needs
+    monkeypatch.setattr(exposed, "_BAND", 700)
+    monkeypatch.setattr(places, "_SITES", 100)
+    bands = survey(content, plan, table, process, height_um=0.7)
+    assert bands.pillars == whole.pillars
+    assert bands.tally.ends == pytest.approx(whole.tally.ends, rel=1e-5)  # float32
+    assert bands.edges.exposure == pytest.approx(whole.edges.exposure, rel=1e-5)
+    assert bands.tally.bins.sum() == whole.tally.bins.sum()
+    assert bands.worst_nm == pytest.approx(whole.worst_nm, rel=1e-4)
+    assert np.nansum(bands.map_nm) == pytest.approx(np.nansum(whole.map_nm), rel=1e-3)
 
 
 def test_without_a_point_exposure_nothing_is_certified():

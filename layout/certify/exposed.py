@@ -1,0 +1,258 @@
+"""Exposure and etch of everything on a mask, strip by strip: background, edge in the resist, what the etch makes of it.
+
+Threshold model: the edge of a shape comes out where the exposure is half of what a wide area of dose 1 receives. The
+diameter of a pillar in the resist follows from the exposure across the edge of its own disc and its background; the
+etch adds the bias of the process, for how alone the pillar stands, and its tilted walls.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from layout.certify import background, outlines
+from layout.certify.background import Raster
+from layout.certify.gathered import Exposed
+from layout.certify.places import Places, strip_of
+from layout.process import Process, compiled
+from metalens.ground.arrays import Array
+
+THRESHOLD = 0.5
+WIDE_UM = 2.0  # Gaussians from here on are summed on pixels
+_LEVELS = 256  # of the table of edges for each shape
+_MOST_PIXELS = 1 << 25  # that are kept of the whole mask; wider ones are made band by band
+_BAND = 1 << 20  # sites at once
+_SAMPLED = 16  # bands, for the densest place
+_SPOTS = 8  # along the range, of a polygon on pixels
+_THREADS = 2
+
+Terms = list[tuple[float, float]]  # (range, weight) of Gaussians
+
+
+@dataclass(eq=False, slots=True)
+class Wide:
+    """One wide Gaussian over the whole mask. mass: (kinds,) that each pillar carries; spots: x, y and mass of the rest.
+
+    whole: its pixels, where they are few enough to keep.
+    """
+
+    raster: Raster
+    mass: Array
+    spots: tuple[Array, Array, Array]
+    whole: Array | None = None
+
+    def between(self, places: Places, first: int, end: int) -> tuple[Raster, Array]:
+        """Pixels with the exposure in some strips."""
+        if self.whole is not None:
+            return self.raster, self.whole
+        bottom, height = places.box_um[1], places.height_um
+        low = self.raster.bottom_um if first <= 0 else bottom + first * height
+        high = (
+            self.raster.bottom_um + self.raster.rows * self.raster.pixel_um
+            if end >= places.strips
+            else bottom + end * height
+        )
+        some = self.raster.between(low, high)
+        more = int(np.ceil(self.raster.halo_um / height)) + 1
+        image = np.zeros((some.rows, some.columns), np.float32)
+        x, y, kind = places.part(first - more, end + more)
+        some.put(x, y, self.mass[kind], image)
+        some.put(*self.spots, image)
+        return some, some.blurred(image)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Band:
+    """What comes out in some strips: places, kinds, (n,) float32 exposure, resist and made diameters (nm)."""
+
+    first: int
+    x_um: Array
+    y_um: Array
+    kind: Array
+    exposure: Array
+    resist_nm: Array
+    made_nm: Array
+
+
+@dataclass(eq=False, slots=True)
+class Simulation:
+    """All strips of a mask. terms: Gaussians; at_um: (m, 2) points of other edges, and what they receive from afar."""
+
+    scene: Exposed
+    process: Process
+    terms: Terms
+    at_um: Array
+    far_of_points: Array = field(init=False)
+    _wide: list[tuple[float, Wide]] = field(init=False)
+    _alone: Wide | None = field(init=False, default=None)
+    _full: float = field(init=False, default=0.0)
+    _edges: "_EdgeTable" = field(init=False)
+
+    def __post_init__(self) -> None:
+        kinds, box = self.scene.kinds, self._box()
+        self._edges = _EdgeTable.of(kinds.size_um, self.terms)
+        carried = kinds.area_um2 * kinds.dose
+        self._wide = [
+            (w, Wide(Raster.over(box, a), carried, outlines.spots(self.scene.others, a / _SPOTS)))
+            for a, w in self.terms
+            if a >= WIDE_UM
+        ]
+        if self.process.bias.isolated_nm:
+            none = (np.empty(0), np.empty(0), np.empty(0))
+            raster = Raster.over(self.scene.places.box_um, self.process.bias.range_um)
+            self._alone = Wide(raster, np.ones(len(carried)), none)
+        self._keep_small([wide for _, wide in self._wide] + ([] if self._alone is None else [self._alone]))
+        self.far_of_points = np.zeros(len(self.at_um))
+        if self._alone is not None:
+            self._full = self._densest(self._alone)
+
+    def _box(self) -> tuple[float, float, float, float]:
+        """Around all places, points and polygons."""
+        left, bottom, right, top = self.scene.places.box_um
+        corners = [np.array([[left, bottom], [right, top]]), self.at_um.reshape(-1, 2), *self.scene.others.corners]
+        low, high = np.min([c.min(0) for c in corners if len(c)], 0), np.max([c.max(0) for c in corners if len(c)], 0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def _keep_small(self, every: Sequence[Wide]) -> None:
+        """One pass over all pillars for those fields that fit into memory."""
+        small = [wide for wide in every if wide.raster.rows * wide.raster.columns <= _MOST_PIXELS]
+        images = [np.zeros((w.raster.rows, w.raster.columns), np.float32) for w in small]
+        for first, end in self._bands() if small else ():
+            x, y, kind = self.scene.places.part(first, end)
+            for wide, image in zip(small, images, strict=True):
+                wide.raster.put(x, y, wide.mass[kind], image)
+        for wide, image in zip(small, images, strict=True):
+            wide.raster.put(*wide.spots, image)
+            wide.whole = wide.raster.blurred(image)
+
+    def _bands(self) -> list[tuple[int, int]]:
+        """(first, end) strips of bands."""
+        places = self.scene.places
+        step = max(1, round(_BAND * places.strips / max(places.count, 1)))
+        return [(first, min(first + step, places.strips)) for first in range(0, places.strips, step)]
+
+    def bands(self) -> Iterator[Band]:
+        """What comes out, band by band from the bottom; two are worked on at once."""
+        bands = self._bands()
+        with ThreadPoolExecutor(_THREADS) as pool:
+            waiting = [pool.submit(self._band, *some) for some in bands[: _THREADS + 1]]
+            for number in range(len(bands)):
+                yield waiting.pop(0).result()
+                if number + _THREADS + 1 < len(bands):
+                    waiting.append(pool.submit(self._band, *bands[number + _THREADS + 1]))
+
+    def _band(self, first: int, end: int) -> Band:
+        x, y, kind = self.scene.places.part(first, end)
+        far = self._far((first, end), (x, y, kind))
+        exposure, resist = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
+        e = self._edges
+        _develop(kind, e.row, self.scene.kinds.dose, far, e.radius_um, e.own, THRESHOLD, exposure, resist)
+        alone = self._isolation(self._alone, (first, end), (x, y))
+        made = self.process.made_diameter_nm(resist, alone).astype(np.float32)
+        return Band(first, x, y, kind, exposure, resist, made)
+
+    def _far(self, strips: tuple[int, int], pillars: tuple[Array, Array, Array]) -> Array:
+        """(n,) exposure of each rim by everything else; of the points in these strips by the wide Gaussians of all."""
+        (x, y, kind), kinds, places = pillars, self.scene.kinds, self.scene.places
+        far, mass = np.zeros(len(x)), (kinds.area_um2 * kinds.dose)[kind]
+        here = np.flatnonzero(
+            (strips[0] <= strip_of(places, self.at_um[:, 1])) & (strip_of(places, self.at_um[:, 1]) < strips[1])
+        )
+        for weight, wide in self._wide:
+            raster, image = wide.between(places, *strips)
+            far += weight * (raster.take(x, y, image) - mass / (np.pi * raster.range_um**2))
+            points = self.at_um[here]
+            self.far_of_points[here] += weight * raster.take(points[:, 0], points[:, 1], image)
+        for range_um, weight in self.terms:
+            if 0.05 * float(kinds.size_um.max()) < range_um < WIDE_UM:
+                more = int(np.ceil(background.reach_um(range_um) / places.height_um))
+                around = places.part(strips[0] - more, strips[1] + more)
+                far += weight * background.beside(self._discs(pillars), self._discs(around), range_um)
+        return far
+
+    def _discs(self, pillars: tuple[Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        x, y, kind = pillars
+        kinds = self.scene.kinds
+        return x, y, (kinds.area_um2 * kinds.dose)[kind], (kinds.size_um / 2)[kind]
+
+    def _near(self, alone: Wide, strips: tuple[int, int], place: tuple[Array, Array]) -> Array:
+        """(n,) neighbours of each pillar, weighed by exp(-r^2 / range^2)."""
+        raster, image = alone.between(self.scene.places, *strips)
+        return np.asarray(np.pi * raster.range_um**2 * raster.take(*place, image) - 1)  # less itself
+
+    def _densest(self, alone: Wide) -> float:
+        """Neighbours at the densest place: of all pillars, or those of some bands, one in a thousand has more."""
+        bands = self._bands()
+        some = np.unique(np.linspace(0, len(bands) - 1, _SAMPLED).round().astype(int))
+        parts = [self.scene.places.part(*bands[k]) for k in some]
+        return float(
+            np.quantile(
+                np.concatenate([self._near(alone, bands[k], p[:2]) for k, p in zip(some, parts, strict=True)]), 0.999
+            )
+        )
+
+    def _isolation(self, alone: Wide | None, strips: tuple[int, int], place: tuple[Array, Array]) -> Array | float:
+        """How alone each pillar stands: what its neighbours lack of the densest place's."""
+        if alone is None:
+            return 0.0
+        if self._full <= 0:
+            return 1.0
+        return np.clip(1 - self._near(alone, strips, place) / self._full, 0, 1)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _EdgeTable:
+    """Exposure across the edge of a disc of unit dose: row (kinds,) in radius_um, own (sizes, levels)."""
+
+    row: Array
+    radius_um: Array
+    own: Array
+
+    @classmethod
+    def of(cls, size_um: Array, terms: Terms) -> "_EdgeTable":
+        sizes, row = np.unique(size_um, return_inverse=True)
+        tables = [_profile(size, terms) for size in sizes.tolist()]
+        return cls(row.astype(np.int64), *(np.array([table[k] for table in tables]) for k in (0, 1)))
+
+
+@compiled
+def _develop(
+    kind: Array,
+    size: Array,
+    dose: Array,
+    far: Array,
+    radius: Array,
+    own: Array,
+    threshold: float,
+    exposure: Array,
+    made_nm: Array,
+) -> None:
+    """Exposure of the drawn edge relative to the threshold, and diameter at which it is the threshold.
+
+    Interpolates in the falling ``own`` (sizes, levels), from its middle level, the drawn edge, outwards or inwards.
+    """
+    last = own.shape[1] - 1
+    for n in range(kind.shape[0]):
+        s, given = size[kind[n]], dose[kind[n]]
+        exposure[n] = (given * own[s, last // 2] + far[n]) / threshold
+        wanted = (threshold - far[n]) / given
+        low = last // 2
+        while low < last - 1 and own[s, low + 1] > wanted:
+            low += 1
+        while low > 0 and own[s, low] <= wanted:
+            low -= 1
+        fall = own[s, low] - own[s, low + 1]
+        share = min(max((own[s, low] - wanted) / fall, 0.0), 1.0) if fall > 0 else 0.0
+        made_nm[n] = 2e3 * (radius[s, low] + share * (radius[s, low + 1] - radius[s, low]))
+
+
+def _profile(size_um: float, terms: Terms) -> tuple[Array, Array]:
+    """(radii, exposure) of a disc of unit dose about its edge: the non-central chi-square of two degrees."""
+    from scipy.special import chndtr
+
+    core = min(a for a, _ in terms)
+    span = min(size_um / 2 * 0.9, 4 * core)
+    radius = np.linspace(size_um / 2 - span, size_um / 2 + span, 2 * _LEVELS + 1)
+    own = sum(w * chndtr(2 * (size_um / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
+    return radius, np.asarray(own)

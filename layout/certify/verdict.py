@@ -1,0 +1,153 @@
+"""What a certificate says of millions of pillars: extremes, a map and a histogram, gathered band by band."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.certify.places import Box
+from layout.process import LayerNumber, compiled
+from metalens.ground.arrays import Array
+
+MOST_ERROR, MOST_NM = 0.01, 1.0  # what a sound exposure keeps
+EDGE_SHARE, EDGE_ERROR = 0.99, 0.02  # of marks: so many points keep it, and all of them this; doses step along an edge
+_SIDE = 160  # points of the map, each way
+_WIDEST_NM, _BIN_NM = 8.0, 1 / 16  # of the histogram; what is beyond counts in its last bins
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Edges:
+    """Edges of marks, labels and other shapes that are no round pillars.
+
+    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,) how far outside the drawn edge it
+    comes out in the resist. layer: (n,) layer numbers.
+    """
+
+    x_um: Array
+    y_um: Array
+    exposure: Array
+    shift_nm: Array
+    layer: Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tally:
+    """Sums over judged pillars (the dose test is not) of a part of the mask.
+
+    ends: largest |exposure - 1|, largest |resist - drawn| and least and largest made diameter, nm. total, count:
+    (y, x) of the map, of resist less drawn. bins: (n,) pillars by that difference.
+    """
+
+    ends: Array
+    total: Array
+    count: Array
+    bins: Array
+
+    @classmethod
+    def empty(cls) -> "Tally":
+        """Of nothing."""
+        bins = np.zeros(2 * round(_WIDEST_NM / _BIN_NM), np.int64)
+        return cls(np.array([0.0, 0.0, np.inf, -np.inf]), np.zeros((_SIDE, _SIDE)), np.zeros((_SIDE, _SIDE)), bins)
+
+    def take(
+        self, place: tuple[Array, Array], judged: Array, values: tuple[Array, Array, Array, Array], box_um: Box
+    ) -> None:
+        """Add pillars at x, y; values: (n,) exposure, drawn, resist and made diameter."""
+        scale = _SIDE / max(box_um[2] - box_um[0], 1e-9), _SIDE / max(box_um[3] - box_um[1], 1e-9)
+        sums = (self.ends, self.total, self.count, self.bins)
+        _tally(*place, judged, *values, box_um[0], box_um[1], *scale, _BIN_NM, *sums)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Survey:
+    """The verdict over everything that is written.
+
+    pillars: round ones, the dose test too. tally: sums over those that are judged. box_um: left, bottom, right, top of
+    the map. edges: of the other shapes. lean_nm: foot less half-height diameter. undosed: layers with shapes and no
+    dose.
+    """
+
+    pillars: int
+    tally: Tally
+    box_um: Box
+    edges: Edges
+    lean_nm: float
+    undosed: tuple[LayerNumber, ...] = ()
+
+    @property
+    def worst_exposure(self) -> float:
+        """Largest |exposure - 1| of the judged pillars and of all edges."""
+        return float(max(self.tally.ends[0], np.abs(self.edges.exposure - 1).max(initial=0.0)))
+
+    @property
+    def worst_nm(self) -> float:
+        """Largest |width in the resist - drawn|: diameters, and twice the shift of an edge."""
+        return float(max(self.tally.ends[1], 2 * np.abs(self.edges.shift_nm).max(initial=0.0)))
+
+    @property
+    def ok(self) -> bool:
+        """Whether every shape has a dose and keeps 1 % of dose-to-size and 1 nm.
+
+        Along the edges of marks and labels 99 of 100 points keep the 1 %, and all of them 2 %.
+        """
+        off = np.abs(self.edges.exposure - 1)
+        edges = not len(off) or (float((off <= MOST_ERROR).mean()) >= EDGE_SHARE and float(off.max()) <= EDGE_ERROR)
+        return not self.undosed and float(self.tally.ends[0]) <= MOST_ERROR and edges and self.worst_nm <= MOST_NM
+
+    @property
+    def thinnest_top_nm(self) -> float:
+        """Least diameter at the top of a judged pillar."""
+        return float(self.tally.ends[2]) - self.lean_nm
+
+    @property
+    def widest_foot_nm(self) -> float:
+        """Largest diameter at the foot of a judged pillar."""
+        return float(self.tally.ends[3]) + self.lean_nm
+
+    @property
+    def map_nm(self) -> Array:
+        """(y, x) mean of resist less drawn diameter, the first row lowest; NaN where no pillar is judged."""
+        t = self.tally
+        return np.divide(t.total, t.count, out=np.full_like(t.total, np.nan), where=t.count > 0)
+
+    @property
+    def histogram(self) -> tuple[Array, Array]:
+        """(edges / nm, pillars) of resist less drawn diameter, from the first used bin to the last."""
+        held = np.flatnonzero(self.tally.bins)
+        first, end = (int(held[0]), int(held[-1]) + 1) if len(held) else (0, 1)
+        return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[first:end]
+
+
+@compiled
+def _tally(
+    x: Array,
+    y: Array,
+    judged: Array,
+    exposure: Array,
+    drawn: Array,
+    resist: Array,
+    made: Array,
+    left: float,
+    bottom: float,
+    across: float,
+    up: float,
+    bin_nm: float,
+    ends: Array,
+    total: Array,
+    count: Array,
+    bins: Array,
+) -> None:
+    rows, columns, last = total.shape[0], total.shape[1], bins.shape[0] - 1
+    for n in range(x.shape[0]):
+        if not judged[n]:
+            continue
+        off = resist[n] - drawn[n]
+        ends[0] = max(ends[0], abs(exposure[n] - 1))
+        ends[1] = max(ends[1], abs(off))
+        ends[2] = min(ends[2], made[n])
+        ends[3] = max(ends[3], made[n])
+        i = min(max(int((y[n] - bottom) * up), 0), rows - 1)
+        j = min(max(int((x[n] - left) * across), 0), columns - 1)
+        total[i, j] += off
+        count[i, j] += 1
+        k = int(np.floor(off / bin_nm)) + bins.shape[0] // 2
+        bins[min(max(k, 0), last)] += 1
