@@ -3,11 +3,14 @@
 Without a topic all are run but those that take a quarter of an hour or need an extra package (``LONG``).
 """
 
+import argparse
 import importlib
 import json
-import pkgutil
+import os
 import platform
+import re
 import sys
+import traceback
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,22 +21,52 @@ LONG = ("install", "hardness", "hard_cells", "limits", "plan", "scene_referee")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 
-def main(words: list[str]) -> None:
-    peers = "--peers" in words
-    folder = Path(__file__).parent
-    known = sorted(m.name for m in pkgutil.iter_modules([str(folder)]) if not m.name.startswith("_"))
-    for topic in [w for w in words if not w.startswith("-")] or [k for k in known if k not in LONG]:
-        module = importlib.import_module(f"benchmarks.{topic}")
-        make = getattr(module, "peer_rows" if peers else "rows", None)
-        if make is None:
-            continue
-        rows = make()
-        print(f"\n{topic}\n{table(rows)}", flush=True)
-        about = {"python": platform.python_version(), "cores": len(__import__("os").sched_getaffinity(0))}
-        result = {"machine": about, "rows": [asdict(row) for row in rows]}
-        name = f"{topic}_peers.json" if peers else f"{topic}.json"
-        (folder / "results" / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+def main(words: list[str]) -> int:
+    """Run topics; one that fails is told and the others go on. 0: all done, 1: some failed.
+
+    Raises:
+        SystemExit: unknown words.
+    """
+    asked = _parser().parse_args(words)
+    failed = [topic for topic in asked.topics or sorted(set(_topics()) - set(LONG)) if not _done(topic, asked.peers)]
     figures.write()
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return bool(failed)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("topics", nargs="*", metavar="TOPIC", choices=_topics(), help=", ".join(_topics()))
+    parser.add_argument("--peers", action="store_true", help="beside other projects, where these are installed")
+    return parser
+
+
+def _topics() -> list[str]:
+    """Modules with ``rows`` or ``peer_rows``, found without importing them."""
+    folder = Path(__file__).parent
+    made = re.compile(r"^def (peer_)?rows\(", re.M)
+    return [p.stem for p in sorted(folder.glob("[!_]*.py")) if made.search(p.read_text(encoding="utf-8"))]
+
+
+def _done(topic: str, peers: bool) -> bool:
+    """Run a topic and keep its rows; one without rows of this sort is passed over."""
+    module = importlib.import_module(f"benchmarks.{topic}")
+    make = getattr(module, "peer_rows" if peers else "rows", None)
+    if make is None:
+        return True
+    try:
+        rows = make()
+    except Exception:  # noqa: BLE001 whatever it is, the other topics go on
+        print(f"\n{topic}", file=sys.stderr)
+        traceback.print_exc()
+        return False
+    print(f"\n{topic}\n{table(rows)}", flush=True)
+    about = {"python": platform.python_version(), "cores": len(os.sched_getaffinity(0))}
+    result = {"machine": about, "rows": [asdict(row) for row in rows]}
+    name = f"{topic}_peers.json" if peers else f"{topic}.json"
+    (Path(__file__).parent / "results" / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return True
 
 
 def table(rows: list[Row]) -> str:
@@ -53,4 +86,4 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 if __name__ == "__main__":
     print(f"benchmarks of {Path(benchmarks.__file__).parent.name}, metalens-toolchain")
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -47,8 +47,13 @@ def asbuilt(path: Path) -> list[Panel]:
             ("parameter", "value", "95 % from", "to"),
             [(name, float(v), *made.interval(name)) for name, v in zip(made.names, made.value, strict=True)],
         ),
-        Images("Frames as captured", made.measured / peak, axis, made.pixel_um, "of the brightest pixel"),
-        Images("Frames as fitted", made.predicted / peak, axis, made.pixel_um, "of the brightest pixel captured"),
+        Images(
+            "Frames as captured and as fitted",
+            np.stack([made.measured, made.predicted]) / peak,
+            [Axis("shown", ["captured", "fitted"], blink=True), *axis],
+            made.pixel_um,
+            "of the brightest pixel captured",
+        ),
         Images("Captured less fitted", made.residual_sigma, axis, made.pixel_um, "sigma", signed=True),
         Numbers("What is known", ("", "in words"), _words(made)),
     ]

@@ -10,7 +10,7 @@ import tyro
 from metalens.commands.common import MASKS, Common, MaybeOutput
 from metalens.ground import manifest, store
 from metalens.ground.errors import ConfigError
-from metalens.view import Panel, write
+from metalens.view import Panel, html, serve, write
 
 VIEWS: dict[str, str] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
 # what tells the kind of a folder: names of files in it, any of them
@@ -30,25 +30,56 @@ class Options(Common):
         file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain; a mask (GDSII or OASIS);
             or the folder of a mask, of captures, or of a co-design run.
         output: the page to write; by default the file's name with .html, beside it.
+        serve: show the page in a browser on this machine and follow what grows, until Ctrl-C; nothing is written. A
+            folder of several artefacts begins with a list of them.
+        port: of --serve on 127.0.0.1; 0: any that is free.
     """
 
     file: tyro.conf.Positional[Path]
     output: MaybeOutput = None
+    serve: bool = False
+    port: int = 0
 
 
 def run(options: Options) -> int:
-    """Write the page; exit 0."""
+    """Write the page, or serve it until interrupted; exit 0."""
+    if options.serve:
+        return _served(options)
+    if options.port:
+        raise ConfigError("--port: only with --serve")
     target = options.output or options.file.with_name(options.file.name.removesuffix(".h5") + ".html")
     with options.claim(target) as draft:
-        kind = kind_of(options.file)
-        panels = panels_of(kind)(options.file)
-        write(draft.path, f"{options.file.name} ({kind})", panels, about=_about(options.file))
+        title, panels = _shown(options.file)
+        write(draft.path, title, panels, about=_about(options.file))
     size = target.stat().st_size
     options.console.result(
         {"page": target.name, "panels": len(panels), "bytes": size},
         f"{target}: {len(panels)} figures of {options.file.name}, {size / 1e6:.2g} MB; open it in a browser",
     )
     return 0
+
+
+def _served(options: Options) -> int:
+    if options.output or options.force:
+        raise ConfigError("--serve writes nothing: leave out --output and --force")
+
+    def made(path: Path) -> str:
+        title, panels = _shown(path)
+        return html(title, panels, about=_about(path))
+
+    def listed() -> list[Path]:
+        return [] if _folder_kind(options.file) or not options.file.is_dir() else _inside(options.file)
+
+    def ready(address: str) -> None:
+        options.console.result({"address": address}, f"{options.file} at {address} until Ctrl-C")
+
+    serve(options.file, made, listed, port=options.port, ready=ready)
+    return 0
+
+
+def _shown(path: Path) -> tuple[str, list[Panel]]:
+    kind = kind_of(path)
+    return f"{path.name} ({kind})", panels_of(kind)(path)
 
 
 def kind_of(path: Path) -> str:
@@ -58,15 +89,25 @@ def kind_of(path: Path) -> str:
         ConfigError: a folder of none of these kinds; what can be shown of it is named. StoreError: no artefact.
     """
     if path.is_dir():
-        for kind, names in FOLDERS.items():
-            if any(True for name in names for _ in path.glob(name)):
-                return kind
-        inside = [p.relative_to(path).as_posix() for p in sorted(path.rglob("*")) if p.suffix in (".h5", *MASKS)]
+        if kind := _folder_kind(path):
+            return kind
+        inside = [p.relative_to(path).as_posix() for p in _inside(path)]
         raise ConfigError(
             f"{path} is no folder of a mask, of captures or of a run"
             + (f"; give one of {', '.join(inside[:9])}" if inside else "; give a file")
         )
     return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
+
+
+def _folder_kind(path: Path) -> str | None:
+    return next((k for k, names in FOLDERS.items() if any(True for name in names for _ in path.glob(name))), None)
+
+
+def _inside(path: Path) -> list[Path]:
+    """Artefacts below a folder: files, and folders of a kind."""
+    return [
+        p for p in sorted(path.rglob("*")) if p.suffix.lower() in (".h5", *MASKS) or (p.is_dir() and _folder_kind(p))
+    ]
 
 
 def _about(path: Path) -> dict[str, object]:

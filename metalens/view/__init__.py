@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from metalens.view.artefacts import lens_panels as lens_panels
+    from metalens.view.page import html as html
     from metalens.view.page import write as write
     from metalens.view.panels import Axis as Axis
     from metalens.view.panels import Classes as Classes
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from metalens.view.panels import Numbers as Numbers
     from metalens.view.panels import Outline as Outline
     from metalens.view.panels import Panel as Panel
+    from metalens.view.server import serve as serve
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -27,7 +29,9 @@ __getattr__, __dir__, __all__ = attach(
         "Numbers": "panels",
         "Outline": "panels",
         "Panel": "panels",
+        "html": "page",
         "lens_panels": "artefacts",
+        "serve": "server",
         "write": "page",
     },
 )

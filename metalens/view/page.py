@@ -110,7 +110,8 @@ def _table(panel: Numbers) -> dict[str, Any]:
 
 
 def _axis(axis: Axis) -> dict[str, Any]:
-    return {"name": axis.name, "values": [_number(v) for v in axis.values], "unit": axis.unit}
+    values = [_number(v) for v in axis.values]
+    return {"name": axis.name, "values": values, "unit": axis.unit, "blink": axis.blink}
 
 
 def _number(value: Any) -> Any:

@@ -12,11 +12,12 @@ from metalens.ground.errors import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A slider: its name, its values, and their unit."""
+    """A slider: its name, its values, and their unit. blink: steps through its values by itself, on one scale."""
 
     name: str
     values: Sequence[float | str]
     unit: str = ""
+    blink: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)

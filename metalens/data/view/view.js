@@ -32,10 +32,23 @@ function sliders(panel, controls, changed) {
     const input = element("input", label, { type: "range", min: 0, max: axis.values.length - 1, value: 0, step: 1 });
     const shown = element("output", label);
     const say = () => { const v = `${text(axis.values[at[i]])} ${axis.unit}`; shown.textContent = v; input.setAttribute("aria-valuetext", v); };
-    input.addEventListener("input", () => { at[i] = Number(input.value); say(); changed(); });
+    const go = (k) => { at[i] = k; input.value = k; say(); changed(); };
+    input.addEventListener("input", () => go(Number(input.value)));
     say();
+    if (axis.blink) blinking(controls, () => go((at[i] + 1) % axis.values.length));
   });
-  return () => at.reduce((sum, k, i) => sum * panel.axes[i].values.length + k, 0);
+  const place = () => at.reduce((sum, k, i) => sum * panel.axes[i].values.length + k, 0);
+  // places of the images that blink with this one: they share a scale
+  place.others = () => panel.axes.reduce((all, axis, i) => all.flatMap((sum) => (axis.blink ? axis.values.map((_, k) => k) : [at[i]]).map((k) => sum * axis.values.length + k)), [0]);
+  return place;
+}
+function blinking(controls, next) {
+  const button = element("button", controls, { type: "button", "aria-pressed": "false" }, "blink");
+  let timer = null;
+  button.addEventListener("click", () => {
+    if (timer) { clearInterval(timer); timer = null; } else timer = setInterval(next, 600);
+    button.setAttribute("aria-pressed", timer ? "true" : "false");
+  });
 }
 
 function tableOf(parent, head, rows, name = "Data") {
@@ -48,9 +61,16 @@ function tableOf(parent, head, rows, name = "Data") {
 function fill(parent, head, rows) {
   const table = element("table", parent), top = element("tr", element("thead", table)), body = element("tbody", table);
   head.forEach((h) => element("th", top, { scope: "col" }, h));
-  rows.slice(0, 2000).forEach((row) => { const tr = element("tr", body); row.forEach((v) => element("td", tr, {}, text(v))); });
+  rows.slice(0, 2000).forEach((row) => { const tr = element("tr", body); row.forEach((v) => element("td", tr, typeof v === "number" ? { class: "number" } : {}, text(v))); });
   if (rows.length > 2000) element("p", parent, {}, `first 2000 of ${rows.length} rows`);
 }
+
+// Labels of an axis with as many digits as tell neighbours apart.
+const ticks = (_, splits) => splits.map((v, i) => {
+  if (v === null || v === undefined) return "";
+  const other = splits[i ? i - 1 : 1] ?? 0, step = Math.abs(v - other) || Math.abs(v) || 1;
+  return Number(v.toPrecision(Math.max(1, Math.min(12, 2 + Math.ceil(Math.log10(Math.max(Math.abs(v), step) / step)))))).toString();
+});
 
 function plot(parent, title, xName, yName, log) {
   let chart = null;
@@ -72,7 +92,7 @@ function plot(parent, title, xName, yName, log) {
     const drawn = { hooks: { drawAxes: (u) => { u.ctx.save(); u.ctx.fillStyle = css("--b") + "40"; bands.forEach(([a, b]) => { const l = u.valToPos(a, "x", true), r = u.valToPos(b, "x", true); u.ctx.fillRect(l, u.bbox.top, Math.max(1, r - l), u.bbox.height); }); u.ctx.restore(); } } };
     chart?.destroy();
     chart = new uPlot({ width, height: 260, title, series, bands: shade, plugins: [drawn], scales: { x: { time: false }, y: log ? { distr: 3 } : {} }, legend: { show: Object.keys(lines).length > 1 },
-      axes: [{ label: xName, ...ink }, { label: yName, size: 64, ...ink }] }, data, parent);
+      axes: [{ label: xName, values: ticks, ...ink }, { label: yName, size: (_, shown) => 36 + 8 * Math.max(3, ...(shown ?? []).map((v) => v.length)), values: ticks, ...ink }] }, data, parent);
     chart.root.querySelectorAll(".u-legend .u-series").forEach((row) => { if (/ [+-] bar$/.test(row.textContent.trim().split(":")[0].trim())) row.style.display = "none"; });
   };
 }
@@ -98,7 +118,8 @@ async function images(panel, section) {
   function draw() {
     const at = image(), context = canvas.getContext("2d"), out = context.createImageData(nx, ny);
     let top = 0;
-    if (own) { for (const v of at) top = Math.max(top, Math.abs(v)); } else top = all;
+    if (own) for (const k of place.others()) for (const v of values.subarray(k * size, (k + 1) * size)) top = Math.max(top, Math.abs(v));
+    else top = all;
     top = top || 1;
     for (let i = 0; i < size; i++) {
       let t = panel.signed ? 0.5 + at[i] / top / 2 : at[i] / top;
@@ -123,15 +144,19 @@ async function images(panel, section) {
   canvas.addEventListener("keydown", (event) => { const step = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key]; if (step) { event.preventDefault(); move(...step); } });
   tableOf(section, ["y / µm", "x / µm", panel.unit || "value"], () => { const at = image(), rows = []; for (let i = 0; i < ny; i += Math.ceil(ny / 40)) for (let k = 0; k < nx; k += Math.ceil(nx / 40)) rows.push([um(i, ny), um(k, nx), at[i * nx + k]]); return rows; }, "Data of this image (every few samples)");
   draw();
+  addEventListener("resize", draw);
 }
 // |Fourier transform| of the sums over one axis: the slice of the transfer function along the other; 1 at zero
 function transfer(at, ny, nx, step) {
   const sums = (n, value) => Array.from({ length: n }, (_, k) => value(k));
   const x = sums(nx, (k) => { let s = 0; for (let i = 0; i < ny; i++) s += at[i * nx + k]; return s; });
   const y = sums(ny, (i) => { let s = 0; for (let k = 0; k < nx; k++) s += at[i * nx + k]; return s; });
-  const most = 0.5 / step, n = 120, f = Array.from({ length: n }, (_, k) => 1e3 * most * k / (n - 1));
-  const slice = (line) => { const whole = line.reduce((a, b) => a + b, 0) || 1; return f.map((v) => { let re = 0, im = 0; line.forEach((value, k) => { const p = 2 * Math.PI * v * 1e-3 * k * step; re += value * Math.cos(p); im += value * Math.sin(p); }); return Math.hypot(re, im) / whole; }); };
-  return { f, x: slice(x), y: slice(y) };
+  const n = 120, upTo = (most) => Array.from({ length: n }, (_, k) => 1e3 * most * k / (n - 1));
+  const slice = (line, f) => { const whole = line.reduce((a, b) => a + b, 0) || 1; return f.map((v) => { let re = 0, im = 0; line.forEach((value, k) => { const p = 2 * Math.PI * v * 1e-3 * k * step; re += value * Math.cos(p); im += value * Math.sin(p); }); return Math.hypot(re, im) / whole; }); };
+  const whole = upTo(0.5 / step), seen = [slice(x, whole), slice(y, whole)];
+  const last = whole.findLastIndex((_, k) => Math.max(seen[0][k], seen[1][k]) > 0.01); // above it nothing is to be seen
+  const f = upTo(Math.min(0.5 / step, 1.3e-3 * whole[Math.min(n - 1, last + 1)]));
+  return { f, x: slice(x, f), y: slice(y, f) };
 }
 // share of the light of the window inside circles about its centroid
 function encircled(at, ny, nx, step) {

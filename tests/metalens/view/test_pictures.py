@@ -1,0 +1,123 @@
+"""What a browser draws, pixel by pixel, against the same picture made with numpy from the data."""
+
+import base64
+import html
+import io
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from metalens.view import Axis, Classes, Curves, Images, Numbers, page
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
+# cividis (Nuñez, Anderton, Renslow 2018) at nine even steps, as drawn
+CIVIDIS = np.array(
+    [[0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115], [138, 134, 120], [165, 156, 116],
+     [195, 179, 105], [255, 234, 70]], float)  # fmt: skip
+
+
+def _colour(share):
+    at = np.clip(share, 0, 1) * 8
+    return np.stack([np.interp(at, np.arange(9), CIVIDIS[:, k]) for k in range(3)], -1)
+
+
+def _told(folder, panels, script, *, width=1440, words=()):
+    """What a script writes into the page, once the page is drawn."""
+    path = folder / "page.html"
+    page.write(path, "page", panels)
+    ask = """<script>(async () => {
+    const drawn = () => document.body.dataset.ready === "true";
+    await new Promise((go) => {
+      const watch = new MutationObserver(() => drawn() && go());
+      if (drawn()) go(); else watch.observe(document.body, { attributes: true });
+    });
+    await new Promise((go) => requestAnimationFrame(() => setTimeout(go, 50)));
+    const told = document.createElement("pre");
+    told.id = "told"; told.textContent = String((() => { %s })()); document.body.append(told); })();
+    </script></body>"""
+    path.write_text(path.read_text(encoding="utf-8").replace("</body>", ask % script), encoding="utf-8")
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--virtual-time-budget=20000"]
+    command += [f"--user-data-dir={folder / 'profile'}", f"--window-size={width},1200", *words, "--dump-dom"]
+    done = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, check=False)
+    return html.unescape(re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.S).group(1))
+
+
+def _canvas(folder, panels, which, **more):
+    url = _told(folder, panels, f"return document.querySelectorAll('{which}')[0].toDataURL();", **more)
+    picture = Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")
+    return np.asarray(picture, float)
+
+
+def test_an_image_has_the_colours_of_its_values(tmp_path):
+    values = np.random.default_rng(5).uniform(0, 3, (2, 7, 11))
+    values[0] *= 0.4  # the first one is shown on its own scale
+    drawn = _canvas(tmp_path, [Images("psf", values, [Axis("depth", [1.0, 2.0], "mm")], 0.5)], "canvas.image")
+    wanted = _colour(values[0] / values[0].max())
+    away = np.ones((7, 11), bool)
+    away[3, :] = away[:, 5] = away[4, :] = away[:, 6] = False  # the cross and its blurred edge
+    # 256 colours: half a step of the table is at most 8 * 60 / 512 levels, and half of one for rounding
+    assert np.abs(drawn - wanted)[away].max() <= 1.5
+
+
+def test_images_that_blink_share_a_scale(tmp_path):
+    values = np.random.default_rng(6).uniform(0, 1, (2, 2, 5, 5))
+    values[1] *= 2.7  # brighter than what is shown first
+    axes = [Axis("shown", ["captured", "fitted"], blink=True), Axis("frame", ["a", "b"])]
+    drawn = _canvas(tmp_path, [Images("frames", values, axes, 0.5)], "canvas.image")
+    wanted = _colour(values[0, 0] / values[:, 0].max())
+    assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
+
+
+def test_a_map_far_away_is_the_mean_over_its_sites_and_shows_no_false_lenses(tmp_path):
+    n = 2048
+    at = np.arange(n) - (n - 1) / 2
+    # rings of three sites at the rim: a map of every n-th site would show coarse ones, false lenses among them
+    radius = np.hypot(at, at[:, None])
+    index = np.where(radius < 1000, 1 + np.floor(radius**2 / 85) % 64, 0).astype(np.uint8)
+    sizes = np.linspace(80.0, 207.0, 64)
+    drawn = _canvas(tmp_path, [Classes("mask", index, sizes, 0.3, "nm")], "canvas.map")
+    high, wide = drawn.shape[:2]
+    scale = min(wide, high) / n * 0.98
+    rows, columns = np.arange(high // 2 - 60, high // 2 + 60), np.arange(wide // 2 + 60, wide // 2 + 220)
+    values = np.where(index > 0, sizes[np.maximum(index, 1).astype(int) - 1], 0)
+    block = 4  # sites of a pixel at this scale: 2 to 4
+    assert 0.25 <= scale < 0.5
+    means = values.reshape(n // block, block, n // block, block).mean((1, 3))
+    y = ((rows + 0.5 - high / 2) / scale + n / 2) / block
+    x = ((columns + 0.5 - wide / 2) / scale + n / 2) / block
+    wanted = _colour((means[np.ix_(y.astype(int), x.astype(int))] - 80.0) / 127.0)
+    assert np.abs(drawn[np.ix_(rows, columns)] - wanted).max() <= 1.5
+
+
+def _everything():
+    x = np.linspace(1, 3, 17)
+    long = "a word-of-great-length_" * 9
+    return [
+        Images(
+            "image", np.random.default_rng(4).uniform(0, 1, (3, 40, 40)), [Axis("depth", [1, 2, 3])], 0.3, optics=True
+        ),
+        Curves("line", x, "x", {"y": 0.99999 + 1e-7 * x}, "y", errors={"y": 1e-8 * x}),
+        Numbers("table", ("name", "value", "from", "to"), [(long, 1.2345e-11, -3.25, 4.5), ("b", 2.0, 1.0, 3.0)]),
+    ]
+
+
+def test_no_page_is_wider_than_the_screen(tmp_path):
+    for width in (1440, 640):
+        script = """const charts = Array.from(document.querySelectorAll(".uplot"));
+        const over = charts.map((u) => u.clientWidth - u.parentElement.clientWidth);
+        return [document.documentElement.scrollWidth, innerWidth, ...over];"""
+        whole, screen, *over = map(int, _told(tmp_path, _everything(), script, width=width).split(","))
+        assert whole <= screen
+        assert max(over) <= 0
+
+
+def test_ticks_tell_neighbours_apart(tmp_path):
+    splits = "[[0.9999985, 0.999999, 0.9999995, 1], [0, 0.25, 0.5], [-40, 0, 40], [0, 2e-9, 4e-9]]"
+    script = f"return JSON.stringify({splits}.map((s) => ticks(null, s)));"
+    wanted = '[["0.9999985","0.999999","0.9999995","1"],["0","0.25","0.5"],["-40","0","40"],["0","2e-9","4e-9"]]'
+    assert _told(tmp_path, _everything(), script) == wanted
