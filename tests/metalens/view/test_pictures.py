@@ -1,19 +1,15 @@
 """What a browser draws, pixel by pixel, against the same picture made with numpy from the data."""
 
 import base64
-import html
 import io
-import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from metalens.view import Axis, Classes, Curves, Images, Numbers, page
+from tests.metalens.view.browser_page import BROWSER, told
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
 # cividis (Nuñez, Anderton, Renslow 2018) at nine even steps, as drawn
 CIVIDIS = np.array(
@@ -26,25 +22,9 @@ def _colour(share):
     return np.stack([np.interp(at, np.arange(9), CIVIDIS[:, k]) for k in range(3)], -1)
 
 
-def _told(folder, panels, script, *, width=1440, words=()):
-    """What a script writes into the page, once the page is drawn."""
-    path = folder / "page.html"
-    page.write(path, "page", panels)
-    ask = """<script>(async () => {
-    const drawn = () => document.body.dataset.ready === "true";
-    await new Promise((go) => {
-      const watch = new MutationObserver(() => drawn() && go());
-      if (drawn()) go(); else watch.observe(document.body, { attributes: true });
-    });
-    await new Promise((go) => requestAnimationFrame(() => setTimeout(go, 50)));
-    const told = document.createElement("pre");
-    told.id = "told"; told.textContent = String((() => { %s })()); document.body.append(told); })();
-    </script></body>"""
-    path.write_text(path.read_text(encoding="utf-8").replace("</body>", ask % script), encoding="utf-8")
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--virtual-time-budget=20000"]
-    command += [f"--user-data-dir={folder / 'profile'}", f"--window-size={width},1200", *words, "--dump-dom"]
-    done = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, check=False)
-    return html.unescape(re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.S).group(1))
+def _told(folder, panels, script, *, width=1440):
+    page.write(folder / "page.html", "page", panels)
+    return told(folder / "page.html", script, width=width)
 
 
 def _canvas(folder, panels, which, **more):
