@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.mutation import rules, table
 from benchmarks.mutation.graph import Graph
-from benchmarks.mutation.reach import PACKAGES, Reach, Seen, digest
+from benchmarks.mutation.reach import PACKAGES, Reach, Seen, compiled, digest, home
 from benchmarks.mutation.runner import Bench, copy_of, load_libraries
 from benchmarks.mutation.server import Server
 
@@ -96,7 +96,7 @@ class Worker:
         mutant, budget_s = task
         module = mutant.path.removesuffix(".py").replace("/", ".")
         source = mutant.applied((ROOT / mutant.path).read_text(encoding="utf-8"))
-        loops = module in cls.graph.compiled
+        loops = home(ROOT / mutant.path, mutant.line)[0] in compiled(ROOT / mutant.path)
         tests = cls.reach.tests(ROOT, mutant.path, mutant.line, budget_s)
         usual = sum(cls.reach.seconds[test] for test in tests)
         answer = None
@@ -106,7 +106,8 @@ class Worker:
             tests, usual = cls.graph.related(module, cls.reach.by_file(), budget_s), budget_s
         if not tests:
             return _row(mutant) | {"outcome": "no test", "seconds": 0.0, "tests": []}
-        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, usual, fresh=loops)
+        fresh = module in cls.graph.compiled
+        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, usual, fresh=fresh)
         outcome = {"passed": "survived", "failed": "killed", "time": "killed by time"}[outcome]
         files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
         return _row(mutant) | {"outcome": outcome, "seconds": round(spent, 1), "tests": files}

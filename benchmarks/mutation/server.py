@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -26,9 +26,9 @@ UNPATCHED = 71  # exit status: no function in memory holds what was changed
 
 
 class Server:
-    """The suite of ``tree``, collected in a child process that waits for questions."""
+    """The suite of ``tree``, or some of it, collected in a child process that waits for questions."""
 
-    def __init__(self, tree: Path) -> None:
+    def __init__(self, tree: Path, tests: Sequence[str] = ("tests",)) -> None:
         self.tree = tree
         self._pipe, theirs = multiprocessing.Pipe()
         self._child = os.fork()
@@ -36,7 +36,7 @@ class Server:
             self._pipe.close()
             os.setpgid(0, 0)
             with contextlib.suppress(BaseException):
-                _serve(tree, theirs)
+                _serve(tree, theirs, tests)
             os._exit(0)
         theirs.close()
 
@@ -58,7 +58,7 @@ class Server:
         os.waitpid(self._child, 0)
 
 
-def _serve(tree: Path, pipe: Connection) -> None:
+def _serve(tree: Path, pipe: Connection, tests: Sequence[str]) -> None:
     os.chdir(tree)
     null = os.open(os.environ.get("MUTANT_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(null, 1)
@@ -67,7 +67,7 @@ def _serve(tree: Path, pipe: Connection) -> None:
     for name in [n for n in sys.modules if n.split(".")[0] == "benchmarks"]:
         del sys.modules[name]
     os.environ.update(PYTHONPATH=str(tree), CI="1")
-    pytest.main([*QUIET, "tests"], [_Loop(pipe)])
+    pytest.main([*QUIET, *tests], [_Loop(pipe)])
 
 
 class _Loop:
