@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib
 import json
 import multiprocessing
 import os
@@ -84,10 +85,7 @@ class _Loop:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        functions: defaultdict[str, list[FunctionType]] = defaultdict(list)
-        for function in gc.get_objects():
-            if type(function) is FunctionType:
-                functions[function.__code__.co_filename].append(function)
+        functions = _functions({})
         gc.freeze()
         while True:
             try:
@@ -100,8 +98,12 @@ class _Loop:
             items += [item for item in session.items if item.nodeid.partition("::")[0] in wanted]
             if change is None:
                 self.pipe.send(self._seen(items, limit_s))
-            else:
-                self.pipe.send(self._outcome(items, functions[change[0]], change, limit_s))
+                continue
+            if change[0] not in functions:  # a module that is loaded when first used
+                parts = Path(change[0]).relative_to(Path.cwd()).with_suffix("").parts
+                importlib.import_module(".".join(parts))
+                functions = _functions(functions)
+            self.pipe.send(self._outcome(items, functions.get(change[0], []), change, limit_s))
 
     def _seen(self, items: list[pytest.Item], limit_s: float) -> Seen:
         with tempfile.TemporaryDirectory(prefix="seen-") as folder:
@@ -140,6 +142,15 @@ class _Loop:
             item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
             if self.first and self.failed:
                 return
+
+
+def _functions(known: dict[str, list[FunctionType]]) -> dict[str, list[FunctionType]]:
+    """Those in memory by the file of their code, of files that are not known."""
+    found: defaultdict[str, list[FunctionType]] = defaultdict(list)
+    for function in gc.get_objects():
+        if type(function) is FunctionType and function.__code__.co_filename not in known:
+            found[function.__code__.co_filename].append(function)
+    return known | dict(found)
 
 
 def _forked(work: Any, limit_s: float) -> tuple[int, float]:

@@ -110,7 +110,7 @@ def test_octagon_is_the_cheapest_of_all_near_the_regular_one(diameter):
 
 @pytest.mark.parametrize("diameter", [9.0, 12.5, 17.0, 24.2])
 def test_on_a_coarse_grid_fewer_vertices_are_taken_where_their_area_is_far_better(diameter):
-    """From the most down; the next is taken where its error is below 0.7 of the best so far, until one is below 1e-3."""
+    """From the most down; the next is taken where its error is below 0.7 of the best so far, to one below 1e-3."""
     best = None
     for count in (64, 48, 32, 24, 20, 16, 12):
         points = polygon.mirrored(polygon._round(diameter, count))

@@ -62,7 +62,7 @@ def test_an_image_with_kernels_that_vary_over_the_field_is_the_sum_over_its_sour
 
 @pytest.mark.parametrize("field", [Field(0.0), Field(0.21, 0.7), Field(0.33, -2.0)])
 def test_rim_cells_weigh_what_lies_inside_the_aperture(field):
-    """Weight times 1 - q² is the share of a cell inside: 24² rays through each meet the lens within its radius or not."""
+    """Weight times 1 - q² is the share of a cell inside: of 24² rays through it, those that meet the lens."""
     pupil = Pupil(nodes=64)
     seen = pupils.view(pupil, field, 20e3)
     d, (cx, cy) = pupil.sensor_distance_um, (pupil.sensor_distance_um * t for t in field.tangents)
