@@ -63,7 +63,7 @@ def pillar(diameter: float, *, vertices: int = 32, shape: str = "round") -> Pill
         raise ProcessError(f"pillar of {diameter} grid steps: need at least 4; take a finer grid")
     if vertices % 4 or not 8 <= vertices <= 64:
         raise ProcessError(f"{vertices} vertices: need a multiple of 4 from 8 to 64")
-    return _pillar(float(diameter), 8 if shape == "shot" else vertices, shape)
+    return _pillar(float(diameter), 8 if shape == "shot" else vertices)
 
 
 _GOOD = 1e-3  # area error at which fewer vertices are not tried
@@ -71,7 +71,7 @@ _FEWER = (48, 32, 24, 20, 16, 12)  # a coarse grid suits few vertices better
 
 
 @functools.lru_cache(maxsize=70000)
-def _pillar(diameter: float, vertices: int, shape: str) -> PillarShape:
+def _pillar(diameter: float, vertices: int) -> PillarShape:
     best: PillarShape | None = None
     for count in (vertices, *(n for n in _FEWER if n < vertices)):
         points = mirrored(_octagon(diameter) if count == 8 else _round(diameter, count))
@@ -79,7 +79,7 @@ def _pillar(diameter: float, vertices: int, shape: str) -> PillarShape:
         made = PillarShape(points, diameter)
         if best is None or abs(made.area_error) < 0.7 * abs(best.area_error):
             best = made
-        if abs(best.area_error) <= _GOOD or shape == "shot":
+        if abs(best.area_error) <= _GOOD:
             break
     return best or made
 
@@ -207,7 +207,7 @@ def edge_error(points: Array, radius: float) -> float:
     along = np.clip(-(p * edge).sum(1) / (edge**2).sum(1), 0, 1)
     foot = np.hypot(*(p + along[:, None] * edge).T)
     vertex = np.hypot(*p.T)
-    return float(max(np.abs(vertex - radius).max(), np.abs(foot - radius).max()))
+    return float(max(vertex.max() - radius, radius - foot.min()))  # feet lie nearer to the origin than vertices
 
 
 @dataclass(frozen=True, slots=True)

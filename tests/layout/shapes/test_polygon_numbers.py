@@ -19,7 +19,7 @@ def dense_error(points, radius):
 LOPSIDED = np.array([[-3, -2], [41, -5], [37, 8], [12, 31], [-4, 9]])  # feet of three edges lie beyond their ends
 
 
-@pytest.mark.parametrize("points", [LOPSIDED, np.array([[30, 20], [-30, 20], [-30, -20], [30, -20]])])
+@pytest.mark.parametrize("points", [LOPSIDED, LOPSIDED[::-1], np.array([[30, 20], [-30, 20], [-30, -20], [30, -20]])])
 @pytest.mark.parametrize("radius", [4.0, 21.0, 25.5, 33.0])
 def test_distance_of_an_outline_from_the_circle_is_that_of_its_farthest_point(points, radius):
     found = polygon.edge_error(points, radius)
@@ -123,7 +123,7 @@ def test_on_a_coarse_grid_fewer_vertices_are_taken_where_their_area_is_far_bette
 
 
 def test_frontier_is_the_worst_error_and_the_mean_count_over_the_diameters():
-    sizes, grid = (203.0, 391.0, 260.5), 2.5
+    sizes, grid = (225.0, 232.5, 391.0), 2.5  # both shapes are too small by most
     shot, round_ = polygon.frontier(sizes, grid_nm=grid, vertices=(24,))
     for found, shape, n in ((shot, "shot", 8), (round_, "round", 24)):
         made = [polygon.pillar(s / grid, vertices=n, shape=shape) for s in sizes]
