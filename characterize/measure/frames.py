@@ -110,7 +110,7 @@ def airy(design: Lens, capture: Capture, shape: tuple[int, ...]) -> Array:
 
 
 def _above(electrons: Array, usable: Array) -> Array:
-    """The frame above the median of its border, masked pixels from their neighbours' median."""
+    """The frame above the median of its border; 0 where it is masked."""
     rim = np.concatenate([electrons[0], electrons[-1], electrons[1:-1, 0], electrons[1:-1, -1]])
     light = electrons - np.median(rim)
     light = np.where(usable, light, 0.0)

@@ -1,0 +1,173 @@
+"""Micrographs on the mask, edges on a shade, spots above their rim and the sharpest depth, each by hand."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import special
+
+from characterize.captures.capture import Capture
+from characterize.measure import frames, metrics, overlay, sem
+from characterize.measure.lattice import Lattice
+from metalens.ground.errors import CaptureError
+from metalens.lens.record import DiameterMap
+
+RNG = np.random.default_rng(8)
+
+
+def found(diameter, site):
+    zero, no = np.zeros(len(site)), np.zeros(len(site), bool)
+    return sem.Diameters(zero, zero, diameter, zero, no, no, site, Lattice(np.zeros(2), np.r_[0, 9.0], np.r_[9.0, 0]))
+
+
+def test_a_micrograph_lies_where_its_pillars_follow_the_design():
+    """5 x 7 sites counted from (-1, 4) lie on the mask from (6, 2): site (0, 0) of the picture is (7, -2) there."""
+    drawn = RNG.uniform(0.1, 0.3, (15, 13))
+    drawn[8, 5] = 0.0  # where the picture shows one all the same
+    site = np.stack(np.meshgrid(np.arange(-1, 4), np.arange(4, 11), indexing="ij"), -1).reshape(-1, 2)
+    there = drawn[site[:, 0] + 7, site[:, 1] - 2] * 1e3
+    made = there * 1.04 - 9.0 + RNG.normal(0, 1.3, len(site))
+    made[9], made[20], made[17] = np.nan, made[20] + 60.0, 190.0  # unmeasured, fallen, without a design
+    assert there[17] == 0
+    site, made, there = (np.delete(a, 17, 0) for a in (site, made, there))
+    laid = overlay.overlay(found(made, site), DiameterMap(drawn, 0.4))
+    assert (laid.row, laid.column, laid.clearly) == (7, -2, True)
+    assert laid.designed_nm == pytest.approx(there)
+    assert laid.error_nm == pytest.approx(made - there, nan_ok=True)
+    assert np.flatnonzero(laid.outlier).tolist() == [19]
+    assert np.array_equal(overlay.numbered(found(made, site), laid).site, site + [7, -2])
+
+
+@pytest.mark.parametrize(("off", "outlying"), [(3.9, False), (4.1, True)])
+@pytest.mark.parametrize("size", [0.02, 3.0])
+def test_an_outlier_is_four_robust_sigma_from_the_median_error(off, outlying, size):
+    """Errors of 20 -+ size: 1.4826 size of sigma, half a nanometre at least."""
+    drawn = RNG.uniform(0.1, 0.3, (6, 7))
+    site = np.stack(np.meshgrid(np.arange(6), np.arange(7), indexing="ij"), -1).reshape(-1, 2)
+    sign = np.where(RNG.permutation(42) % 2, 1, -1)
+    error = 20 + size * sign
+    error[11] = 20 + sign[11] * off * max(1.4826 * size, 0.5)  # on its own side: the median stays 20
+    laid = overlay.overlay(found(drawn.ravel() * 1e3 + error, site), DiameterMap(drawn, 0.4))
+    assert np.flatnonzero(laid.outlier).tolist() == ([11] if outlying else [])
+
+
+@pytest.mark.parametrize("height", [3, 80, 83])
+def test_a_scale_bar_is_the_longest_run_in_the_lowest_quarter(height):
+    quarter = max(height // 4, 1)
+    picture = np.full((height, 90), 70, np.uint8)
+    picture[: height - quarter, 5:85] = 255  # bright, and no bar
+    picture[-1, 3:20], picture[-1, 30:55], picture[-1, 60:82] = 255, 255, 255
+    if quarter > 1:
+        picture[-quarter, 40:66] = 255
+    assert sem.scale_from_bar(picture, 520.0) == pytest.approx(520 / (26 if quarter > 1 else 25))
+    picture[-1], picture[-quarter] = 70, 70
+    picture[-1, 70:] = 255  # 20 pixels up to the border
+    assert sem.scale_from_bar(picture, 520.0) == pytest.approx(26.0)
+    picture[-1, 70] = 70
+    with pytest.raises(CaptureError, match="19 pixels"):
+        sem.scale_from_bar(picture, 520.0)
+
+
+@pytest.mark.parametrize("ramp", [0.0, 3.0])
+def test_the_line_of_an_edge_does_not_follow_a_shade(ramp):
+    """An edge of 30 counts, 10 a pixel at its steepest, off the middle of a frame that brightens by 3 a pixel."""
+    rows, x = np.arange(40), np.arange(60)
+    line = 0.11 * rows + 17.3
+    pixels = 30 * special.ndtr((x - line[:, None]) / 1.2) + ramp * x
+    slope, offset = metrics._edge_line(pixels, rows)
+    assert slope == pytest.approx(0.11, abs=2e-3)
+    assert offset == pytest.approx(17.3, abs=0.05)
+
+
+def test_an_edge_is_read_through_a_hann_window_about_its_steepest_place():
+    """A blur of 3 pixels on 12 to both sides: the window takes its part, as an integral."""
+    sigma, lean, reach = 3.0, math.radians(6.0), 12
+    y, x = np.mgrid[:16, : 2 * reach + 3] - np.array([7.5, reach + 1.0])[:, None, None]
+    edge = special.ndtr((x + y * math.tan(lean)) * math.cos(lean) / sigma)
+    made = metrics.mtf_of_edge(edge, pixel_um=1.0)
+    fine = np.linspace(-reach, reach, 4001)
+    seen = np.exp(-0.5 * (fine / sigma) ** 2) * np.cos(math.pi * fine / (2 * reach)) ** 2
+    for f in (0.03, 0.06, 0.09):
+        want = (seen * np.cos(2 * math.pi * f * fine)).sum() / seen.sum()
+        got = np.interp(f, made.frequency_per_um, made.modulation)
+        assert got == pytest.approx(want, abs=0.02)  # reach is a whole number of pixels; bins
+        assert abs(got - math.exp(-2 * (math.pi * f * sigma) ** 2)) > 0.02  # and not that of the blur alone
+
+
+def capture(n=1, **more):
+    unknown = np.full(n, np.nan)
+    return Capture(np.zeros((n, 5, 6)), unknown, np.zeros((n, 2)), unknown, ("a",) * n, 8, **more)
+
+
+def test_light_is_counted_above_the_median_of_the_rim():
+    frame = np.full((6, 8), 50.0)
+    frame[0, ::2] = frame[-1, 1::2] = 46.0  # 8 of 24 rim pixels lower
+    frame[1:-1, 0] = 54.0
+    frame[2, 3], frame[3, 4] = 90.0, 80.0
+    usable = np.ones(frame.shape, bool)
+    usable[2, 3] = False
+    light = frames._above(frame, usable)
+    assert light[3, 4] == 30
+    assert light[2, 3] == 0
+    assert light[0, 0] == -4
+
+
+@pytest.mark.parametrize(("top", "seen"), [(5.2, True), (4.8, False)])
+def test_a_spot_stands_five_robust_sigma_above_the_rim(top, seen):
+    frame = np.where(np.add.outer(np.arange(6), np.arange(8)) % 2, 53.0, 47.0)  # sigma 1.4826 x 3 about 50
+    frame[1:-1, 1:-1] = 40.0
+    frame[2, 5] = 50 + top * 1.4826 * 3
+    if seen:
+        assert frames._above(frame, np.ones(frame.shape, bool)).max() == pytest.approx(top * 1.4826 * 3)
+    else:
+        with pytest.raises(CaptureError, match="five times"):
+            frames._above(frame, np.ones(frame.shape, bool))
+
+
+def row(depth, angle, ee80, x=0.0):
+    spot = metrics.Spot(1.0, ee80, (1.0, 1.0), (x, 0.3))
+    return frames.Frame("f", depth, angle, spot, 1.0, 1.0, 1.0, 3.0, 1.0, 9.0)
+
+
+def test_the_sharpest_depth_is_the_top_of_a_parabola_in_its_inverse():
+    best, curve = 1 / 23e3, 4e9
+    depths = (18e3, 21e3, 24e3, 31e3)
+    sharp = [2.5 - curve * (1 / z - best) ** 2 for z in depths]
+    rows = [row(z, 0.0, s**-0.5) for z, s in zip(depths, sharp, strict=True)]
+    rows += [row(z, 5.0, s) for z, s in ((18e3, 2.0), (21e3, 3.0), (24e3, 5.0))]  # sharpest at the near end
+    rows += [row(z, 9.0, 1.0) for z in (18e3, 21e3)]  # too few
+    made = frames._best(rows[::-1])
+    assert set(made) == {0.0, 5.0}
+    assert made[0.0] == pytest.approx(23e3, rel=1e-6)
+    assert made[5.0] == pytest.approx(18e3)
+
+
+def test_distortion_is_the_place_over_that_of_a_straight_ray_relative_to_the_smallest_angle():
+    design = SimpleNamespace(sensor_distance_um=1900.0)
+    place = {a: 1900 * math.tan(math.radians(a)) * (0.98 + 1e-3 * a**2) for a in (-7.0, 4.0, 11.0)}
+    rows = [row(20e3, 0.0, 1.0, 3.1 - 0.4), row(30e3, 0.0, 1.0, 3.1 + 0.4)]
+    rows += [row(20e3, a, 1.0, x + 3.1) for a, x in place.items()]
+    found = frames._distortion(rows, capture(about={"window": "fixed"}), design)
+    want = {a: (0.98 + 1e-3 * a**2) / (0.98 + 1e-3 * 16) - 1 for a in sorted(place)}
+    assert list(found) == sorted(place)
+    assert found == pytest.approx(want, rel=1e-9)
+    assert frames._distortion(rows, capture(), design) == {}
+    assert frames._distortion(rows[:2], capture(about={"window": "fixed"}), design) == {}
+
+
+def test_the_airy_pattern_falls_to_nothing_at_its_first_ring():
+    """0.61 λ / sin of the rim, on pixels so small that they do not blur; wide pixels take its mean."""
+    design = SimpleNamespace(wavelength_um=0.9, diameters=SimpleNamespace(radius_um=400.0), sensor_distance_um=1500.0)
+    sine = 400 / math.hypot(400, 1500)
+    ring = 3.8317059702 / (2 * math.pi * sine / 0.9)
+    pattern = frames.airy(design, capture(pixel_um=ring / 20), (41, 61))
+    assert pattern[20, 30] == pytest.approx(1, abs=2e-3)
+    assert pattern[20, 50] < 2e-3
+    assert pattern[40, 30] < 2e-3
+    u = 3.8317059702 / 2
+    assert pattern[30, 30] == pytest.approx((2 * special.j1(u) / u) ** 2, abs=2e-3)
+    other = frames.airy(design, capture(pixel_um=ring / 20, wavelength_um=0.45), (41, 61))
+    assert other[30, 30] < 2e-3  # half the wavelength, half the ring
+    wide = frames.airy(design, capture(pixel_um=ring / 4), (7, 9))
+    assert wide[3, 4] == pytest.approx(pattern[18:23, 28:33].mean(), abs=2e-3)
