@@ -36,7 +36,7 @@ def test_a_micrograph_lies_where_its_pillars_follow_the_design():
     assert laid.designed_nm == pytest.approx(there)
     assert laid.error_nm == pytest.approx(made - there, nan_ok=True)
     assert np.flatnonzero(laid.outlier).tolist() == [19]
-    assert np.array_equal(overlay.numbered(found(made, site), laid).site, site + [7, -2])
+    assert np.array_equal(overlay.numbered(found(made, site), laid).site, site + np.array([7, -2]))
 
 
 @pytest.mark.parametrize(("off", "outlying"), [(3.9, False), (4.1, True)])
