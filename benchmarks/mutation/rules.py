@@ -133,7 +133,7 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, str]]:
 def _binary(node: ast.BinOp) -> Iterator[tuple[str, str]]:
     left, right = (f"({ast.unparse(side)})" for side in (node.left, node.right))
     kind = type(node.op)
-    if any(isinstance(side, ast.Constant) and isinstance(side.value, str) for side in (node.left, node.right)):
+    if any(_words(side) for side in (node.left, node.right)):
         return
     if kind in INVERSE:
         rule = "sign" if kind in (ast.Add, ast.Sub) else "factor"
@@ -146,6 +146,10 @@ def _binary(node: ast.BinOp) -> Iterator[tuple[str, str]]:
         yield "factor", f"-(-{left} // {right})"
     elif kind is ast.MatMult:
         yield "axis", f"({left} @ {right}) * -1"
+
+
+def _words(node: ast.expr) -> bool:
+    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
 
 
 def _constant(value: float) -> Iterator[tuple[str, str]]:

@@ -74,3 +74,11 @@ def test_order_is_the_share_of_likeness_that_neighbours_have():
     best = np.mean([np.sort(np.delete(row, i))[-2:] for i, row in enumerate(alike)])
     want = (follow - np.mean(pairs)) / (best - np.mean(pairs))
     assert check.order_score(data(planes)) == pytest.approx(want, rel=1e-9)
+
+
+def test_noise_is_the_robust_scatter_of_steps_about_their_median():
+    """Light that grows by 5 from plane to plane while pixels swing by 2: steps of 5 ± 4, noise 1.4826 x 4 / √2."""
+    chequer = np.where(np.add.outer(np.arange(20), np.arange(22)) % 2, 2.0, -2.0)
+    planes = np.array([50 + 5.0 * k + (-1) ** k * chequer for k in range(6)])
+    by_noise = 1.4826 * 4 / math.sqrt(2) * math.sqrt(planes.size) / math.sqrt(((planes - 30) ** 2).sum())
+    assert check.missed(math.hypot(by_noise, 0.03), data(planes), 30.0) == pytest.approx(0.03, rel=1e-9)

@@ -102,3 +102,64 @@ def test_a_start_takes_light_and_level_from_the_frames():
     assert gain == pytest.approx(np.full(4, math.log(90.0 * 20)))
     assert level == pytest.approx(np.full(4, 12.0))
     assert not np.concatenate([dx, dy]).any()
+
+
+@pytest.mark.parametrize(("chi2", "widened"), [(0.4, 1.0), (1.6, 1.6), (9.0, 9.0)])
+def test_error_bars_grow_with_a_misfit_and_never_shrink(monkeypatch, chi2, widened):
+    """sigma = sqrt of the covariance's diagonal times chi² where that is above 1."""
+    pupil = model()
+    n = pupil.layout().size
+    mixed = RNG.normal(size=(n, n))
+    covariance = mixed @ mixed.T
+    stack = RNG.uniform(5, 9, (4, 16, 16))
+    seen = Data(stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack)
+    solution = SimpleNamespace(
+        value=np.zeros(n), covariance=covariance, chi2_per_dof=chi2, image=stack + 1, residual_sigma=stack,
+        converged=True, reason="",
+    )  # fmt: skip
+    for name, answer in (
+        ("_complete", SPEC),
+        ("clean", SimpleNamespace(corrections=("dark",))),
+        ("_positions", Z),
+        ("_crop", (seen, 4.0, ["cut"])),
+        ("_fit", (pupil, solution)),
+        ("_cautions", ()),
+    ):
+        monkeypatch.setattr(pupilfit, name, lambda *_, answer=answer, **__: answer)
+    found = pupilfit.fit_pupil(None, SPEC, judge=False, insist=True)
+    assert found.sigma == pytest.approx(np.sqrt(np.diag(covariance) * widened), rel=1e-12)
+    assert found.cautions[:2] == ("dark", "cut")
+    assert found.held_out is None
+
+
+@pytest.mark.parametrize(("high", "kept"), [(4.2, True), (4.8, False)])
+def test_a_rim_pixel_beyond_three_robust_sigma_has_no_part_in_the_tilt(high, kept):
+    """A chequer of ±1 about a plane: sigma is 1.4826, three of them 4.45."""
+    y, x = np.mgrid[-1:1:21j, -1:1:27j]
+    chequer = np.where(np.add.outer(np.arange(21), np.arange(27)) % 2, 1.0, -1.0)
+    level = 40 + 2.3 * x - 1.1 * y + chequer
+    spots = [(0, 20), (3, 26), (18, 25), (20, 22)]  # all to one side, so that they would tilt it
+    for row, column in spots:
+        level[row, column] = 40 + 2.3 * x[row, column] - 1.1 * y[row, column] + high
+    rim = (np.abs(x) > 0.8) | (np.abs(y) > 0.8)
+    for row, column in spots:
+        rim[row, column] &= kept
+    design = np.stack([np.ones_like(x), x, y], -1)
+    _, a, b = np.linalg.lstsq(design[rim], level[rim], rcond=None)[0]
+    assert pupilfit._plane(np.tile(level, (3, 1, 1))) == pytest.approx(a * x + b * y, abs=1e-9)
+
+
+def test_cells_on_the_rim_of_a_pupil_weigh_their_share_inside():
+    """The vector of a ray has length 1, so that components carry the weight: against 24² points a cell."""
+    pupil = model()
+    step = 2 * SPEC.sine / pupil.nodes
+    part = ((np.arange(24) + 0.5) / 24 - 0.5) * step
+    inside = np.hypot(pupil.sx[:, None, None] + part, pupil.sy[:, None, None] + part[:, None]) < SPEC.sine
+    share = inside.mean((1, 2))
+    weight = np.abs(pupil.components).reshape(-1, len(share))
+    weight = np.sqrt((weight**2).sum(0))
+    deep = share == 1
+    weight = weight / np.median(weight[deep & (np.hypot(pupil.sx, pupil.sy) > 0.7 * SPEC.sine)])
+    rim = (share > 0) & (share < 1)
+    assert np.abs(weight - share)[rim].mean() < 0.05  # slant of the rim; slow growth of obliquity to it
+    assert weight[rim].sum() == pytest.approx(share[rim].sum(), rel=0.03)
