@@ -168,27 +168,21 @@ def _tables(outcome: Outcome) -> Iterator[report.Table]:
     listed = outcome.values.get("rows")
     if isinstance(listed, list) and listed and isinstance(listed[0], dict):
         head = [k for k, v in listed[0].items() if not isinstance(v, dict | list)]
-        yield report.Table([report.in_words(h) for h in head], [[_cell(row[k]) for k in head] for row in listed])
+        yield report.Table([report.in_words(h) for h in head], [[row[k] for k in head] for row in listed])
     fitted = outcome.values.get("parameters")
     if isinstance(fitted, dict):
         rows = [
-            (name, value, sigma, f"{value - 1.96 * sigma:.4g} to {value + 1.96 * sigma:.4g}")
+            (report.in_words(name), value, sigma, f"{value - 1.96 * sigma:.4g} to {value + 1.96 * sigma:.4g}")
             for name, (value, sigma) in fitted.items()
         ]
         yield report.Table(("parameter", "value", "1 sigma", "95 % interval"), rows)
     plain = [
-        (report.in_words(name), _cell(value))
+        (report.in_words(name), value)
         for name, value in outcome.values.items()
         if isinstance(value, bool | int | float | str)
     ]
     words = " ".join(outcome.stage.words)
     yield report.Table(("result", "value"), plain, f"metalens {words}: {outcome.seconds:.1f} s")
-
-
-def _cell(value: Any) -> Any:
-    if value is None:
-        return "–"
-    return f"{value:.5g}" if isinstance(value, float) else value
 
 
 def _error(outcome: Outcome) -> str:

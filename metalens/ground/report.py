@@ -34,7 +34,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of text or numbers under a head; numbers are shown to ``digits`` significant digits."""
+    """Rows of text or numbers under a head, as :func:`in_figures` shows them."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[Any]]
@@ -47,7 +47,7 @@ class Table:
         return [[self._text(value) for value in row] for row in self.rows]
 
     def _text(self, value: Any) -> str:
-        return f"{value:.{self.digits}g}" if isinstance(value, float) else str(value)
+        return in_figures(value, self.digits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +80,9 @@ class KeyFigure:
     good: bool | None = None
 
 
-UNITS = {"um": "um", "nm": "nm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "seconds": "s", "e": "electrons"}
-UNITS |= {"px": "px", "mb": "MB", "waves": "waves", "um2": "um²", "rad2": "rad²", "e2": "electrons²", "percent": "%"}
+ROUNDING = 1e-12  # what is smaller in the units of this toolchain (um, rad, shares, electrons) is rounding
+UNITS = {"um": "µm", "nm": "nm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "seconds": "s", "e": "electrons"}
+UNITS |= {"px": "px", "mb": "MB", "waves": "waves", "um2": "µm²", "rad2": "rad²", "e2": "electrons²", "percent": "%"}
 UNITS |= {"mmacs": "million MACs"}
 WORDS = {
     "max": "largest",
@@ -90,6 +91,7 @@ WORDS = {
     "psf": "PSF",
     "mtf": "MTF",
     "iou": "overlap of masks",
+    "strehl": "Strehl ratio",
 }
 WORDS |= {"fwhm": "width at half maximum", "macs": "MACs", "chi2": "chi²", "dof": "degree of freedom", "t": "t"}
 WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time"}
@@ -101,7 +103,7 @@ def in_words(key: str) -> str:
     >>> in_words("max_phase_error_rad")
     'largest phase error / rad'
     >>> in_words("mtf50_x_per_um")
-    'mtf50 x / (1/um)'
+    'mtf50 x / (1/µm)'
     """
     *parts, last = key.split("_")
     unit = UNITS.get(last, "") if parts else ""
@@ -109,6 +111,21 @@ def in_words(key: str) -> str:
         unit, parts = f"(1/{unit})", parts[:-1]
     said = " ".join(WORDS.get(part, part) for part in (parts if unit else [*parts, last]))
     return f"{said} / {unit}" if unit else said
+
+
+def in_figures(value: Any, digits: int = 4) -> str:
+    """A value as a reader wants it: ``digits`` significant digits, yes and no, 0 for what rounding has left.
+
+    >>> [in_figures(v) for v in (0.123456, True, 7.2e-15, None, "air", float("nan"))]
+    ['0.1235', 'yes', '0', '–', 'air', 'nan']
+    """
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "0" if abs(value) < ROUNDING else f"{value:.{digits}g}"
+    return str(value)
 
 
 def png(figure: "Canvas", *, dpi: int = 220) -> bytes:

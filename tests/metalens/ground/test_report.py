@@ -64,12 +64,12 @@ def test_same_drawing_gives_the_same_bytes():
     [
         ("max_phase_error_rad", "largest phase error / rad"),
         ("chi2_per_dof", "chi² per degree of freedom"),
-        ("mtf50_x_per_um", "mtf50 x / (1/um)"),
+        ("mtf50_x_per_um", "mtf50 x / (1/µm)"),
         ("gaze_axial_deg", "gaze axial / deg"),
-        ("energy_um2", "energy / um²"),
+        ("energy_um2", "energy / µm²"),
         ("seconds", "time"),
         ("peak_e", "peak / electrons"),
-        ("strehl", "strehl"),
+        ("strehl", "Strehl ratio"),
         ("psf_tolerance", "PSF tolerance"),
     ],
 )
