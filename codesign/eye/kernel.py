@@ -140,10 +140,16 @@ def _put(x: Any, at: Any, rows: Any, out: Any, n: Any, k: Any, row: Any, column:
                 out[n, k, row + j, column + i] = x[at + j * COLUMNS + i]
 
 
+_PLAIN = _tile(render_lanes.plain, ROWS, dual=False)
+_DUAL = _tile(render_lanes.dual, DUAL_ROWS, dual=True)
+# globals: a compiled function that a loop closes over enters the key of numba's cache by a name that is never the same
+_shade, _shade_dual = _PLAIN.shade, _DUAL.shade
+
+
 def _frames(stamp: int) -> Any:
     """The loop over tiles; ``stamp`` of the sources enters the key of numba's cache on disk."""
-    tile = _tile(render_lanes.plain, ROWS, dual=False)
-    shade, size, count, lanes = tile.shade, tile.size, tile.words, tile.lanes
+    tile = _PLAIN
+    size, count, lanes = tile.size, tile.words, tile.lanes
     seen, bare, front, near, far, back, hole = (
         tile.at[name] for name in ("seen", "bare", "front", "near", "far", "back", "hole")
     )
@@ -166,7 +172,7 @@ def _frames(stamp: int) -> Any:
             x, words = np.empty(size, np.float32), np.empty(count, np.int32)
             for column in range(0, len(u), COLUMNS):
                 _aim(u, w, row, column, x, lanes, ROWS)
-                shade(parameters[n], bank, x, words)
+                _shade(parameters[n], bank, x, words)
                 for lane in range(lanes):
                     x[front + lane] *= scale[n]
                     x[back + lane] *= scale[n]
@@ -182,8 +188,8 @@ def _frames(stamp: int) -> Any:
 
 
 def _tangents(stamp: int) -> Any:
-    tile = _tile(render_lanes.dual, DUAL_ROWS, dual=True)
-    shade, size, count, lanes = tile.shade, tile.size, tile.words, tile.lanes
+    tile = _DUAL
+    size, count, lanes = tile.size, tile.words, tile.lanes
     near, far, seen, front, back = (tile.at[name] for name in ("near", "far", "seen", "front", "back"))
 
     @numba.njit(parallel=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
@@ -200,7 +206,7 @@ def _tangents(stamp: int) -> Any:
             x, words = np.zeros(size, np.float32), np.empty(count, np.int32)
             for column in range(0, len(u), COLUMNS):
                 _aim(u, w, row, column, x, 3 * lanes, DUAL_ROWS)
-                shade(parameters[n], bank, x, words)
+                _shade_dual(parameters[n], bank, x, words)
                 for k in range(3):
                     _put(x, near + k * lanes, DUAL_ROWS, out, n, 5 * k, row, column)
                     _put(x, far + k * lanes, DUAL_ROWS, out, n, 5 * k + 1, row, column)

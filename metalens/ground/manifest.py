@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,26 @@ from metalens.ground.errors import StoreError
 
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
 _LARGEST = 1 << 26  # bytes of a manifest
-_HEAD = 4096
-# first bytes of a file, and what ours has soon after
+_HEAD, _TAIL = 4096, 64
+# first bytes of a file, and what ours has soon after or at its end
 _MARKS = (
     (b"\x89PNG", b"Software\0metalens"),
     (b"<!doctype html>", b'name="generator" content="metalens'),
     (b"MATLAB 5.0 MAT-file, metalens", b""),
     (b"file,depth_um,angle_deg,exposure_s", b""),
+    (b'<?xml version="1.0" encoding="utf-8"?>\n<report-database>', b"<generator>metalens"),
+    (b"PK", b"metalens"),  # NumPy's archive, with a comment
+    (b"", b" 0 0 0\t \t\n"),  # Zemax grid phase: blanks at the end of its first line, for want of comments
 )
 
 
-def write(folder: Path, command: str, *, finished: bool = True) -> None:
-    """Write the manifest of everything in a folder; unfinished: of one that is still being made."""
+def write(folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()) -> None:
+    """Write the manifest of everything in a folder but ``others``, which are not ours and are named as such.
+
+    Unfinished: of a folder that is still being made.
+    """
     listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
-              for name in (sorted(files(folder)) if finished else ())}  # fmt: skip
+              for name in (sorted({*files(folder)} - {*others}) if finished else ())}  # fmt: skip
     about = {
         "kind": KIND,
         "version": VERSION,
@@ -32,6 +38,7 @@ def write(folder: Path, command: str, *, finished: bool = True) -> None:
         "command": command,
         "versions": dict(store.package_versions()),
         "files": listed,
+        "others": sorted(others),
     }
     store.write_text(folder / NAME, json.dumps(about, indent=1) + "\n")
 
@@ -52,7 +59,9 @@ def read(folder: Path) -> dict[str, Any] | None:
         if (found["kind"], found["version"]) != (KIND, VERSION):
             raise ValueError(f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}")
         entries = {str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])} for n, e in found["files"].items()}
-        return found | {"files": entries, "finished": bool(found["finished"]), "command": str(found["command"])}
+        others = [str(name) for name in found.get("others", ())]
+        plain = {"finished": bool(found["finished"]), "command": str(found["command"])}
+        return found | plain | {"files": entries, "others": others}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise StoreError(f"{path}: damaged or no manifest of a metalens folder ({error}); make it again") from None
 
@@ -99,9 +108,11 @@ def foreign(path: Path) -> str:
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD)
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+            known = head + file.read()
     except OSError as error:
         return f"cannot be read ({error.strerror})"
-    if any(head.startswith(first) and mark in head for first, mark in _MARKS):
+    if any(head.startswith(first) and mark in known for first, mark in _MARKS):
         return ""
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return "" if _is_our_tiff(path) else "was not made by metalens"
@@ -122,6 +133,19 @@ def _foreign_folder(path: Path) -> str:
     if found["finished"] and others:
         return f"holds {min(others)}, which metalens did not make"
     return ""
+
+
+def strange(folder: Path) -> set[str]:
+    """Files that neither the manifest of a folder lists nor that of a folder inside it.
+
+    Raises:
+        StoreError: a manifest is damaged.
+    """
+    present = set(files(folder))
+    for place in (folder, *(path.parent for path in folder.rglob(NAME))):
+        found, inside = read(place), place.relative_to(folder)
+        present -= {(inside / name).as_posix() for name in (*found["files"], NAME)} if found else set()
+    return present
 
 
 def _is_our_tiff(path: Path) -> bool:

@@ -103,7 +103,10 @@ def long_work(
     run goes on in it, or in a copy of the finished folder. What stands at ``target`` stays until the end.
 
     Args:
-        grow: always go on, from a copy of what stands at ``target``, whoever made it, and put the whole back.
+        grow: always go on, from a copy of what stands at ``target``, and put the whole back; it must have a manifest,
+            or hold nothing but folders that have one.
+
+    What others put into a folder of ours goes with it, and does not become ours.
 
     Raises:
         OutputError: nothing to resume, or unfinished work that would be lost; see :func:`_refuse`.
@@ -229,7 +232,8 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
 
 def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False) -> None:
     """Give the folder its manifest and exchange it with what stands."""
-    manifest.write(new, lock.COMMAND.get())
+    begun = manifest.read(new)
+    manifest.write(new, lock.COMMAND.get(), others=begun["others"] if begun else ())
     _sync(new)
     with lock.undisturbed(), lock.folder(target.parent):
         if not whoever:
@@ -264,14 +268,17 @@ def _open_work(scratch: Path, target: Path, terms: Terms, *, resume: bool, grow:
     if found is not None:
         work.rename(scratch / "given_up")
     fresh = scratch / "work"
-    copied = resume and _something(target)
+    copied, others = resume and _something(target), set[str]()
     if copied:
+        others = manifest.strange(target)
+        if others and manifest.read(target) is None:
+            raise OutputError(f"{target} holds {min(others)} and no {manifest.NAME}: not made by metalens")
         if not grow:
             manifest.check(target)
         shutil.copytree(target, fresh, symlinks=True)
     else:
         fresh.mkdir()
-    manifest.write(fresh, lock.COMMAND.get(), finished=False)
+    manifest.write(fresh, lock.COMMAND.get(), finished=False, others=others)
     fresh.rename(work)
     return copied
 

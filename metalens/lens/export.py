@@ -2,6 +2,7 @@
 
 import io
 import math
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +51,8 @@ def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     file = io.BytesIO()
     if suffix == ".npz":
         np.savez_compressed(file, allow_pickle=False, **values)
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.comment = b"metalens lens, um and rad"
         write_bytes(path, file.getvalue())
     else:
         from scipy.io import savemat
@@ -88,10 +91,11 @@ class GridPhase:
     def text(self) -> str:
         """The file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy nodata`` a point, largest y first.
 
-        Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the program then takes differences.
+        Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the program then takes differences. The
+        blanks that end the first line say whose file it is.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
-        lines = [f"{n} {n} {step} {step} 0 0 0"]
+        lines = [f"{n} {n} {step} {step} 0 0 0\t \t"]
         lines += [
             f"0 0 0 0 {_NO_DATA}" if math.isnan(value) else f"{value!r} 0 0 0 0"
             for value in self.phase_rad.ravel().tolist()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.eye import kernel, renderer
 from codesign.eye import population as eye
-from codesign.eye import renderer
 from codesign.eye.population import POPULATION, Rig, States
 from codesign.eye.renderer import Camera
 
@@ -28,6 +28,14 @@ def test_compiled_frames_agree_with_the_twin():
     assert float((cover - out.frames.coverage).abs().max()) < 1e-3
     assert float(((depth - out.frames.depth_um) * (cover > 0)).abs().max()) < 0.5  # um
     assert float((pupil - out.pupil).abs().max()) < 1e-3
+
+
+def test_the_compiled_loops_are_found_again_in_the_cache():
+    """Its key holds what a loop closes over: numbers are the same in every process, compiled functions are not."""
+    for loop in (kernel.frames, kernel.tangents):
+        closed = loop.py_func.__closure__
+        assert len(closed) >= 5
+        assert {type(cell.cell_contents) for cell in closed} == {int}
 
 
 @pytest.mark.parametrize("pixels", [1, 13, 37])

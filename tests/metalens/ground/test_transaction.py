@@ -1,6 +1,7 @@
 # ruff: noqa: PT012 (what ends a block is the subject here)
 """Outputs appear whole or not at all, whatever ends the work; what is not ours stays, even with force."""
 
+import contextlib
 import json
 import os
 import random
@@ -170,6 +171,42 @@ def test_unfinished_work_is_not_thrown_away_unasked(tmp_path):
     with transaction.long_work(tmp_path / "run", keep=("c",), terms=FORCE) as draft:
         assert not draft.resumed
     assert sorted(os.listdir(tmp_path)) == ["run"]
+
+
+@pytest.mark.parametrize("how", [{"resume": True}, {"grow": True}])
+def test_what_others_put_into_a_folder_stays_theirs_when_the_work_on_it_goes_on(tmp_path, how):
+    target = tmp_path / "run"
+    put(target, ours="old")
+    put(target / "part", inner="ours too")
+    (target / "notes.txt").write_text("mine")
+    (target / "part" / "photo.jpg").write_text("mine")
+    for turn in (1, 2):  # interrupted once, then finished
+        with contextlib.suppress(KeyboardInterrupt), transaction.long_work(target, keep=("ours",), **how) as draft:
+            (draft.path / "more").write_text(str(turn))
+            if turn == 1:
+                raise KeyboardInterrupt
+    found = manifest.read(target)
+    assert set(found["files"]) == {"ours", "more", "part/inner", "part/manifest.json"}
+    assert found["others"] == ["notes.txt", "part/photo.jpg"]
+    with pytest.raises(OutputError, match=r"notes\.txt, which metalens did not make"):
+        put(target, new="x")
+    assert (target / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_of_others_does_not_grow(tmp_path):
+    """It would be copied whole, and could be a home."""
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years")
+    before = tree(tmp_path)
+    grown = transaction.long_work(tmp_path / "thesis", keep=(), grow=True)
+    with pytest.raises(OutputError, match=r"chapter\.tex"), grown:
+        pass
+    assert tree(tmp_path) == before
+    (tmp_path / "thesis" / "chapter.tex").unlink()
+    put(tmp_path / "thesis" / "part", inner="ours")
+    with transaction.long_work(tmp_path / "thesis", keep=(), grow=True) as draft:
+        (draft.path / "more").write_text("x")
+    assert set(manifest.read(tmp_path / "thesis")["files"]) == {"more", "part/inner", "part/manifest.json"}
 
 
 def test_a_changed_folder_is_refused_by_name(tmp_path):
