@@ -179,8 +179,8 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         reason=solution.reason,
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
         degeneracies=_open(task, found, covariance, absent),
-        cautions=(*cautions, *(_seen(solution, absent, unseen) if gain.known else ())),
-        problems=tuple(_problems(task, solution, gain)),
+        cautions=(*cautions, *(_seen(task, solution, absent, unseen) if gain.known else ())),
+        problems=(*_problems(task, solution, gain), *verdict.held_back(names, solution, task.prior)),
         low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
         high=np.maximum(found.high, solution.value + explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
         draws=found.draws,
@@ -192,9 +192,11 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
     )
 
 
-def _seen(solution: Solution, absent: list[Lean], unseen: float) -> list[str]:
+def _seen(task: Task, solution: Solution, absent: list[Lean], unseen: float) -> list[str]:
     """What is in the frames and in no parameter: structure of the residuals, causes, frames left out."""
-    words = [*verdict.structure(solution.residual_sigma), *missing.words(absent)]
+    noise = np.sqrt(task.data.variance(solution.image))
+    shared = task.data.shared(solution.image) / noise
+    words = [*verdict.structure(solution.residual_sigma, shared), *missing.words(absent)]
     if unseen > _LEFT_OUT:
         words.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
     return words
@@ -222,7 +224,7 @@ def _psf_verdict(known: tuple[float, float], unseen: float) -> str:
 
 
 def _problems(task: Task, solution: Solution, gain: Gain) -> list[str]:
-    problems = verdict.problems(task.names, solution, task.prior, gain)
+    problems = verdict.problems(task.names, solution, gain)
     clipped = float(task.data.saturated.mean())
     if problems and clipped > 0.1:
         problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")

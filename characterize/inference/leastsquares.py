@@ -44,6 +44,13 @@ class Data:
         light = np.maximum(image, 0)
         return self.variance_e2 + light / self.scale + (self.model_error * light) ** 2
 
+    def shared(self, image: Array) -> Array:
+        """(2, n, y, x) electrons of one standard deviation of what is one error in all frames: by dark, by flat.
+
+        The first is part of the noise of every frame, the second is not.
+        """
+        return np.stack([np.sqrt(self.common_floor * self.variance_e2), self.common_light * np.maximum(image, 0)])
+
     def planes(self, index: Array) -> "Data":
         """Some of the frames."""
         part = [a[index] for a in (self.electrons, self.usable, self.saturated, self.variance_e2, self.scale)]
@@ -97,6 +104,7 @@ class Solution:
     image, residual_sigma: (n, y, x) model, and (data - model) / sigma, 0 where masked or silent.
     chi2_per_dof: of the pixels that count. merit: robust chi-square with priors, to compare starts.
     converged, reason: why it stopped.
+    beyond: (p,) sigma from each value to where the parabola has its least: 0 but for bounds that hold it back.
     """
 
     value: Array
@@ -109,6 +117,7 @@ class Solution:
     converged: bool
     reason: str
     iterations: int
+    beyond: Array
 
 
 def fit(
@@ -268,15 +277,17 @@ def _solution(data: Data, state: _State, prior: Prior, settings: Settings, ended
     chi2 = float((state.residual[inlier] ** 2).sum()) / dof
     log_noise = float(2 * np.log(state.noise[counted]).sum())
     merit = _merit(data, state.image, state.x, state.noise, prior, settings) + log_noise
+    covariance = invert(state.curvature)
     return Solution(
         state.x,
-        invert(state.curvature),
+        covariance,
         state.information,
         state.image,
         shown,
         chi2,
         merit,
         *ended,
+        beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
     )
 
 

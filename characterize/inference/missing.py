@@ -67,7 +67,7 @@ def leans(task: Task, mode: Solution) -> list[Lean]:
     fitted = (np.asarray(slopes) * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
-    fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread))
+    fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread), task.data.shared(image) * root)
     found = []
     for cause, amount, told, changes in _changes(
         task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))
@@ -100,12 +100,16 @@ def untold(found: list[Lean]) -> list[str]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fitted:
-    """The fit at its mode: slopes (p, pixels) over the noise, their information with the priors, and the residuals."""
+    """The fit at its mode: slopes (p, pixels) over the noise, their information with the priors, and the residuals.
+
+    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the noise.
+    """
 
     names: tuple[str, ...]
     slopes: Array
     known: Array
     rest: Array
+    shared: Array
 
     def lean(self, cause: str, changes: Array) -> Lean:
         """Score test of (k, pixels) changes; directions of which the fit takes up all but a thousandth are left out."""
@@ -113,13 +117,27 @@ class Fitted:
         changes = changes[size > 0] / size[size > 0, None]
         if not len(changes):
             return Lean(cause, 0.0, 0, 1.0)
-        cross = self.slopes @ changes.T
-        left = changes @ changes.T - cross.T @ np.linalg.solve(self.known, cross)
-        values, vectors = np.linalg.eigh(left)
-        seen = values > 1e-3
-        score = vectors.T[seen] @ (changes @ self.rest - cross.T @ np.linalg.solve(self.known, self.slopes @ self.rest))
-        chi2, degrees = float((score**2 / values[seen]).sum()), int(seen.sum())
-        return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)) if degrees else 1.0)
+        left, score = self.left(changes)
+        values, vectors = np.linalg.eigh(changes @ left.T)
+        vectors = vectors[:, values > 1e-3]
+        degrees = vectors.shape[1]
+        if not degrees:
+            return Lean(cause, 0.0, 0, 1.0)
+        scatter = vectors.T @ (changes @ left.T + self.in_common(left)) @ vectors
+        chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
+        return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
+
+    def left(self, changes: Array) -> tuple[Array, Array]:
+        """(k, pixels) what the fit does not take up of changes, and (k,) how much of it is in the residuals."""
+        left = changes - np.linalg.solve(self.known, self.slopes @ changes.T).T @ self.slopes
+        return left, left @ self.rest
+
+    def in_common(self, left: Array) -> Array:
+        """(k, k) by which scores scatter more since errors of dark and flat are one in all frames."""
+        shape = self.shared.shape[1:]
+        dark, flat = ((left.reshape(-1, *shape) * one).sum(1).reshape(len(left), -1) for one in self.shared)
+        counted = left * self.shared[0].ravel()
+        return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
     def taken(self, change: Array, amount: float, told: str) -> str:
         """What the parameters would do with a change of the images; empty where it does nothing.
@@ -196,15 +214,13 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
     places = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
     places = [p for p in places if max(abs(p[0]), abs(p[1])) >= _NEAREST_PX]
     places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
-    inverse = np.linalg.inv(fit.known)
     best = 0.0
     for shift in places:
-        copy = (_moved(light, shift) * root).ravel()
-        cross = fit.slopes @ copy
-        left = float(copy @ copy - cross @ inverse @ cross)
-        score = float(copy @ fit.rest - cross @ inverse @ (fit.slopes @ fit.rest))
-        if left > 1e-3 * float(copy @ copy) and score > 0:
-            best = max(best, score**2 / left)
+        copy = (_moved(light, shift) * root).reshape(1, -1)
+        left, score = fit.left(copy)
+        seen = float((copy * left).sum())
+        if seen > 1e-3 * float((copy**2).sum()) and score[0] > 0:
+            best = max(best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0])))
     chance = min(1.0, len(places) * float(stats.chi2.sf(best, 1)) / 2)
     return Lean("a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance)
 

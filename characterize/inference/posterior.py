@@ -67,11 +67,9 @@ class Valley:
 
         C AᵀW S W A C with S the covariance of the pixels by them, less what of it is in the noise already.
         """
-        data, p = self._data, len(self.mode)
+        p = len(self.mode)
         slopes = self.slopes[:-p].reshape(*self._image.shape, p)
-        root = self._root.reshape(self._image.shape)
-        light = data.common_light * np.maximum(self._image, 0) * root
-        dark = np.sqrt(data.common_floor * data.variance_e2) * root
+        dark, light = self._data.shared(self._image) * self._root.reshape(self._image.shape)
         flat, floor = ((slopes * c[..., None]).sum(0).reshape(-1, p) for c in (light, dark))
         counted = (slopes * dark[..., None]).reshape(-1, p)
         spread = flat.T @ flat + floor.T @ floor - counted.T @ counted

@@ -11,6 +11,7 @@ from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
+_BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
 _STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a thousand frames of noise reach 4
 
 
@@ -30,8 +31,8 @@ def chance_of(solution: Solution) -> float:
     return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
 
 
-def problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Gain) -> list[str]:
-    """Checks of a finished fit, each with the cause it points to."""
+def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str]:
+    """Checks of a finished fit, each with the cause it points to; bounds are judged by :func:`held_back`."""
     words = []
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
@@ -55,24 +56,45 @@ def problems(names: tuple[str, ...], solution: Solution, prior: Prior, gain: Gai
     wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
     if wave > WAVES_RAD:
         words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
-    for name, value in at_bounds(names, solution, prior):
-        words.append(f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread")
     return words
 
 
+def held_back(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[str]:
+    """:func:`at_bounds` in words."""
+    return [
+        f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread"
+        for name, value in at_bounds(names, solution, prior)
+    ]
+
+
 def at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[tuple[str, float]]:
-    """Parameters that ended on a bound which is not the natural zero of a blur."""
-    ends = zip(names, solution.value.tolist(), prior.low, prior.high, strict=True)
+    """Parameters that a bound holds back, one which is not the natural zero of a blur.
+
+    The frames want them beyond it by more than ``_BEYOND`` sigma; where they say so little that a value inside is
+    nearly as good, the bound is the end of an interval and no fault.
+    """
+    ends = zip(names, solution.value.tolist(), solution.beyond.tolist(), prior.low, prior.high, strict=True)
     blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px", "glass_um")
-    return [(n, v) for n, v, low, high in ends if v >= high or (v <= low and n not in blurs)]
+    return [
+        (n, v)
+        for n, v, out, low, high in ends
+        if (v >= high and out > _BEYOND) or (v <= low and out < -_BEYOND and n not in blurs)
+    ]
 
 
-def structure(residual_sigma: Array) -> list[str]:
+def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
     """What chi-square does not see, in words: residuals that go together from pixel to pixel or from frame to frame.
 
-    Of noise, the mean product of neighbours scatters about 0 by one over the root of their number.
+    Of noise, the mean product of neighbours scatters about 0 by one over the root of their number. Errors of dark and
+    flat are the same in every frame: their part of the products is expected.
+
+    Args:
+        shared: (2, n, y, x) standard deviations of such errors over the noise, by dark and by flat, see
+            :meth:`characterize.inference.leastsquares.Data.shared`.
     """
     r = np.clip(residual_sigma, -6, 6)
+    dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
+    r = r / np.sqrt(1 + flat**2)
     words = []
     sides = np.array([_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])])
     worst = int(np.argmax(sides.max(0)))
@@ -82,7 +104,7 @@ def structure(residual_sigma: Array) -> list[str]:
             "is there than the parameters describe; see the residual map"
         )
     if len(r) > 1:
-        frames = float((r[1:] * r[:-1]).sum() / math.sqrt(max((r[1:] * r[:-1] != 0).sum(), 1)))
+        frames = _from_frame_to_frame(r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2))
         if frames > _STRUCTURE:
             words.append(f"residuals go together from frame to frame ({frames:.1f} sigma): the same is missed in each")
     levels = r.mean((1, 2)) * math.sqrt(max(r[0].size, 1))
@@ -92,6 +114,24 @@ def structure(residual_sigma: Array) -> list[str]:
             f"frame {at} is brighter or darker than the model by {abs(levels[at]):.1f} sigma: exposure or lamp"
         )
     return words
+
+
+def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
+    """Sum of products of neighbouring frames less what is expected of it, over its standard deviation.
+
+    Of T = rᵀ A r with A = 1/2 beside the diagonal and covariance K in each pixel: tr AK and 2 tr AKAK.
+    """
+    expected, variance = 0.0, 0.0
+    for row in range(r.shape[1]):
+        some = [part[:, row].T for part in (dark, flat)]
+        k = sum(np.einsum("pi,pj->pij", one, one) for one in some)
+        np.einsum("pii->pi", k)[:] = r[:, row].T != 0
+        ak = np.zeros_like(k)
+        ak[:, 1:] += k[:, :-1] / 2
+        ak[:, :-1] += k[:, 1:] / 2
+        expected += float(np.einsum("pii->", ak))
+        variance += 2 * float(np.einsum("pij,pji->", ak, ak))
+    return (float((r[1:] * r[:-1]).sum()) - expected) / math.sqrt(max(variance, 1.0))
 
 
 def _together(one: Array, other: Array) -> Array:

@@ -1,20 +1,21 @@
 """What the answering causes do to the pillars, from the cell solvers: t itself where they are quick, else slopes."""
 
 import functools
-from collections.abc import Container
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from characterize.model import solving
+from characterize.model import kept, solving
 from metalens import modal, rcwa
-from metalens.cell import Cell
+from metalens.cell import Cell, index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, MaterialError
 from metalens.lens import Lens
 from metalens.made import Answers, Cause, Sensitivity, Solved, of_kind, sensitivity
 
 _NODES, _MOST = 25, 14
+_SOURCES = "metalens.cell", "metalens.modal", "metalens.rcwa", "metalens.made", "metalens.pillars", "characterize.model"
 
 
 def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) -> Sensitivity:
@@ -30,25 +31,68 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
     the largest change of the slope across the lens; the best one below degree 15 where none does. The error reached
     is in ``error``. Cells that no solver takes get the effective-index slopes of :func:`metalens.made.sensitivity`.
 
+    What was solved once is kept in the user's cache folder (:mod:`characterize.model.kept`).
+
     Args:
         wanted: names of causes whose slope no solver knows in closed form (the sidewall) and that are wanted all the
             same: by differences of the RCWA solver (half a degree of wall: 0.1 deg² of curvature); zero without.
     """
+    try:
+        about = _about(lens, tolerance, [row.name for row in _unknown() if row.name in wanted])
+        return _unpacked(kept.kept("pillars", about, _SOURCES, lambda: _packed(_solve(lens, tolerance, wanted))))
+    except (CellError, MaterialError):
+        return sensitivity(lens)
+
+
+def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
+    """All that the slopes of a lens come from, as text."""
+    d, cell = lens.diameters.diameter_um[lens.diameters.diameter_um > 0], lens.cell
+    films = [film.material for film in (*cell.under, *cell.over)]
+    sections = [one for layer in cell.layers for one in (layer.material, layer.between, layer.coat) if one is not None]
+    media = cell.pillar, cell.between, cell.substrate, cell.cover, *films, *sections
+    indices = [index(medium, lens.wavelength_um) for medium in media]
+    proxy = {name: np.asarray(value).tolist() for name, value in lens.proxy.to_arrays().items()}
+    return repr((cell, indices, lens.wavelength_um, float(d.min()), float(d.max()), proxy, tolerance, wanted))
+
+
+def _packed(found: Sensitivity) -> dict[str, Array]:
+    """As named arrays."""
+    numbers = np.array([found.center_um, found.error, found.low_um, found.high_um])
+    out = {"coefficients": found.coefficients, "numbers": numbers}
+    if found.solved is not None:
+        table = found.solved
+        out |= {"wavelength": np.array(table.wavelength_um), "diameter": table.diameter_um, "powers": table.powers}
+    return out
+
+
+def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
+    """From named arrays."""
+    table = None
+    if "powers" in arrays:
+        table = Solved(float(arrays["wavelength"]), arrays["diameter"], arrays["powers"])
+    center, error, low, high = arrays["numbers"].tolist()
+    return Sensitivity(arrays["coefficients"], center, error, low, high, table)
+
+
+def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
+    """:func:`slopes` by the solvers."""
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())
     low, high = (low, high) if high > low else (low - 1e-3, high + 1e-3)
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     diameters = (low + high) / 2 + (high - low) / 2 * unit
-    try:
-        found = solving.solved(lens) if _upright(lens.cell) else None
-        rows = np.array([_exact(lens.cell, float(one), lens.wavelength_um, wanted, found) for one in diameters]).T
-    except (CellError, MaterialError):
-        return sensitivity(lens)
+    found = solving.solved(lens) if _upright(lens.cell) else None
+    rows = np.array([_exact(lens.cell, float(one), lens.wavelength_um, wanted, found) for one in diameters]).T
     degree, error = _degree(unit, rows, tolerance)
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
     return Sensitivity(np.array(padded) * scale, (low + high) / 2, error, low, high, found)
+
+
+def _unknown() -> list[Cause]:
+    """Answering causes of which no solver knows the slope in closed form."""
+    return [row for _, row in of_kind(Answers) if isinstance(row.acts, Answers) and not row.acts.exact]
 
 
 def _upright(cell: Cell) -> bool:

@@ -1,5 +1,6 @@
 """Causes that are not fitted: chance is chance, what is there is found, and what cannot be told apart is said."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -20,14 +21,14 @@ rng = np.random.default_rng(20)
 SLOPES = rng.normal(size=(4, 900)) * np.array([[3.1], [0.7], [11.0], [2.3]])
 CHANGES = rng.normal(size=(3, 900)) + 0.4 * SLOPES[:3]
 PRIOR = np.diag([0.0, 0.3**-2.0, 0.0, 2.1**-2.0])
+ALONE = np.zeros((2, 9, 10, 10))
 
 
-def fit_of(rest):
+def fit_of(rest, shared=ALONE):
     """The residuals at the mode of a linear problem: data less what the least squares take, priors included."""
     known = SLOPES @ SLOPES.T + PRIOR
-    return Fitted(
-        ("one", "two", "three", "four"), SLOPES, known, rest - SLOPES.T @ np.linalg.solve(known, SLOPES @ rest)
-    )
+    left = rest - SLOPES.T @ np.linalg.solve(known, SLOPES @ rest)
+    return Fitted(("one", "two", "three", "four"), SLOPES, known, left, shared)
 
 
 def test_where_nothing_is_missing_the_score_is_chi_square():
@@ -38,6 +39,23 @@ def test_where_nothing_is_missing_the_score_is_chi_square():
         found.append(fit_of(rng.normal(size=900) + SLOPES.T @ truth).lean("any", CHANGES).chi2)
     assert np.mean(found) == pytest.approx(3, abs=0.22)
     assert np.var(found) == pytest.approx(6, abs=1.3)
+
+
+def test_errors_that_are_one_in_all_frames_are_not_taken_for_a_cause():
+    """Nine frames, each with the dark's error as 0.4 of its unit noise and the flat's as 0.3 beyond it.
+
+    A cause that looks the same in all frames would scatter with variance 1 + 8 * 0.16 + 9 * 0.09 = 3.09, not 1.
+    """
+    dark, flat = np.full((2, 9, 10, 10), [[[[0.4]]], [[[0.3]]]])
+    alike = np.tile(rng.normal(size=100), 9)[None]
+    found, plain = [], []
+    for _ in range(1500):
+        own, common = rng.normal(size=(9, 100)), rng.normal(size=(2, 100))
+        noise = (math.sqrt(1 - 0.4**2) * own + 0.4 * common[0] + 0.3 * common[1]).ravel()
+        found.append(fit_of(noise, np.stack([dark, flat])).lean("any", alike).chi2)
+        plain.append(fit_of(noise).lean("any", alike).chi2)
+    assert np.mean(found) == pytest.approx(1, abs=0.16)  # 1500 draws: 0.037
+    assert np.mean(plain) == pytest.approx(3.09, abs=0.5)
 
 
 def test_what_is_there_is_found_whatever_the_fit_takes_of_it():

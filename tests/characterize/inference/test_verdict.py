@@ -48,6 +48,20 @@ def test_noise_is_not_taken_for_structure():
     assert not any(verdict.structure(RNG.standard_normal((5, 20, 24))) for _ in range(200))
 
 
+def test_errors_of_dark_and_flat_go_together_from_frame_to_frame_and_are_expected():
+    """Eleven frames of 24 x 24: 0.16 + 0.09 of each product is common, 19 sigma if it were not known to be."""
+    dark, flat = np.full((2, 11, 24, 24), [[[[0.4]]], [[[0.3]]]])
+    told = {"known": 0, "not": 0, "more": 0}
+    for _ in range(60):
+        own, common = RNG.standard_normal((11, 24, 24)), RNG.standard_normal((3, 24, 24))
+        residual = math.sqrt(1 - 0.4**2) * own + 0.4 * common[0] + 0.3 * common[1]
+        told["known"] += bool(verdict.structure(residual, np.stack([dark, flat])))
+        told["not"] += bool(verdict.structure(residual))
+        more = verdict.structure(residual + 0.45 * common[2], np.stack([dark, flat]))
+        told["more"] += any("frame to frame" in line for line in more)
+    assert told == {"known": 0, "not": 60, "more": 60}
+
+
 @pytest.mark.parametrize("axis", [1, 2])
 @pytest.mark.parametrize("alike", [9, 2])
 def test_neighbours_that_go_together_by_more_than_four_sigma_and_a_half_are_told(axis, alike):
@@ -92,8 +106,11 @@ def test_a_frame_of_another_exposure_is_told():
 def test_bounds_that_a_parameter_ran_into_are_named():
     names = ("bias_nm", "pinhole_um", "crosstalk_px", "height_nm")
     prior = SimpleNamespace(low=np.array([-5.0, 0.0, 0.02, -9.0]), high=np.array([5.0, 20.0, 3.0, 9.0]))
-    found = SimpleNamespace(value=np.array([-5.0, 0.0, 3.0, 8.9]))
+    found = SimpleNamespace(value=np.array([-5.0, 0.0, 3.0, 8.9]), beyond=np.array([-2.1, -7.0, 2.1, 9.0]))
     assert verdict.at_bounds(names, found, prior) == [("bias_nm", -5.0), ("crosstalk_px", 3.0)]
+    assert "bias_nm ran to its bound -5" in verdict.held_back(names, found, prior)[0]
+    weak = SimpleNamespace(value=found.value, beyond=np.array([-1.9, -7.0, 1.9, 9.0]))
+    assert not verdict.held_back(names, weak, prior)
 
 
 def test_what_is_known_is_an_interval_within_the_usual_uncertainty():
