@@ -64,7 +64,7 @@ def _write(path: Path, title: str, arrays: Mapping[str, Array]) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with store.replacing(path) as part, open(part, "wb") as file:
-            np.savez(file, **dict(arrays))
+            np.savez(file, **dict(arrays))  # type: ignore[arg-type]  # the stub takes its own flags for all names
         ours = sorted(path.parent.glob(f"{title}_*{_ENDING}"), key=lambda p: p.stat().st_mtime)
         for old in ours[:-MOST]:
             old.unlink(missing_ok=True)

@@ -53,10 +53,11 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     columns = []
     for _, row, amounts in changes:
         for amount in amounts:
-            same = amount == 0 or not isinstance(row.acts, Answers)
-            columns.append(
-                plain if same else _along(row.acts.changed(cell, amount, wavelength_um), wavelength_um, diameters)
-            )
+            if not isinstance(row.acts, Answers) or amount == 0:
+                columns.append(plain)
+                continue
+            changed = row.acts.changed(cell, amount, wavelength_um)
+            columns.append(_along(changed, wavelength_um, diameters))
     return Solved(wavelength_um, diameters, _powers(np.array(columns).T, changes))
 
 
