@@ -197,16 +197,37 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     for patch in optics.patches:
         kernels = torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes])
         transfer.append(_transfer(kernels, _size(patch, stack.shape[-1])))
-        made.append(replace(patch, energy=_illumination(patch, optics.grid, energy)))
+        made.append(replace(patch, energy=_illumination(patch, optics, energy)))
     return replace(optics, stack=stack, energy=energy, patches=made, transfer=transfer)
 
 
-def _illumination(patch: Patch, grid: Grid, energy: Tensor) -> Tensor:
+def _illumination(patch: Patch, optics: Imager, energy: Tensor) -> Tensor:
     """(pixels, depths) E at every pixel of a patch."""
-    ends = []
-    for (a, b), n, k in zip((patch.rows, patch.columns), grid.frame, energy.shape, strict=False):
-        ends.append(dense(torch.arange(a, b, dtype=torch.float64) * ((k - 1) / max(n - 1, 1)), k).to(energy))
+    both = zip((patch.rows, patch.columns), between_nodes(optics.grid, optics.plan), strict=True)
+    ends = [weights[a:b].to(energy) for (a, b), weights in both]
     return torch.einsum("ya,xb,abz->yxz", *ends, energy).flatten(0, 1)
+
+
+def between_nodes(grid: Grid, plan: Plan) -> list[Tensor]:
+    """(pixel rows, node rows) and (pixel columns, node columns): interpolation from the nodes to every pixel."""
+    return [
+        dense(torch.linspace(float(nodes[0]), float(nodes[-1]), n, dtype=torch.float64), nodes)
+        for n, nodes in zip(grid.frame, (plan.y_um, plan.x_um), strict=True)
+    ]
+
+
+def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
+    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row, column]) of the frame."""
+    flat, position = optics.stack.flatten(0, 2), vergence(depths_um, optics.plan.depths_um)
+    deep = dense(position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)).to(flat)
+    out = flat.new_zeros(len(pixels), len(depths_um), *flat.shape[1:])
+    for patch in optics.patches:
+        (top, below), (left, right) = patch.rows, patch.columns
+        for i, (row, column) in enumerate(pixels.tolist()):
+            if top <= row < below and left <= column < right:
+                weights = deep @ patch.weights[(row - top) * (right - left) + column - left]
+                out[i] += (weights @ (patch.mix @ flat[patch.nodes].flatten(1))).view_as(out[i])
+    return out
 
 
 def trimmed(optics: Imager, tolerance: float) -> Imager:

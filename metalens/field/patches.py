@@ -2,10 +2,11 @@
 
     image(X) = Σ_patches Σ_r kernel_r * [weight_r(x, z) source(x, z)]
 
-The PSFs are known on a grid of nodes over the field (4-point Lagrange between them) and at depths of equal steps of
-1/z (likewise). In each patch the nodes that touch it are one matrix (nodes × depths, samples); its leading singular
-vectors, seen through a 1/f texture, are the kernels, and their coefficients are interpolated to every pixel. Patches
-overlap by a few pixels, where their shares, which add up to 1, are folded into the weights.
+The PSFs are known on a grid of nodes over the field (4-point Lagrange between them, wherever they lie) and at depths
+of equal steps of 1/z (likewise). In each patch the PSFs at a few places are one matrix (places × depths, samples); its
+leading singular vectors, seen through a 1/f texture, are the kernels. What the PSFs at more places, as close as the
+nodes, weigh in them is interpolated to every pixel. Patches overlap by a few pixels, where their shares, which add up
+to 1, are folded into the weights.
 """
 
 import itertools
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 TAPS = 4  # of the interpolation
-PLACES = 5  # along an axis of a patch at which its PSFs are compared
+PLACES = 5  # along an axis of a patch from whose PSFs the kernels are made
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,11 +69,21 @@ def lagrange(wanted: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return first.long(), torch.stack(weights, -1)
 
 
-def dense(wanted: Tensor, count: int) -> Tensor:
-    """(…, count) the weights of :func:`lagrange` on all nodes."""
-    first, weights = lagrange(wanted, count)
-    out = torch.zeros(*wanted.shape, count, dtype=wanted.dtype, device=wanted.device)
-    return out.scatter_(-1, first[..., None] + torch.arange(weights.shape[-1], device=wanted.device), weights)
+def dense(wanted: Tensor, nodes: Tensor) -> Tensor:
+    """(n, nodes) weights of the 4-point Lagrange interpolation at (n,) places between ascending nodes.
+
+    As :func:`lagrange`, for nodes at any distances.
+    """
+    taps, last = min(TAPS, len(nodes)), len(nodes) - 1
+    first = (torch.searchsorted(nodes, wanted, right=True) - taps // 2).clamp(0, last + 1 - taps)
+    index = first[:, None] + torch.arange(taps, device=nodes.device)
+    at = nodes[index]
+    weights = torch.ones_like(at)
+    for i in range(taps):
+        for j in range(taps):
+            if j != i:
+                weights[:, i] *= (wanted - at[:, j]) / (at[:, i] - at[:, j])
+    return torch.zeros(len(wanted), len(nodes), dtype=at.dtype, device=at.device).scatter_(1, index, weights)
 
 
 def texture_view(kernels: Tensor) -> Tensor:
@@ -115,20 +126,18 @@ def _ramp(position: Tensor) -> Tensor:
 
 
 def cut(
-    stack: Tensor, energy: Tensor, frame: tuple[int, int], *, patches: int, overlap: int, tolerance: float
+    stack: Tensor, energy: Tensor, grid: list[Tensor], *, patches: int, overlap: int, tolerance: float
 ) -> list[Patch]:
     """Patches of a field of PSFs.
 
     Args:
-        stack: (node rows, node columns, depths, h, w), each of sum 1; the nodes run from the first to the last pixel.
+        stack: (node rows, node columns, depths, h, w), each of sum 1.
         energy: (node rows, node columns, depths) light of each.
-        frame: (y, x) pixels. patches: along each axis. overlap: pixels that two neighbours share.
+        grid: (pixel rows, node rows) and (pixel columns, node columns) of :func:`dense`.
+        patches: along each axis. overlap: pixels that two neighbours share.
         tolerance: of the image of a 1/f texture, relative L2, at the worst depth of every patch.
     """
-    along = [shares(n, patches, overlap) for n in frame]
-    grid = [
-        dense(torch.linspace(0, k - 1, n, dtype=torch.float64), k) for n, k in zip(frame, stack.shape, strict=False)
-    ]
+    along = [shares(len(part), patches, overlap) for part in grid]
     seen = texture_view(stack.detach().double())
     return [_patch(seen, energy, grid, row, column, tolerance) for row, column in itertools.product(*along)]
 
@@ -142,45 +151,54 @@ def _patch(
     tolerance: float,
 ) -> Patch:
     """Leading singular vectors of the PSFs at a few places of a patch, and what they weigh at every pixel and depth."""
-    in_y, in_x = (g[a:b].to(seen) for g, (a, b, _) in zip(grid, (row, column), strict=True))
-    places = [torch.linspace(0, len(part) - 1, PLACES).round().long() for part in (in_y, in_x)]
-    at_y, at_x = (part[where] for part, where in zip((in_y, in_x), places, strict=True))
-    touched = [torch.nonzero(part.abs().amax(0) > 0)[:, 0] for part in (at_y, at_x)]
-    at_y, at_x = at_y[:, touched[0]], at_x[:, touched[1]]
-    near = seen[touched[0]][:, touched[1]]
-    depths = near.shape[2]
-    rows = torch.einsum("pa,qb,abzf->pqzf", at_y, at_x, near).flatten(0, 2)
+    inside = [g[a:b].to(seen) for g, (a, b, _) in zip(grid, (row, column), strict=True)]
+    touched = [torch.nonzero(part.abs().amax(0) > 0)[:, 0] for part in inside]
+    near, depths = seen[touched[0]][:, touched[1]], seen.shape[2]
+    some = [_places(len(part), PLACES) for part in inside]
+    rows, at_y, at_x = _at_places(near, inside, some, touched)
     values, vectors = torch.linalg.eigh(rows @ rows.mT)
-    vectors = vectors.flip(1)
-    power = (vectors**2 * values.flip(0).clamp_min(0)).reshape(-1, depths, len(values)).mean(0)
+    values, vectors = values.flip(0).clamp_min(1e-14 * float(values[-1])), vectors.flip(1)
+    power = (vectors**2 * values).reshape(-1, depths, len(values)).mean(0)
     missing = torch.sqrt(power.flip(1).cumsum(1).flip(1) / power.sum(1, keepdim=True)).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
-    left = vectors[:, :rank].reshape(PLACES, PLACES, depths, rank)
-    share = row[2].to(seen)[:, None] * column[2].to(seen)
-    to_y, to_x = (_between(where, len(part)) for where, part in zip(places, (in_y, in_x), strict=True))
-    table = torch.einsum("yp,xq,pqzr->yxzr", to_y.to(seen), to_x.to(seen), left)
-    light = torch.einsum("ya,xb,abz->yxz", in_y, in_x, energy.to(seen))
-    mix = torch.einsum("pa,qb,pqzr->rabz", at_y, at_x, left)
-    index = (touched[0][:, None] * seen.shape[1] + touched[1])[..., None] * depths + torch.arange(
-        depths, device=seen.device
+    left = vectors[:, :rank]
+    more = [_places(len(part), max(PLACES, len(nodes))) for part, nodes in zip(inside, touched, strict=True)]
+    weighed = _at_places(near, inside, more, touched)[0] @ (rows.mT @ (left / values[:rank]))
+    table = weighed.reshape(len(more[0]), len(more[1]), depths, rank)
+    to_y, to_x = (
+        dense(torch.arange(len(part), dtype=torch.float64), at.double()).to(seen)
+        for part, at in zip(inside, more, strict=True)
     )
+    table = torch.einsum("yp,xq,pqzr->yxzr", to_y, to_x, table)
+    light = torch.einsum("ya,xb,abz->yxz", *inside, energy.to(seen))
+    share = row[2].to(seen)[:, None] * column[2].to(seen)
+    mix = torch.einsum("pa,qb,pqzr->rabz", at_y, at_x, left.reshape(len(some[0]), len(some[1]), depths, rank))
     return Patch(
         (row[0], row[1]),
         (column[0], column[1]),
         (table * share[..., None, None]).flatten(0, 1).float(),
         light.flatten(0, 1).float(),
         mix.flatten(1).float(),
-        index.flatten(),
+        _flat(touched, seen.shape[1], depths),
         torch.cat([missing, missing.new_zeros(1)])[: rank + 1],
         rank,
     )
 
 
-def _between(places: Tensor, pixels: int) -> Tensor:
-    """(pixels, places) polynomial through all places."""
-    at, x = torch.arange(pixels, dtype=torch.float64)[:, None], places.double()
-    columns = []
-    for i in range(len(x)):
-        others = torch.cat([x[:i], x[i + 1 :]])
-        columns.append(((at - others) / (x[i] - others)).prod(1))
-    return torch.stack(columns, 1)
+def _places(pixels: int, count: int) -> Tensor:
+    """(count,) pixels of a patch from its first to its last, at most all of them."""
+    return torch.linspace(0, pixels - 1, min(count, pixels), dtype=torch.float64).round().long()
+
+
+def _at_places(
+    near: Tensor, inside: list[Tensor], places: list[Tensor], touched: list[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(places × depths, features) PSFs at pixels of a patch, and the weights of the nodes in them along y and x."""
+    at_y, at_x = (part[at][:, few] for part, at, few in zip(inside, places, touched, strict=True))
+    return torch.einsum("pa,qb,abzf->pqzf", at_y, at_x, near).flatten(0, 2), at_y, at_x
+
+
+def _flat(touched: list[Tensor], columns: int, depths: int) -> Tensor:
+    """Indices of some rows and columns of nodes, all depths, in the flattened stack."""
+    deep = torch.arange(depths, device=touched[0].device)
+    return (((touched[0][:, None] * columns + touched[1])[..., None] * depths) + deep).flatten()

@@ -1,5 +1,6 @@
 """Which field points, depths and wavelengths an image needs: tried on one line through the field, cheapest first."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,9 +15,13 @@ from metalens.ground.errors import SceneError
 from metalens.psf import Nodes, Source
 from metalens.psf import spectrum as spectra
 
-STEPS = (24, 16, 12, 8, 6, 4)  # between nodes that are tried, in 96ths of the field or of the range of 1/z
+STEPS = (24, 16, 12, 8, 6, 4)  # between depths that are tried, in 96ths of the range of 1/z
 FINE = 96
-SHARES = {"kernels": 0.6, "field": 0.5, "depth": 0.3, "spectrum": 0.4}  # of the tolerance; together 0.93 of it
+ALONG = 192  # steps of an axis of the field, on which its nodes lie
+MOST = 57  # nodes along an axis
+DENSER = (0.0, 2.0)  # by how much more the nodes lie at the rim of the field than on the axis
+ORDER = 2.5  # power of their distance by which the error falls; more would need PSFs without edges
+SHARES = {"kernels": 0.6, "field": 0.4, "depth": 0.3, "spectrum": 0.4, "transform": 0.4}  # of the tolerance; 0.97 of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +86,7 @@ def planned(
     the nearest, the middle and the farthest depth. A whole spectrum is used from the start, coarse for the line.
 
     Raises:
-        SceneError: tolerance not above 0, or not met with 25 nodes along an axis.
+        SceneError: tolerance not above 0, or not met with ``MOST`` nodes along an axis.
     """
     if not 0 < tolerance < 1:
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
@@ -92,7 +97,7 @@ def planned(
     ends = depth_nodes(grid, 3)
 
     def across(places: Tensor) -> Tensor:
-        x = torch.stack([(2 * places / FINE - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
+        x = torch.stack([(2 * places / ALONG - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
         return spectral(optics, x + torch.tensor(middle_um, dtype=torch.float64), ends, coarse, window)
 
     def deep(places: Tensor) -> Tensor:
@@ -101,12 +106,14 @@ def planned(
         near, far = (1 / d for d in grid.depths_um)
         return spectral(optics, at, 1 / (near + (far - near) * places / FINE), coarse, window).transpose(0, 1)
 
-    count = _fewest(across, tolerance * SHARES["field"], "field points along an axis")
+    count, denser = _line(across, (middle_um[0], half[1]), tolerance * SHARES["field"])
     depths = 1 if grid.depths_um[0] == grid.depths_um[1] else _fewest(deep, tolerance * SHARES["depth"], "depths")
-    long = max(half)
-    counts = [max(2, math.ceil((count - 1) * h / long) + 1) for h in half]
+    if neglected(optics, coarse, window, (_corner(middle_um, half), ends)) > tolerance * SHARES["transform"]:
+        window = replace(window, curved=True)
+    counts = [max(2, math.ceil((count - 1) * h / half[1]) + 1) for h in half]
     y, x = (
-        m + torch.linspace(-h, h, c, dtype=torch.float64) for m, h, c in zip(middle_um[::-1], half, counts, strict=True)
+        m + (2 * placed(c, denser, (m, h)) / ALONG - 1) * h
+        for m, h, c in zip(middle_um[::-1], half, counts, strict=True)
     )
     return Plan(y, x, depth_nodes(grid, depths), waves, window, folds and counts[0] == counts[1] and half[0] == half[1])
 
@@ -123,6 +130,36 @@ def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, win
     for wave, weight in zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True):
         total = total + weight * psfs(optics, at_um, depths_um=depths_um, wavelength_um=wave, window=window)
     return total
+
+
+def _corner(middle_um: tuple[float, float], half_um: list[float]) -> Tensor:
+    """(2, [x, y]) two places well off the middle of a field."""
+    unit = torch.tensor([[0.75, 0.45], [-0.3, 0.8]], dtype=torch.float64)
+    return unit * torch.tensor([half_um[1], half_um[0]]) + torch.tensor(middle_um, dtype=torch.float64)
+
+
+def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+    """What the transform neglects: PSFs of the first wavelength at (field points, depths), with the rays seen from
+    their own width beside the field point, against themselves."""
+
+    def found(shift_um: tuple[float, float]) -> Tensor:
+        wave = float(waves.wavelengths_um[0])
+        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=wave, window=window, shift_um=shift_um)
+        return light.detach()
+
+    plain = found((0.0, 0.0))
+    wide = width(plain / plain.sum((-1, -2), keepdim=True)) * window.step_um
+    return float((relative(found((wide * 0.6, wide * 0.8)), plain) ** 2).mean().sqrt())
+
+
+def width(psfs: Tensor) -> float:
+    """Root mean square distance of the light from its centroid, samples, mean over the PSFs."""
+    n = psfs.shape[-1]
+    place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
+    total = psfs.sum((-1, -2))
+    x, y = (psfs.sum(-2) * place).sum(-1) / total, (psfs.sum(-1) * place).sum(-1) / total
+    square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
+    return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
 
 
 def waves_of(
@@ -155,26 +192,69 @@ def _coarse(source: Source, count: int) -> Nodes:
     return Nodes(*spectra.gauss(um, share, count), np.nan)
 
 
-def _fewest(at: Callable[[Tensor], Tensor], tolerance: float, what: str) -> int:
-    """Nodes needed on a line of PSFs, judged half-way between them; ``at`` gives PSFs at places 0 … FINE."""
-    known: dict[int, Tensor] = {}
+def placed(count: int, denser: float, span: tuple[float, float]) -> Tensor:
+    """(nodes,) places 0 … ALONG of an axis, whole numbers: so many, denser with their distance X from the lens axis.
 
-    def line(places: range) -> Tensor:
-        missing = [i for i in places if i not in known]
+    The density is 1 + denser |X| / largest |X|: astigmatism moves the edges of a PSF by X², coma by X.
+
+    Args:
+        span: middle and half length of the axis in um.
+    """
+    x = span[0] + np.linspace(-1, 1, 8 * ALONG + 1) * span[1]
+    rim = max(np.abs(x).max(), 1e-9)
+    passed = x / rim + denser / 2 * (x / rim) * np.abs(x / rim)
+    even = np.linspace(passed[0], passed[-1], min(count, ALONG + 1))
+    place = np.rint((np.interp(even, passed, x) - span[0]) / span[1] * (ALONG / 2)) if span[1] else np.zeros(1)
+    return torch.from_numpy(np.unique(place) + ALONG / 2)
+
+
+class _Known:
+    """PSFs of sum 1 at whole places of a line, each computed once."""
+
+    def __init__(self, at: Callable[[Tensor], Tensor]) -> None:
+        self.at, self.kept = at, dict[int, Tensor]()
+
+    def error(self, nodes: list[int]) -> float:
+        """Of the interpolation half-way between the nodes, root mean square, at the worst depth."""
+        between = sorted({(a + b) // 2 for a, b in itertools.pairwise(nodes)} - set(nodes))
+        want, given = self.psfs(between), self.psfs(nodes)
+        weights = dense(*(torch.tensor(places, dtype=torch.float64) for places in (between, nodes)))
+        got = torch.einsum("nk,kzyx->nzyx", weights.to(want), given)
+        return float((relative(got, want) ** 2).mean(0).sqrt().max())
+
+    def psfs(self, places: list[int]) -> Tensor:
+        """(places, depths, h, w)."""
+        missing = [i for i in places if i not in self.kept]
         if missing:
-            found = at(torch.tensor(missing, dtype=torch.float64))
-            known.update(zip(missing, found / found.sum((-1, -2), keepdim=True), strict=True))
-        return torch.stack([known[i] for i in places])
+            found = self.at(torch.tensor(missing, dtype=torch.float64))
+            self.kept.update(zip(missing, found / found.sum((-1, -2), keepdim=True), strict=True))
+        return torch.stack([self.kept[i] for i in places])
 
-    for step in STEPS:
-        nodes, between = range(0, FINE + 1, step), range(step // 2, FINE, step)
-        weights = dense(torch.tensor(between, dtype=torch.float64) / step, len(nodes))
-        want = line(between)
-        got = torch.einsum("nk,kzyx->nzyx", weights.to(want), line(nodes))
-        error = float((relative(got, want) ** 2).mean(0).sqrt().max())
+
+def _line(at: Callable[[Tensor], Tensor], span: tuple[float, float], tolerance: float) -> tuple[int, float]:
+    """Number and density of the nodes that a line of PSFs needs; ``at`` gives PSFs at places 0 … ALONG."""
+    known, count = _Known(at), 5
+    while count <= MOST:
+        tried = [(known.error(placed(count, d, span).int().tolist()), d) for d in DENSER]
+        error, denser = min(tried)
         if error <= tolerance:
-            return len(nodes)
+            return count, denser
+        most = count - 1 if error > 0.3 else (count - 1) * (error / tolerance) ** (1 / ORDER)
+        count = max(count + 2, 1 + 2 * math.ceil(0.45 * min(most, 2 * (count - 1))))
     raise SceneError(
-        f"{len(nodes)} {what} leave {error:.2g} of the image, above {tolerance:.2g}: "
+        f"{count - 2} field points along an axis leave {error:.2g} of the image, above {tolerance:.2g}: "
+        "raise the tolerance or the sample, or narrow the field"
+    )
+
+
+def _fewest(at: Callable[[Tensor], Tensor], tolerance: float, what: str) -> int:
+    """Nodes needed at even steps of a line of PSFs; ``at`` gives PSFs at places 0 … FINE."""
+    known = _Known(at)
+    for step in STEPS:
+        error = known.error(list(range(0, FINE + 1, step)))
+        if error <= tolerance:
+            return FINE // step + 1
+    raise SceneError(
+        f"{FINE // step + 1} {what} leave {error:.2g} of the image, above {tolerance:.2g}: "
         "raise the tolerance or the sample, or narrow the field"
     )

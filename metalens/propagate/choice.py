@@ -26,7 +26,7 @@ class Choice:
     seconds: float
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=1024)
 def choose(case: Case, tolerance: float, *, differentiable: bool = False) -> Choice:
     """The cheapest method that meets the tolerance.
 

@@ -56,7 +56,7 @@ class Layout:
     seconds: float
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=1024)
 def layout(case: Case, tolerance: float) -> Layout | None:
     """How the window is cut so that it costs least; None where no cut brings the tables down to some 100 MB.
 

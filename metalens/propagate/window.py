@@ -1,7 +1,9 @@
 """Windowed propagation: only the field on the sensor window, from Legendre moments of the lens."""
 
-import functools
+import dataclasses
+import threading
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from metalens.propagate.operators import Depths, depth_basis, depth_factors, ope
 from metalens.propagate.paths import reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, moments, reduce
 
+KEPT_BYTES = 400e6  # of plans that are kept
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
 
@@ -35,11 +38,20 @@ class Plan:
     depths: Depths
     moments: Moments
     tensors: dict[str, torch.Tensor]
+    slopes: dict[int, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
 
     @property
     def nodes_um(self) -> tuple[Array, Array]:
         """(e,), (x,) positions of the lens nodes of the tiles."""
         return _nodes_um(self.case, self.layout.sizes.nodes)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that its arrays take."""
+        held = [*self.tensors.values(), *(t for made in self.slopes.values() for t in made.values())]
+        held += [self.moments.rows, self.moments.columns]
+        arrays = [self.depths.basis, self.depths.coefficients, self.moments.table]
+        return sum(t.nbytes for t in held) + sum(a.nbytes for a in arrays if a is not None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,13 +65,38 @@ class Moving:
     centre: torch.Tensor
 
 
-@functools.lru_cache(maxsize=12)
+_kept: dict[tuple[Any, ...], Plan] = {}  # used last at the end
+_lock = threading.Lock()
+
+
 def plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, moving: bool = False) -> Plan:
-    """Plan a windowed propagation; the last few are kept. ``moving``: for use with :class:`Moving`.
+    """Plan a windowed propagation; those used last are kept, as many as fit in ``KEPT_BYTES``.
+
+    Args:
+        moving: for use with :class:`Moving`.
 
     Raises:
         PropagationError: the window is too large for the method.
     """
+    key = (case, tolerance, dtype, device, moving)
+    with _lock:
+        found = _kept.pop(key, None)
+        if found is not None:
+            _kept[key] = found
+            return found
+    found = _planned(case, tolerance, dtype, device, moving=moving)
+    with _lock:
+        _kept[key] = found
+        room = KEPT_BYTES
+        for other in reversed(list(_kept)):
+            room -= _kept[other].bytes
+            if room < 0 and other != key:
+                del _kept[other]
+    return found
+
+
+def _planned(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, *, moving: bool) -> Plan:
+    """A new plan."""
     found = layout(case, tolerance)
     if found is None:
         raise PropagationError("the window is too large for one plan; see propagate.choose, or make it smaller")
@@ -133,11 +170,12 @@ def _padded(array: Array, count: int) -> Array:
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
-@functools.lru_cache(maxsize=12)
 def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
-    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2)."""
-    rows = plan.moments.rows
-    return _stacked(plan.case, plan.layout, plan.depths, plan.tolerance, (rows.dtype, rows.device), axis)
+    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2); kept with the plan."""
+    if axis not in plan.slopes:
+        kind = plan.moments.rows.dtype, plan.moments.rows.device
+        plan.slopes[axis] = _stacked(plan.case, plan.layout, plan.depths, plan.tolerance, kind, axis)
+    return plan.slopes[axis]
 
 
 def field_windowed(

@@ -11,7 +11,8 @@ import torch
 from metalens.cell import Film, Index
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, node_psfs, psfs, with_psfs
-from metalens.field.patches import relative
+from metalens.field.patches import dense, relative
+from metalens.field.plan import ALONG, placed
 from metalens.ground.errors import PropagationError, SceneError
 from metalens.image import Frames
 from metalens.psf import Nodes
@@ -119,6 +120,43 @@ def test_a_slow_lens_whose_blur_is_many_samples_wide():
     # what the sharp rim bends beyond the window folds back: 4√2 / (π² k p h) of the light, here 4 %
     beyond = 4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / 0.85 * RADIUS / math.hypot(far, RADIUS) * 15.5 * STEP)
     assert float(relative(got * (want.sum() / got.sum()), want)) < beyond
+
+
+def test_wide_psfs_to_second_order_of_their_width():
+    """Far out of focus 25° off the axis the light is 80 um wide, a third of the distance to the lens: the flux of the
+    second order takes what the first leaves down to rim and fold, 3e-3."""
+    wave, place, depth = SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS), (100.0, -52.0), 300.0
+    optics, at = Optics(wave, Layers(), DISTANCE), torch.tensor([place], dtype=torch.float64)
+    wide = Referee(radius=RADIUS, distance=DISTANCE, focus=FOCUS, design_wavelength=0.85, fine=0.6, count=512)
+    want = torch.from_numpy(wide.sampled(wide.intensity(place, depth, 0.85), STEP, 31).copy())
+    errors = []
+    for curved in (False, True):
+        window = Window(31, STEP, curved)
+        got = psfs(optics, at, depths_um=torch.tensor([depth]), wavelength_um=0.85, window=window)[0, 0].double()
+        errors.append(float(relative(got * (want.sum() / got.sum()), want)))
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 4e-3
+
+
+def test_lines_of_nodes_at_any_distance_interpolate_cubics():
+    """The four-point rule is exact for cubics wherever the nodes lie, ends included."""
+    nodes = torch.tensor([-3.1, -2.0, -1.7, 0.4, 1.9, 2.2, 4.0], dtype=torch.float64)
+    at = torch.linspace(-3.1, 4.0, 23, dtype=torch.float64)
+
+    def cubic(x):
+        return 0.3 * x**3 - 1.7 * x**2 + 0.9 * x - 4.1
+
+    assert torch.allclose(dense(at, nodes) @ cubic(nodes), cubic(at), rtol=1e-12, atol=1e-11)
+
+
+def test_nodes_of_an_axis_are_denser_off_the_lens_axis():
+    """Density 1 + 2 |X| / largest: the step at the rim is a third of that on the axis, wherever the lens axis is."""
+    steps = placed(21, 2.0, (0.0, 500.0)).diff()
+    assert float(steps[0] / steps.max()) == pytest.approx(0.4, abs=0.12)  # whole places, steps of 6 to 17 of them
+    aside = placed(21, 2.0, (700.0, 300.0))
+    assert aside[0] == 0
+    assert aside[-1] == ALONG
+    assert float(aside.diff()[:5].mean()) > float(aside.diff()[-5:].mean())
 
 
 def test_films_thicker_than_the_gap_are_refused():

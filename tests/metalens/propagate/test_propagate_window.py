@@ -12,6 +12,7 @@ import torch
 from metalens import propagate, psf
 from metalens.ground import legendre
 from metalens.ground.errors import PropagationError
+from metalens.propagate import window as windowed
 from metalens.propagate.nodes import layout
 from metalens.propagate.operators import depth_basis, depth_factors
 
@@ -176,6 +177,32 @@ def test_a_window_too_large_for_one_plan_is_computed_in_parts():
     geometry = dict(pitch_um=3.0, sensor_distance_um=3000.0, window_um=800.0, samples=6)
     stack = check(*lens((300, 300), distance=3000.0, pitch=3.0), tolerance=1e-4, **geometry)
     assert "tiles" in stack.reason
+
+
+def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
+    """21 directions in turn keep their plans; where bytes for three are left, the oldest go."""
+    cases = [
+        propagate.case(
+            (31, 27),
+            pitch_um=0.4,
+            wavelength_um=0.85,
+            sensor_distance_um=40.0,
+            depths_um=[900.0],
+            angle_rad=0.01 * i,
+            window_um=6.0,
+            samples=5,
+        )
+        for i in range(21)
+    ]
+    about = 1e-3, torch.float32, torch.device("cpu")
+    first = [windowed.plan(one, *about) for one in cases]
+    assert all(windowed.plan(one, *about) is kept for one, kept in zip(cases, first, strict=True))
+    assert all(one.bytes > sum(t.nbytes for t in one.tensors.values()) for one in first)
+    monkeypatch.setattr(windowed, "KEPT_BYTES", 3.5 * max(one.bytes for one in first))
+    newer = windowed.plan(cases[0], 2e-3, *about[1:])
+    assert windowed.plan(cases[0], 2e-3, *about[1:]) is newer
+    assert windowed.plan(cases[20], *about) is first[20]
+    assert windowed.plan(cases[5], *about) is not first[5]
 
 
 def test_energy_is_kept_in_a_large_window():
