@@ -51,7 +51,7 @@ class Plan:
         held = [*self.tensors.values(), *(t for made in self.slopes.values() for t in made.values())]
         held += [self.moments.rows, self.moments.columns]
         arrays = [self.depths.basis, self.depths.coefficients, self.moments.table]
-        return sum(t.nbytes for t in held) + sum(a.nbytes for a in arrays if a is not None)
+        return sum(int(t.nbytes) for t in held) + sum(int(a.nbytes) for a in arrays if a is not None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
