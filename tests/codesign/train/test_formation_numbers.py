@@ -1,0 +1,67 @@
+"""Noise of one normal draw, the cost of a pitch and the loss of the optics, each by its formula."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.network import cost
+from codesign.train import formation
+from metalens.image import Sensor
+
+RNG = np.random.default_rng(14)
+
+
+def test_electrons_of_one_draw_have_photon_and_read_variance_up_to_the_well():
+    """(draw - mean)² over a million pixels: m + reads read²; at the well the mean stops, and so does its noise."""
+    sensor = Sensor(6.0, 4.0, 1.0, 0.0, 900.0, 7.3)  # the well grows with the area: 2.25 x 900
+    mean = torch.tensor([60.0, 500.0, 5000.0], dtype=torch.float64)[:, None, None].expand(3, 600, 600).contiguous()
+    reads = torch.tensor(1.7, dtype=torch.float64)
+    drawn = formation._normal(mean, sensor, torch.Generator().manual_seed(5), reads)
+    held = np.array([60.0, 500.0, 2025.0])
+    got = drawn.mean((1, 2)).numpy(), drawn.var((1, 2)).numpy()
+    variance = held + 7.3**2 * 1.7
+    assert np.abs(got[0] - held).max() < 5 * math.sqrt(variance.max() / 360000)
+    assert got[1] == pytest.approx(variance, rel=0.012)  # sqrt(2 / 360000) = 0.24 %, five of them
+
+
+def test_the_cost_of_a_pitch_is_that_of_its_pixels():
+    """Counts linear in the size are interpolated exactly: window / pitch x share of the resolution."""
+    net = SimpleNamespace(counts=lambda architecture, sizes: 5.0 * np.asarray(sizes) + 11)
+    pitch = torch.tensor(7.0, dtype=torch.float64, requires_grad=True)
+    found = formation.network_macs(net, SimpleNamespace(resolution=0.75), 812.0, pitch)
+    assert float(found.detach()) == pytest.approx(5 * 812 / 7 * 0.75 + 11, rel=1e-9)
+    found.backward()
+    assert float(pitch.grad) == pytest.approx(-5 * 812 * 0.75 / 49, rel=1e-6)
+    assert float(cost.interpolated(lambda sizes: 3.0 * np.asarray(sizes), 40.25)) == pytest.approx(120.75, rel=1e-9)
+
+
+def test_the_texture_of_the_optics_loss_falls_as_1_over_f_squared():
+    power = formation._texture(12).numpy()
+    fy, fx = np.fft.fftfreq(12)[:, None], np.fft.rfftfreq(12)
+    assert power.shape == (12, 7)
+    assert power.mean() == pytest.approx(1, rel=1e-5)
+    assert power[3, 2] / power[1, 5] == pytest.approx(
+        (fy[1, 0] ** 2 + fx[5] ** 2 + (0.5 / 12) ** 2) / (fy[3, 0] ** 2 + fx[2] ** 2 + (0.5 / 12) ** 2), rel=1e-5
+    )
+
+
+def test_the_optics_loss_is_minus_log_information_and_a_hinge_on_the_energy():
+    """Whittle's information by numpy over steps of 2 and 3 mm, in 1/mm²; energy within two samples of the middle."""
+    psfs = RNG.uniform(0, 1, (3, 8, 8)) ** 2
+    psfs *= np.array([0.7, 0.55, 0.8])[:, None, None] / psfs.sum((1, 2), keepdims=True)
+    made = SimpleNamespace(intensity=torch.from_numpy(psfs), depths_um=torch.tensor([18e3, 20e3, 23e3]).double())
+    settings = SimpleNamespace(sample_um=1.3)
+    fy, fx = np.fft.fftfreq(8)[:, None], np.fft.fftfreq(8)
+    power = 1 / (fy**2 + fx**2 + (0.5 / 8) ** 2)
+    power = power / power[:, :5].mean()
+    logs = np.log(np.abs(np.fft.fft2(psfs)) ** 2 * power + 1e-3)
+    told = [0.5 * (((logs[k + 1] - logs[k]) / gap) ** 2).sum() for k, gap in ((0, 2.0), (1, 3.0))]
+    place = np.arange(8) - 3.5
+    inside = np.clip(2 + 0.5 - np.hypot(place[:, None], place), 0, 1)
+    share = (psfs * inside).sum((1, 2))
+    energy = float(np.sort(share)[1]) + 0.01  # two of three are below
+    want = -np.mean(np.log(np.array(told) + 0.05)) + 50 * np.maximum(energy - share, 0).mean()
+    assert float(formation.depth_loss(made, settings, energy=energy)) == pytest.approx(want, rel=1e-5)
