@@ -149,3 +149,9 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert "give --force" in capsys.readouterr().err
     assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
     assert "is no run folder" in capsys.readouterr().err
+
+
+def test_places_that_cover_a_plane_are_each_the_farthest_from_all_before():
+    places = np.array([[0.0, 0.0], [1.0, 0.2], [9.0, 1.0], [8.0, 7.0], [0.5, 6.0], [4.6, 3.6]])
+    assert experiment.spread(places, 5, first=1).tolist() == [1, 3, 2, 4, 5]
+    assert experiment.spread(places, 1, first=4).tolist() == [4]

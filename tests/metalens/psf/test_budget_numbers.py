@@ -1,0 +1,90 @@
+"""Terms of a PSF's error added as they should be, and the model's own terms by plain quadrature."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy import integrate, special
+
+from metalens.psf import budget
+from metalens.psf.budget import Budget
+
+NAN = math.nan
+
+
+def test_terms_add_as_squares_and_unknown_ones_not_at_all():
+    one = Budget(0.02, 0.03, 0.06, polarisation=0.1, angle=0.2, glass=NAN, neighbours=0.2, outside=0.5)
+    assert one.computed == pytest.approx(0.07, rel=1e-12)
+    assert one.model == pytest.approx(0.3, rel=1e-12)
+    assert one.total == pytest.approx(math.hypot(0.07, 0.3), rel=1e-12)
+    assert Budget(0.02).model == 0
+    assert Budget(0.02).total == 0.02
+    assert dataclasses.replace(one, glass=0.4).model == pytest.approx(0.5, rel=1e-12)
+
+
+def test_the_worst_budget_takes_the_largest_of_every_term():
+    made = budget.worst([Budget(0.2, 0.01, angle=0.5), Budget(0.1, 0.04, 0.3, glass=0.2), Budget(0.15, angle=0.1)])
+    assert (made.numerical, made.sampling, made.spectrum, made.angle, made.glass) == (0.2, 0.04, 0.3, 0.5, 0.2)
+    assert math.isnan(made.polarisation)
+
+
+def test_the_line_for_a_person_names_what_is_known():
+    words = Budget(0.02, outside=0.123).text
+    assert words.startswith("error by cause: numerical 2.0e-02, sampling 0.0e+00, spectrum 0.0e+00; of the device 2.0e")
+    assert words.endswith("; 12.3% of the light falls beside the window")
+    assert "glass" not in words
+
+
+def radial(aperture, at, bessel, of):
+    """Integral over the sines of a perfect lens, by adaptive quadrature."""
+    return integrate.quad(lambda p: of(p) * special.jv(bessel, p * at) * p, 0, aperture, limit=400)[0]
+
+
+def apart(one, other, radius):
+    """Relative L2 distance of two radial PSFs of sum 1 over the plane."""
+    one, other = one / (one @ radius), other / (other @ radius)
+    return math.sqrt((one - other) ** 2 @ radius / (other**2 @ radius))
+
+
+def test_the_models_own_terms_are_integrals_over_the_aperture():
+    """1 / (1 - p²) dp² is the solid angle twice over; vectors: √cos θ (1 ± cos θ), sin θ of Richards and Wolf."""
+    aperture = 0.61
+    radius = np.linspace(0, 30 / aperture, 240)
+
+    def cosine(p):
+        return math.sqrt(1 - p * p)
+
+    def factor(p):
+        return 1 - 0.28j * p - 0.55 * p * p
+
+    plain = np.array([radial(aperture, r, 0, lambda p: 1 / (1 - p * p)) for r in radius])
+    crowd = np.array(
+        [
+            complex(
+                radial(aperture, r, 0, lambda p: factor(p).real / (1 - p * p)),
+                radial(aperture, r, 0, lambda p: factor(p).imag / (1 - p * p)),
+            )
+            for r in radius
+        ]
+    )
+    parts = [
+        np.array([radial(aperture, r, n, lambda p, of=of: of(p) / (1 - p * p) / math.sqrt(cosine(p))) for r in radius])
+        for n, of in ((0, lambda p: 1 + cosine(p)), (1, lambda p: p), (2, lambda p: 1 - cosine(p)))
+    ]
+    vector = parts[0] ** 2 + 2 * parts[1] ** 2 + parts[2] ** 2
+    want = apart(plain**2, vector, radius)
+    assert budget.scalar_error(aperture) == pytest.approx(want, rel=1e-6)
+    made = budget.with_model(
+        Budget(0.01), aperture=aperture, vector=False, incidence_rad=0.2, has_angles=False, ghost=0.07
+    )
+    assert made.polarisation == pytest.approx(want, rel=1e-6)
+    assert made.neighbours == pytest.approx(apart(np.abs(crowd) ** 2, plain**2, radius), rel=1e-6)
+    assert made.angle == pytest.approx(2.5 * math.sin(0.2) ** 2, rel=1e-12)
+    assert (made.glass, made.numerical) == (0.07, 0.01)
+    exact = budget.with_model(
+        Budget(0.01), aperture=aperture, vector=True, incidence_rad=0.9, has_angles=True, ghost=0.0
+    )
+    assert (exact.polarisation, exact.angle) == (0.0, 0.0)
+    wide = budget.with_model(Budget(0.01), aperture=0.1, vector=True, incidence_rad=1.2, has_angles=False, ghost=0.0)
+    assert wide.angle == 1.0
