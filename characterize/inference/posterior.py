@@ -89,8 +89,11 @@ class Valley:
         return np.asarray(np.clip(x, self.prior.low, self.prior.high))
 
     def bend(self, i: int) -> float:
-        """Sigma by which images 2 sigma to either side miss the parabola's prediction."""
-        ends = [self.residual(self.inside(self.mode + sign * 2 * self.along(i))) for sign in (1, -1)]
+        """Sigma by which images 2 sigma to either side miss the parabola's prediction; inf where a bound lies nearer."""
+        places = [self.mode + sign * 2 * self.along(i) for sign in (1, -1)]
+        if any((self.inside(x) != x).any() for x in places):
+            return math.inf
+        ends = [self.residual(x) for x in places]
         return float(np.linalg.norm((ends[0] + ends[1]) / 2 - self.bottom))
 
     def descend(

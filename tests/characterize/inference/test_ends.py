@@ -1,0 +1,187 @@
+"""What the tests on straight models cannot tell: bent valleys to their ends, draws, weights of outliers, priors."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference import explore, posterior, search, verdict
+from characterize.inference.leastsquares import Data, Prior, Settings, fit
+from characterize.inference.posterior import REACH, Valley, profile
+from characterize.model import PARAMETERS, PLACE, Known
+
+RNG = np.random.default_rng(21)
+SHAPES = np.array([[[[0.43, -0.17, 0.28]]], [[[0.05, 0.4, -0.17]]]])  # (parameter, frame, y, x)
+NOISE = 0.7
+
+
+def seen(images):
+    everywhere = np.ones(images.shape, bool)
+    return Data(images, everywhere, ~everywhere, np.full(images.shape, NOISE**2), np.full(images.shape, 1e15))
+
+
+def bent(x, jacobian):
+    """The first parameter acts as e^x: its valley is a parabola in e^x, and far from one in x."""
+    image = math.exp(x[0]) * SHAPES[0] + x[1] * SHAPES[1]
+    return image, np.stack([math.exp(x[0]) * SHAPES[0], SHAPES[1]]) if jacobian else None
+
+
+@pytest.mark.parametrize("top", [4.0, 1.8])
+def test_ends_of_a_bent_valley_are_those_of_what_is_straight_in_the_data(top):
+    """e^x is known to ± 1.96 sigma, the second amplitude fitted along: x to its logarithm; a bound cuts it."""
+    truth = np.array([1.5, 0.6])
+    data = seen(bent(truth, False)[0])
+    columns = SHAPES.reshape(2, -1).T
+    reach = REACH * NOISE * math.sqrt(np.linalg.inv(columns.T @ columns)[0, 0])
+    middle = math.exp(1.5)
+    assert 0.5 < reach / middle < 0.7  # ends far from alike
+    low, high = math.log(middle - reach), math.log(middle + reach)
+    prior = Prior(np.zeros(2), np.full(2, np.inf), np.array([-9.0, -99.0]), np.array([top, 99.0]))
+    found, better = profile(Valley(bent, data, truth, prior), 0)
+    assert better is None
+    assert not found.parabolic
+    # a search ends within 0.08 of the root of the rise, 4 % of it, and goes the rest by proportion
+    assert found.low == pytest.approx(low, abs=0.05 * (1.5 - low))
+    assert found.high == pytest.approx(min(high, top), abs=0.05 * (high - 1.5))
+    for value, rise in zip(found.value, found.rise, strict=True):
+        want = ((math.exp(value) - middle) / (reach / REACH)) ** 2
+        assert rise == pytest.approx(want, abs=0.05 * max(want, 0.4))  # descents end within 0.02
+
+
+def test_along_a_valley_the_rest_goes_with_the_covariance():
+    """One sigma of the first parameter moves it by sigma and raises the parabola by 1; nothing cheaper does."""
+    valley = Valley(bent, seen(bent(np.array([1.5, 0.6]), False)[0]), np.array([1.5, 0.6]), Prior.none(np.zeros(2)))
+    for i in (0, 1):
+        step = valley.along(i)
+        assert step[i] == pytest.approx(valley.sigma[i], rel=1e-9)
+        information = np.linalg.inv(valley.covariance)
+        assert step @ information @ step == pytest.approx(1, rel=1e-9)
+        assert (information @ step)[1 - i] == pytest.approx(0, abs=1e-9 * abs(information).max())
+
+
+def fake(sigma, rho, least, common=0.0):
+    covariance = np.array([[1, rho], [rho, 1]]) * np.outer(sigma, sigma)
+    shared = common * covariance
+    return SimpleNamespace(sigma=np.array(sigma), covariance=covariance, least=least, calibration=lambda: shared)
+
+
+def test_modes_far_up_are_weighed_without_leaving_the_range_of_numbers():
+    valleys = [fake((0.7, 2.1), 0.6, 4000.0), fake((0.7, 2.1), 0.6, 4003.0), fake((0.7, 2.1), 0.6, 9e4)]
+    ratio = math.exp(-1.5)
+    assert posterior.shares(valleys) == pytest.approx([1 / (1 + ratio), ratio / (1 + ratio), 0], rel=1e-9)
+
+
+def test_of_two_lenses_the_covariance_has_the_intervals_and_the_correlation_of_the_draws(monkeypatch):
+    """Sigma is the whole interval over 2 x 1.96; correlations of the draws, a fifth of the best parabola's."""
+    best = SimpleNamespace(value=np.array([1.0, 2.0]), merit=50.0, chi2_per_dof=0.8)
+    other = SimpleNamespace(value=np.array([1.6, -9.0]), merit=50.9, chi2_per_dof=0.8)
+    valleys = [fake((0.7, 2.1), 0.6, 50.0), fake((0.9, 0.5), -0.2, 50.9)]
+    prior = SimpleNamespace(low=np.array([-50.0, -9.3]), high=np.array([99.0, 99.0]))
+    about = SimpleNamespace(names=("bias_nm", "background_e"), prior=prior)
+    drawn = RNG.normal(0, 1, (posterior.DRAWS, 2)) @ np.array([[1.0, 0.5], [0, 3.0]])
+    monkeypatch.setattr(posterior, "draws", lambda given: drawn if given == valleys else None)
+    found = explore._joined(about, [best, other], valleys, {})
+    clipped = np.clip(drawn, prior.low, prior.high)
+    assert found.draws == pytest.approx(clipped)
+    sigma = (found.high - found.low) / (2 * 1.959964)
+    correlation = 0.8 * np.corrcoef(clipped.T)[0, 1] + 0.2 * 0.6
+    want = np.array([[sigma[0] ** 2, correlation * sigma.prod()], [correlation * sigma.prod(), sigma[1] ** 2]])
+    assert found.covariance == pytest.approx(want, rel=1e-6)
+    assert found.share == pytest.approx(posterior.shares(valleys))
+    shared = [fake((0.7, 2.1), 0.6, 50.0, common=0.5), valleys[1]]
+    monkeypatch.setattr(posterior, "draws", lambda given: np.zeros((posterior.DRAWS, 2)))
+    spread = explore._joined(about, [best, other], shared, {}).draws  # of the calibration alone
+    assert np.cov(spread.T)[0, 0] == pytest.approx(0.5 * 0.49, rel=6 * math.sqrt(2 / posterior.DRAWS))
+    assert np.corrcoef(spread.T)[0, 1] == pytest.approx(0.6, abs=4 / math.sqrt(posterior.DRAWS))
+
+
+def test_a_parameter_that_no_draw_moves_leaves_a_regular_covariance():
+    drawn = np.column_stack([RNG.normal(0, 2.0, 50), np.full(50, 3.0)])
+    got = explore._covariance(drawn, fake((0.7, 2.1), 0.6, 0.0), np.array([0.31, 5.3]))
+    assert got == pytest.approx(np.array([[0.31**2, 0.12 * 0.31 * 5.3], [0.12 * 0.31 * 5.3, 5.3**2]]), rel=1e-9)
+
+
+def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch):
+    """Images 1 + a q of a picture at right angles, a normal about 0.7 with sigma 0.3; nothing leaves the bounds."""
+    bright, picture = np.zeros((1, 2, 4)), np.zeros((1, 2, 4))
+    bright[0, 0], picture[0, 1] = 2.0, 1.7
+
+    def problem(model, names, start):
+        return lambda x, jacobian: (bright + x[0] * picture + x[1] * 100, None)
+
+    monkeypatch.setattr(explore.residual, "problem", problem)
+    monkeypatch.setattr(explore, "between", lambda model: model)
+    monkeypatch.setattr(explore, "_SHOWN", 4000)
+    wide = np.full(2, np.inf)
+    covariance = np.diag([0.09, 4.0])
+    prior = Prior(np.zeros(2), wide, -wide, wide)
+    about = SimpleNamespace(model=None, names=("bias_nm", "background_e"), prior=prior, start=None)
+    best = SimpleNamespace(value=np.array([0.7, 5.0]))
+    found = SimpleNamespace(draws=np.empty((0, 2)), covariance=covariance, best=best)
+    angle = np.arctan2(RNG.normal(0.7, 0.3, 10**6) * 1.7, 2.0) - math.atan2(0.7 * 1.7, 2.0)
+    want = math.sqrt(np.mean(np.sin(angle) ** 2))
+    # 4000 draws of a square: 1.1 % of its root
+    assert explore.predicted_error(about, found) == pytest.approx((want, want), rel=0.05)
+    about.prior = Prior(np.zeros(2), wide, np.array([0.7, -9.0]), np.array([0.7, 9.0]))
+    assert explore.predicted_error(about, found) == pytest.approx((0, 0), abs=1e-12)
+
+
+def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not_at_all():
+    """One amplitude; residuals from the value found, weights min(1, h / |r|)."""
+    shape, sigma = RNG.uniform(0.5, 1.5, (2, 5, 4)), RNG.uniform(1.5, 3.0, (2, 5, 4))
+    image = 90.0 * shape + sigma * RNG.standard_normal(shape.shape)
+    image[0, 1, 2] += 25 * sigma[0, 1, 2]
+    image[1, 0, 0] -= 12 * sigma[1, 0, 0]
+    usable, full = np.ones(shape.shape, bool), np.zeros(shape.shape, bool)
+    usable[0, 4, 3], full[1, 2, 2], full[1, 3, 1] = False, True, True
+    image[1, 2, 2], image[1, 3, 1] = 40.0, 90 * shape[1, 3, 1] + 4 * sigma[1, 3, 1]  # brighter than it, or not yet
+    data = Data(image, usable, full, sigma**2, np.full(shape.shape, 1e15))
+    found = fit(
+        lambda x, slopes: (x[0] * shape, shape[None] if slopes else None), data, np.array([80.0]),
+        settings=Settings(huber=3.0, step_tolerance=1e-9),
+    )  # fmt: skip
+    left = (image - found.value[0] * shape) / sigma
+    weight = np.minimum(1, 3 / np.abs(left)) * usable
+    weight[1, 2, 2] = 0.0
+    assert left[1, 3, 1] > 3  # a full pixel that the model falls short of counts
+    assert found.information[0, 0] == pytest.approx((weight * shape**2 / sigma**2).sum(), rel=1e-6)
+    assert (weight * shape / sigma * left).sum() == pytest.approx(0, abs=1e-4 * (weight * shape / sigma).sum())
+
+
+def test_metrology_with_an_error_takes_the_place_of_what_is_usual():
+    names = ("bias_nm", "height_nm", "distance_um", "background_e")
+    known = {"bias_nm": Known("bias_nm", 3.1, 0.7), "height_nm": Known("height_nm", -4.2, 0.0)}
+    got = search.prior_of(names, known, 1800.0)
+    table = [PARAMETERS[PLACE[name]] for name in names]
+    assert got.mean.tolist() == [3.1, -4.2, table[2].start, table[3].start]
+    assert got.sigma.tolist() == [0.7, table[1].sigma, table[2].sigma, table[3].sigma]
+    assert (got.low[2], got.high[2]) == (max(table[2].low, -450.0), min(table[2].high, 450.0))
+    assert (got.low[0], got.high[0]) == (table[0].low, table[0].high)
+
+
+def test_reversed_starts_turn_biases_beyond_their_sigma_and_take_the_rest_along():
+    """A Gaussian with the reversed ones held at minus their value has its mean where the others go."""
+    names = [n for n in search._REVERSED if n in PLACE][:2]
+    names = (names[0], "background_e", names[1], "log_gain")
+    mixed = RNG.standard_normal((4, 4))
+    covariance = mixed @ mixed.T + 0.5 * np.eye(4)
+    sigma = np.sqrt(np.diag(covariance))
+    value = np.array([1.4 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
+    wide = np.full(4, 1e9)
+    about = SimpleNamespace(names=names, prior=Prior(np.zeros(4), wide, -wide, wide))
+    got = search.reversals(about, SimpleNamespace(value=value, covariance=covariance))
+    assert len(got) == 3  # each alone, and both
+    for start, some in zip(got, ([0], [2], [0, 2]), strict=True):
+        rest = [i for i in range(4) if i not in some]
+        gain = covariance[np.ix_(rest, some)] @ np.linalg.inv(covariance[np.ix_(some, some)])
+        assert start[some] == pytest.approx(-value[some])
+        assert start[rest] == pytest.approx(value[rest] + gain @ (-2 * value[some]))
+    value = np.array([0.9 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
+    assert len(search.reversals(about, SimpleNamespace(value=value, covariance=covariance))) == 1
+
+
+def test_chance_of_a_misfit_is_that_of_the_pixels_that_count():
+    left = np.array([0.3, 0.0, -1.2, 0.0, 0.7, 2.0, -0.1])
+    assert verdict.chance_of(SimpleNamespace(residual_sigma=left)) == pytest.approx(math.sqrt(2 / 5))
+    assert verdict.chance_of(SimpleNamespace(residual_sigma=np.zeros(4))) == pytest.approx(math.sqrt(2))
