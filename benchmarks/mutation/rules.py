@@ -159,7 +159,7 @@ def _constant(value: float) -> Iterator[tuple[str, str]]:
             yield "constant", str(value - 1)
     elif value in (1e-3, 1e3, 1e6, 1e-6, 1e-9, 1e9):
         yield "unit", "1.0"
-    elif value:
+    elif 1e-12 < abs(value) < 1e12:  # beyond: guards against 0 and infinity, of no particular size
         yield "constant", repr(value * 2)
         yield "constant", repr(value / 2)
 

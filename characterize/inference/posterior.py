@@ -89,7 +89,7 @@ class Valley:
         return np.asarray(np.clip(x, self.prior.low, self.prior.high))
 
     def bend(self, i: int) -> float:
-        """Sigma by which images 2 sigma to either side miss the parabola's prediction; inf where a bound lies nearer."""
+        """Sigma by which images 2 sigma to either side miss the parabola's prediction; inf with a bound between."""
         places = [self.mode + sign * 2 * self.along(i) for sign in (1, -1)]
         if any((self.inside(x) != x).any() for x in places):
             return math.inf

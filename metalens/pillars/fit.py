@@ -219,7 +219,7 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
 def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson 1961: weights times
     deviation)."""
-    weight = np.full(values.shape, 1 / values.shape[-1])
+    weight = np.ones(values.shape)
     best, least = np.zeros((*values.shape[:-1], basis.shape[1])), np.full(values.shape[:-1], np.inf)
     for _ in range(rounds):
         root = np.sqrt(weight)[..., None]

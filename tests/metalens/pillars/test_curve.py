@@ -54,3 +54,12 @@ def test_a_steep_place_carries_more_of_the_solver_s_shift():
     _, error = curve(np.array([0.25]))
     shift = max(1e-4 / steep(0.1), 5e-4 / steep(0.4))
     assert error[0] == pytest.approx(1e-4 + shift * steep(0.25), rel=1e-3)
+
+
+def test_each_place_takes_the_larger_error_of_its_own_two_neighbours():
+    """Errors fall and rise from node to node; the curve is straight, so that they are carried as they are."""
+    solved = np.array([0.10, 0.20, 0.28, 0.34, 0.40])
+    nodes = Nodes(solved, BEST(solved), np.array([9e-4, 2e-4, 7e-4, 1e-4, 5e-4]), np.ones(5), True, "met")
+    at = np.array([0.15, 0.24, 0.31, 0.39])
+    _, error = Curve(nodes, BEST, (BEST,), 2e-3)(at)
+    assert error == pytest.approx(3e-5 + 2e-4 + np.array([9e-4, 7e-4, 7e-4, 5e-4]), rel=1e-5)

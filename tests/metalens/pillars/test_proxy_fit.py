@@ -176,3 +176,45 @@ def test_a_candidate_that_turns_negative_between_entries_is_passed_over():
     with pytest.raises(DomainError, match="sweep with more samples") as refused:
         proxy_fit.fit(made, Wanted(least_transmission=0.05))
     assert "fit it again" not in str(refused.value)  # what the proxy says of its coefficients is no advice to a user
+
+
+class Stated:
+    """A proxy of typed errors; its phase turns back at one wavelength."""
+
+    wavelengths_um, max_angle_rad = (0.8, 0.9), 0.2
+
+    def __init__(self, phase, level, bad=None):
+        self.max_phase_error_rad, self.max_transmission_error, self.bad = phase, level, bad
+
+    def monotone(self, wavelength, angle):
+        return (wavelength, angle) != self.bad
+
+
+def test_a_fit_costs_its_larger_error_in_units_of_the_tolerance():
+    wanted = Wanted(phase_tolerance_rad=4e-3, transmission_tolerance=0.05)
+    assert proxy_fit._cost(Stated(6e-3, 0.01), wanted) == pytest.approx(1.5)
+    assert proxy_fit._cost(Stated(6e-3, 0.1), wanted) == pytest.approx(2.0)
+    assert proxy_fit._meets(Stated(4e-3, 0.05), wanted)
+    assert not proxy_fit._meets(Stated(4.01e-3, 0.01), wanted)
+    for bad in ((0.8, 0.0), (0.9, 0.2), (0.8 / 2 + 0.9 / 2, 0.2)):
+        assert proxy_fit._cost(Stated(1e-3, 0.01, bad), wanted) == math.inf
+
+
+def test_the_least_largest_deviation_is_chebyshevs():
+    """x³ by parabolas errs by 1/4, x⁴ by cubics by 1/8 (its own polynomials); on points as dense as the samples are."""
+    x = np.cos(math.pi * (np.arange(60) + 0.5) / 60)
+    for power, least in ((3, 1 / 4), (4, 1 / 8)):
+        basis = np.polynomial.chebyshev.chebvander(x, power - 1)
+        found = proxy_fit._lawson(basis, np.stack([x**power, -2 * x**power]), rounds=200)
+        off = np.abs(found @ basis.T - np.stack([x**power, -2 * x**power])).max(1)
+        assert off == pytest.approx([least, 2 * least], rel=0.02)  # weights settle as 1 / rounds
+        plain = np.abs(basis @ np.linalg.lstsq(basis, x**power, rcond=None)[0] - x**power).max()
+        assert plain > 0.9 * least
+
+
+def test_errors_of_phase_and_transmission_stand_each_in_its_place():
+    made = proxy.fit(synthetic(), Wanted(coefficients=8, phase_tolerance_rad=0.3, transmission_tolerance=0.1))
+    phase, level = errors(made, (0.85,), (0.0,))
+    assert made.max_phase_error_rad == pytest.approx(phase, rel=0.1)  # between the samples
+    assert made.max_transmission_error == pytest.approx(level, rel=0.1)
+    assert abs(phase / level - 1) > 0.3
