@@ -1,0 +1,252 @@
+"""The table of causes in closed form: maps over the lens, derivatives of pillars, drawn lenses, t under a change."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from metalens.cell import Cell, Index
+from metalens.made import causes, response
+from metalens.made.causes import CAUSES, Answers, Bends, Guide, Widens
+from metalens.made.response import Answer, Sensitivity
+from metalens.made.solved import Solved
+from metalens.made.spread import DRAWN, Draw, Spread, draws
+from metalens.made.state import State
+
+RNG = np.random.default_rng(17)
+U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
+
+
+def test_biases_over_the_lens_by_hand():
+    """10, -4, 7, 3, 2, -5 nm of: all, x, y, bow, saddle, oblique saddle; in um at three places off every axis."""
+    names = ("bias_nm", "bias_x_nm", "bias_y_nm", "bias_r_nm", "bias_a_nm", "bias_o_nm")
+    made = State.of(dict(zip(names, (10.0, -4.0, 7.0, 3.0, 2.0, -5.0), strict=True)))
+    bow = 0.5 * (2 * (U**2 + V**2) - 1)
+    want = 10 - 4 * U + 7 * V + 3 * bow + 2 * (U**2 - V**2) - 5 * 2 * U * V
+    assert made.bias_um(U, V) == pytest.approx(want * 1e-3, rel=1e-12)
+    assert made["bias_y_nm"] == 7.0
+    assert not made.bends()
+    assert not made.phase_rad(U, V).any()
+    assert causes.maps(Widens, U, V)[1] == pytest.approx(1e-3 * U, rel=1e-12)
+    assert causes.named(Widens) == names
+
+
+def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
+    """Against cosines and sines of the angle; orthogonal over the disc with piston, tilt and focus."""
+    radius, angle = np.hypot(U, V), np.arctan2(V, U)
+    want = [
+        math.sqrt(6) * radius**2 * np.cos(2 * angle),
+        math.sqrt(6) * radius**2 * np.sin(2 * angle),
+        math.sqrt(8) * (3 * radius**3 - 2 * radius) * np.cos(angle),
+        math.sqrt(8) * (3 * radius**3 - 2 * radius) * np.sin(angle),
+        math.sqrt(8) * radius**3 * np.cos(3 * angle),
+        math.sqrt(8) * radius**3 * np.sin(3 * angle),
+        math.sqrt(5) * (6 * radius**4 - 6 * radius**2 + 1),
+    ]
+    assert causes.maps(Bends, U, V) == pytest.approx(np.array(want), rel=1e-9)
+    x, w = np.polynomial.legendre.leggauss(8)
+    r, turn = np.sqrt((x + 1) / 2)[:, None], np.arange(16) * math.pi / 8 + 0.1
+    u, v, weight = r * np.cos(turn), r * np.sin(turn), np.repeat(w / 2 / 16, 16)
+    basis = np.concatenate([np.stack([np.ones_like(u), 2 * u, 2 * v]), causes.maps(Bends, u, v)]).reshape(10, -1)
+    assert basis * weight @ basis.T == pytest.approx(np.eye(10), abs=1e-9)
+    made = State.of({"coma_y_rad": 0.3, "trefoil_x_rad": -0.2})
+    assert made.phase_rad(U, V) == pytest.approx(0.3 * want[3] - 0.2 * want[4], rel=1e-9)
+    assert made.bends()
+
+
+def test_answers_travel_in_micrometres_radians_and_one():
+    made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9})
+    assert made.answers() == pytest.approx([-7e-3, 0.013, math.radians(0.9)], rel=1e-12)
+
+
+def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
+    """b(V) = 1 - exp(-V²), V the normalised frequency: n_eff² = around² + b (n² - around²)."""
+    contrast = n**2 - around**2
+    return np.sqrt(around**2 + (1 - np.exp(-((k * d / 2) ** 2) * contrast / 9)) * contrast)
+
+
+def test_quick_derivatives_are_those_of_guides_of_one_mode():
+    """By differences of exp(i k n_eff h): height, index (b of D √(n² - around²)) and a wall that leans about half height."""
+    d, h, n, wall, k = np.array([0.11, 0.17, 0.23]), 0.62, 3.1, math.radians(2.5), 2 * math.pi / 0.85
+    step = 1e-4
+    up, down = effective(d + step, n), effective(d - step, n)
+    here = effective(d, n)
+    guide = Guide(k, d, here, (up - down) / (2 * step), (up - 2 * here + down) / step**2, n, 1.3, h, wall)
+    rows = {row.name: row.acts.quick(guide) for _, row in causes.of_kind(Answers)}
+    assert rows["height_nm"] == pytest.approx(1j * k * here, rel=1e-9)
+    by_index = (effective(d, n + 1e-5) - effective(d, n - 1e-5)) / 2e-5
+    assert rows["index"] == pytest.approx(1j * k * h * by_index, rel=1e-5)
+    z = (np.arange(400) + 0.5) / 400 * h - h / 2  # a frustum: D + 2 z tan(wall), to second order in the wall
+
+    def phase(lean):
+        at = d[:, None] + 2 * z * lean
+        second = guide.effective[:, None] + (at - d[:, None]) * guide.slope[:, None]
+        return k * (second + (at - d[:, None]) ** 2 / 2 * guide.curvature[:, None]).mean(1) * h
+
+    by_wall = (phase(wall + 1e-4) - phase(wall - 1e-4)) / 2e-4
+    assert rows["sidewall_deg"] == pytest.approx(1j * by_wall, rel=1e-4)
+
+
+def test_changed_cells_have_so_much_more_of_the_cause():
+    cell = Cell(0.4, 0.6, Index(3.1, 0.02), sidewall_rad=0.03)
+    rows = {row.name: row.acts.changed(cell, 0.011, 0.85) for _, row in causes.of_kind(Answers)}
+    assert rows["height_nm"].height_um == pytest.approx(0.611)
+    assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx((3.111, 0.02))
+    assert rows["sidewall_deg"].sidewall_rad == pytest.approx(0.041)
+
+
+def test_a_drawn_gradient_points_in_its_own_direction():
+    """From edge to edge: half of it from the axis to the rim, cosine along x and sine along y."""
+    made = Draw({"gradient_nm": 5.0, "bow_nm": -2.0, "height_nm": 6.0}, 0.7).state()
+    assert made["bias_x_nm"] == pytest.approx(2.5 * math.cos(0.7))
+    assert made["bias_y_nm"] == pytest.approx(2.5 * math.sin(0.7))
+    assert (made["bias_r_nm"], made["height_nm"], made["bias_nm"]) == (-2.0, 6.0, 0.0)
+
+
+def test_lenses_are_drawn_with_the_stated_sigma_and_in_all_directions():
+    sigma = {"bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 0.0, "height_nm": 7.0, "index": 0.013, "sidewall_deg": 0.4}
+    assert set(sigma) == set(DRAWN)
+    lenses = draws(Spread(**sigma), 4000, seed=3)
+    for name, want in sigma.items():
+        values = np.array([lens.amounts[name] for lens in lenses])
+        assert values.std() == pytest.approx(want, rel=0.05)  # 1 / sqrt(8000) is 1.1 %
+        assert abs(values.mean()) <= 4 * want / math.sqrt(4000)
+    turns = np.array([lens.turn_rad for lens in lenses])
+    assert np.histogram(turns, 8, (0, 2 * math.pi))[0] == pytest.approx(np.full(8, 500), abs=100)  # sigma 21
+    assert Spread.only(bow_nm=1.5).values() == dict.fromkeys(DRAWN, 0.0) | {"bow_nm": 1.5}
+    usual = Spread().values()
+    assert usual == {
+        "bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 2.0, "height_nm": 7.0, "index": 0.02, "sidewall_deg": 0.5,
+    }  # fmt: skip
+
+
+def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_for():
+    rows = np.array([[1.0, -2.0 + 1j, 3.0], [0.5j, 4.0, -1.0]])
+    made = Sensitivity(rows, 0.2, low_um=0.1, high_um=0.35)
+    for d in (0.14, 0.31):
+        o = d - 0.2
+        assert made.at(np.array([d]))[:, 0] == pytest.approx([*(r[0] + r[1] * o + r[2] * o * o for r in rows), 0])
+    for d, edge in ((0.05, 0.1), (0.5, 0.35)):
+        o = edge - 0.2
+        want = [r[0] + r[1] * o + r[2] * o * o + (d - edge) * (r[1] + 2 * r[2] * o) for r in rows]
+        assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx([*want, 0])  # the third cause is not there
+        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], 0])
+
+
+def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_series():
+    """Of two pillars: ln t by three causes, the middle one solved as 0.5 + 0.3 a - 2 a²; the proxy says 0.45."""
+    slopes = RNG.normal(size=(3, 2)) + 1j * RNG.normal(size=(3, 2))
+    slopes[1] = 0
+    flat = np.zeros((3, 3, 2), complex)
+    flat[:, 0] = 0.5, 0.6j
+    flat[1, 1:] = [[0.3, -0.2j], [-2.0, 1.0]]
+    proxy = np.array([0.45, 0.55j])
+    amounts = np.array([0.2, 0.07, -0.4])
+    made = Answer(slopes, flat, proxy)
+    row = flat[1, 0] + flat[1, 1] * 0.07 + flat[1, 2] * 0.07**2
+    plain = np.exp(0.2 * slopes[0] - 0.4 * slopes[2])
+    assert made.factor(amounts) == pytest.approx(plain * row / proxy, rel=1e-12)
+    assert made.factor(np.zeros(3)) == pytest.approx(flat[0, 0] / proxy, rel=1e-12)
+    rates = made.rates(amounts)
+    assert rates[[0, 2]] == pytest.approx(slopes[[0, 2]])
+    assert rates[1] == pytest.approx((flat[1, 1] + 2 * flat[1, 2] * 0.07) / row, rel=1e-12)
+    step = np.array([0, 1e-6, 0])
+    by_difference = np.log(made.factor(amounts + step) / made.factor(amounts - step)) / 2e-6
+    assert rates[1] == pytest.approx(by_difference, rel=1e-6)
+    assert Answer(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(plain, rel=1e-12)
+
+
+class Line:
+    """A proxy of straight phase and transmission."""
+
+    domain_um, wavelengths_um = (0.1, 0.3), (0.85, 0.85)
+
+    def phase_rad(self, d, wavelength, angle=0.0):
+        return 7.0 * d + 20 * d**2 + angle
+
+    def dphase_ddiameter(self, d, wavelength, angle=0.0):
+        return 7.0 + 40 * d
+
+    def transmission(self, d, wavelength, angle=0.0):
+        return 0.9 - d
+
+    def dtransmission_ddiameter(self, d, wavelength, angle=0.0):
+        return np.full_like(d, -1.0)
+
+
+def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
+    d = np.array([0.05, 0.2, 0.36, 1.2])
+    phase = np.array([7 * 0.1 + 20 * 0.01 - 0.05 * 11, 7 * 0.2 + 20 * 0.04, 7 * 0.3 + 1.8 + 0.06 * 19, 0.0]) + 0.1
+    level = np.array([0.85, 0.7, 0.54, 0.0])
+    got = response.designed(Line(), d, 0.85, angle_rad=0.1)
+    assert got[:3] == pytest.approx((level * np.exp(1j * phase))[:3], rel=1e-12)
+    assert got[3] == 0  # held within 0 and 1
+    rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
+    response_ = Sensitivity(rows, 0.2)
+    changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0]), angle_rad=0.1)
+    assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
+
+
+def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
+    """t of the middle cause solved over three diameters; its slope is not counted a second time."""
+    at = np.array([0.12, 0.18, 0.24, 0.28])
+    powers = np.zeros((3, 2, 4), complex)
+    powers[:, 0] = 0.8 * np.exp(1j * (7.2 * at + 19 * at**2))
+    powers[1, 1] = (3 + 2j) * at
+    solved = Solved(0.85, at, powers)
+    slopes = Sensitivity(np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved)
+    made = response.answer(Line(), slopes, np.array([0.18, 0.24]))
+    amounts = np.array([0.5, 0.02, -0.3])
+    want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
+    proxy = response.designed(Line(), at[1:3], 0.85)
+    assert made.factor(amounts) * proxy == pytest.approx(want * np.exp(0.15j - 0.03), rel=1e-9)
+    beyond = response.answer(Line(), slopes, np.array([0.3]))
+    end = response.designed(Line(), at[3:], 0.85)
+    assert beyond.factor(np.zeros(3)) == pytest.approx(powers[0, 0, 3:] / end, rel=1e-9)
+
+
+def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
+    """phase = k n_eff h; the thinnest: Rayleigh's cylinders across the field, of a fill of 5 %."""
+    cell = Cell(0.4, 0.6, Index(3.1), between=Index(1.2))
+    d = np.linspace(0.1, 0.3, 21)
+    made = response.guide(cell, Line(), 0.85, d)
+    k, fill = 2 * math.pi / 0.85, math.pi * 0.01 / 4 / 0.16
+    ratio = (3.1**2 - 1.44) / (3.1**2 + 1.44)
+    thin = 1.2 * math.sqrt((1 + fill * ratio) / (1 - fill * ratio))
+    want = thin + (7 * d + 20 * d**2 - 0.9) / (k * 0.6)
+    assert made.effective == pytest.approx(want, rel=1e-9)
+    assert made.slope == pytest.approx((7 + 40 * d) / (k * 0.6), rel=1e-6)
+    assert made.curvature == pytest.approx(np.full(21, 40 / (k * 0.6)), rel=1e-4)
+    assert (made.k, made.index, made.around, made.height_um) == pytest.approx((k, 3.1, 1.2, 0.6))
+
+
+def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
+    diameter = np.zeros((4, 5))
+    diameter[1:3, 1:4] = [[0.12, 0.2, 0.27], [0.15, 0.22, 0.31]]
+    lens = SimpleNamespace(
+        diameters=SimpleNamespace(diameter_um=diameter),
+        proxy=Line(),
+        cell=Cell(0.4, 0.6, Index(3.1)),
+        wavelength_um=0.85,
+    )
+    made = response.sensitivity(lens)
+    assert (made.low_um, made.high_um, made.error) == (0.12, 0.3, 0.5)  # of the lens, within the proxy's
+    d = np.linspace(0.12, 0.3, 61)
+    guide = response.guide(lens.cell, lens.proxy, 0.85, d)
+    for n, (_, row) in enumerate(causes.of_kind(Answers)):
+        assert made.at(d)[n] == pytest.approx(row.acts.quick(guide), rel=1e-3, abs=1e-6)
+
+
+def test_the_table_says_what_the_documents_say():
+    """Prior, bound and unit of the rows that a fit opens by default."""
+    rows = {row.name: (row.scale, row.sigma, row.low, row.high, row.unit, row.free) for row in CAUSES}
+    assert rows["bias_nm"] == (1.0, 15.0, -26.0, 26.0, 1e-3, True)
+    for name in ("bias_x_nm", "bias_y_nm", "bias_r_nm"):
+        assert rows[name] == (1.0, 10.0, -15.0, 15.0, 1e-3, True)
+    for name in ("bias_a_nm", "bias_o_nm"):
+        assert rows[name] == (1.0, 10.0, -15.0, 15.0, 1e-3, False)
+    assert rows["height_nm"] == (5.0, 10.0, -28.0, 28.0, 1e-3, True)
+    assert rows["index"] == (0.02, 0.02, -0.075, 0.075, 1.0, False)
+    assert rows["sidewall_deg"] == (0.3, 0.5, -1.6, 1.6, pytest.approx(math.pi / 180), False)
+    assert rows["coma_x_rad"] == (0.05, 1.0, -6.0, 6.0, 1.0, True)
