@@ -67,7 +67,7 @@ def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
 
 
 def test_quick_derivatives_are_those_of_guides_of_one_mode():
-    """By differences of exp(i k n_eff h): height, index (b of D √(n² - around²)) and a wall that leans about half height."""
+    """By differences of exp(i k n_eff h): height, index (b of D √(n² - n0²)), a wall about half height."""
     d, h, n, wall, k = np.array([0.11, 0.17, 0.23]), 0.62, 3.1, math.radians(2.5), 2 * math.pi / 0.85
     step = 1e-4
     up, down = effective(d + step, n), effective(d - step, n)
