@@ -45,7 +45,7 @@ def run(options: Options) -> int:
 
 
 def _plan(options: Options, path: Path) -> int:
-    target, wanted, design = options.output, config.load(path, Protocol), lenses.load(options.lens)
+    target, wanted, design = options.output, config.load(path, Protocol), lenses.load_plain(options.lens)
     with options.claim(target) as draft:
         found = protocol.plan(design, wanted, slopes(design))
         store.write_text(draft.path, _listed(found))
@@ -77,7 +77,7 @@ def _listed(found: Plan) -> str:
 def _shoot(options: Options, path: Path) -> int:
     target = options.output
     truth = config.load(path, Truth)
-    design = lenses.load(options.lens)
+    design = lenses.load_plain(options.lens)
     with options.claim_folder(target) as draft:
         shots = bench.shoot(design, truth, slopes(design, wanted=[k.name for k in truth.parameter if k.value]))
         _fill(draft.path, shots, truth, design)

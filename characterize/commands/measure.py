@@ -61,7 +61,7 @@ def run(options: Options) -> int:
 def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
     """Measure captures into the folder: numbers, text, and that all is well."""
     shots = captures.load(options.source)
-    design = lenses.load(options.design) if options.design else None
+    design = lenses.load_plain(options.design) if options.design else None
     found = frames.measure(shots, design=design, reference_e=options.reference_e)
     rows = [_plain(row) for row in found.frames]
     values: dict[str, object] = {
@@ -96,7 +96,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     laid: overlay.Overlay | None = None
     table: overlay.Table = []
     if options.design is not None:
-        laid = overlay.overlay(found, lenses.load(options.design).diameters)
+        laid = overlay.overlay(found, lenses.load_plain(options.design).diameters)
         table = overlay.bias_table(laid)
         found = overlay.numbered(found, laid)
     values = _summary(found, laid, table, pixel)

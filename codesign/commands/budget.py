@@ -57,7 +57,7 @@ def run(options: Options) -> int:
     target = options.output
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
-    made, given = lens.load(options.lens), _given(options)
+    made, given = lens.load_plain(options.lens), _given(options)
     with options.claim(target, beside=(".html", ".png")) as draft:
         rows = list(options.console.track(budget.entries(budget.bench(made, given)), total=9, label="links"))
         save(draft.path, rows, _provenance(options, given))

@@ -70,7 +70,7 @@ def run(options: Options) -> int:
     settings = Settings() if options.config is None else config.load(options.config, Settings)
     if options.scenes is not None:
         settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
-    made = [lenses.load(path) for path in options.lenses]
+    made = [lenses.load_plain(path) for path in options.lenses]
     names = distinct([path.stem for path in options.lenses])
     folder = options.output
     with options.claim_folder(folder) as draft:

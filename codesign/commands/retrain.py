@@ -74,7 +74,7 @@ def run(options: Options) -> int:
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
     retraining.check_image(source)
     result = asbuilt.load(options.asbuilt)
-    design = lens.load(options.run_dir / "lens.h5")
+    design = lens.load_plain(options.run_dir / "lens.h5")
     retraining.check_lens(design, result, insist=options.insist)
     truth = config.load(options.truth, Truth) if options.truth else None
     old = correction.present_bias(options.process)

@@ -59,6 +59,8 @@ def prepare(
     """As :func:`plan`, with everything that a report needs; ``with_doses``: with the correction of the process."""
     names.check(name)
     diameters = source.diameters if isinstance(source, Lens) else source
+    if not (diameters.plain and (not isinstance(source, Lens) or source.cell.round)):
+        raise ProcessError("a mask of other than round pillars on a square lattice is not drawn")
     pitch = pitch_units(diameters.pitch_um, process)
     found = cells.quantise(diameters, process)
     classes = _plain_classes(found.diameters_nm, process)

@@ -130,6 +130,16 @@ class Cell:
         )
 
     @property
+    def alike(self) -> bool:
+        """Whether light along x and along y meets the same cell at normal incidence: a turn of less than half does."""
+        turns = {"square": math.pi / 2, "hexagonal": math.pi / 3}
+        if self.lattice.kind not in turns:
+            return False
+        outline = self.shape.outline(self.pitch_um / 2)
+        step = turns[self.lattice.kind]
+        return outline.repeats(step) or (self.lattice.centred and outline.repeats(2 * step))
+
+    @property
     def described(self) -> str:
         """Shape, lattice and layers in words."""
         layers = f" in {len(self.layers)} layers" if self.layers else ""

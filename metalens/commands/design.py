@@ -2,7 +2,7 @@
 
 import importlib
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from metalens import design, lens, library
 from metalens.cell import Cell
 from metalens.commands.common import Common, Output
 from metalens.design import (
+    Conversion,
     Cubic,
     DoubleHelix,
     Focus,
@@ -30,7 +31,7 @@ from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
 from metalens.lens import Layers, check_gaps
 from metalens.lens import picture as lens_plot
-from metalens.pillars import Proxy
+from metalens.pillars import PillarLibrary
 
 MOST_SUMMED = 60_000_000  # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
@@ -51,6 +52,8 @@ class Design:
     layers: [[layers.front]] and [[layers.behind]] with material and thickness_um, in the order that the light meets
         them: films that the phase is corrected for; the gap behind the pillars is filled by the cell's cover.
     double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` chooses its own source distance.
+    hand: of the circular light that comes, where the library is for circular light: right (x + iy) or left. The phase
+        is then made by the turn of pillars of one size.
     """
 
     profile: Profile = "hyperbolic"
@@ -66,6 +69,7 @@ class Design:
     fisher: Fisher = field(default_factory=Fisher)
     map: PhaseMap | None = None
     layers: Layers = field(default_factory=Layers)
+    hand: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
         if not 0 < self.aperture_mm <= 10:
@@ -107,12 +111,15 @@ def run(options: Options) -> int:
     wanted = config.load(options.config, Design)
     target, read = options.output, _read(wanted, options.config)
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
-        quality, check, judged = _make(wanted, options, draft.path)
-    values, text = _values(quality, check), _text(target, wanted, quality, check)
-    if judged is not None:
-        values["fisher"], text = judged.values, f"{text}\n\n{judged.text}"
+        made = _make(wanted, options, draft.path)
+    values, text = _values(made.quality, made.check), _text(target, wanted, made.quality, made.check)
+    if made.conversion is not None:
+        values["circular"] = {"hand": wanted.hand, **asdict(made.conversion)}
+        text = f"{text}\n{_converted(made.conversion, made.quality, wanted.hand)}"
+    if made.judged is not None:
+        values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     options.console.result(values, text)
-    return 0 if check is None or check.passed else 1
+    return 0 if made.check is None or made.check.passed else 1
 
 
 def _read(wanted: Design, where: Path) -> list[Path]:
@@ -121,12 +128,13 @@ def _read(wanted: Design, where: Path) -> list[Path]:
     return ([where.parent / wanted.library] if wanted.library else []) + ([own.file] if own else [])
 
 
-def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusCheck | None, "_Judged | None"]:
+def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     """Design, check and write the lens with its pictures."""
-    cell, proxy, inputs = _pillars(wanted, options.config, options.console)
+    made_of, inputs = _pillars(wanted, options.config, options.console)
+    cell, proxy = made_of.cell, library.proxy_of(made_of)
     proxy.at(wanted.focus.wavelength_um)  # outside the library it is refused here, not after the search for a phase
     if options.process is not None:
-        wanted = replace(wanted, limits=_printable(options.process, cell))
+        wanted = replace(wanted, limits=_printable(options.process, cell, wanted.limits))
         inputs[options.process.name] = store.sha256(options.process)
     inputs[options.config.name] = store.sha256(options.config)
     wanted = replace(wanted, layers=_filled(wanted.layers, cell))
@@ -135,17 +143,14 @@ def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusC
         inputs[own.file.name] = store.sha256(own.file)
     radius_um = wanted.aperture_mm * 500
     phase, focus, judged = _phase(wanted, options, radius_um)
-    made, quality = design.make(
-        phase,
-        focus,
-        aperture_um=2 * radius_um,
-        cell=cell,
-        proxy=proxy,
-        limits=wanted.limits,
-        profile=wanted.profile,
-        provenance=store.Provenance(config=config.dumps(wanted), inputs=inputs),
-        accept_partial_turn=options.accept_partial_turn,
-    )
+    about: dict[str, Any] = {"aperture_um": 2 * radius_um, "limits": wanted.limits, "profile": wanted.profile}
+    about["provenance"] = store.Provenance(config=config.dumps(wanted), inputs=inputs)
+    conversion: Conversion | None = None
+    if made_of.turned is not None:
+        made, quality, conversion = design.make_turned(phase, focus, library=made_of, hand=wanted.hand, **about)
+    else:
+        partial = options.accept_partial_turn
+        made, quality = design.make(phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about)
     meets = wanted.profile != "map" or focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
     quality = replace(quality, focuses=meets)
     check = check_focus(made) if _checkable(wanted, options, quality) else None
@@ -153,7 +158,17 @@ def _make(wanted: Design, options: Options, path: Path) -> tuple[Quality, FocusC
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return quality, check, judged
+    return Outcome(quality, check, judged, conversion)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a design is worth. check: of its focus; judged: of a free form; conversion: of circular light."""
+
+    quality: Quality
+    check: FocusCheck | None
+    judged: "_Judged | None"
+    conversion: Conversion | None
 
 
 def _filled(layers: Layers, cell: Cell) -> Layers:
@@ -227,22 +242,20 @@ def _scene_objective(wanted: Design, radius_um: float) -> Any:
     return module.SceneObjective(design_pupil(wanted.focus, radius_um), wanted.fisher)
 
 
-def _pillars(wanted: Design, where: Path, console: Console) -> tuple[Cell, Proxy, dict[str, str]]:
-    """The pillar cell with its proxy, and the hash of the library file if there is one."""
+def _pillars(wanted: Design, where: Path, console: Console) -> tuple[PillarLibrary, dict[str, str]]:
+    """The library of the pillars, and the hash of its file if there is one."""
     if wanted.library is not None:
         path = where.parent / wanted.library
-        made = library.load(path)
-        return made.cell, library.proxy_of(made), {path.name: store.sha256(path)}
+        return library.load(path), {path.name: store.sha256(path)}
     cell = wanted.cell or library.DEFAULT_CELL
-    made = library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console)
-    return cell, library.proxy_of(made), {}
+    return library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console), {}
 
 
-def _printable(path: Path, cell: Cell) -> Limits:
+def _printable(path: Path, cell: Cell, limits: Limits) -> Limits:
     """The limits of a process file, through a package above this one that the command line names."""
     module = importlib.import_module(OBJECTIVES["process"])
     thinnest, gap = module.printable(path, pitch_um=cell.pitch_um, height_um=cell.height_um)
-    return Limits(min_diameter_nm=thinnest, min_gap_nm=gap)
+    return replace(limits, min_diameter_nm=thinnest, min_gap_nm=gap)
 
 
 def _located(wanted: Design, where: Path) -> PhaseMap | None:
@@ -263,6 +276,8 @@ def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
     else:
         values["wave_efficiency"] = quality.efficiency
     values |= {
+        "sampled_aperture": quality.sampled_aperture,
+        "steepest": quality.steepest,
         "transmission": quality.transmission,
         "strehl": quality.strehl,
         "max_phase_error_rad": quality.max_phase_error_rad,
@@ -286,6 +301,17 @@ def _cone(quality: Quality) -> list[str]:
     ]
 
 
+def _converted(found: Conversion, quality: Quality, hand: str) -> str:
+    """What becomes of circular light, in words."""
+    whole = quality.strehl * found.converted
+    return (
+        f"  {hand} circular light, pillars of {1e3 * found.size_um:.1f} nm: {found.converted:.3f} +- "
+        f"{found.converted_error:.2g} leaves with the other hand and the wanted phase ({whole:.3f} in the focus), "
+        f"{found.unconverted:.2g} +- {found.unconverted_error:.1g} with the same hand and no phase;\n"
+        f"  pillars are taken as turned alone, which is {found.isolated_error:.2g} of t off the solved lattice"
+    )
+
+
 def _films(layers: Layers) -> list[str]:
     """What the light passes beside the pillars."""
     found = []
@@ -306,6 +332,12 @@ def _text(target: Path, wanted: Design, quality: Quality, check: FocusCheck | No
         f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
         *_films(wanted.layers),
     ]
+    if quality.steepest > quality.sampled_aperture:
+        lines.append(
+            f"  at the rim the phase is steeper than the lattice samples (sine {quality.steepest:.3f}, "
+            f"{quality.sampled_aperture:.3f} without aliases): there light leaves in other directions too; take a "
+            "smaller pitch"
+        )
     if quality.turns < 1:
         lines.append(
             f"  the pillars cover {quality.turns:.3f} of a turn: the nearest stands in for the phases that none has, "

@@ -1,6 +1,7 @@
 """CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy, and a figure beside it."""
 
 import dataclasses
+import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +15,9 @@ from metalens.cell import Blend, Cell
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, store
 from metalens.ground.errors import DomainError
-from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted
+from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, converted
 from metalens.pillars import fit as proxy_fit
+from metalens.pillars.circular import Turned
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,8 @@ def run(options: Options) -> int:
         journal = target.with_name(target.name + ".resume")
         made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)
         seconds = time.perf_counter() - start
+        if wanted.sweep.light == "circular":
+            made = converted.with_turns(made)
         fitted, refusal = _fit(made, wanted.proxy)
         notes = fitted.notes if fitted else (refusal,)
         about = store.Provenance(config.dumps(wanted), inputs)
@@ -78,7 +82,7 @@ def _inputs(path: Path, cell: Cell) -> dict[str, str]:
 
 def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:
     try:
-        return proxy_fit.fit(made, wanted), ""
+        return (converted.fit if made.sweep.light == "circular" else proxy_fit.fit)(made, wanted), ""
     except DomainError as refused:
         return None, str(refused)
 
@@ -119,11 +123,13 @@ def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failur
         "median_error": float(np.median(made.t_error)),
         "failures": failures,
     }
+    if made.turned is not None:
+        values["circular"] = _circular(made.turned)
     if fitted is not None:
         proxy = fitted.proxy
         values |= {
             "domain_um": list(proxy.domain_um),
-            "turns": fitted.turns,
+            "turns": None if math.isnan(fitted.turns) else fitted.turns,
             "coefficients": proxy.phase_coefficients.size + proxy.transmission_coefficients.size,
             "max_phase_error_rad": proxy.max_phase_error_rad,
             "max_transmission_error": proxy.max_transmission_error,
@@ -153,14 +159,44 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
             "",
             *_proxy_lines(fitted),
         ]
+    if made.turned is not None:
+        lines += _turned_lines(made.turned)
     return "\n".join(lines + [f"  FAILED: {failure}" for failure in failures])
+
+
+def _circular(turned: Turned) -> dict[str, Any]:
+    """What the turned pillar does to circular light, the lesser hand."""
+    share, bar = min(turned.efficiency(1.0), turned.efficiency(-1.0))
+    kept, kept_bar = max(turned.unconverted(1.0), turned.unconverted(-1.0))
+    return {
+        "size_um": turned.size_um,
+        "converted": share,
+        "converted_error": bar,
+        "unconverted": kept,
+        "unconverted_error": kept_bar,
+        "angles_deg": np.degrees(turned.angle_rad).tolist(),
+        "isolated_error": turned.model_error,
+        "solver_error": float(turned.t_error.max()),
+    }
+
+
+def _turned_lines(turned: Turned) -> list[str]:
+    found = _circular(turned)
+    return [
+        f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {found['converted']:.3f} +- "
+        f"{found['converted_error']:.2g} of circular light is converted with the geometric phase, "
+        f"{found['unconverted']:.2g} +- {found['unconverted_error']:.1g} keeps its hand",
+        f"  a pillar turned alone is {found['isolated_error']:.2g} of t off the solved ones at "
+        f"{len(turned.angle_rad)} turns (solver within {found['solver_error']:.1g})",
+    ]
 
 
 def _proxy_lines(fitted: ProxyFit) -> list[str]:
     proxy = fitted.proxy
     low, high = (1e3 * d for d in proxy.domain_um)
+    turns = "" if math.isnan(fitted.turns) else f", {fitted.turns:.2f} turns"
     lines = [
-        f"  proxy in diameter^{proxy.power} from {low:.1f} to {high:.1f} nm, {fitted.turns:.2f} turns: phase within "
+        f"  proxy in diameter^{proxy.power} from {low:.1f} to {high:.1f} nm{turns}: phase within "
         f"{proxy.max_phase_error_rad:.1e} rad, |T| within {proxy.max_transmission_error:.1e} (half of them unseen)"
     ]
     if fitted.polarization_spread > 0:

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from metalens.design.focus_check import check_focus as check_focus
     from metalens.design.focusing import focuses as focuses
     from metalens.design.of_phase import Limits as Limits
-    from metalens.design.of_phase import PhaseOf as PhaseOf
     from metalens.design.of_phase import Quality as Quality
     from metalens.design.of_phase import field_angle as field_angle
     from metalens.design.of_phase import make as make
@@ -22,23 +21,28 @@ if TYPE_CHECKING:
     from metalens.design.profiles import Focus as Focus
     from metalens.design.profiles import PhaseMap as PhaseMap
     from metalens.design.profiles import hyperbolic as hyperbolic
+    from metalens.design.sites import PhaseOf as PhaseOf
+    from metalens.design.turned import Conversion as Conversion
+    from metalens.design.turned import make_turned as make_turned
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Conversion": "turned",
         "Cubic": "profiles",
         "DoubleHelix": "profiles",
         "Focus": "profiles",
         "FocusCheck": "focus_check",
         "Limits": "of_phase",
         "PhaseMap": "profiles",
-        "PhaseOf": "of_phase",
+        "PhaseOf": "sites",
         "Quality": "of_phase",
         "check_focus": "focus_check",
         "field_angle": "of_phase",
         "focuses": "focusing",
         "hyperbolic": "profiles",
         "make": "of_phase",
+        "make_turned": "turned",
         "neighbours": "",
         "phase_of": "of_phase",
         "printable": "of_phase",

@@ -89,7 +89,7 @@ def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
     """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
     return propagate.case(
         lens.diameters.diameter_um.shape,
-        pitch_um=lens.diameters.pitch_um,
+        **lens.diameters.grid._asdict(),
         wavelength_um=lens.wavelength_um,
         sensor_distance_um=lens.sensor_distance_um + shift_um,
         depths_um=lens.source_distance_um,
@@ -114,7 +114,7 @@ def _in_step(level: Array, case: Case) -> float:
     total = sum(
         float((row * np.abs(kernel(case, x, at, 0.0, 0.0, 0.0))).sum()) for row, at in zip(level, y, strict=True)
     )
-    return total * case.pitch_um**2
+    return total * case.area_um2
 
 
 def _vertex(position: Array, value: Array) -> float:

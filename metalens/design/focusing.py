@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from metalens.design.of_phase import PhaseOf
 from metalens.design.profiles import Focus
+from metalens.design.sites import PhaseOf
 from metalens.lens import media
 
 RAYS = 25  # along an axis

@@ -1,8 +1,7 @@
 """A phase profile made of pillars: every site takes the diameter whose proxy phase is the wanted one."""
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -10,14 +9,12 @@ import numpy as np
 from metalens.cell import Cell
 from metalens.design import phase_map, profiles
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
+from metalens.design.sites import PhaseOf, least_period_um, sites
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, LensError
 from metalens.ground.store import Provenance
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import DiameterMap, Hand, Lens
 from metalens.pillars import Proxy
-
-PhaseOf = Callable[[Array, Array], Array]  # (x,) and (y,) positions in um to (y, x) phase in rad
-_BLOCK_SITES = 1 << 21  # sites worked on at a time, so that memory does not grow with the lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +33,8 @@ class Quality:
     turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the phases that none has.
     focuses: whether rays of the design source meet in one spot (:func:`metalens.design.focuses`); where they do not,
         aperture and field have no meaning, and the efficiency is that of the wanted wave front.
+    steepest: slope of the phase at the rim over the wave number, the bend in sines that it asks for (of the focus).
+    sampled_aperture: bend that the lattice carries without aliases, wavelength / (2 longest period); nan if not known.
     """
 
     pillars: int
@@ -48,6 +47,8 @@ class Quality:
     rms_phase_error_rad: float = 0.0
     turns: float = 1.0
     focuses: bool = True
+    steepest: float = 0.0
+    sampled_aperture: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +57,12 @@ class Limits:
 
     min_diameter_nm: thinnest pillar.
     min_gap_nm: least distance between neighbouring pillars.
+    grid_nm: of the mask; the rows of a hexagonal lattice are placed on it.
     """
 
     min_diameter_nm: float = 82.0
     min_gap_nm: float = 70.0
+    grid_nm: float = field(default=1.0, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         if not (self.min_diameter_nm > 0 and self.min_gap_nm > 0):
@@ -100,7 +103,7 @@ def make(
     """Fill a round aperture with pillars (paper Eq. 2 inverted).
 
     Args:
-        phase: wanted phase; see :func:`phase_of`.
+        phase: wanted phase; see :func:`phase_of`. On a hexagonal lattice the pillars stand on its sites.
         aperture_um: diameter of the aperture; every pillar's centre lies half a pitch inside it.
         limits: of the process; the proxy's domain is narrowed to them.
         profile: name kept in the lens.
@@ -115,15 +118,31 @@ def make(
     """
     within = printable(proxy, cell, limits or Limits(), focus.wavelength_um, accept_partial_turn=accept_partial_turn)
     gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"
-    count = int(aperture_um / cell.pitch_um) if math.isfinite(aperture_um) else 0
-    if count < 1:
-        raise LensError(f"empty aperture: {aperture_um} um holds no cell of pitch {cell.pitch_um} um")
-    diameter, sums = np.zeros((count, count), np.float32), _Sums()
-    for rows, inside, wanted in _wanted(phase, count, aperture_um, cell.pitch_um):
+    place = sites(cell, aperture_um, grid_nm=(limits or Limits()).grid_nm)
+    diameter, sums = np.zeros(place.shape, np.float32), Sums()
+    for rows, inside, wanted in place.blocks(phase):
         diameter[rows][inside] = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within, gap=gap)
-        sums.add(wanted, diameter[rows][inside].astype(float), proxy, focus.wavelength_um)
-    lens = Lens(
-        diameters=DiameterMap(diameter, cell.pitch_um),
+        made = diameter[rows][inside].astype(float)
+        phase_made = proxy.phase_rad(made, focus.wavelength_um)
+        sums.add(wanted, phase_made, proxy.transmission(made, focus.wavelength_um))
+    lens = lens_of(place.map(diameter), cell, proxy, focus, profile=profile, provenance=provenance)
+    turns = proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
+    return lens, sums.quality(focus, aperture_um / 2, turns, period_um=least_period_um(cell))
+
+
+def lens_of(
+    diameters: DiameterMap,
+    cell: Cell,
+    proxy: Proxy,
+    focus: Focus,
+    *,
+    profile: str,
+    provenance: Provenance | None = None,
+    hand: Hand = "",
+) -> Lens:
+    """The lens of a map of pillars and what it images."""
+    return Lens(
+        diameters=diameters,
         cell=cell,
         proxy=proxy,
         wavelength_um=focus.wavelength_um,
@@ -132,21 +151,8 @@ def make(
         profile=profile,
         provenance=provenance or Provenance(),
         layers=focus.layers,
+        hand=hand,
     )
-    return lens, sums.quality(
-        focus, aperture_um / 2, proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
-    )
-
-
-def _wanted(phase: PhaseOf, count: int, aperture_um: float, pitch_um: float) -> Iterator[tuple[slice, Array, Array]]:
-    """Blocks of rows: which of their sites lie inside the aperture, and the phase wanted there."""
-    axis = (np.arange(count) - (count - 1) / 2) * pitch_um
-    reach = aperture_um / 2 - pitch_um / 2 if count > 1 else 0.0
-    block = max(1, _BLOCK_SITES // count)
-    for start in range(0, count, block):
-        rows = slice(start, start + block)
-        inside = axis[rows, None] ** 2 + axis**2 <= reach**2 * (1 + 1e-12)
-        yield rows, inside, phase(axis, axis[rows])[inside]
 
 
 def printable(
@@ -157,9 +163,8 @@ def printable(
     Raises:
         LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
     """
-    if cell.lattice.kind != "square":
-        raise LensError(f"a lens holds its pillars on a square lattice, the cell is {cell.described}")
-    thinnest, widest = limits.min_diameter_nm * 1e-3, cell.widest_um(limits.min_gap_nm * 1e-3)
+    across = cell.outline(cell.pitch_um / 2).narrowest_um / (cell.pitch_um / 2)  # width of a pillar over its size
+    thinnest, widest = limits.min_diameter_nm * 1e-3 / across, cell.widest_um(limits.min_gap_nm * 1e-3)
     low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
     if low >= high:
         raise LensError(
@@ -176,16 +181,16 @@ def printable(
     return low, high
 
 
-class _Sums:
+class Sums:
     """Running sums over all pillars that :class:`Quality` is made of."""
 
     def __init__(self) -> None:
         self.count, self.field, self.level, self.power, self.worst = 0, 0j, 0.0, 0.0, 0.0
         self.square = 0.0
 
-    def add(self, wanted: Array, made_um: Array, proxy: Proxy, wavelength_um: float) -> None:
-        error = np.remainder(proxy.phase_rad(made_um, wavelength_um) - wanted + np.pi, 2 * np.pi) - np.pi
-        level = proxy.transmission(made_um, wavelength_um)
+    def add(self, wanted: Array, made: Array, level: Array) -> None:
+        """Add pillars: wanted and made phase in rad, and |T|."""
+        error = np.remainder(made - wanted + np.pi, 2 * np.pi) - np.pi
         self.count += error.size
         self.field += complex((level * np.exp(1j * error)).sum())
         self.level += float(level.sum())
@@ -193,7 +198,8 @@ class _Sums:
         self.square += float((error**2).sum())
         self.worst = max(self.worst, float(np.abs(error).max(initial=0)))
 
-    def quality(self, focus: Focus, radius_um: float, turns: float) -> Quality:
+    def quality(self, focus: Focus, radius_um: float, turns: float, *, period_um: float) -> Quality:
+        """Of all pillars that were added; period_um: see :func:`metalens.design.sites.least_period_um`."""
         peak = abs(self.field) ** 2
         return Quality(
             pillars=self.count,
@@ -205,6 +211,8 @@ class _Sums:
             max_phase_error_rad=self.worst,
             rms_phase_error_rad=math.sqrt(self.square / self.count),
             turns=turns,
+            steepest=focus.aperture(radius_um) + radius_um / math.hypot(radius_um, focus.source_distance_um),
+            sampled_aperture=focus.wavelength_um / (2 * period_um),
         )
 
 

@@ -11,10 +11,13 @@ if TYPE_CHECKING:
     from metalens.lens.layers import Layers as Layers
     from metalens.lens.layers import check_gaps as check_gaps
     from metalens.lens.media import Media as Media
+    from metalens.lens.record import HANDS as HANDS
     from metalens.lens.record import DiameterMap as DiameterMap
+    from metalens.lens.record import Hand as Hand
     from metalens.lens.record import Lens as Lens
     from metalens.lens.record import from_parts as from_parts
     from metalens.lens.record import load as load
+    from metalens.lens.record import load_plain as load_plain
     from metalens.lens.record import parts as parts
     from metalens.lens.record import save as save
     from metalens.lens.record import streamed as streamed
@@ -23,6 +26,8 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "DiameterMap": "record",
+        "HANDS": "record",
+        "Hand": "record",
         "Layers": "layers",
         "Lens": "record",
         "Media": "media",
@@ -30,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "export": "",
         "from_parts": "record",
         "load": "record",
+        "load_plain": "record",
         "media": "",
         "parts": "record",
         "picture": "",

@@ -32,7 +32,8 @@ def check(path: str | Path) -> None:
 def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     """Write a lens in the format that the name's ending says.
 
-    ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission, pitch_um, wavelength_um.
+    ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission, pitch_um, wavelength_um; where
+    pillars are turned angle_rad.
     ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
 
     Returns:
@@ -73,7 +74,7 @@ def arrays(lens: Lens) -> dict[str, Array]:
         "transmission": lens.transmission(),
         "pitch_um": np.array(d.pitch_um),
         "wavelength_um": np.array(lens.wavelength_um),
-    }
+    } | ({} if d.angle_rad is None else {"angle_rad": np.asarray(d.angle_rad)})
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,10 +108,12 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
     """The unwrapped phase of a lens on ``samples`` by ``samples`` points across its aperture.
 
     Raises:
-        LensError: fewer than 5 samples; see :func:`unwrapped`.
+        LensError: fewer than 5 samples, or another lattice than a square one; see :func:`unwrapped`.
     """
     from scipy.ndimage import binary_erosion, map_coordinates
 
+    if lens.diameters.lattice.kind != "square":
+        raise LensError(f"grid phase of a {lens.diameters.lattice.kind} lattice: need a square one; write .npz or .mat")
     if samples < 5:
         raise LensError(f"{samples} samples across the aperture: need 5 or more")
     phase, d = unwrapped(lens), lens.diameters

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from metalens.cell.shapes import turned
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.lens.record import Lens
@@ -46,20 +47,23 @@ def mean_field(lens: Lens, sites: int) -> Array:
 
     Read in bands of rows: a large lens stays in its file.
     """
-    d = lens.diameters.diameter_um
+    d, centred = lens.diameters.diameter_um, lens.diameters.lattice.centred
     height, width = (-(-n // sites) for n in d.shape)
     mean = np.empty((height, width), complex)
     for i in range(height):
-        band = np.zeros((sites, width * sites))
-        rows = np.asarray(d[i * sites : (i + 1) * sites])
+        band, angle = np.zeros((2, sites, width * sites))
+        at = slice(i * sites, (i + 1) * sites)
+        rows = np.asarray(d[at])
         band[: len(rows), : rows.shape[1]] = rows
-        field = np.where(band > 0, np.exp(1j * _phase_of(lens, band)), 0)
+        angle[: len(rows), : rows.shape[1]] = lens.geometric_rad(at)
+        phase = lens.proxy.phase_rad(np.where(band > 0, band, lens.proxy.domain_um[0]), lens.wavelength_um)
+        field = np.where(band > 0, np.exp(1j * (phase + angle)), 0) * (2 if centred and sites > 1 else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean
 
 
 def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
-    from matplotlib.collections import EllipseCollection
+    from matplotlib.collections import PolyCollection
 
     d = lens.diameters
     ny, nx = d.diameter_um.shape
@@ -69,19 +73,19 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
     there = part > 0
     size = part[there]
-    sites = np.stack([x[there], y[there]], 1)
-    shown = EllipseCollection(
-        size, size, np.zeros(len(size)), offsets=sites, units="xy", transOffset=axes.transData, cmap="viridis"
-    )
-    shown.set_array(size * 1e3)
+    turn = np.zeros(len(size)) if d.angle_rad is None else d.angle_rad[rows, columns][there]
+    drawn = [_outline(lens, *one) for one in zip(size, turn, x[there], y[there], strict=True)]
+    shown = PolyCollection(drawn, cmap="viridis")
+    shown.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
     axes.add_collection(shown)
     half = d.pitch_um / 2
     axes.set(xlim=(x.min() - half, x.max() + half), ylim=(y.max() + half, y.min() - half), aspect="equal")
     axes.set(title="single pillars", xlabel="x / µm", ylabel="y / µm")
-    figure.colorbar(shown, ax=axes, label="diameter / nm", shrink=0.85)
+    figure.colorbar(shown, ax=axes, label="size / nm" if d.angle_rad is None else "turn / deg", shrink=0.85)
     axes.grid(visible=False)
 
 
-def _phase_of(lens: Lens, diameter_um: Array) -> Array:
-    inside = np.where(diameter_um > 0, diameter_um, lens.proxy.domain_um[0])
-    return np.asarray(lens.proxy.phase_rad(inside, lens.wavelength_um))
+def _outline(lens: Lens, size_um: float, turn_rad: float, x_um: float, y_um: float) -> Array:
+    """(n, 2) corners of one pillar where it stands."""
+    corners = lens.cell.outline(float(size_um)).parts[0].vertices(32)
+    return turned(corners, float(turn_rad)) + np.array([x_um, y_um])

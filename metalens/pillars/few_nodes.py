@@ -6,9 +6,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from metalens.ground.arrays import Array
-from metalens.pillars.engines import Light
+from metalens.pillars.engines import Light, Polarization
 from metalens.pillars.record import Sweep
 
+Normal = dict[str, Polarization]
 Rows = dict[Light, Array]  # (3, diameter) complex: t, r, error estimate
 ALL_UP_TO = 6  # values of an axis that are all solved
 NARROW_UM = 0.005  # half-width of a resonance that may lie between two nodes and show at neither
@@ -33,17 +34,24 @@ def picks(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(values[i] for i in sorted(chosen))
 
 
-def lights(sweep: Sweep, wavelengths_um: tuple[float, ...], angles_deg: tuple[float, ...]) -> list[Light]:
-    """Every distinct plane wave: at normal incidence s and p are the same."""
-    return [light(w, a, p) for a in angles_deg for p in (sweep.polarizations if a else ("x",)) for w in wavelengths_um]
+ALIKE: dict[str, Polarization] = {"s": "x", "p": "x", "x": "x", "y": "y"}  # light along x and y meets the same cell
+UNLIKE: dict[str, Polarization] = {**ALIKE, "s": "y"}  # planes of incidence along x: s is the light along y
 
 
-def light(wavelength_um: float, angle_deg: float, polarization: str) -> Light:
+def lights(
+    sweep: Sweep, wavelengths_um: tuple[float, ...], angles_deg: tuple[float, ...], normal: Normal = ALIKE
+) -> list[Light]:
+    """Every distinct plane wave; ``normal``: what the polarisations are at normal incidence."""
+    found = [light(w, a, p, normal) for a in angles_deg for p in sweep.polarizations for w in wavelengths_um]
+    return list(dict.fromkeys(found))
+
+
+def light(wavelength_um: float, angle_deg: float, polarization: Polarization, normal: Normal = ALIKE) -> Light:
     """The plane wave of an entry."""
-    return Light(wavelength_um, math.radians(angle_deg), polarization if angle_deg else "x")  # type: ignore[arg-type]
+    return Light(wavelength_um, math.radians(angle_deg), polarization if angle_deg else normal[polarization])
 
 
-def complete(sweep: Sweep, solved: Rows, poles: dict[Light, Array], diameters: Array) -> Rows:
+def complete(sweep: Sweep, solved: Rows, poles: dict[Light, Array], diameters: Array, normal: Normal = ALIKE) -> Rows:
     """All rows of the sweep: the solved ones, then between wavelengths, then between angles.
 
     poles: (k, 2) diameter and half-width of the resonances of every solved curve. Where a narrow one moves from one
@@ -53,10 +61,11 @@ def complete(sweep: Sweep, solved: Rows, poles: dict[Light, Array], diameters: A
     sharp = {light: found[found[:, 1] < NARROW_UM] for light, found in poles.items()}
     for polarization in sweep.polarizations:
         for angle in sweep.angles_deg:
-            family = {w: light(w, angle, polarization) for w in sweep.wavelengths_um}
+            family = {w: light(w, angle, polarization, normal) for w in sweep.wavelengths_um}
             _fill(rows, family, sharp, diameters)
         for wavelength in sweep.wavelengths_um:
-            family = {math.sin(math.radians(a)) ** 2: light(wavelength, a, polarization) for a in sweep.angles_deg}
+            at = {math.sin(math.radians(a)) ** 2: a for a in sweep.angles_deg}
+            family = {x: light(wavelength, a, polarization, normal) for x, a in at.items()}
             _fill(rows, family, sharp, diameters)
     return rows
 

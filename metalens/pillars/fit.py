@@ -68,8 +68,8 @@ class ProxyFit:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Data:
-    """Phase and |T| on (angle, wavelength, diameter), and the coordinates."""
+class Data:
+    """What is fitted: phase and |T| (angle, wavelength, diameter), and the coordinates."""
 
     phase: Array
     level: Array
@@ -95,7 +95,7 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         least_half_width_um=wanted.least_half_width_um,
         within_um=wanted.within_um,
     )
-    data = _Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
+    data = Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
     terms = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
     kept, proxy = _longest(data, wanted, terms)
     while terms < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
@@ -113,11 +113,17 @@ def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
 
 
 def proxy_of(library: PillarLibrary) -> Proxy:
-    """The proxy that a library holds, fitted now where it holds none."""
+    """The proxy that a library holds, fitted now where it holds none.
+
+    Raises:
+        DomainError: no proxy fits; a library for circular light holds none (it is fitted where that is swept).
+    """
+    if library.proxy is None and library.sweep.light == "circular":
+        raise DomainError("a library for circular light without a proxy: make it with 'metalens library'")
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
-def _longest(data: _Data, wanted: Wanted, terms: int) -> tuple[_Data, Proxy]:
+def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the tolerances."""
     good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
     best = _best(_head(data, good), wanted, terms)
@@ -140,7 +146,7 @@ def _meets(proxy: Proxy, wanted: Wanted) -> bool:
     return _cost(proxy, wanted) <= 1
 
 
-def _best(data: _Data, wanted: Wanted, terms: int) -> Proxy | None:
+def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
     """Of the powers of the diameter, the one with the least error in units of the tolerances; None where each takes
     |T| below 0 between the entries."""
     found = []
@@ -161,7 +167,7 @@ def _cost(proxy: Proxy, wanted: Wanted) -> float:
     )
 
 
-def fit_terms(data: _Data, power: int, terms: int) -> Proxy:
+def fit_terms(data: Data, power: int, terms: int) -> Proxy:
     """The proxy with ``terms`` coefficients in diameter^power for the phase, and as many for |T|."""
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
@@ -185,7 +191,7 @@ def fit_terms(data: _Data, power: int, terms: int) -> Proxy:
     )
 
 
-def _axes(data: _Data, power: int) -> tuple[Array, Array, Array]:
+def _axes(data: Data, power: int) -> tuple[Array, Array, Array]:
     """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
     sine = np.sin(data.angle) ** 2
     return (
@@ -234,7 +240,7 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     return best
 
 
-def _trial(data: _Data, power: int, coefficients: int) -> Trial | None:
+def _trial(data: Data, power: int, coefficients: int) -> Trial | None:
     """One line of the table; None where |T| falls below 0 between the entries."""
     try:
         proxy = fit_terms(data, power, coefficients // 2)
@@ -243,15 +249,15 @@ def _trial(data: _Data, power: int, coefficients: int) -> Trial | None:
     return Trial(coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error)
 
 
-def _head(data: _Data, count: int) -> _Data:
-    return _Data(data.phase[..., :count], data.level[..., :count], data.diameter[:count], data.wavelength, data.angle)
+def _head(data: Data, count: int) -> Data:
+    return Data(data.phase[..., :count], data.level[..., :count], data.diameter[:count], data.wavelength, data.angle)
 
 
-def _turns(data: _Data) -> float:
+def _turns(data: Data) -> float:
     return float((data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
 
 
-def _notes(smooth: Stretch, data: _Data, kept: _Data, terms: int) -> tuple[str, ...]:
+def _notes(smooth: Stretch, data: Data, kept: Data, terms: int) -> tuple[str, ...]:
     if len(kept.diameter) == len(data.diameter):
         return smooth.notes
     return (

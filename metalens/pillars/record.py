@@ -4,7 +4,7 @@ import itertools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, ConfigError, DomainError
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
+from metalens.pillars.circular import Turned
+from metalens.pillars.circular import check as check_turned
 from metalens.pillars.engines import Polarization
 from metalens.pillars.proxy import Proxy
 
@@ -34,6 +36,8 @@ class Sweep:
     samples: evenly spaced diameters; more are added around resonances.
     tolerance: error bar that is asked of every entry's t.
     engine: auto, rcwa or modal.
+    light: linear, or circular: x and y at normal incidence, for pillars that are turned one by one; the proxy is then
+        that of the light converted to the other hand.
     """
 
     wavelengths_um: tuple[float, ...] = (0.85,)
@@ -42,6 +46,7 @@ class Sweep:
     samples: int = 200
     tolerance: float = 1e-3
     engine: str = "auto"
+    light: Literal["linear", "circular"] = "linear"
 
     def __post_init__(self) -> None:
         for name, values in (("wavelengths_um", self.wavelengths_um), ("angles_deg", self.angles_deg)):
@@ -57,10 +62,14 @@ class Sweep:
             raise ConfigError(f"tolerance = {self.tolerance}: need 1e-8 to 0.1")
         if self.engine not in ("auto", "rcwa", "modal"):
             raise ConfigError(f"engine = {self.engine!r}: need auto, rcwa or modal")
+        if self.light == "circular" and self.angles_deg != (0.0,):
+            raise ConfigError(f"angles_deg = {list(self.angles_deg)} of circular light: need normal incidence, [0.0]")
 
     @property
     def polarizations(self) -> tuple[Polarization, ...]:
-        """x at normal incidence alone (a square lattice treats x and y alike), else s and p."""
+        """x at normal incidence alone (a square lattice treats x and y alike), else s and p; x and y for circular."""
+        if self.light == "circular":
+            return ("x", "y")
         return ("x",) if self.angles_deg == (0.0,) else ("s", "p")
 
     def span_um(self, cell: Cell) -> tuple[float, float]:
@@ -93,6 +102,7 @@ class PillarLibrary:
         t(D) near the real axis.
     engine: modal or rcwa. solves: exact solves behind the entries.
     proxy: polynomial of Eq. 2 fitted to the entries; notes: what was cut from its domain, and why.
+    turned: for circular light, the pillar of most conversion solved at several turns.
     """
 
     cell: Cell
@@ -111,6 +121,7 @@ class PillarLibrary:
     proxy: Proxy | None = None
     notes: tuple[str, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
+    turned: Turned | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.polarization), len(self.angle_rad), len(self.wavelength_um), len(self.diameter_um))
@@ -133,7 +144,9 @@ def check(cell: Cell, sweep: Sweep) -> None:
         CellError: pillars touch, or diffraction orders propagate (named); MaterialError: a wavelength outside
         the range of a material.
     """
-    sweep.span_um(cell)
+    span = sweep.span_um(cell)
+    if sweep.light == "circular":
+        check_turned(cell, span[1])
     films = [film.material for film in (*cell.under, *cell.over)]
     for wavelength in sweep.wavelengths_um:
         for material in (cell.pillar, cell.between, *films):
@@ -156,6 +169,8 @@ def save(path: str | Path, library: PillarLibrary) -> None:
     arrays["notes"] = np.array(library.notes, dtype=str)
     if library.proxy is not None:
         arrays |= {f"proxy/{name}": array for name, array in library.proxy.to_arrays().items()}
+    if library.turned is not None:
+        arrays |= {f"turned/{name}": array for name, array in library.turned.to_arrays().items()}
     attributes: dict[str, Any] = {
         "cell": config.dumps(library.cell),
         "sweep": config.dumps(library.sweep),
@@ -175,7 +190,10 @@ def load(path: str | Path) -> PillarLibrary:
     """
     stored = store.load(path, "library")
     arrays, about = stored.arrays, stored.attributes
-    proxy = {name[6:]: array for name, array in arrays.items() if name.startswith("proxy/")}
+    proxy, turned = (
+        {name.removeprefix(group): array for name, array in arrays.items() if name.startswith(group)}
+        for group in ("proxy/", "turned/")
+    )
     names = ("angle_rad", "wavelength_um", "diameter_um", "t", "r", "t_error", "energy", "resonances")
     return PillarLibrary(
         cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
@@ -187,6 +205,7 @@ def load(path: str | Path) -> PillarLibrary:
         proxy=Proxy.from_arrays(proxy) if proxy else None,
         notes=tuple(_text(v) for v in arrays["notes"]),
         provenance=stored.provenance,
+        turned=Turned.from_arrays(turned) if turned else None,
     )
 
 

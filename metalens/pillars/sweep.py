@@ -64,27 +64,28 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
     engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
     journal = _Journal(checkpoint, cell, sweep)
     span = sweep.span_um(cell)
+    normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
 
     def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
         tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
         return dict(zip(lights, map(functools.partial(_curve, sweep), journal.run(tasks, console, label)), strict=True))
 
-    first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg))
+    first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg), normal)
     curves = solved(first, "curves")
     diameters = _diameters(span, sweep.samples, list(curves.values()))
     rows = {light: _evaluate(curve, diameters) for light, curve in curves.items()}
-    full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+    full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
     weak = [light for light, row in full.items() if light not in curves and _misses(row, sweep).sum() > WORTH_A_CURVE]
     if weak:
         more = solved(weak, "more curves")
         curves |= more
         rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
-        full = few_nodes.complete(sweep, rows, _poles(curves), diameters)
+        full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
     extra = _points(cell, sweep, engine, diameters, full)
     for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
         _replace(full[Light(*task["light"])], diameters, result)
     solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(len(t["diameters_um"]) for t in extra)
-    made = _library(cell, sweep, (engine, solves), diameters, curves, full)
+    made = _library(cell, sweep, (engine, solves), diameters, curves, full, normal)
     journal.finish()
     return made
 
@@ -146,13 +147,19 @@ def _replace(row: Array, diameters: Array, result: Result) -> None:
 
 
 def _library(
-    cell: Cell, sweep: Sweep, effort: tuple[str, int], diameters: Array, curves: dict[Light, Curve], full: Rows
+    cell: Cell,
+    sweep: Sweep,
+    effort: tuple[str, int],
+    diameters: Array,
+    curves: dict[Light, Curve],
+    full: Rows,
+    normal: few_nodes.Normal,
 ) -> PillarLibrary:
     shape = (len(sweep.polarizations), len(sweep.angles_deg), len(sweep.wavelengths_um), len(diameters))
     t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
     resonances = []
     for i, j, k in np.ndindex(*shape[:3]):
-        light = few_nodes.light(sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i])
+        light = few_nodes.light(sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i], normal)
         row = full[light]
         t[i, j, k], r[i, j, k], error[i, j, k] = row[0], row[1], row[2].real
         if light in curves:

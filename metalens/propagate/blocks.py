@@ -99,10 +99,11 @@ def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float
     """Blocks of a length along an axis with as few nodes as the kernel needs at its ends and its middle."""
     if length < 4:
         return Blocks(case.shape[axis], length, length)
-    bases = Blocks(case.shape[axis], length, length).middles_um(case.pitch_um)
+    step_um = case.steps_um[axis]
+    bases = Blocks(case.shape[axis], length, length).middles_um(step_um)
     middles = bases[[0, len(bases) // 2, -1], None, None]
     across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
-    line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * case.pitch_um
+    line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * step_um
     values = kernel(line, across) if axis == 0 else kernel(across, line)
     count = max(legendre.needed(values, tolerance), 2)
     return Blocks(case.shape[axis], length, length if count > PROBES else min(count, length))
@@ -118,8 +119,8 @@ def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
     rows = Blocks(case.shape[0], length, length)
     picked = np.unique([0, rows.count // 4, rows.count // 2, rows.count - 1])
     x = case.pillars_um[1][:: max(1, case.shape[1] // 16)]
-    y = rows.middles_um(case.pitch_um)[picked, None, None]
-    half = (length - 1) / 2 * case.pitch_um
+    y = rows.middles_um(case.steps_um[0])[picked, None, None]
+    half = (length - 1) / 2 * case.steps_um[0]
     got = _powers(case, reference, (y, half), x, ORDER[itemsize])
     want = carrier_turns(case, reference, x, y + half * rows.along[:, None])
     error = np.abs(rows.along[:, None] ** np.arange(ORDER[itemsize]) @ got - want).max()
@@ -167,8 +168,8 @@ class Carrier:
 
     def _coefficients(self, some: slice, order: int) -> Array:
         """(block, order, column) float64 of some block rows."""
-        middles = self.rows.middles_um(self.case.pitch_um)[some, None, None]
-        half = (self.rows.length - 1) / 2 * self.case.pitch_um
+        middles = self.rows.middles_um(self.case.steps_um[0])[some, None, None]
+        half = (self.rows.length - 1) / 2 * self.case.steps_um[0]
         found = _powers(self.case, self.reference, (middles, half), self.case.pillars_um[1], order)
         found[:, 0] -= np.rint(found[:, 0])
         return found

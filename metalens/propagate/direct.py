@@ -14,7 +14,7 @@ from metalens.propagate.sincos import turns64
 
 
 def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
-    """Field on the window, every pillar a point source of area p² (paper Eqs. 1-3 in space, exp(-iωt)).
+    """Field on the window, every pillar a source of area p² (its cell; paper Eqs. 1-3 in space, exp(-iωt)).
 
     U(X) = Σ p² T e^{iφ} U_in · d/(2πr²) (1/r - ik) e^{ikr}, with |U_in| = 1 and its phase zero at the lens centre.
     Through films the kernel is that of :mod:`metalens.propagate.paths`.
@@ -57,10 +57,10 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
     """Add the light of pillar rows (depth, y, x) to ``out`` (depth, point)."""
     y, x = at_um
     real, imaginary = np.ascontiguousarray(light.real), np.ascontiguousarray(light.imag)
-    numbers: Any = (case.wavenumber, case.sensor_distance_um, case.pitch_um**2)
+    numbers: Any = (case.wavenumber, case.sensor_distance_um, case.area_um2)
     kernel: Any = _accumulate
     if case.behind is not None:
-        kernel, numbers = add_rays, (case.wavenumber, case.pitch_um**2, *media_arrays(case.behind))
+        kernel, numbers = add_rays, (case.wavenumber, case.area_um2, *media_arrays(case.behind))
 
     def work(a: int, b: int) -> None:
         kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])

@@ -176,7 +176,7 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
     if case.behind is not None:
         total, numbers = sum_rays, (case.wavenumber, *case.centre_um, *media_arrays(case.behind))
     split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
-    return np.asarray(out * case.pitch_um**2)
+    return np.asarray(out * case.area_um2)
 
 
 @numba.njit(inline="always")

@@ -19,7 +19,8 @@ from metalens.lens import Media
 class Case:
     """Geometry of one propagation; hashable, so that plans can be kept.
 
-    shape: (y, x) pillars; pitch_um: their lattice constant.
+    shape: (y, x) sites of the map; pitch_um: from column to column; row_um: from row to row (0: as the columns).
+    site_um2: area of the cell of one pillar (0: of the map's own; on a hexagonal lattice every other site is empty).
     wavelength_um: in the medium on both sides of the lens; in vacuum where films are given.
     sensor_distance_um: lens plane to sensor plane.
     tangents: (x, y) tangents of the field angle; in air where films are given.
@@ -43,12 +44,16 @@ class Case:
     samples: tuple[int, int]
     front: tuple[tuple[float, float], ...] = ()
     behind: Media | None = None
+    row_um: float = 0.0
+    site_um2: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("pitch_um", "wavelength_um", "sensor_distance_um", "step_um"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise PropagationError(f"{name} is {value}, need a positive length in um")
+        if not all(np.isfinite(v) and v >= 0 for v in (self.row_um, self.site_um2)):
+            raise PropagationError(f"row_um = {self.row_um}, site_um2 = {self.site_um2}: need finite values, 0 or more")
         if min(self.shape) < 1 or min(self.samples) < 1:
             raise PropagationError(f"{self.shape} pillars and {self.samples} samples, need at least one of each")
         inverse = np.array(self.inverse_depths_per_um)
@@ -68,10 +73,20 @@ class Case:
         return 2 * np.pi / self.wavelength_um
 
     @property
+    def steps_um(self) -> tuple[float, float]:
+        """(y, x) distance of neighbouring rows and columns."""
+        return self.row_um or self.pitch_um, self.pitch_um
+
+    @property
+    def area_um2(self) -> float:
+        """Of the cell of one pillar: what its light is worth."""
+        return self.site_um2 or self.steps_um[0] * self.steps_um[1]
+
+    @property
     def half_size_um(self) -> tuple[float, float]:
-        """(y, x) distance from the axis to the outermost pillar centre, at least half a pitch."""
-        ny, nx = self.shape
-        return max(ny - 1, 1) / 2 * self.pitch_um, max(nx - 1, 1) / 2 * self.pitch_um
+        """(y, x) distance from the axis to the outermost site, at least half a step."""
+        y, x = (max(n - 1, 1) / 2 * step for n, step in zip(self.shape, self.steps_um, strict=True))
+        return y, x
 
     @property
     def half_window_um(self) -> tuple[float, float]:
@@ -82,7 +97,8 @@ class Case:
     @property
     def pillars_um(self) -> tuple[Array, Array]:
         """(y,), (x,) positions of the pillar rows and columns."""
-        return axis(self.shape[0], self.pitch_um), axis(self.shape[1], self.pitch_um)
+        y, x = (axis(n, step) for n, step in zip(self.shape, self.steps_um, strict=True))
+        return y, x
 
     @property
     def window_um(self) -> tuple[Array, Array]:

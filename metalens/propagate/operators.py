@@ -136,7 +136,7 @@ def _low_rank(
     table = correction(case, *at)
     if slope is not None:
         table = table * slopes(case, *at)[slope]
-    left, right = _factors(table.reshape(my * mx, mp * me) * case.pitch_um**2, tolerance)
+    left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
     y_um, x_um = case.window_um
     Iy, Ix = legendre.interpolation(my, y_um / wy), legendre.interpolation(mx, x_um / wx)
     window_terms = np.einsum("Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True)

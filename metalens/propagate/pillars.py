@@ -69,7 +69,7 @@ def moments(
     rows, columns = blocks
     width = columns.length
     wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
-    places = (rows.nodes_um(case.pitch_um), columns.nodes_um(case.pitch_um))
+    places = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
     table = None
     if device is not None and device.type != "cpu":
         places = case.pillars_um

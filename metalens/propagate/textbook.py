@@ -13,14 +13,14 @@ def transfer(case: Case, count: tuple[int, int], *, band_limited: bool) -> Array
 
     band_limited: drop frequencies whose phase the padded grid cannot sample (Matsushima and Shimobaba 2009).
     """
-    fy, fx = (np.fft.fftfreq(n, case.pitch_um) for n in count)
+    fy, fx = (np.fft.fftfreq(n, step) for n, step in zip(count, case.steps_um, strict=True))
     kz2 = case.wavelength_um**-2 - fx**2 - fy[:, None] ** 2
     kz = 2 * np.pi * np.sqrt(np.abs(kz2))
     d = case.sensor_distance_um
     h = np.exp(np.where(kz2 >= 0, 1j * kz, -kz) * d)
     if band_limited:
-        for f, n in ((fy[:, None], count[0]), (fx, count[1])):
-            limit = 1 / (case.wavelength_um * np.sqrt((2 * d / (n * case.pitch_um)) ** 2 + 1))
+        for f, n, step in ((fy[:, None], count[0], case.steps_um[0]), (fx, count[1], case.steps_um[1])):
+            limit = 1 / (case.wavelength_um * np.sqrt((2 * d / (n * step)) ** 2 + 1))
             h = np.where(np.abs(f) <= limit, h, 0)
     return h
 
@@ -62,13 +62,14 @@ def angular_spectrum(
 def _lattice(case: Case, pad: int) -> tuple[Array, Array]:
     """(x,), (y,) indices of the window samples in the padded grid, whose origin is the first pillar."""
     found = []
-    for name, n, c, w in zip("xy", case.shape[::-1], case.centre_um, case.window_um[::-1], strict=True):
-        at = (c + w) / case.pitch_um + (n - 1) / 2
+    steps = case.steps_um[::-1]
+    for name, n, c, w, step in zip("xy", case.shape[::-1], case.centre_um, case.window_um[::-1], steps, strict=True):
+        at = (c + w) / step + (n - 1) / 2
         index = np.rint(at).astype(int)
         if np.abs(at - index).max() > 1e-6:
             raise PropagationError(
                 f"window samples along {name} lie off the pillars' lattice; use a step that is a multiple of the pitch "
-                f"{case.pitch_um} um and a centre on the lattice, or another method"
+                f"{step} um and a centre on the lattice, or another method"
             )
         if index.min() < -(n * pad - n) // 2 or index.max() >= n + (n * pad - n) // 2:
             raise PropagationError(f"window leaves the padded grid along {name}; raise pad above {pad}")

@@ -34,6 +34,8 @@ def case(
     samples: int,
     offset_um: tuple[float, float] = (0.0, 0.0),
     layers: Layers | None = None,
+    row_um: float = 0.0,
+    site_um2: float = 0.0,
 ) -> Case:
     """Geometry of one propagation.
 
@@ -44,6 +46,9 @@ def case(
         window_um, samples: full width of the square window, and cells along it.
         offset_um: (x, y) of the window centre from the chief ray.
         layers: films around the lens; ``wavelength_um`` is then that in vacuum, and ``angle_rad`` that in air.
+        row_um: distance of the rows, 0 for that of the columns; site_um2: area of the cell of one pillar, 0 for that
+            of the grid. On a hexagonal lattice of pitch p: p / 2 from column to column, p sqrt(3) / 2 from row to row,
+            an area of p² sqrt(3) / 2, and 0 transmission at every other site.
 
     Raises:
         PropagationError: a length that is not positive, an angle of 90° or more, no depth.
@@ -68,6 +73,8 @@ def case(
         centre_um=(meets[0], meets[1]),
         step_um=float(window_um) / max(int(samples), 1),
         samples=(int(samples), int(samples)),
+        row_um=float(row_um),
+        site_um2=float(site_um2),
         **films,
     )
 

@@ -168,5 +168,5 @@ def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
 
 def _incoherent(power: float, case: Case) -> float:
     """Magnitude of the field at the window centre if all pillars added with random phases."""
-    area = case.pitch_um**2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
+    area = case.area_um2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
     return math.sqrt(power) * area

@@ -68,7 +68,7 @@ def from_lens(
             psf_stack(
                 phase,
                 level,
-                pitch_um=lens.diameters.pitch_um,
+                **lens.diameters.grid._asdict(),
                 wavelength_um=nodes.wavelengths_um.tolist(),
                 weights=nodes.weights.tolist(),
                 sensor_distance_um=lens.sensor_distance_um,
@@ -119,15 +119,10 @@ def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
 
 def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:
     """(phase wrapped to ±π, transmission) of every pillar for light from a direction; 0 where there is no pillar."""
-    d = lens.diameters.diameter_um
-    open_ = d > 0
     tilt = float(np.arctan(np.hypot(*np.tan(angle_rad))))
     tilt = tilt if lens.proxy.max_angle_rad > 0 else 0.0
-    inside = np.where(open_, d, lens.proxy.domain_um[0])
-    phase = np.asarray(lens.proxy.phase_rad(inside, wavelength_um, tilt))
-    level = np.asarray(lens.proxy.transmission(inside, wavelength_um, tilt))
-    turns = phase / (2 * np.pi)
-    return np.where(open_, (turns - np.rint(turns)) * 2 * np.pi, 0), np.where(open_, level, 0)
+    turns = lens.phase_rad(wavelength_um, tilt) / (2 * np.pi)
+    return (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(wavelength_um, tilt)
 
 
 def depth_samples(

@@ -37,6 +37,8 @@ def psf_stack(
     layers: Layers | None = None,
     vector: bool = False,
     integrate: bool = True,
+    row_um: float = 0.0,
+    site_um2: float = 0.0,
 ) -> PsfStack:
     """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
 
@@ -54,6 +56,7 @@ def psf_stack(
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
         vector: Ex, Ey and Ez of both polarisations in place of one scalar (:mod:`metalens.psf.vector`); six times the
             work.
+        row_um, site_um2: of another lattice than a square one, see :func:`metalens.propagate.case`.
 
     Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
     window moves with the chief ray, and so do the derivatives.
@@ -73,6 +76,7 @@ def psf_stack(
         raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
+    about |= {"row_um": row_um, "site_um2": site_um2}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
     about |= {"offset_um": _value(offset_um), "layers": layers}
     several = np.ndim(_value(angle_rad)) == 2
@@ -87,7 +91,7 @@ def psf_stack(
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
     axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
     stack = _record(light, cases, axes, worst, tolerance)
-    budget = _budget(stack, worst, torch.stack([row[2] for row in found], -1) * pitch_um**2, several=several)
+    budget = _budget(stack, worst, torch.stack([row[2] for row in found], -1) * cases[0].area_um2, several=several)
     stack = dataclasses.replace(stack, budget=budget)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 

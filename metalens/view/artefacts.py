@@ -58,6 +58,8 @@ def lens_panels(path: Path) -> list[Panel]:
     """Every pillar, and what it does to the light."""
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
+    if not lens.diameters.plain:
+        return [*_turns(lens), _section(diameter, lens)]
     index, sizes = classes_of(diameter)
     return [
         Classes(
@@ -77,12 +79,22 @@ def lens_panels(path: Path) -> list[Panel]:
     ]
 
 
+def _turns(lens: lenses.Lens) -> list[Panel]:
+    """The turn of every pillar, to a degree, on a square lattice."""
+    d = lens.diameters
+    if d.angle_rad is None or d.lattice.kind != "square":
+        return []
+    degrees = np.mod(np.rint(np.degrees(d.angle_rad)), 180).astype(np.uint16) + 1
+    index = np.where(d.diameter_um > 0, degrees, 0).astype(np.uint16)
+    words = f"Turn of every pillar from +x to +y, to a degree; each is {lens.cell.shape.name}."
+    return [Classes("Pillars", index, np.arange(180.0), d.pitch_um, "deg", words)]
+
+
 def _section(diameter: Array, lens: lenses.Lens) -> Curves:
     """Phase and diameter along the middle row."""
     middle = diameter[len(diameter) // 2]
     held = middle > 0
-    phase = np.full(len(middle), np.nan)
-    phase[held] = lens.proxy.phase_rad(middle[held], lens.wavelength_um)
+    phase = lens.phase_rad()[len(diameter) // 2]
     x = lens.diameters.x_um[held]
     wrapped = (phase[held] / (2 * math.pi)) % 1
     return Curves("Phase along the middle row", x, "x / um", {"phase modulo a turn": wrapped}, "turns")

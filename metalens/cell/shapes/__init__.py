@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from metalens.cell.shapes.outline import Conic as Conic
     from metalens.cell.shapes.outline import Loop as Loop
     from metalens.cell.shapes.outline import Outline as Outline
+    from metalens.cell.shapes.outline import turned as turned
     from metalens.cell.shapes.round import Circle as Circle
     from metalens.cell.shapes.round import Ellipse as Ellipse
     from metalens.cell.shapes.round import Ring as Ring
@@ -33,5 +34,6 @@ __getattr__, __dir__, __all__ = attach(
         "Ring": "round",
         "Shape": "every",
         "Square": "straight",
+        "turned": "outline",
     },
 )

@@ -15,6 +15,7 @@ from metalens.ground.errors import CellError
 Point = tuple[float, float]
 _ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
 _PROBES = np.array([[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]])  # over the radius, no two alike
+_DIRECTIONS = np.stack([np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +142,22 @@ class Outline:
         gx, gy = (_PROBES / self.radius_um).T
         apart = np.abs(self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)).max()
         return bool(apart <= _ALIKE * self.area_um2)
+
+    def repeats(self, turn_rad: float) -> bool:
+        """Whether a turn in the plane leaves it as it is (judged by its Fourier factors)."""
+        gx, gy = (_PROBES / self.radius_um).T
+        c, s = math.cos(turn_rad), math.sin(turn_rad)
+        apart = np.abs(self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)).max()
+        return bool(apart <= _ALIKE * self.area_um2)
+
+    @property
+    def narrowest_um(self) -> float:
+        """Least width across, between parallel lines (of the outermost part, its hollows filled)."""
+        corners = self.parts[0].vertices(64)
+        edge = np.roll(corners, -1, axis=0) - corners
+        across = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+        reach = corners @ np.concatenate([across, _DIRECTIONS]).T
+        return float(np.ptp(reach, axis=0).min())
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
         """Least distance to its copies at these lattice steps; 0 where they touch or overlap (within 1 % of radius)."""

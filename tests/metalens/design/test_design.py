@@ -156,7 +156,7 @@ def test_one_pillar_is_a_lens(proxy):
 
 def test_blocks_of_rows_do_not_show(proxy, monkeypatch):
     whole, one = _make(proxy)
-    monkeypatch.setattr(design, "_BLOCK_SITES", 500)
+    monkeypatch.setattr("metalens.design.sites._BLOCK_SITES", 500)
     parts, other = _make(proxy)
     np.testing.assert_array_equal(whole.diameters.diameter_um, parts.diameters.diameter_um)
     assert one.efficiency == pytest.approx(other.efficiency, rel=1e-12)
