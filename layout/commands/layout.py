@@ -23,6 +23,7 @@ from layout.rules import markers
 from metalens import lens as lenses
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
 from metalens.lens import Lens
 
@@ -50,6 +51,7 @@ def _prepare(options: Options) -> Job:
     with stages("read"):
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
+        _refuse_beyond_plain(options, source)
     with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, with_doses=options.dose)
     with stages("write fields"):
@@ -58,6 +60,18 @@ def _prepare(options: Options) -> Job:
     with stages("check"):
         found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
     return Job(options, source, rules, made, split, plan, found, stages)
+
+
+def _refuse_beyond_plain(options: Options, source: Lens) -> None:
+    """What knows round pillars on a square lattice alone.
+
+    Raises:
+        ProcessError: naming the option.
+    """
+    disc = source.cell.shape.kind == "circle" and not source.cell.shape.hole
+    for name in ("study", "step", "stl"):
+        if getattr(options, name) and not (source.diameters.plain and disc):
+            raise ProcessError(f"--{name} takes round pillars on a square lattice, not {source.cell.described}")
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
@@ -118,9 +132,10 @@ def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
 
 
 def _certifiable(job: Job) -> bool:
-    """Whether the simulator knows the point exposure (Gaussians) and the tone."""
+    """Whether the simulator knows the point exposure (Gaussians), the tone, and the pillars (round, square lattice)."""
     exposure = job.process.exposure
-    return exposure.known and exposure.csv is None and job.process.tone == "positive"
+    plain = job.source.diameters.plain and job.plan.classes[0].round
+    return exposure.known and exposure.csv is None and job.process.tone == "positive" and plain
 
 
 def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float]) -> Survey:

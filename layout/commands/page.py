@@ -103,7 +103,22 @@ def _rules(job: Job, shots: dict[str, bytes]) -> Section:
     return Section("Design rules", found.summary + ".", items)
 
 
+def _shaped(job: Job) -> Section:
+    """Of pillars that are not round."""
+    turned = job.source.diameters.angle_rad is not None
+    turns = f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees" if turned else ""
+    area = [abs(polygon.twice_area(made.outline)) / 2 for made in job.plan.classes]
+    rows = [["classes", len(area)], ["least area / nm²", min(area)], ["largest area / nm²", max(area)]]
+    text = (
+        f"Each is a {job.source.cell.shape.name}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"
+        f"{turns}, its corners on the grid; rounding by the etch is not made up for."
+    )
+    return Section("Pillars", text, [Table(("what", "value"), rows)])
+
+
 def _classes(job: Job, shots: dict[str, bytes]) -> Section:
+    if not job.plan.classes[0].round:
+        return _shaped(job)
     shapes = {made.diameter_units: made for made in job.plan.classes}
     grid = job.plan.grid
     made = [polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)]

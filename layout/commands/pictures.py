@@ -8,6 +8,7 @@ from layout.certify import Survey
 from layout.files import Window, sites_in
 from layout.mask import Lattice, MaskPlan
 from layout.rules import DrcReport
+from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
@@ -53,8 +54,8 @@ def pillars(plan: MaskPlan, windows: tuple[Window, ...]) -> bytes:
     for ax, window in zip(axes[0], windows, strict=True):
         shapes, sizes = [], []
         for k, x, y in (site for lattice in plan.lattices for site in sites_in(plan, lattice, window)):
-            for polygon in plan.classes[k - 1].polygons:
-                shapes.append((polygon + np.array([x, y])) * scale)
+            for corners in plan.classes[k - 1].polygons:
+                shapes.append((corners + np.array([x, y])) * scale)
                 sizes.append(plan.classes[k - 1].diameter_nm)
         drawn = PolyCollection(shapes, array=np.array(sizes), cmap="viridis", edgecolors="#222", linewidths=0.4)
         drawn.set_clim(low, high)
@@ -134,7 +135,8 @@ def _thumbnail(plan: MaskPlan, lattice: Lattice, most: int = 700) -> Array:
     (rows, columns) in per cent, NaN where there is no pillar. Every n-th pillar would show rings that are not there.
     """
     step = max(1, -(-max(lattice.rows, lattice.columns) // most))
-    table = 100 * np.pi / 4 * np.array([0.0, *(made.diameter_units**2 for made in plan.classes)]) / lattice.pitch**2
+    areas = np.array([0.0, *(polygon.twice_area(made.outline) / 2 for made in plan.classes)])
+    table = 100 * areas / (lattice.pitch * lattice.down)
     edges = np.arange(0, lattice.columns, step)
     rows = []
     for first in range(0, lattice.rows, step):
@@ -146,9 +148,9 @@ def _thumbnail(plan: MaskPlan, lattice: Lattice, most: int = 700) -> Array:
 
 
 def _extent(plan: MaskPlan, lattice: Lattice) -> tuple[float, float, float, float]:
-    scale, half = plan.unit_nm * 1e-3, lattice.pitch / 2
-    left, top = lattice.x0 - half, lattice.y0 + half
-    right, bottom = left + lattice.columns * lattice.pitch, top - lattice.rows * lattice.pitch
+    scale = plan.unit_nm * 1e-3
+    left, top = lattice.x0 - lattice.pitch / 2, lattice.y0 + lattice.down / 2
+    right, bottom = left + lattice.columns * lattice.pitch, top - lattice.rows * lattice.down
     return left * scale, right * scale, bottom * scale, top * scale
 
 

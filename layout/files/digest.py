@@ -50,10 +50,13 @@ class Digest:
         self._grow(int(slot.max()) + 1)
         _take(slot, x.astype(np.int64), y.astype(np.int64), turn, self._sums, self._hashes)
 
-    def sites(self, block: Array, x0: int, y0: int, pitch: int) -> None:
-        """Add the sites of a block of class numbers (0: none), its first site at (x0, y0), rows towards -y."""
+    def sites(self, block: Array, x0: int, y0: int, pitch: tuple[int, int]) -> None:
+        """Add the sites of a block of class numbers (0: none), its first site at (x0, y0), rows towards -y.
+
+        pitch: of columns and of rows.
+        """
         self._grow(2 * int(block.max(initial=0)) + 1)
-        _sites(np.ascontiguousarray(block), x0, y0, pitch, self._sums, self._hashes)
+        _sites(np.ascontiguousarray(block), x0, y0, *pitch, self._sums, self._hashes)
 
     @property
     def children(self) -> Array:
@@ -99,9 +102,9 @@ def _take(slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Arr
 
 
 @compiled
-def _sites(block: Array, x0: int, y0: int, pitch: int, sums: Array, hashes: Array) -> None:
+def _sites(block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array) -> None:
     for row in range(block.shape[0]):
-        y = y0 - row * pitch
+        y = y0 - row * down
         for column in range(block.shape[1]):
             if block[row, column]:
                 k, x = 2 * block[row, column], x0 + column * pitch

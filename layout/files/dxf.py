@@ -106,13 +106,13 @@ def sites_in(plan: MaskPlan, lattice: Lattice, window: Window) -> Iterator[tuple
     half = window.size_um / 2
     left = _ceil((window.x_um - half) * scale - lattice.x0, lattice.pitch, lattice.columns)
     right = _ceil((window.x_um + half) * scale - lattice.x0, lattice.pitch, lattice.columns)
-    first = _ceil(lattice.y0 - (window.y_um + half) * scale, lattice.pitch, lattice.rows)
-    end = _ceil(lattice.y0 - (window.y_um - half) * scale, lattice.pitch, lattice.rows)
+    first = _ceil(lattice.y0 - (window.y_um + half) * scale, lattice.down, lattice.rows)
+    end = _ceil(lattice.y0 - (window.y_um - half) * scale, lattice.down, lattice.rows)
     if left >= right or first >= end:
         return
     block = lattice.source(first, end)[:, left:right]
     for row, column in np.argwhere(block > 0).tolist():
-        x, y = lattice.x0 + (left + column) * lattice.pitch, lattice.y0 - (first + row) * lattice.pitch
+        x, y = lattice.x0 + (left + column) * lattice.pitch, lattice.y0 - (first + row) * lattice.down
         yield int(block[row, column]), x, y
 
 

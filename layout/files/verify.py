@@ -99,7 +99,7 @@ def _compare_lattice(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> 
         for i in range(0, len(placed.child), _CHUNK):
             part = slice(i, i + _CHUNK)
             column, off_x = np.divmod(placed.x[part].astype(np.int64) - lattice.x0, lattice.pitch)
-            row, off_y = np.divmod(lattice.y0 - placed.y[part].astype(np.int64), lattice.pitch)
+            row, off_y = np.divmod(lattice.y0 - placed.y[part].astype(np.int64), lattice.down)
             outside = (row < 0) | (row >= lattice.rows) | (column < 0) | (column >= lattice.columns)
             wrong = outside | (off_x != 0) | (off_y != 0) | (placed.turn[part] >= len(QUARTERS))
             if wrong.any():
@@ -115,7 +115,7 @@ def _compare_sums(plan: MaskPlan, lattice: Lattice, children: tuple[str, ...], r
     """As :func:`_compare_lattice`, where of each class only sums over its places were kept."""
     digest = Digest()
     for first, block in lattice.blocks(max(1, _CHUNK // lattice.columns)):
-        digest.sites(block, lattice.x0, lattice.y0 - first * lattice.pitch, lattice.pitch)
+        digest.sites(block, lattice.x0, lattice.y0 - first * lattice.down, (lattice.pitch, lattice.down))
     wanted = digest.of(np.arange(len(plan.classes) + 1))
     number = {made.name: k for k, made in enumerate(plan.classes, 1)}
     count, wrong = int(read.count.sum()), []

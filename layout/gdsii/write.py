@@ -118,7 +118,7 @@ def _references(plan: MaskPlan, lattice: Lattice, counts: Array) -> Iterator[mem
     turn = 0
     xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), templates.dtype)
     for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
-        ys = _words(lattice.y0 - lattice.pitch * np.arange(first, first + len(block)), templates.dtype)
+        ys = _words(lattice.y0 - lattice.down * np.arange(first, first + len(block)), templates.dtype)
         count_classes(block, counts)
         row, column = 0, 0
         while row < len(block):

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.dose import Solution
-from layout.mask import cells, die, dosed, tone
+from layout.mask import cells, die, dosed, shaped, tone
 from layout.mask.plan import Lattice, MaskPlan, PillarClass, pillar_classes
 from layout.process import LayerNumber, Process, names
+from metalens.cell.shapes import Circle
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
@@ -59,13 +60,14 @@ def prepare(
     """As :func:`plan`, with everything that a report needs; ``with_doses``: with the correction of the process."""
     names.check(name)
     diameters = source.diameters if isinstance(source, Lens) else source
-    if not (diameters.plain and (not isinstance(source, Lens) or source.cell.round)):
-        raise ProcessError("a mask of other than round pillars on a square lattice is not drawn")
-    pitch = pitch_units(diameters.pitch_um, process)
-    found = cells.quantise(diameters, process)
-    classes = _plain_classes(found.diameters_nm, process)
-    x0, y0, axis = _origin(found.sites.shape, pitch, process.rules.grid_nm)
-    lattice = found.sites.lattice("LENS", pitch=pitch, x0=x0, y0=y0, upside_down=True)
+    steps = pitch_units(diameters.steps_um[0], process), pitch_units(diameters.steps_um[1], process)
+    found, classes = _drawn(source, process)
+    plain = diameters.plain and classes[0].round
+    if not plain:
+        _refuse_beyond_plain(process, with_doses)
+    x0, y0, axis = _origin(found.sites.shape, steps, process.rules.grid_nm)
+    lattice = found.sites.lattice("LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True)
+    lattice = dataclasses.replace(lattice, row_pitch=steps[1], centred=diameters.lattice.centred)
     bare = MaskPlan(
         name=name,
         classes=classes,
@@ -86,6 +88,33 @@ def prepare(
         bare, solution = dosed.corrected(bare, process)
     _check_layers(bare, process)
     return MadePlan(bare, found, solution, radius_um)
+
+
+def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, tuple[PillarClass, ...]]:
+    """The pillars as classes, and what is drawn for each."""
+    if isinstance(source, Lens):
+        disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
+        if source.diameters.angle_rad is not None or not disc:
+            return shaped.classes(source, process, unit_nm=UNIT_NM)
+        if not source.diameters.plain and process.bias.isolated_nm:
+            raise ProcessError("bias.isolated_nm is known for square lattices; need 0 for another lattice")
+    found = cells.quantise(source.diameters if isinstance(source, Lens) else source, process)
+    return found, _plain_classes(found.diameters_nm, process)
+
+
+def _refuse_beyond_plain(process: Process, with_doses: bool) -> None:
+    """What is only known for round pillars on a square lattice.
+
+    Raises:
+        ProcessError: a negative tone, or a dose correction that is asked for.
+    """
+    if process.tone == "negative":
+        raise ProcessError("tone = 'negative': need round pillars on a square lattice; take positive")
+    if with_doses and process.exposure.corrected:
+        raise ProcessError(
+            "exposure: doses are corrected for round pillars on a square lattice alone; leave the correction to the "
+            "writer (--no-dose) or set exposure.correct = false"
+        )
 
 
 def stream(
@@ -126,14 +155,14 @@ def stream(
             raise ProcessError(f"rows {first} to {end - 1}: a diameter outside {range_um} um; widen range_um")
         return np.where(drawn > 0, drawn - (thinnest - 1), 0).astype(kind)[::-1]
 
-    x0, y0, axis = _origin(shape, pitch, rules.grid_nm)
+    x0, y0, axis = _origin(shape, (pitch, pitch), rules.grid_nm)
     lattice = Lattice("LENS", shape[0], shape[1], pitch, x0, y0, sites)
     made = MaskPlan(name, classes, (lattice,), grid=rules.grid_nm, axis=axis)
     return tone.inverted(made, process) if process.tone == "negative" else made
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:
-    """The pitch in database units.
+    """A step of the lattice in database units.
 
     Raises:
         ProcessError: it is no multiple of the grid.
@@ -147,9 +176,9 @@ def pitch_units(pitch_um: float, process: Process) -> int:
     return round(steps) * process.rules.grid_nm
 
 
-def _origin(shape: tuple[int, ...], pitch: int, grid: int) -> tuple[int, int, tuple[float, float]]:
+def _origin(shape: tuple[int, ...], steps: tuple[int, int], grid: int) -> tuple[int, int, tuple[float, float]]:
     """First site on the grid such that the axis is at (0, 0), or half a grid step off where it cannot be."""
-    half_x, half_y = (shape[1] - 1) * pitch / 2, (shape[0] - 1) * pitch / 2
+    half_x, half_y = (shape[1] - 1) * steps[0] / 2, (shape[0] - 1) * steps[1] / 2
     x0, y0 = math.floor(-half_x / grid) * grid, math.ceil(half_y / grid) * grid
     return x0, y0, (x0 + half_x, y0 - half_y)
 

@@ -91,7 +91,7 @@ class _Units:
     """From micrometres to database units on the grid."""
 
     def __init__(self, plan: MaskPlan) -> None:
-        self.per_um, self.grid, self.pitch = 1e3 / plan.unit_nm, plan.grid, plan.lattices[0].pitch
+        self.per_um, self.grid, self.pitch = 1e3 / plan.unit_nm, plan.grid, plan.lattices[0].constant
 
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid

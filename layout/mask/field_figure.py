@@ -12,14 +12,13 @@ from layout.process import Process
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
     """``plan`` with one rectangle for each write field, clipped to the lens."""
     lattice = plan.lattices[0]
-    half = lattice.pitch // 2
 
-    def edges(sites: np.ndarray, most: int) -> list[int]:
-        return [int(s) * lattice.pitch - half for s in np.unique(np.clip(sites, 0, most))]
+    def edges(sites: np.ndarray, most: int, step: int) -> list[int]:
+        return [int(s) * step - step // 2 for s in np.unique(np.clip(sites, 0, most))]
 
-    xs = [lattice.x0 + v for v in edges(split.columns, lattice.columns)]
-    first_row = lattice.y0 - (lattice.rows - 1) * lattice.pitch
-    ys = [first_row + v for v in edges(split.rows, lattice.rows)]
+    xs = [lattice.x0 + v for v in edges(split.columns, lattice.columns, lattice.pitch)]
+    first_row = lattice.y0 - (lattice.rows - 1) * lattice.down
+    ys = [first_row + v for v in edges(split.rows, lattice.rows, lattice.down)]
     boxes = tuple(
         np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) // plan.grid * plan.grid
         for (left, right), (bottom, top) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys))

@@ -26,7 +26,7 @@ class FieldPlan:
 
     rows, columns: (fields + 1,) first row (column) of each field and the end of the last; a fixed raster may begin
         before the first site and end after the last.
-    shape: (y, x) sites; pitch_um: lattice constant.
+    shape: (y, x) sites; pitch_um: from column to column; row_um: from row to row.
     mode: ``floating`` or ``shift``, see :class:`layout.process.process.WriteField`.
     pillars: (y fields, x fields) pillars in each.
     cut_before: pillars that the same raster, left where the axis of the lens is a field corner, would cut.
@@ -41,6 +41,7 @@ class FieldPlan:
     pillars: Array
     cut_before: int
     clearance_um: float
+    row_um: float = 0.0
 
     @property
     def used(self) -> int:
@@ -55,7 +56,7 @@ class FieldPlan:
     @property
     def y_um(self) -> Array:
         """Positions of the borders along y."""
-        return np.asarray((self.rows - self.shape[0] / 2) * self.pitch_um)
+        return np.asarray((self.rows - self.shape[0] / 2) * (self.row_um or self.pitch_um))
 
     @property
     def size_um(self) -> tuple[float, float]:
@@ -86,17 +87,16 @@ def split(diameters: DiameterMap, process: Process, *, drawn: Cells | None = Non
     Raises:
         ProcessError: a field smaller than the pitch; as :func:`layout.mask.cells.quantise`.
     """
-    settings, pitch = process.write_field, diameters.pitch_um
-    sites = int(settings.size_um / pitch + 1e-9)
-    if sites < 1:
+    settings, (pitch, down) = process.write_field, diameters.steps_um
+    across, sites = (int(settings.size_um / step + 1e-9) for step in (pitch, down))
+    if min(across, sites) < 1:
         raise ProcessError(f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it")
     made = quantise(diameters, process) if drawn is None else drawn
     seen = _Seen.of(diameters, made, settings.size_um)
-    rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, sites)
-    clearance = (pitch - float(made.diameters_nm[-1]) * nm) / 2
-    return FieldPlan(
-        rows, columns, made.sites.shape, pitch, settings.mode, _counted(made, rows, columns), seen.cut, clearance
-    )
+    rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, across)
+    clearance = (min(pitch, down) - float(made.diameters_nm[-1]) * nm) / 2  # below 0 where borders cut pillars
+    counts = _counted(made, rows, columns)
+    return FieldPlan(rows, columns, made.sites.shape, pitch, settings.mode, counts, seen.cut, clearance, down)
 
 
 @dataclass(eq=False, slots=True)

@@ -32,7 +32,8 @@ class PillarClass:
     name: of the cell. diameter_nm, diameter_units: of the circle that ``outline`` stands for, as drawn.
     layer: (layer, datatype). outline: (n, 2) of the pillar. drawn: polygons that are written (the outline itself,
     or what is left of the lattice square for a negative tone). dose: relative to the base dose. goal: wanted exposure
-    of the edge, relative to dose-to-size (1 but in a dose test).
+    of the edge, relative to dose-to-size (1 but in a dose test). round: whether the outline stands for a circle of that
+    diameter; else the diameter is the size of the shape.
     """
 
     name: str
@@ -43,6 +44,7 @@ class PillarClass:
     drawn: tuple[Array, ...] = ()
     dose: float = 1.0
     goal: float = 1.0
+    round: bool = True
 
     @property
     def polygons(self) -> tuple[Array, ...]:
@@ -52,11 +54,13 @@ class PillarClass:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Lattice:
-    """Pillars on a square lattice, written as one cell.
+    """Pillars on a lattice, written as one cell.
 
     rows, columns: of sites. source: gives any block of rows as class numbers (0: none); array: all of them, where
     they are in memory.
-    x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row * pitch.
+    x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row * down.
+    row_pitch: from row to row, 0 for that of the columns. centred: every other site stays empty (a hexagonal lattice:
+    the pitch is half its constant).
     """
 
     name: str
@@ -67,19 +71,36 @@ class Lattice:
     y0: int
     source: RowSource
     array: Array | None = None
+    row_pitch: int = 0
+    centred: bool = False
 
     def __post_init__(self) -> None:
         names.check(self.name)
-        corners = (self.x0, self.y0, self.x0 + self.columns * self.pitch, self.y0 - self.rows * self.pitch)
+        corners = (self.x0, self.y0, self.x0 + self.columns * self.pitch, self.y0 - self.rows * self.down)
         if max(map(abs, corners)) > FARTHEST:
             raise ProcessError(
                 f"lattice {self.name} reaches {max(map(abs, corners))} database units from the origin, beyond 32 bits "
                 f"({FARTHEST}); take a smaller aperture or a coarser unit"
             )
 
+    @property
+    def down(self) -> int:
+        """From row to row."""
+        return self.row_pitch or self.pitch
+
+    @property
+    def square(self) -> bool:
+        """Whether rows and columns are as far apart, and every site is one of the lattice."""
+        return self.down == self.pitch and not self.centred
+
+    @property
+    def constant(self) -> int:
+        """From a pillar to the next one of its row."""
+        return self.pitch * (2 if self.centred else 1)
+
     @classmethod
     def of(cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int) -> "Lattice":
-        """A lattice held in memory: (rows, columns) uint8 or uint16."""
+        """A square lattice held in memory: (rows, columns) uint8 or uint16."""
         if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
             raise ProcessError(f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 (rows, columns)")
         rows, columns = classes.shape

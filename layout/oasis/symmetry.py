@@ -23,7 +23,7 @@ class Piece:
 def is_square_symmetric(lattice: Lattice) -> bool:
     """Whether the lattice, centred at (0, 0), is the same under the eight symmetries of the square."""
     a = lattice.array
-    if a is None or lattice.rows != lattice.columns or lattice.rows < 4:
+    if a is None or not lattice.square or lattice.rows != lattice.columns or lattice.rows < 4:
         return False
     span = (lattice.columns - 1) * lattice.pitch
     if (2 * lattice.x0, 2 * lattice.y0) != (-span, span):

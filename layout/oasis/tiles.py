@@ -32,11 +32,11 @@ def _put_signed(out: Array, at: int, value: int) -> int:
 
 
 @compiled
-def encode_tile(tile: Array, pitch: int, x0: int, y0: int, out: Array) -> int:
+def encode_tile(tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array) -> int:
     """Placements of a tile in raster order: the first at its place, each other relative to the one before.
 
     Args:
-        tile: (rows, columns) class numbers; x0, y0: its first site.
+        tile: (rows, columns) class numbers; pitch, down: of columns and rows; x0, y0: its first site.
         out: room for LARGEST_RECORD bytes a site.
 
     Returns:
@@ -44,7 +44,7 @@ def encode_tile(tile: Array, pitch: int, x0: int, y0: int, out: Array) -> int:
     """
     at, last_x, last_y, fresh = 0, 0, 0, True
     for row in range(tile.shape[0]):
-        y = y0 - row * pitch
+        y = y0 - row * down
         for column in range(tile.shape[1]):
             kind = tile[row, column]
             if kind:

@@ -29,6 +29,7 @@ Form = Literal["small", "fast", "reader"]
 _LEVELS: dict[str, int] = {"small": 6, "fast": 2, "reader": 6}
 _STRIP = 32  # columns of a strip in the reader's form
 _THREADS = 2
+_QUARTER, _MIRROR = np.array([[0, 1], [-1, 0]]), np.array([[-1, 0], [0, 1]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,8 @@ def write(plan: MaskPlan, path: str | Path, *, form: Form = "small", circles: bo
         fold: store a lens that is symmetric under the square once, as an eighth.
 
     Raises:
-        ProcessError: an odd diameter with ``circles``; a drawn shape that is no pillar (negative tone).
+        ProcessError: an odd diameter with ``circles``; a drawn shape that is no pillar (negative tone) or not round;
+            the reader's form of another lattice than a square one.
         OSError: the target cannot be written, or the disk is full; what was there before stays.
     """
     if form not in _LEVELS:
@@ -60,7 +62,10 @@ def write(plan: MaskPlan, path: str | Path, *, form: Form = "small", circles: bo
 
 
 def _write_file(file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool) -> None:
-    placed = [_piece_list(lattice, fold) for lattice in plan.lattices]
+    alike = fold and all(_square_symmetric(made) for made in plan.classes)
+    placed = [_piece_list(lattice, alike) for lattice in plan.lattices]
+    if settings.reader and not all(lattice.square for lattice in plan.lattices):
+        raise ProcessError("OASIS form 'reader' lists sites of a square lattice; take small or fast")
     folded = [piece.lattice.name for made in placed if len(made) > 1 for piece in made]
     cell_names = [*plan.cell_names[:-1], *folded, plan.name]
     names.distinct(cell_names)
@@ -81,6 +86,16 @@ def _write_file(file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool)
 
 def _cell_name(number: int, name: str) -> bytes:
     return bytes([oasis.CELLNAME_REF]) + oasis.string(name) + oasis.unsigned(number)
+
+
+def _square_symmetric(made: PillarClass) -> bool:
+    """Whether a quarter turn and a mirror leave what is drawn as it is."""
+
+    def corners(*shapes: Array) -> set[tuple[int, int]]:
+        return {(int(x), int(y)) for shape in shapes for x, y in shape}
+
+    drawn = corners(*made.polygons)
+    return all(corners(*(p @ m for p in made.polygons)) == drawn for m in (_QUARTER, _MIRROR))
 
 
 def _piece_list(lattice: Lattice, fold: bool) -> list[Piece]:
@@ -127,6 +142,8 @@ def _placement(number: int, turn: tuple[int, bool] = (0, False)) -> bytes:
 def _pillar(made: PillarClass, circles: bool) -> bytes:
     if not circles:
         return b"".join(_polygon(made.layer, polygon) for polygon in made.polygons)
+    if not made.round:
+        raise ProcessError(f"class {made.name} is not round: circles cannot stand for it; leave circles out")
     if made.drawn:
         raise ProcessError("circles can be written for a positive tone only; leave circles out")
     width = made.diameter_units
@@ -161,17 +178,17 @@ def _tiles(lattice: Lattice, level: int, counts: Array) -> Iterator[bytes]:
     def jobs() -> Iterator[Callable[[], bytes]]:
         for first, block in lattice.blocks(tiles.TILE_ROWS):
             tiles.count_classes(block, counts)
-            y = lattice.y0 - first * lattice.pitch
+            y = lattice.y0 - first * lattice.down
             for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
                 tile, x = block[:, left : left + tiles.TILE_COLUMNS], lattice.x0 + left * lattice.pitch
-                yield partial(_tile, tile, lattice.pitch, x, y, level)
+                yield partial(_tile, tile, (lattice.pitch, lattice.down), x, y, level)
 
     yield from _in_order(jobs())
 
 
-def _tile(tile: Array, pitch: int, x0: int, y0: int, level: int) -> bytes:
+def _tile(tile: Array, pitch: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
     out = np.empty(tile.size * tiles.LARGEST_RECORD, np.uint8)
-    used = tiles.encode_tile(tile, pitch, x0, y0, out)
+    used = tiles.encode_tile(tile, *pitch, x0, y0, out)
     return oasis.compressed(out[:used].data, level) if used else b""
 
 

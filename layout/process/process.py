@@ -43,6 +43,7 @@ class Rules:
     minimum_foot_gap_nm: narrowest gap at the foot of the pillars as they come out of the etch, with tilted walls.
     grid_nm: step of all mask coordinates (whole nm).
     diameter_step_nm: step of the diameters, a multiple of the grid: one class of pillars each.
+    angle_step_deg: step of the turns of pillars that are turned one by one, a divisor of 180: one class each.
     vertices: of a pillar polygon, 8 to 64, a multiple of 4.
     shape: ``round``: equal-area polygon of ``vertices``; ``shot``: only horizontal, vertical and diagonal edges.
     maximum_density, density_window_um: share of the area that pillars may cover in any window of that size.
@@ -54,6 +55,7 @@ class Rules:
     minimum_foot_gap_nm: float = 50.0
     grid_nm: int = 1
     diameter_step_nm: int = 2
+    angle_step_deg: float = 1.0
     vertices: int = 32
     shape: Literal["round", "shot"] = "round"
     maximum_density: float = 0.75
@@ -61,12 +63,22 @@ class Rules:
     exclusion: tuple[Zone, ...] = ()
 
     def __post_init__(self) -> None:
-        _positive(self, "minimum_feature_nm", "minimum_gap_nm", "grid_nm", "diameter_step_nm", "density_window_um")
+        _positive(
+            self,
+            "minimum_feature_nm",
+            "minimum_gap_nm",
+            "grid_nm",
+            "diameter_step_nm",
+            "density_window_um",
+            "angle_step_deg",
+        )
         if self.diameter_step_nm % self.grid_nm:
             raise ProcessError(
                 f"a grid of {self.grid_nm} nm is coarser than, or no divisor of, diameter_step_nm = "
                 f"{self.diameter_step_nm}; make the step a multiple of the grid"
             )
+        if abs(180 / self.angle_step_deg - round(180 / self.angle_step_deg)) > 1e-9:
+            raise ProcessError(f"angle_step_deg = {self.angle_step_deg}: need a divisor of 180, as 1, 2.5 or 15")
         if not 8 <= self.vertices <= 64 or self.vertices % 4:
             raise ProcessError(f"vertices = {self.vertices}: need a multiple of 4 from 8 to 64")
         if not 0 < self.maximum_density <= 1:

@@ -80,18 +80,20 @@ def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcR
 
 def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) -> tuple[Array, float]:
     """Pillars of each class, and the largest density of any window; dense windows are reported."""
-    side = max(1, round(rules.density_window_um * 1e3 / plan.unit_nm / lattice.pitch / 2))
-    tiles = (math.ceil(lattice.rows / side) + 1, math.ceil(lattice.columns / side) + 1)
+    window = rules.density_window_um * 1e3 / plan.unit_nm / 2
+    side, down = (max(1, round(window / step)) for step in (lattice.pitch, lattice.down))
+    tiles = (math.ceil(lattice.rows / down) + 1, math.ceil(lattice.columns / side) + 1)
     area = np.array([0.0, *(polygon.twice_area(made.outline) / 2 for made in plan.classes)])
     counts, cover = np.zeros(len(area), np.int64), np.zeros(tiles)
     for first, block in lattice.blocks(max(1, _BLOCK_SITES // lattice.columns)):
-        drc_loops.count_and_cover(block, first, area, side, counts, cover)
+        drc_loops.count_and_cover(block, first, area, (down, side), counts, cover)
     report.pillars += int(counts[1:].sum())
     windows = cover[:-1, :-1] + cover[1:, :-1] + cover[:-1, 1:] + cover[1:, 1:]
-    share = windows / (2.0 * side * lattice.pitch) ** 2
+    wide, high = 2 * side * lattice.pitch, 2 * down * lattice.down
+    share = windows / (float(wide) * high)
     for i, j in np.argwhere(share > rules.maximum_density):
-        x, y = lattice.x0 + j * side * lattice.pitch, lattice.y0 - i * side * lattice.pitch
-        box = (int(x), int(y) - 2 * side * lattice.pitch, int(x) + 2 * side * lattice.pitch, int(y))
+        x, y = lattice.x0 + j * side * lattice.pitch, lattice.y0 - i * down * lattice.down
+        box = (int(x), int(y) - high, int(x) + wide, int(y))
         report.add("density", 1, Violation("density", box, float(share[i, j]), rules.maximum_density, lattice.name))
     return counts, float(share.max(initial=0.0))
 
@@ -145,43 +147,67 @@ def _gaps(
     if foot_nm is not None:
         np.maximum.at(foot, kind[1:][counts[1:] > 0], foot_nm[counts[1:] > 0])
     reach = max(2 * widest + limit, (foot.max() + rules.minimum_foot_gap_nm) / plan.unit_nm)
-    offsets = _offsets(lattice.pitch, reach)
+    offsets = _offsets(lattice.pitch, lattice.down, reach)
+    steps = np.array([lattice.pitch, lattice.down])
     table = np.zeros((len(offsets), len(kinds) + 1, len(kinds) + 1), np.int64)
     for block, new, _ in _with_rows_above(lattice, int(offsets[:, 1].max())):
         drc_loops.pair_histogram(block, new, kind, offsets, table)
-    bad, least = _measure(table, offsets * lattice.pitch, outlines, limit)
+    bad, least = _measure(table, offsets * steps, outlines, limit)
     report.minimum_gap_nm = min(report.minimum_gap_nm, least * plan.unit_nm)
     if bad:
         _report_gaps(plan, lattice, (kind, offsets, table), bad, report)
     if foot_nm is not None:
-        _feet(lattice, rules, (offsets, table, foot), report)
+        _all_feet(plan, lattice, rules, (offsets * steps, table, foot), (foot_nm, counts, least), report)
+
+
+def _all_feet(
+    plan: MaskPlan,
+    lattice: Lattice,
+    rules: Rules,
+    pairs: tuple[Array, Array, Array],
+    found: tuple[Array, Array, float],
+    report: DrcReport,
+) -> None:
+    """Gaps between feet; of pillars that are not round by the least gap drawn, less what the widest wall leans out."""
+    foot_nm, counts, least = found
+    used = [k for k, made in enumerate(plan.classes) if counts[k + 1] and not made.round]
+    if not used:
+        _feet(lattice, rules, pairs, report)
+        return
+    apart = least * plan.unit_nm - max(float(foot_nm[k]) - plan.classes[k].diameter_nm for k in used)
+    _feet_found(lattice, rules, apart, int(apart < rules.minimum_foot_gap_nm - 1e-9), report)
 
 
 def _feet(lattice: Lattice, rules: Rules, pairs: tuple[Array, Array, Array], report: DrcReport) -> None:
     """Gaps between round feet, for each kind of pair; one violation is listed for each lattice."""
-    offsets, table, foot = pairs
+    moves, table, foot = pairs
     m, a, b = np.nonzero(table)
     standing = (a > 0) & (b > 0)
     m, a, b = m[standing], a[standing], b[standing]
-    gaps = np.hypot(*offsets[m].T) * lattice.pitch * report.unit_nm - (foot[a] + foot[b]) / 2
+    gaps = np.hypot(*moves[m].T) * report.unit_nm - (foot[a] + foot[b]) / 2
     least = float(gaps.min(initial=math.inf))
-    report.minimum_foot_gap_nm = min(report.minimum_foot_gap_nm, least)
     bad = gaps < rules.minimum_foot_gap_nm - 1e-9
-    if bad.any():
-        box = (lattice.x0, lattice.y0 - lattice.rows * lattice.pitch, lattice.x0 + lattice.columns * lattice.pitch)
+    _feet_found(lattice, rules, least, int(table[m[bad], a[bad], b[bad]].sum()), report)
+
+
+def _feet_found(lattice: Lattice, rules: Rules, least: float, pairs: int, report: DrcReport) -> None:
+    """Enter the least gap between feet, and how many pairs are nearer than the rule."""
+    report.minimum_foot_gap_nm = min(report.minimum_foot_gap_nm, least)
+    if pairs:
+        box = (lattice.x0, lattice.y0 - lattice.rows * lattice.down, lattice.x0 + lattice.columns * lattice.pitch)
         text = f"feet of etched pillars in {lattice.name}"
-        report.add("foot", int(table[m[bad], a[bad], b[bad]].sum()), None)
+        report.add("foot", pairs, None)
         report.add("foot", 0, Violation("foot", (*box, lattice.y0), least, rules.minimum_foot_gap_nm, text))
 
 
-def _offsets(pitch: int, reach: float) -> Array:
+def _offsets(pitch: int, down: int, reach: float) -> Array:
     """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each opposite pair; at least four."""
-    n = max(1, int(reach // pitch))
+    across, up = (max(1, int(reach // step)) for step in (pitch, down))
     steps = [
         (i, j)
-        for j in range(n + 1)
-        for i in range(-n, n + 1)
-        if (j > 0 or i > 0) and (max(abs(i), j) == 1 or math.hypot(i, j) * pitch < reach)
+        for j in range(up + 1)
+        for i in range(-across, across + 1)
+        if (j > 0 or i > 0) and (max(abs(i), j) == 1 or math.hypot(i * pitch, j * down) < reach)
     ]
     return np.array(steps)
 
@@ -254,7 +280,7 @@ def _off_grid(plan: MaskPlan, report: DrcReport) -> None:
             if (np.asarray(shape) % grid).any():
                 report.add("off-grid", 1, Violation("off-grid", _box(shape, 0, 0), 0.0, float(grid), made.name))
     for lattice in plan.lattices:
-        if lattice.pitch % grid or lattice.x0 % grid or lattice.y0 % grid:
+        if lattice.pitch % grid or lattice.down % grid or lattice.x0 % grid or lattice.y0 % grid:
             box = (lattice.x0, lattice.y0, lattice.x0, lattice.y0)
             report.add("off-grid", 1, Violation("off-grid", box, 0.0, float(grid), lattice.name))
     for figure in plan.figures:
@@ -264,7 +290,7 @@ def _off_grid(plan: MaskPlan, report: DrcReport) -> None:
 
 
 def _place(lattice: Lattice, row: int, column: int) -> tuple[int, int]:
-    return lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.pitch
+    return lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.down
 
 
 def _box(outline: Array, x: int, y: int) -> tuple[int, int, int, int]:

@@ -41,11 +41,11 @@ def find_pairs(block: Array, new: int, kind: Array, offsets: Array, bad: Array, 
 
 
 @compiled
-def count_and_cover(block: Array, first: int, area: Array, side: int, counts: Array, cover: Array) -> None:
-    """Add the pillars of each class to ``counts`` and their area to (tiles, tiles) ``cover`` of ``side`` sites."""
+def count_and_cover(block: Array, first: int, area: Array, side: tuple[int, int], counts: Array, cover: Array) -> None:
+    """Add the pillars of each class to ``counts`` and their area to tiles of ``side`` (rows, columns)."""
     for row in range(block.shape[0]):
-        tile_row = (first + row) // side
+        tile_row = (first + row) // side[0]
         for column in range(block.shape[1]):
             c = block[row, column]
             counts[c] += 1
-            cover[tile_row, column // side] += area[c]
+            cover[tile_row, column // side[1]] += area[c]

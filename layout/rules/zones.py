@@ -38,18 +38,18 @@ def _zone_box(zone: Zone, unit_nm: float) -> Box:
 
 def _standing(plan: MaskPlan, lattice: Lattice, zone: Box) -> Iterator[tuple[int, Array]]:
     """(class, (n, 2) sites) of the pillars that reach into the zone."""
-    pitch = lattice.pitch
+    pitch, down = lattice.pitch, lattice.down
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
     left = max(0, math.floor((zone[0] - reach - lattice.x0) / pitch))
     right = min(lattice.columns, math.ceil((zone[2] + reach - lattice.x0) / pitch) + 1)
-    top = max(0, math.floor((lattice.y0 - zone[3] - reach) / pitch))
-    bottom = min(lattice.rows, math.ceil((lattice.y0 - zone[1] + reach) / pitch) + 1)
+    top = max(0, math.floor((lattice.y0 - zone[3] - reach) / down))
+    bottom = min(lattice.rows, math.ceil((lattice.y0 - zone[1] + reach) / down) + 1)
     if left >= right or top >= bottom:
         return
     block = lattice.source(top, bottom)[:, left:right]
     for k in np.unique(block[block > 0]).tolist():
         rows, columns = np.nonzero(block == k)
-        xy = np.column_stack([lattice.x0 + (columns + left) * pitch, lattice.y0 - (rows + top) * pitch])
+        xy = np.column_stack([lattice.x0 + (columns + left) * pitch, lattice.y0 - (rows + top) * down])
         hit = xy[_overlaps(plan.classes[k - 1].outline, xy, zone)]
         if len(hit):
             yield k, hit
@@ -105,7 +105,7 @@ def _apart(boxes: Array, box: Array) -> Array:
 
 def _lattice_box(plan: MaskPlan, lattice: Lattice) -> Box:
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
-    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.pitch
+    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
     return lattice.x0 - reach, lattice.y0 - bottom - reach, lattice.x0 + right + reach, lattice.y0 + reach
 
 

@@ -88,4 +88,5 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
 def _outline(lens: Lens, size_um: float, turn_rad: float, x_um: float, y_um: float) -> Array:
     """(n, 2) corners of one pillar where it stands."""
     corners = lens.cell.outline(float(size_um)).parts[0].vertices(32)
-    return turned(corners, float(turn_rad)) + np.array([x_um, y_um])
+    placed: Array = turned(corners, float(turn_rad)) + np.array([x_um, y_um])
+    return placed

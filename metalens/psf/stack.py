@@ -75,9 +75,8 @@ def psf_stack(
     if not tolerance > 0:
         raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
-    about: dict[str, Any] = {"pitch_um": pitch_um, "window_um": window_um, "samples": samples}
-    about |= {"row_um": row_um, "site_um2": site_um2}
-    about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um)}
+    about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
+    about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um), "samples": samples}
     about |= {"offset_um": _value(offset_um), "layers": layers}
     several = np.ndim(_value(angle_rad)) == 2
     cases, found = [], []
@@ -91,16 +90,16 @@ def psf_stack(
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
     axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
     stack = _record(light, cases, axes, worst, tolerance)
-    budget = _budget(stack, worst, torch.stack([row[2] for row in found], -1) * cases[0].area_um2, several=several)
-    stack = dataclasses.replace(stack, budget=budget)
+    given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
+    stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
-def _budget(stack: PsfStack, worst: Result, given_um2: torch.Tensor, *, several: bool) -> Budget:
-    """By cause; given_um2: (…, angle) light that leaves the pillars towards the sensor for unit irradiance."""
-    whole = given_um2[..., None] if several else given_um2
+def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor) -> PsfStack:
+    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
     share = (stack.energy_um2.detach().cpu().double() / whole).min()
-    return Budget(worst.error, sampling=worst.sampling, outside=max(0.0, 1 - float(share)))
+    budget = Budget(worst.error, sampling=worst.sampling, outside=max(0.0, 1 - float(share)))
+    return dataclasses.replace(stack, budget=budget)
 
 
 def _passed(case: Case) -> float:

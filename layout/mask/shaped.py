@@ -1,0 +1,110 @@
+"""Pillars that are not round, or turned one by one: a class for every drawn size and turn.
+
+All edges of a pillar move alike, by the bias of the process at its size; its turn is rounded to a step, its corners to
+the grid. Rounding of the corners by the etch is not made up for.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from layout.mask.cells import Cells
+from layout.mask.held import hold
+from layout.mask.plan import MOST_CLASSES, PillarClass
+from layout.process import Process
+from metalens.cell import Cell
+from metalens.cell.shapes import turned
+from metalens.ground.arrays import Array
+from metalens.ground.errors import LensError, ProcessError
+from metalens.ground.units import nm
+from metalens.lens import DiameterMap, Lens
+
+_BLOCK_SITES = 1 << 20
+_FLAT = 1e-9
+
+
+def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, tuple[PillarClass, ...]]:
+    """The pillars of a lens as classes, and what is drawn for each.
+
+    Raises:
+        ProcessError: a shape in several parts or with hollows, too many classes, a pillar of less than a step.
+        LensError: no pillar.
+    """
+    d, cell = source.diameters, source.cell
+    _check(cell, process)
+    turns = _turns(cell, d, process)
+    counts: dict[int, int] = {}
+    for _, block in _keys(d, process, turns):
+        for key, count in zip(*np.unique(block, return_counts=True), strict=True):
+            counts[int(key)] = counts.get(int(key), 0) + int(count)
+    used = np.array(sorted(key for key in counts if key), np.int64)
+    if not len(used):
+        raise LensError("empty lens: the map holds no pillar; check the aperture")
+    if len(used) > MOST_CLASSES:
+        raise ProcessError(f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg")
+    kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
+    numbered = (
+        (first, np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind))
+        for first, block in _keys(d, process, turns)
+    )
+    sites = hold(d.diameter_um.shape, kind, numbered)
+    made = tuple(_class(cell, int(key), process, turns, unit_nm) for key in used)
+    across = np.array([2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made])
+    found = np.array([counts[int(key)] for key in used])
+    return Cells(sites, across, found, process.rules.diameter_step_nm / 2), made
+
+
+def _check(cell: Cell, process: Process) -> None:
+    outline = cell.outline(cell.pitch_um / 2)
+    corners = outline.parts[0].vertices(32)
+    edge = np.roll(corners, -1, axis=0) - corners
+    bend = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
+    if len(outline.parts) > 1 or bend.min() < -_FLAT or getattr(cell.shape, "hole", False):
+        raise ProcessError(
+            f"a mask of {cell.described}: pillars are drawn in one part without hollows (the rules are checked between "
+            "convex shapes); need a circle, square, rectangle, ellipse, or a convex polygon"
+        )
+    if process.bias.isolated_nm:
+        raise ProcessError(
+            f"bias.isolated_nm = {process.bias.isolated_nm} is known for round pillars on a square lattice; need 0 for "
+            f"{cell.described}"
+        )
+
+
+def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
+    """Classes of turns; 1 where none is turned."""
+    if d.angle_rad is None:
+        return 1
+    whole = 180.0 if cell.outline(cell.pitch_um / 2).repeats(math.pi) else 360.0
+    return max(1, round(whole / process.rules.angle_step_deg))
+
+
+def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, Array]]:
+    """(first row, drawn size in nm times the turns, plus the turn) of blocks of rows; 0 for no pillar."""
+    step = process.rules.diameter_step_nm
+    size = max(1, _BLOCK_SITES // max(1, d.diameter_um.shape[1]))
+    for first in range(0, d.diameter_um.shape[0], size):
+        design = np.asarray(d.diameter_um[first : first + size], float) / nm
+        drawn = np.rint(process.bias.drawn_nm(design) / step).astype(np.int64) * step
+        if ((drawn < step) & (design > 0)).any():
+            raise ProcessError(f"a pillar would be drawn below one step of {step} nm; check the bias")
+        turn = np.zeros(design.shape, np.int64)
+        if d.angle_rad is not None:
+            degrees = np.degrees(np.asarray(d.angle_rad[first : first + size], float))
+            turn = np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
+        yield first, np.where(design > 0, drawn * turns + turn, 0)
+
+
+def _class(cell: Cell, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
+    """What is drawn for a key."""
+    grid, (drawn, turn) = process.rules.grid_nm, divmod(key, turns)
+    made = float(process.bias.made_nm(np.array(float(drawn)))) * nm
+    outline = cell.outline(made, grow_um=drawn * nm - made).parts[0].vertices(process.rules.vertices)
+    corners = turned(outline, math.radians(turn * process.rules.angle_step_deg)) / nm / unit_nm
+    points = np.asarray(np.rint(corners / grid) * grid, np.int64)
+    points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
+    name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
+    layer = process.layers.pillar
+    return PillarClass(name, float(drawn), round(drawn / unit_nm), layer, points, round=False)
