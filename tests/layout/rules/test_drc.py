@@ -223,15 +223,25 @@ def test_feet_that_nearly_meet_are_found():
     assert drc.check(plan, tight, foot_nm=feet).counts["foot"] == 2  # both pairs of unlike pillars, in x and in y
 
 
-@pytest.mark.parametrize(("pitch", "reach"), [(400, 390.0), (400, 401.0), (350, 1060.0), (300, 1500.0)])
-def test_every_neighbour_within_reach_is_visited_once(pitch, reach):
+@pytest.mark.parametrize(
+    ("pitch", "down", "reach"),
+    [
+        (400, 400, 390.0),
+        (400, 400, 401.0),
+        (350, 350, 1060.0),
+        (300, 300, 1500.0),
+        (168, 291, 700.0),
+        (380, 150, 500.0),
+    ],
+)
+def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach):
     """By brute force over all steps: one of each opposite pair, the left ones of the rows above included."""
-    steps = {tuple(s) for s in drc._offsets(pitch, reach).tolist()}
+    steps = {tuple(s) for s in drc._offsets(pitch, down, reach).tolist()}
     near = {
         (i, j)
         for i in range(-7, 8)
         for j in range(-7, 8)
-        if (i, j) != (0, 0) and (max(abs(i), abs(j)) == 1 or math.hypot(i, j) * pitch < reach)
+        if (i, j) != (0, 0) and (max(abs(i), abs(j)) == 1 or math.hypot(i * pitch, j * down) < reach)
     }
     assert steps | {(-i, -j) for i, j in steps} == near
     assert not steps & {(-i, -j) for i, j in steps}

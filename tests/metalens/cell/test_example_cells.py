@@ -70,3 +70,35 @@ def test_titania_lens_from_toml_to_mask(tmp_path, capsys):
     assert found["numerical_aperture"] == pytest.approx(0.8, abs=0.01)
     assert 0.7 < found["efficiency"] <= found["transmission"] <= 1
     assert found["turns"] < 1
+
+
+@pytest.mark.slow
+def test_rectangles_with_geometric_phase_from_toml_to_mask(tmp_path, capsys):
+    found = chained(tmp_path, "a_si_rectangle_940", "rectangle.h5", capsys)
+    assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(30 / 100)), rel=0.01)
+    assert found["focus_passed"]
+    light = found["circular"]
+    assert light["hand"] == "right"
+    assert light["converted"] > 0.95
+    assert light["converted"] + light["unconverted"] <= 1 + light["converted_error"]  # the rest is reflected
+    shown = main(
+        [
+            "psf",
+            str(tmp_path / "lens.h5"),
+            "--config",
+            str(FOLDER.parent / "lenses" / "psf.toml"),
+            "--quiet",
+            "-o",
+            str(tmp_path / "psf.h5"),
+        ]
+    )
+    assert shown == 0
+
+
+@pytest.mark.slow
+def test_a_hexagonal_lens_from_toml_to_mask(tmp_path, capsys):
+    found = chained(tmp_path, "hexagonal_850", "hexagonal.h5", capsys)
+    assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(30 / 100)), rel=0.01)
+    assert found["focus_passed"]
+    assert found["steepest"] < found["sampled_aperture"]
+    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1

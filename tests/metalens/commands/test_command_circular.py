@@ -1,0 +1,79 @@
+"""``metalens design`` and ``psf`` of a lens for circular light, from a library with a known pillar."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from metalens import lens as lenses
+from metalens import library
+from metalens.cell import Cell, Index
+from metalens.cell.shapes import Rectangle
+from metalens.cli import main
+from metalens.pillars import Proxy
+from metalens.pillars.circular import Turned, isolated
+
+T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)
+DESIGN = """library = "known.h5"
+aperture_mm = 0.021
+wavelength_nm = 940.0
+sensor_distance_mm = 0.04
+source_distance_mm = inf
+hand = "HAND"
+limits = { min_diameter_nm = 100, min_gap_nm = 90 }
+"""
+PSF = """depths_mm = [1e6, 1e6, 1.0]
+angles_deg = [0.0]
+window_um = 6.1
+samples = 61
+tolerance = 1e-3
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("circular")
+    c, sizes = (T_X - T_Y) / 2, np.linspace(0.2, 0.26, 20)
+    t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
+    proxy = Proxy(np.array([[np.angle(c), 0.0]]), np.array([[abs(c), 0.0]]), (0.2, 0.26), (0.94, 0.94), 0.0, 0.0)
+    angles = np.radians([0, 15, 30, 45, -30, -15])
+    turned = Turned(0.23, 0.94, angles, isolated(T_X, T_Y, angles), np.full(6, 0.01))
+    cell, sweep = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5)), library.Sweep((0.94,), light="circular")
+    small = np.full(t.shape, 1e-3)
+    about = (t, t * 0, small, small, np.empty((0, 5)), "rcwa", 1, proxy)
+    made = library.PillarLibrary(cell, sweep, ("x", "y"), np.zeros(1), np.array([0.94]), sizes, *about, turned=turned)
+    library.save(where / "known.h5", made)
+    (where / "psf.toml").write_text(PSF)
+    return where
+
+
+@pytest.mark.parametrize("hand", ["right", "left"])
+def test_design_and_psf_of_either_hand(folder, capsys, hand):
+    (folder / "design.toml").write_text(DESIGN.replace("HAND", hand))
+    target = folder / f"{hand}.h5"
+    assert main(["design", str(folder / "design.toml"), "-o", str(target), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["focus_passed"]
+    assert found["circular"]["hand"] == hand
+    assert found["circular"]["converted"] == pytest.approx(abs(T_X - T_Y) ** 2 / 4)
+    assert found["circular"]["isolated_error"] == pytest.approx(0, abs=1e-9)
+    assert lenses.load(target).hand == hand
+    out = folder / f"psf_{hand}.h5"
+    assert main(["psf", str(target), "--config", str(folder / "psf.toml"), "-o", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["converged"]
+
+
+def test_the_image_is_that_of_the_converted_light(folder):
+    """Energy: |t_x - t_y|² / 4 of what falls on the aperture, 2 % of it beyond the window (Airy rings)."""
+    from metalens import psf
+
+    lens = lenses.load(folder / "right.h5")
+    stack = psf.from_lens(lens, psf.View((math.inf,), window_um=24.0, samples=121), tolerance=1e-3)
+    given = np.count_nonzero(lens.diameters.diameter_um) * 0.41**2 * abs(T_X - T_Y) ** 2 / 4
+    assert 0.94 < float(stack.energy_um2[0, 0]) / given < 1.0
+
+
+def test_what_knows_only_fixed_pillars_refuses_the_lens(folder, capsys):
+    assert main(["budget", str(folder / "right.h5"), "-o", str(folder / "b.h5")]) == 2
+    assert "turned one by one" in capsys.readouterr().err
