@@ -76,8 +76,8 @@ def psf_stack(
         raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
-    about |= {"sensor_distance_um": _value(sensor_distance_um), "depths_um": _value(depths_um), "samples": samples}
-    about |= {"offset_um": _value(offset_um), "layers": layers}
+    about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers}
+    about |= {"depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)), "offset_um": _value(offset_um)}
     several = np.ndim(_value(angle_rad)) == 2
     cases, found = [], []
     for angle in angle_rad if several else [angle_rad]:
@@ -88,8 +88,7 @@ def psf_stack(
         found.append(_direction((maps, alike, share.tolist()), tolerance, moving, vector=vector, integrate=integrate))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
-    axes = np.atleast_1d(np.asarray(about["depths_um"], float)), np.array(waves), share
-    stack = _record(light, cases, axes, worst, tolerance)
+    stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
     given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
     stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
