@@ -9,9 +9,9 @@ import torch
 
 from benchmarks import Row, fastest
 from benchmarks import _millimetre as millimetre
+from benchmarks import characterize_referee as referee
 from characterize.bench import bench
 from characterize.captures import capture
-from characterize.inference.estimate import Options, fit
 from characterize.measure import sem
 from characterize.model.forward import ForwardModel, Setting
 from characterize.model.parameters import vector
@@ -29,6 +29,7 @@ def rows() -> list[Row]:
         *_beads(),
         *_reduced(),
         *_millimetre(),
+        *_fit(),
         *_micrographs(),
     ]
 
@@ -54,8 +55,8 @@ def _beads() -> list[Row]:
 
 
 def _millimetre() -> list[Row]:
-    """A lens of 1 mm: the reduced model beside the sum over every pillar, and the fit of 23 parameters to 11 depths."""
-    design, shots, light = millimetre.shoot()
+    """A lens of 1 mm at 11 depths: the reduced model beside the sum over every pillar."""
+    design, spent, light = millimetre.shoot()
     start = time.perf_counter()
     model = millimetre.model(design)
     built = time.perf_counter() - start
@@ -63,24 +64,36 @@ def _millimetre() -> list[Row]:
     found = model.images(x)[0]
     found *= (found * light).sum() / (found**2).sum()
     quick = fastest(lambda: model.images(x))
-    start, busy = time.perf_counter(), time.process_time()
-    fitted = fit(shots.capture, design, Options(), response=millimetre.RESPONSE)
-    seconds, busy = time.perf_counter() - start, time.process_time() - busy
-    goal = f"<= 10 s; {busy:.1f} s of processor time"
-    z = millimetre.normalised(fitted)
     peak = float(np.abs(found - light).max() / light.max())
     worst = max(np.abs(f - w).max() / w.max() for f, w in zip(found, light, strict=True))
     case, threads = f"1 mm lens, 11 depths of {millimetre.PIXELS} x {millimetre.PIXELS} pixels", torch.get_num_threads()
-    times = f"<= 1e-3; {shots.seconds / quick:.0f} times faster, {built:.1f} s to gather the pillars once"
+    times = f"<= 1e-3; {spent / quick:.0f} times faster, {built:.1f} s to gather the pillars once"
     about = "sum over every pillar, share of the peak"
-    fit_case = f"{case}, {len(fitted.names)} parameters, 3 starts"
     return [
-        Row(case, "every pillar", shots.seconds, float("nan"), "is the reference", threads),
+        Row(case, "every pillar", spent, float("nan"), "is the reference", threads),
         Row(case, "reduced model", quick, peak, about, threads, goal=times),
         Row(case, "reduced model", quick, float(worst), "the same, of each frame's own peak", threads, goal="<= 1e-3"),
-        Row(fit_case, "fit", seconds, float(np.sqrt((z**2).mean())), "truth, sigma, rms", threads, goal=goal),
-        Row(fit_case, "fit", seconds, float(np.abs(z).max()), "truth, sigma, worst", threads),
-        Row(fit_case, "fit", seconds, fitted.chi2_per_dof, "chi-square per degree", threads, goal="0.95 to 1.05"),
+    ]
+
+
+def _fit() -> list[Row]:
+    """The fit of a 1 mm lens of the referee bench with default priors; pillars as an earlier run left them, and solved.
+
+    Its truth shares no pillar, camera or prior with the fit (:mod:`benchmarks.characterize_referee`).
+    """
+    start = time.perf_counter()
+    referee.prepared("whole")
+    solved = time.perf_counter() - start
+    run = referee.study("whole", 0)
+    case, threads = "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts", torch.get_num_threads()
+    seconds, goal = run["wall_seconds"], f"<= 8 s; {run['seconds']:.1f} s of processor time"
+    z, inside = np.array(list(run["z"].values())), list(run["inside"].values())
+    return [
+        Row(case, "pillars", solved, float("nan"), "solved, or found in the cache", threads),
+        Row(case, "fit", seconds, float(np.sqrt((z**2).mean())), "truth, sigma, rms", threads, goal=goal),
+        Row(case, "fit", seconds, float(np.abs(z).max()), "truth, sigma, worst", threads),
+        Row(case, "fit", seconds, float(np.mean(inside)), "intervals that hold the truth", threads),
+        Row(case, "fit", seconds, run["chi2_per_dof"], "chi-square per degree", threads, goal="0.95 to 1.05"),
     ]
 
 

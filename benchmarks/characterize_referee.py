@@ -70,7 +70,8 @@ DECLARED = {
 
 
 @functools.cache
-def _lens(case: str) -> tuple[Any, Any]:
+def prepared(case: str) -> tuple[Any, Any]:
+    """The design of a case, and its pillars under change."""
     import hidden_lens
 
     lens = hidden_lens.lens(*CASES[case]["lens"])
@@ -82,18 +83,18 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
     import hidden_lens
     import pillar_bench
 
-    lens, response = _lens(case)
+    lens, response = prepared(case)
     about = CASES[case]
     values = hidden_lens.hidden(seed, scale=about["scale"])
     session = hidden_lens.session(seed, values=values, **about["session"])
     session = pillar_bench.with_faults(session, **(faults or {}))
     seen = pillar_bench.shoot(lens, session)
-    start = time.process_time()
+    start, clock = time.process_time(), time.perf_counter()
     try:
         found = fit(seen.capture, lens, Options(insist=True), response=response)
     except FitError as refusal:
         return {"seed": seed, "refused": str(refusal), "seconds": time.process_time() - start}
-    seconds = time.process_time() - start
+    seconds, wall = time.process_time() - start, time.perf_counter() - clock
     inside, error = {}, {}
     for i, name in enumerate(found.names):
         if name in hidden_lens.TRUTHS:
@@ -105,6 +106,7 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
     return {
         "seed": seed,
         "seconds": seconds,
+        "wall_seconds": wall,
         "inside": inside,
         "z": error,
         "parabolic": len(found.draws) == 0,

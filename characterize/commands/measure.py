@@ -1,4 +1,4 @@
-"""Captures -> MTF, Strehl, spot sizes, distortion; a micrograph -> every pillar's diameter and a bias table."""
+"""Captures -> MTF, Strehl, spot sizes, distortion; an edge -> MTF; a micrograph -> every diameter and a bias table."""
 
 import csv
 import dataclasses
@@ -14,7 +14,7 @@ import tyro
 
 from characterize.captures import capture as captures
 from characterize.commands import measure_page
-from characterize.measure import frames, overlay, sem
+from characterize.measure import frames, metrics, overlay, sem
 from metalens import lens as lenses
 from metalens.commands import Common, Output
 from metalens.ground import store
@@ -24,14 +24,16 @@ from metalens.ground.errors import CaptureError, ConfigError
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Options of ``metalens measure``: a micrograph where its scale is given, else captures.
+    """Options of ``metalens measure``: a micrograph or an edge where its pixel is given, else captures.
 
     Attributes:
-        source: capture folder or stack; or one picture of pillars from above (TIFF, PNG), with --pixel-nm or --bar-nm.
+        source: capture folder or stack; or one picture of pillars from above (TIFF, PNG), with --pixel-nm or --bar-nm;
+            or one of a straight edge tilted by 2 to 20 degrees, with --edge-um.
         output: folder to write: measure.json, a table of frames or pillars, a page; of a micrograph on a design the
             bias table of PROCESS.toml too.
         design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a micrograph.
         reference_e: electrons of the beam through an empty aperture of the lens's size, for the focusing efficiency.
+        edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation transfer across it (ISO 12233).
         pixel_nm: size of a micrograph's pixel; bar_nm: length of its white scale bar, where the pixel is unknown.
         pitch_nm: distance of neighbouring pillars; found in the picture without it.
         edge_bias_nm: by which edges appear outside the true ones, from a calibration sample.
@@ -42,6 +44,7 @@ class Options(Common):
     output: Output
     design: Path | None = None
     reference_e: float = math.nan
+    edge_um: float | None = None
     pixel_nm: float | None = None
     bar_nm: float | None = None
     pitch_nm: float = 0.0
@@ -51,9 +54,14 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Measure and write; exit 0, or 1 where no pillar could be measured."""
-    of_frames = options.pixel_nm is None and options.bar_nm is None
+    of_pillars = options.pixel_nm is not None or options.bar_nm is not None
+    if of_pillars and options.edge_um is not None:
+        raise ConfigError("give --edge-um (a slanted edge), or --pixel-nm or --bar-nm (pillars), not both")
+    if options.edge_um is not None and not 0 < options.edge_um < math.inf:
+        raise ConfigError(f"--edge-um {options.edge_um}: need the pixel in um, above 0")
+    measure = _micrograph if of_pillars else _frames if options.edge_um is None else _edge
     with options.claim_folder(options.output) as draft:
-        values, text, good = (_frames if of_frames else _micrograph)(options, draft.path)
+        values, text, good = measure(options, draft.path)
     options.console.result(values, text)
     return 0 if good else 1
 
@@ -84,12 +92,31 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, boo
     return values, "\n".join(lines), True
 
 
+def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
+    """Measure the modulation across an edge into the folder: numbers, text, and that all is well."""
+    image, pixel = _cropped(_one_picture(options.source), options.crop), float(options.edge_um or 0)
+    found = metrics.mtf_of_edge(image, pixel_um=pixel)
+    curve = np.stack([found.frequency_per_um, found.modulation], 1)
+    keep = found.frequency_per_um <= 1 / pixel
+    values: dict[str, object] = {"mtf50_per_um": found.mtf50_per_um, "nyquist_per_um": 0.5 / pixel, "pixel_um": pixel}
+    rows: list[dict[str, object]] = [{"frequency_per_um": f, "modulation": m} for f, m in curve[keep].round(6).tolist()]
+    store.write_text(folder / "edge.csv", _table(rows))
+    store.write_text(folder / "measure.json", _json(values))
+    measure_page.edge_page(folder / "measure.html", image, found, pixel_um=pixel)
+    text = f"{options.output}: modulation one half at {found.mtf50_per_um:.4g} per um (Nyquist {0.5 / pixel:.4g})"
+    return values, text, True
+
+
+def _one_picture(source: Path) -> Array:
+    pictures = captures.read_images(source)
+    if len(pictures) != 1:
+        raise CaptureError(f"{source}: {len(pictures)} pictures; need one")
+    return np.asarray(pictures[0])
+
+
 def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
     """Measure a picture of pillars into the folder: numbers, text, and whether any pillar was measured."""
-    pictures = captures.read_images(options.source)
-    if len(pictures) != 1:
-        raise CaptureError(f"{options.source}: {len(pictures)} pictures; a micrograph is one")
-    whole = np.asarray(pictures[0])
+    whole = _one_picture(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = _cropped(whole, options.crop)
     found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.measure import frames, overlay, sem
+from characterize.measure import frames, metrics, overlay, sem
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
@@ -44,8 +44,6 @@ def _curves(found: frames.Quality) -> bytes:
     """Modulation over frequency and encircled energy over the radius."""
     from matplotlib.figure import Figure
 
-    from characterize.measure import metrics
-
     figure = Figure(figsize=(7, 3))
     mtf, energy = figure.subplots(1, 2)
     radius = np.linspace(0, min(found.light.shape[1:]) / 2 * found.step_um, 60)
@@ -59,6 +57,22 @@ def _curves(found: frames.Quality) -> bytes:
     energy.set_xlabel("radius / um")
     energy.set_ylabel("share of the light")
     return report.png(figure)
+
+
+def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) -> None:
+    """The edge and the modulation across it."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3))
+    picture, curve = figure.subplots(1, 2)
+    picture.imshow(image, cmap="gray")
+    picture.set_axis_off()
+    curve.plot(found.frequency_per_um, found.modulation)
+    curve.axvline(0.5 / pixel_um, color="0.6", linestyle=":")
+    curve.set_xlabel("cycles / um")
+    curve.set_ylabel("modulation")
+    caption = f"Modulation one half at {found.mtf50_per_um:.4g} per um; dotted: Nyquist's frequency of the pixels."
+    report.write(path, "Slanted edge", [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])])
 
 
 def micrograph_page(

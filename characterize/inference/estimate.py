@@ -13,7 +13,7 @@ from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
 from characterize.inference.missing import Lean
-from characterize.inference.prepare import check_depths, check_enough, data_of, merged, setting_of, stated
+from characterize.inference.prepare import check_depths, check_enough, data_of, merged, quick_enough, setting_of, stated
 from characterize.inference.search import Task, with_values
 from characterize.model import (
     NAMES,
@@ -79,11 +79,12 @@ def fit(
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     task = Task(model, _rearranged(data, found), start, known, found, options.free)
+    task = dataclasses.replace(task, model=quick_enough(model, task.data, search.starts(task, biases_nm=(0.0,))[0]))
     task, ends = _ends(task, frames.gain, cautions)
     if frames.gain.known and verdict.left_over(ends[0]):
-        rest = residual.attempt(model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
+        rest = residual.attempt(task.model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
         if rest is not None:
-            task = dataclasses.replace(task, model=model.with_residual(rest.modes, thinplate.basis))
+            task = dataclasses.replace(task, model=task.model.with_residual(rest.modes, thinplate.basis))
             ends = [rest.solution]
             cautions.append(
                 f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "

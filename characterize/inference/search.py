@@ -20,6 +20,7 @@ _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ALONG_NM = 9.0  # bias by which starts are moved along the valley
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _ROUGH, _AGAIN = 40.0, 2, 5e-3, 3
+_WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,27 +68,36 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
     tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
     floor = min(tries[0].merit, first[0].merit)
     promising = [t for t in tries if t.merit < floor + _PROMISING]
-    ends = [best]
-    for one in promising:
-        if len(ends) > _MOST:
+    return _mirrored(task, distinct([best, *_followed(task, best, [t.value for t in promising][: 2 * _MOST])]))
+
+
+def _followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
+    """Where some starts lead: a few steps on all frames, and to the end what promises as much as the best.
+
+    At most ``_MOST`` ends, none that leads to the best itself or to another.
+    """
+    settings = Settings(iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False)
+    ends: list[Solution] = []
+    for begin in begins:
+        if len(ends) == _MOST:
             break
-        if all(_apart(one.value, end) > 2.0 for end in ends):
+        if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
+            continue
+        one = leastsquares.fit(task.problem(), task.data, begin, prior=task.prior, settings=settings)
+        if one.merit < best.merit + MODES_WITHIN + _WORTH and all(_apart(one.value, e) > 2.0 for e in [best, *ends]):
             ends.append(_long(task, one.value))
-    return _mirrored(task, distinct(ends))
+    return ends
 
 
 def _mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
     """The ends, and where their biases reversed lead: frames near focus look much alike with a gradient of either sign.
 
-    A few steps on all frames from each; what promises as much as the best is fitted to the end. Again from a new best.
+    Again from a new best.
     """
-    settings = Settings(iterations=6, step_tolerance=0.5, secant=True, finish=False)
     for _ in range(_AGAIN):
         best = ends[0]
         begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
-        tries = [leastsquares.fit(task.problem(), task.data, b, prior=task.prior, settings=settings) for b in begins]
-        close = [t for t in tries if t.merit < best.merit + _PROMISING and all(_apart(t.value, e) > 2.0 for e in ends)]
-        ends = distinct([*ends, *(_long(task, t.value) for t in close)])
+        ends = distinct([*ends, *_followed(task, best, begins)])
         if ends[0].merit > best.merit - 1:
             break
     return ends

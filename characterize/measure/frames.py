@@ -79,8 +79,7 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
         circle = 3 * spot.fwhm_um
         share = math.nan
         if math.isfinite(reference_e) and math.isfinite(circle):
-            inside = metrics.encircled_energy(image, step_um=step, radius_um=np.array([circle / 2]))[0]
-            share = float(inside * image.sum() / reference_e)
+            share = metrics.focusing_efficiency(image, reference_e, step_um=step, aperture_um=circle)
         rows.append(
             Frame(
                 capture.names[i],

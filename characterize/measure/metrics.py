@@ -139,23 +139,18 @@ def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
 
 
 def focusing_efficiency(
-    image_e: Array, reference_e: Array, *, step_um: float, aperture_um: float, exposure_ratio: float = 1.0
+    image_e: Array, reference_e: Array | float, *, step_um: float, aperture_um: float, exposure_ratio: float = 1.0
 ) -> float:
     """Light within a stated circle about the centroid over the light through an open aperture of the lens's size.
 
     Args:
         image_e, reference_e: electrons, background taken off; the reference is a frame of the same beam through an
-            empty aperture, whole on the sensor.
+            empty aperture, whole on the sensor, or the sum of it.
         aperture_um: diameter of the circle (often three times the FWHM): always state it with the number.
         exposure_ratio: exposure of the image over that of the reference.
     """
     share = encircled_energy(image_e, step_um=step_um, radius_um=np.array([aperture_um / 2]))[0]
     return float(share * np.sum(image_e) / np.sum(reference_e) / exposure_ratio)
-
-
-def through_focus(stack: Array, *, step_um: float) -> list[Spot]:
-    """:func:`spot` of every frame of a stack (depth or field), background taken off."""
-    return [spot(frame, step_um=step_um) for frame in stack]
 
 
 def _second_moments(light: Array, x: Array, y: Array) -> tuple[tuple[float, float], tuple[float, float]]:

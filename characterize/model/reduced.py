@@ -50,11 +50,14 @@ class Operators:
     window_terms: Array
     remainder: Array
 
-    def field(self, light: Array, *, tolerance: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) in the precision of the operators; fewer terms with a ``tolerance``."""
+    def terms(self, tolerance: float) -> int:
+        """How many terms leave a relative ``tolerance`` out."""
+        return max(1, int((self.remainder > tolerance).sum()))
+
+    def field(self, light: Array, *, terms: int | None = None) -> Array:
+        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or some."""
         kind = self.along_y.dtype
         out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), kind)
-        terms = max(1, int((self.remainder > tolerance).sum()))
         light = light.astype(kind, copy=False)
         flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
 

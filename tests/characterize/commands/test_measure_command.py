@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from scipy import special
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
 import test_sem
@@ -47,6 +48,26 @@ def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert 690 < told["best_depth_um"]["0.0"] < 760
     assert (tmp_path / "out" / "measure.html").is_file()
+
+
+def test_an_edge_gives_the_modulation_across_it(tmp_path):
+    """An edge blurred by a Gaussian of 1.7 pixels and by the pixels: MTF sinc(f) exp(-2 (pi f 1.7)²), f a pixel."""
+    y, x = np.mgrid[:90, :80]
+    across = (x - 38.3 + 0.12 * (y - 44)) / math.hypot(1, 0.12)
+    light = 200 + 3000 * special.ndtr(across / math.hypot(1.7, 1 / math.sqrt(12)))
+    tifffile.imwrite(tmp_path / "edge.tif", np.rint(light).astype(np.uint16))
+    out = tmp_path / "out"
+    assert main(["measure", str(tmp_path / "edge.tif"), "--edge-um", "2.4", "-o", str(out), "--quiet"]) == 0
+    rows = np.loadtxt(out / "edge.csv", delimiter=",", skiprows=1)
+    f = rows[:, 0] * 2.4
+    want = np.sinc(f) * np.exp(-2 * (math.pi * f * 1.7) ** 2)
+    low = f < 0.2
+    assert np.abs(rows[low, 1] - want[low]).max() < 0.02  # of the metric; the box of a pixel is nearly a Gaussian
+    half = float(np.interp(-0.5, -want[f < 0.4], f[f < 0.4])) / 2.4
+    assert json.loads((out / "measure.json").read_text())["mtf50_per_um"] == pytest.approx(half, rel=0.02)
+    assert (out / "measure.html").is_file()
+    both = ["measure", str(tmp_path / "edge.tif"), "--edge-um", "2.4", "--pixel-nm", "4", "-o", str(out), "--quiet"]
+    assert main(both) == 2
 
 
 def test_a_micrograph_gives_every_pillar(tmp_path):
