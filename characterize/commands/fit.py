@@ -82,19 +82,21 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
     spec = config.load(pupil, PupilSpec)
+    if spec.mask is not None:
+        spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     shots = captures.load(options.capture)
     with options.claim(target, beside=report.BESIDE) as draft:
         found = fit_pupil(shots, spec, insist=options.insist)
-        save(draft.path, found, _provenance(options, pupil))
+        save(draft.path, found, _provenance(options, pupil, *([spec.mask] if spec.mask else [])))
         report.pupil_report(draft.path.with_suffix(".html"), found)
     options.console.result(_values(found), _text(found, target))
     return 1 if found.problems else 0
 
 
-def _provenance(options: Options, source: Path) -> store.Provenance:
+def _provenance(options: Options, *sources: Path) -> store.Provenance:
     path = options.capture
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    files += [source] + ([options.metrology] if options.metrology else [])
+    files += [*sources] + ([options.metrology] if options.metrology else [])
     texts = [p.read_text(encoding="utf-8") for p in (options.pupil, options.metrology) if p is not None]
     return store.Provenance(config="\n".join(texts), inputs={p.name: store.sha256(p) for p in files})
 
@@ -129,12 +131,13 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
 
 
 def _values(found: PupilFit) -> dict[str, object]:
-    scores = {"agreement": found.agreement, "held_out": found.held_out}
+    scores = {"agreement": found.agreement, "held_out": found.held_out, "spline": found.between}
     return {
         **{key: dataclasses.asdict(score) for key, score in scores.items() if score is not None},
         "chi2_per_dof": found.chi2_per_dof,
         "converged": found.converged,
         "reason": found.reason,
+        "optics": {name: [value, sigma] for name, value, sigma in found.optics},
         "parameters": {n: [float(v), float(s)] for n, v, s in zip(found.names, found.value, found.sigma, strict=True)},
         "cautions": list(found.cautions),
         "problems": list(found.problems),
@@ -143,7 +146,8 @@ def _values(found: PupilFit) -> dict[str, object]:
 
 def _text(found: PupilFit, target: Path) -> str:
     lines = [f"{target}: pupil fitted to {len(found.measured)} planes; {found.reason}"]
-    for label, score in (("all planes fitted", found.agreement), ("odd planes predicted from even", found.held_out)):
+    scores = ("all planes fitted", found.agreement), ("odd planes predicted from even", found.held_out)
+    for label, score in (*scores, ("the same by a cubic spline, without physics", found.between)):
         if score is not None:
             numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
             lines.append(f"  {label}: {numbers}")

@@ -1,6 +1,7 @@
 """Fit of a generic pupil to a through-focus stack, judged on planes that the fit never saw."""
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,23 +13,12 @@ from characterize.captures import Frames, clean
 from characterize.captures import capture as captures
 from characterize.inference import Data, Prior, Settings, Solution, leastsquares
 from characterize.pupil import check as pupilcheck
+from characterize.pupil.free import Optics, freed, told
+from characterize.pupil.judge import Agreement, agree, spline
 from characterize.pupil.record import PupilModel, PupilSpec
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, FitRefused
-
-
-@dataclass(frozen=True, slots=True)
-class Agreement:
-    """How predicted images compare with measured ones, all planes together.
-
-    ncc: Pearson correlation over all pixels. plane_ncc: mean over planes of the correlation inside the plane.
-    nrmse: |predicted - measured| / |measured - background|.
-    """
-
-    ncc: float
-    plane_ncc: float
-    nrmse: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,7 +28,9 @@ class PupilFit:
     names, value, sigma: parameters with 1 sigma intervals (widened where chi2_per_dof is above 1).
     measured, predicted: (n, y, x) windows in electrons; every plane of ``predicted`` by the fit of all planes.
     phase_rad, amplitude: (nodes, nodes) pupil maps, nan and 0 outside the aperture.
-    held_out: agreement on odd planes predicted from a fit of the even ones, or None where not judged.
+    held_out: agreement on planes left out, predicted from a fit of the others, or None where not judged.
+    between: the same of a cubic spline along the stack through the planes that were fitted, pixel by pixel.
+    optics: (name, value, standard error) of what was freed.
     cautions: degeneracies and corrections in words. problems: checks that failed, with their cause.
     """
 
@@ -54,6 +46,8 @@ class PupilFit:
     amplitude: Array
     agreement: Agreement
     held_out: Agreement | None
+    between: Agreement | None
+    optics: tuple[tuple[str, float, float], ...]
     chi2_per_dof: float
     converged: bool
     reason: str
@@ -61,10 +55,13 @@ class PupilFit:
     problems: tuple[str, ...] = ()
 
 
-def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True, insist: bool = False) -> PupilFit:
-    """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also even planes alone, tested on odd.
+def fit_pupil(
+    capture: captures.Capture, spec: PupilSpec, *, judge: bool = True, sparse: int = 2, insist: bool = False
+) -> PupilFit:
+    """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also of some planes, tested on others.
 
     Args:
+        sparse: of which planes alone: every second, third ...
         insist: return a pupil that fails its checks (problems filled) instead of refusing it.
 
     Raises:
@@ -77,7 +74,11 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True,
     if len(position) < 3:
         raise FitError(f"{len(position)} planes: a pupil needs three or more through focus")
     data, background, notes = _crop(frames, spec)
-    held_out, start = _judge(spec, position, data, background) if judge and len(position) >= 5 else (None, None)
+    stated = spec
+    spec, position, optics = _freed(spec, position, data, sparse if judge else 1)
+    held_out, between, start = None, None, None
+    if judge and len(position) >= 2 * sparse + 1:
+        held_out, between, start = _judge(spec, position, data, background, sparse)
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
     agreement = agree(solution.image, data, background)
@@ -101,21 +102,14 @@ def fit_pupil(capture: captures.Capture, spec: PupilSpec, *, judge: bool = True,
         amplitude=amplitude,
         agreement=agreement,
         held_out=held_out,
+        between=between,
+        optics=optics,
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        cautions=(*frames.corrections, *notes, *_cautions(spec, solution)),
+        cautions=(*frames.corrections, *notes, *told(stated, optics), *_cautions(spec, solution)),
         problems=tuple(problems),
     )
-
-
-def agree(predicted: Array, data: Data, background: float) -> Agreement:
-    """Agreement over usable, unsaturated pixels."""
-    keep = data.usable & ~data.saturated
-    a, b = predicted[keep], data.electrons[keep]
-    planes = [_ncc(p[k], d[k]) for p, d, k in zip(predicted, data.electrons, keep, strict=True)]
-    error = float(np.linalg.norm(a - b) / np.linalg.norm(b - background))
-    return Agreement(_ncc(a, b), float(np.mean(planes)), error)
 
 
 def save(path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None) -> None:
@@ -144,7 +138,8 @@ def save(path: str | Path, fit: PupilFit, provenance: store.Provenance | None = 
         "converged": fit.converged,
         "reason": fit.reason,
     }
-    for label, score in (("agreement", fit.agreement), ("held_out", fit.held_out)):
+    about |= {f"fitted_{name}": value for name, value, _ in fit.optics}
+    for label, score in (("agreement", fit.agreement), ("held_out", fit.held_out), ("between", fit.between)):
         if score is not None:
             about |= {f"{label}_{key}": value for key, value in dataclasses.asdict(score).items()}
     store.save(path, "pupil", arrays, attributes=about, provenance=provenance)
@@ -221,24 +216,38 @@ def _find(light: Array) -> tuple[int, int]:
     return row, column
 
 
-def _judge(spec: PupilSpec, position: Array, data: Data, background: float) -> tuple[Agreement, Array]:
-    """Even planes fitted, odd ones predicted: gains and backgrounds between neighbours, drift from its polynomial.
+def _freed(spec: PupilSpec, position: Array, data: Data, sparse: int) -> tuple[PupilSpec, Array, Optics]:
+    """What is free, from every ``sparse``-th plane, so that the others judge it too."""
+    seen = np.arange(0, len(position), sparse if len(position) >= 2 * sparse + 1 else 1)
+    part, planes = position[seen], data.planes(seen)
+    coarse = functools.partial(_coarse, spec, part, planes)
+    made, optics, longer = freed(spec, part, planes, coarse, step_um=float(np.abs(np.diff(position)).mean()))
+    return made, longer * position, optics
 
-    Also the parameters of all planes so found, where a fit of all of them starts.
+
+def _judge(
+    spec: PupilSpec, position: Array, data: Data, background: float, sparse: int
+) -> tuple[Agreement, Agreement, Array]:
+    """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a spline through the same planes.
+
+    Gains and backgrounds between neighbours, drift from its polynomial. Also the parameters of all planes so found,
+    where a fit of all of them starts.
     """
-    even, odd = np.arange(0, len(position), 2), np.arange(1, len(position), 2)
-    fitted, solution = _fit(spec, position[even], data.planes(even))
+    seen = np.arange(0, len(position), sparse)
+    hidden = np.setdiff1d(np.arange(seen[-1]), seen)
+    fitted, solution = _fit(spec, position[seen], data.planes(seen))
     model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
     model.span_um = fitted.span_um
-    shared = fitted.layout().size - 2 * len(even)
-    order = np.argsort(position[even])
+    shared = fitted.layout().size - 2 * len(seen)
+    order = np.argsort(position[seen])
     gain, level = (
-        np.interp(position, position[even][order], solution.value[shared + k * len(even) :][: len(even)][order])
+        np.interp(position, position[seen][order], solution.value[shared + k * len(seen) :][: len(seen)][order])
         for k in (0, 1)
     )
     x = np.concatenate([solution.value[:shared], gain, level])
-    predicted, _ = model.images(x, False)
-    return agree(predicted[odd], data.planes(odd), background), x
+    predicted, rest = model.images(x, False)[0][hidden], data.planes(hidden)
+    between = spline(position, data, seen, hidden)
+    return agree(predicted, rest, background), agree(between, rest, background), x
 
 
 def _fit(spec: PupilSpec, position: Array, data: Data, start: Array | None = None) -> tuple[PupilModel, Solution]:
@@ -333,7 +342,3 @@ def _cautions(spec: PupilSpec, solution: Solution) -> list[str]:
     if not spec.bead_um:
         words.append("no bead size given: it is part of the fitted blur")
     return words
-
-
-def _ncc(a: Array, b: Array) -> float:
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])

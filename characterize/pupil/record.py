@@ -6,16 +6,20 @@ apodisation 1 / sqrt(cos theta)), or its scalar form for low apertures; phase an
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy import ndimage
 
+from characterize.captures.capture import read_images
 from characterize.model import detector
 from characterize.pupil import zernike
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, FitError
 
 _BLOCK = 1 << 22  # samples of the fields that are formed at once
+FREE = {"numerical_aperture": 0.1, "index": 0.03, "pixel_um": 0.1, "step_um": 0.1}  # usual relative errors
 _SHARP = 0.01  # pixels of blur that are none: 5e-4 of the finest detail
 
 
@@ -33,6 +37,9 @@ class PupilSpec:
     drift_order: of the polynomial sideways drift through the stack.
     model: vector or scalar; auto takes vector above NA / index 0.6.
     model_error: share of the light that no model of this kind explains; keeps bright pixels from ruling the fit.
+    mask: file (NPY, TIFF) of a known phase in the pupil, rad, on a square about the aperture's circle, rows along +y;
+        the fitted phase is what comes on top. mask_turn_deg: by which it is turned, from +x to +y.
+    free: of numerical_aperture, index, pixel_um, step_um those that are known roughly and are fitted too.
     """
 
     numerical_aperture: float
@@ -48,8 +55,16 @@ class PupilSpec:
     drift_order: int = 3
     model: Literal["auto", "vector", "scalar"] = "auto"
     model_error: float = 0.03
+    mask: Path | None = None
+    mask_turn_deg: float = field(default=0.0, metadata={"signed": True})
+    free: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.mask is not None and not self.mask.name:
+            raise FitError(f"mask = {str(self.mask)!r}: need the name of a file")
+        unknown = [name for name in self.free if name not in FREE]
+        if unknown or len(set(self.free)) < len(self.free):
+            raise FitError(f"free = {list(self.free)}: need some of {', '.join(FREE)}, each once")
         if not 0 < self.numerical_aperture < self.index:
             raise FitError(f"numerical_aperture = {self.numerical_aperture}: need above 0 and below index {self.index}")
         for key in ("wavelength_um", "pixel_um", "step_um"):
@@ -99,24 +114,26 @@ class PupilModel:
     defocus; the rim of the disc is weighted by the covered share of its cells.
     """
 
-    def __init__(self, spec: PupilSpec, position_um: Array, *, phase_order: int, amplitude_order: int) -> None:
+    def __init__(
+        self, spec: PupilSpec, position_um: Array, *, phase_order: int, amplitude_order: int, nodes: int | None = None
+    ) -> None:
         _need(spec, position_um)
         self.spec, self.position_um = spec, position_um
         self.span_um = max(float(np.abs(position_um).max()), 1e-9)
         highest = 2 * spec.numerical_aperture / spec.wavelength_um
         over = detector.fine_enough(spec.pixel_um, highest)
         self.grid = detector.Grid(spec.window, spec.window, spec.pixel_um, over, margin=3)
-        self._sample_pupil(phase_order, amplitude_order)
+        self._sample_pupil(phase_order, amplitude_order, nodes)
         fy, fx = self.grid.frequencies()
         fixed = detector.pixel(fy, fx, spec.pixel_um) if over > 1 else np.ones_like(fy * fx)
         self._fixed, self._f = fixed * detector.ball(fy, fx, spec.bead_um), (fy, fx)
         self._sharp = over == 1 and not spec.bead_um
 
-    def _sample_pupil(self, phase_order: int, amplitude_order: int) -> None:
+    def _sample_pupil(self, phase_order: int, amplitude_order: int, nodes: int | None) -> None:
         spec, k = self.spec, 2 * math.pi * self.spec.index / self.spec.wavelength_um
         sine, width = spec.sine, (spec.window + 6) * spec.pixel_um
         blur = 2 * self.span_um * sine / math.sqrt(1 - sine**2)
-        nodes = 2 * math.ceil(sine * spec.index / spec.wavelength_um * (width + blur) * 0.55 + 6)
+        nodes = nodes or 2 * math.ceil(sine * spec.index / spec.wavelength_um * (width + blur) * 0.55 + 6)
         q = (np.arange(nodes) - (nodes - 1) / 2) * (2 * sine / nodes)
         sx, sy = np.meshgrid(q, q)
         weight = np.clip((sine - np.hypot(sx, sy)) / (q[1] - q[0]) + 0.5, 0, 1)
@@ -130,6 +147,9 @@ class PupilModel:
         u, v = self.sx * squeeze / sine, self.sy * squeeze / sine
         self.phase_basis = zernike.basis(self.phase_indices, u, v)
         self.amplitude_basis = zernike.basis(self.amplitude_indices, u, v)
+        self._mask = (
+            1.0 if spec.mask is None else phase_mask(spec.mask, u, v, turn_rad=math.radians(spec.mask_turn_deg))
+        )
         turns = np.concatenate([1j * self.phase_basis, self.amplitude_basis, -1j * k * np.stack([self.sx, self.sy])])
         self._columns = self._square(turns.astype(np.complex64))
         self.components = weight[self.inside] * _components(self.sx * squeeze, self.sy * squeeze, spec.vectorial)
@@ -213,7 +233,7 @@ class PupilModel:
         drift = self._legendre()
         angle = (phase @ self.phase_basis)[None] + self.k * self.position_um[:, None] * self.cosine
         angle = angle - self.k * ((dx @ drift)[:, None] * self.sx + (dy @ drift)[:, None] * self.sy)
-        return np.asarray(np.exp(1j * angle))
+        return np.asarray(np.exp(1j * angle) * self._mask)
 
     def _legendre(self) -> Array:
         """(drift order + 1, n) Legendre polynomials along the stack."""
@@ -252,6 +272,29 @@ def _components(sx: Array, sy: Array, vectorial: bool) -> Array:
         -np.sqrt(sine2) * s,
     ]
     return np.asarray(np.stack(rows) / np.sqrt(cosine))
+
+
+def phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) -> Array:
+    """exp(i phase) of a mask in a file at pupil places (u, v) over the aperture's radius.
+
+    Linear between the file's pixels, of the complex number: jumps by 2 pi are none.
+
+    Raises:
+        CaptureError: no square picture of finite numbers.
+    """
+    try:
+        phase = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.asarray(read_images(path)[0])
+    except (OSError, ValueError, EOFError) as error:
+        raise CaptureError(f"{path}: no mask can be read: {error}") from error
+    n = len(phase) if phase.ndim == 2 else 0
+    if n < 8 or phase.shape != (n, n) or phase.dtype.kind not in "fiu" or not np.isfinite(phase).all():
+        raise CaptureError(f"{path}: a mask of {phase.shape} {phase.dtype}; need a square of 8 finite numbers or more")
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    place = [(one + 1) * n / 2 - 0.5 for one in (c * v - s * u, c * u + s * v)]
+    turns = np.exp(1j * phase.astype(float))
+    parts = [ndimage.map_coordinates(part, place, order=1, mode="nearest") for part in (turns.real, turns.imag)]
+    found = parts[0] + 1j * parts[1]
+    return np.asarray(found / np.maximum(np.abs(found), 1e-9))
 
 
 def _need(spec: PupilSpec, position_um: Array) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from characterize.inference.leastsquares import Data
 from characterize.pupil import check
-from characterize.pupil.fit import agree
+from characterize.pupil.judge import agree
 
 RNG = np.random.default_rng(9)
 
