@@ -68,17 +68,12 @@ def fit_pupil(
         CaptureError: wavelength, pixel or stage positions unknown.
         FitError: too few planes, no bead, or refused: no convergence, planes out of order, predictions too poor.
     """
-    spec = _complete(spec, capture)
-    frames = clean(capture)
+    spec, frames = _complete(spec, capture), clean(capture)
     position = _positions(capture, spec)
-    if len(position) < 3:
-        raise FitError(f"{len(position)} planes: a pupil needs three or more through focus")
     data, background, notes = _crop(frames, spec)
     stated = spec
     spec, position, optics = _freed(spec, position, data, sparse if judge else 1)
-    held_out, between, start = None, None, None
-    if judge and len(position) >= 2 * sparse + 1:
-        held_out, between, start = _judge(spec, position, data, background, sparse)
+    held_out, between, start = _judge(spec, position, data, background, sparse if judge else len(position))
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
     agreement = agree(solution.image, data, background)
@@ -158,6 +153,8 @@ def _complete(spec: PupilSpec, capture: captures.Capture) -> PupilSpec:
 
 def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
     """Stage positions about the sharpest plane, from the capture or from step_um."""
+    if len(capture.frames) < 3:
+        raise FitError(f"{len(capture.frames)} planes: a pupil needs three or more through focus")
     stated = capture.position_um
     if not math.isnan(spec.step_um) or not np.isfinite(stated).all():
         stated = np.arange(len(capture.frames)) * spec.step_um
@@ -227,12 +224,14 @@ def _freed(spec: PupilSpec, position: Array, data: Data, sparse: int) -> tuple[P
 
 def _judge(
     spec: PupilSpec, position: Array, data: Data, background: float, sparse: int
-) -> tuple[Agreement, Agreement, Array]:
+) -> tuple[Agreement | None, Agreement | None, Array | None]:
     """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a spline through the same planes.
 
     Gains and backgrounds between neighbours, drift from its polynomial. Also the parameters of all planes so found,
-    where a fit of all of them starts.
+    where a fit of all of them starts. Nothing of too few planes.
     """
+    if len(position) < 2 * sparse + 1:
+        return None, None, None
     seen = np.arange(0, len(position), sparse)
     hidden = np.setdiff1d(np.arange(seen[-1]), seen)
     fitted, solution = _fit(spec, position[seen], data.planes(seen))
