@@ -81,3 +81,18 @@ def test_rim_cells_weigh_what_lies_inside_the_aperture(field):
     rim = (share > 0) & (share < 1)
     assert np.abs(found - share)[rim].mean() < 0.03  # the rim's slant within a cell
     assert found.sum() == pytest.approx(share.sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("field", [Field(0.21, 0.7), Field(0.33, -2.0)])
+def test_rays_of_a_field_take_the_phase_of_the_node_nearest_to_them(field):
+    """Places of the on-axis nodes, in cosines from the axis: none lies nearer to where a ray leaves the lens."""
+    pupil = Pupil(nodes=64)
+    seen = pupils.view(pupil, field, 20e3)
+    nodes = pupils.axis(pupil).numpy()
+    path = np.sqrt(seen.x_um.numpy() ** 2 + seen.y_um.numpy() ** 2 + pupil.sensor_distance_um**2)
+    lit = seen.weight.numpy() > 0
+    row, column = (n[lit] for n in divmod(seen.node.numpy(), 64))
+    for got, place in ((row, seen.y_um.numpy()), (column, seen.x_um.numpy())):
+        assert np.array_equal(got, np.abs(nodes - (place / path)[lit][:, None]).argmin(1))
+    first, last = (np.argwhere(lit).min(0), 63 - np.argwhere(lit).max(0))
+    assert np.abs(first - last).max() <= 1  # the aperture stands in the middle of the cosines

@@ -58,3 +58,24 @@ def test_a_systematic_draw_follows_the_light_and_its_root():
 def test_the_scan_goes_through_a_window_in_z_order():
     order = estimate.scan((4, 4))
     assert order.tolist() == [0, 1, 4, 5, 2, 3, 6, 7, 8, 9, 12, 13, 10, 11, 14, 15]
+
+
+def test_products_of_sums_are_taken_over_pairs_of_unlike_draws():
+    """Three draws of five pixels by loops: a sum over i ≠ j of b_i d_j has the mean of the product of both sums."""
+    value = np.array([[0.1, 0.3, 0.25, 0.15, 0.2]])
+    points, chance = np.array([[1, 3, 4]]), np.array([[0.3, 0.1, 0.25]])
+    d = np.array([0.02, -0.013, 0.031])
+    part = value[0, points[0]]
+    alone = np.mean(d**2 / chance[0])
+    cross = common = 0.0
+    for i in range(3):
+        for j in range(3):
+            if i != j:
+                cross += part[i] * d[i] / chance[0, i] * d[j] / chance[0, j] / 6
+                common += d[i] / chance[0, i] * d[j] / chance[0, j] / 6
+    want = alone - 2 * cross + common * (value**2).sum()
+    assert want > 0.03 * alone
+    assert estimate.square_error(value, points, chance, d[None]) == pytest.approx(want, rel=1e-12)
+    even = np.array([[0.02, 0.02 / 3, 0.02 * 0.8]]) * 15  # δ as the light itself: nothing is wrong but the floor
+    level = 0.03 * np.mean(even[0] ** 2 / chance[0])
+    assert estimate.square_error(value, points, chance, even) >= level * (1 - 1e-12)

@@ -1,0 +1,49 @@
+"""Where the stage stood, in every unit that a file may carry."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from characterize.captures import stage
+
+
+@pytest.mark.parametrize(
+    ("column", "scale"),
+    [("depth_um", 1.0), ("z_nm", 1e-3), ("position_mm", 1e3), ("depth_mm", 1e3), ("position_nm", 1e-3)],
+)
+def test_positions_and_angles_carry_their_unit(tmp_path, column, scale):
+    (tmp_path / "stage.csv").write_text(
+        f"file,page,{column},angle_deg,angle_y_rad,exposure_s\na.tif,3,2.5,4,0.02,0.1\nb.tif,0,-7,-1.5,0.3,0.25\n"
+    )
+    rows = stage.read_stage(tmp_path)
+    assert rows.files == ("a.tif", "b.tif")
+    assert rows.page == (3, 0)
+    assert rows.position_um == pytest.approx(np.array([2.5, -7.0]) * scale, rel=1e-12)
+    want = np.array([[math.radians(4), 0.02], [math.radians(-1.5), 0.3]])
+    assert rows.angle_rad == pytest.approx(want, rel=1e-12)
+    assert rows.exposure_s.tolist() == [0.1, 0.25]
+
+
+def test_what_is_not_listed_is_unknown_and_along_the_axis(tmp_path):
+    (tmp_path / "stage.json").write_text(json.dumps([{"file": "a.png", "angle_rad": 0.1, "angle_y_deg": 2}]))
+    rows = stage.read_stage(tmp_path)
+    assert np.isnan(rows.position_um).all()
+    assert np.isnan(rows.exposure_s).all()
+    assert rows.page == (0,)
+    assert rows.angle_rad == pytest.approx(np.array([[0.1, math.radians(2)]]))
+
+
+def test_other_names_and_units_of_a_description_are_taken(tmp_path):
+    (tmp_path / "capture.toml").write_text("pixel_size_nm = 65\nz_step_um = -0.2\nemission_nm = 520\n")
+    found = stage.read_about(tmp_path)
+    assert found == pytest.approx({"pixel_um": 0.065, "step_um": -0.2, "wavelength_um": 0.52})
+    (tmp_path / "capture.toml").write_text("voxel_um = [0.3, 0.11, 0.12]\nstep_um = 0.4\n")
+    assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.12}
+
+
+def test_planes_of_ome_xml_carry_their_unit():
+    xml = '<Plane PositionZ="1.5" PositionZUnit="mm"/><Plane PositionZ="-2"/><Plane PositionZ="7" PositionZUnit="µm"/>'
+    assert stage.ome_positions(xml).tolist() == [1500.0, -2.0, 7.0]
+    assert stage.ome_positions('<Plane PositionZ="30" PositionZUnit="nm"/>') == pytest.approx([0.03])

@@ -1,0 +1,60 @@
+"""The error estimate of a mesh as its parts say, for discs of every width and at a cutoff."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from metalens.modal import ladder
+from metalens.modal.ladder import Choice, Rung
+
+NARROW_PLAN, WIDE_PLAN = object(), object()
+RUNG = Rung(
+    "typed",
+    (
+        Choice(NARROW_PLAN, 0.6, 2e-4, 7e-3, oblique=3e-4, middle=5e-4),
+        Choice(WIDE_PLAN, 1.0, 1e-4, 4e-3),
+    ),
+    safety=1.4, usual=1e-2, at_cutoff=3.1, thin=0.45,
+)  # fmt: skip
+
+
+def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0):
+    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch)
+
+
+@pytest.mark.parametrize(
+    ("rho", "bloch", "want"),
+    [
+        (0.2, 0.0, 0.45 * 0.02 + 0.2 * (2e-4 + 7e-3 * 0.2**4) * 1.7),  # thin: the forms err apart
+        (0.28, 0.3, 1.4 * 0.02 + (2e-4 + 7e-3 * 0.28**4 + 3e-4) * 1.7),
+        (0.5, 0.0, 1.4 * 0.02 + (2e-4 + 7e-3 * 0.5**4 + 5e-4) * 1.7),
+        (0.8, 0.3, 1.4 * 0.02 + (1e-4 + 4e-3 * 0.8**4) * 1.7),
+        (0.95, 0.0, 3 * 1.4 * 0.02 + 1.5 * (1e-4 + 4e-3 * 0.95**4) * 1.7),  # a narrow gap
+    ],
+)
+def test_the_estimate_adds_half_difference_and_drift_by_the_width_of_the_disc(rho, bloch, want):
+    assert RUNG.choice(rho).plan is (NARROW_PLAN if rho <= 0.6 else WIDE_PLAN)
+    assert RUNG.error(found(bloch=bloch), rho) == pytest.approx(want + 0.02 * 1e-2, rel=1e-9)
+
+
+def test_near_a_cutoff_the_difference_counts_more_and_exact_cutoffs_in_part():
+    shared = 2e-4 + 7e-3 * 0.5**4 + 5e-4
+    want = 3.1 * 0.02 + shared * 1.7 + 0.15 * 0.04 + 2e-4
+    assert RUNG.error(found(grazing=0.04), 0.5) == pytest.approx(want, rel=1e-9)
+    thin = 3.1 * 0.02 + (2e-4 + 7e-3 * 0.2**4) * 1.7 + 0.15 * 0.04 + 2e-4  # no longer as of thin discs
+    assert RUNG.error(found(grazing=0.04), 0.2) == pytest.approx(thin, rel=1e-9)
+    gap = 4.2 * 0.02 + 1.5 * (1e-4 + 4e-3 * 0.95**4) * 1.7 + 0.15 * 0.04 + 2e-4  # 3 x 1.4 is above 3.1
+    assert RUNG.error(found(grazing=0.04), 0.95) == pytest.approx(gap, rel=1e-9)
+
+
+def test_modes_far_below_the_error_are_left_out():
+    assert RUNG.weak == pytest.approx(1e-3 * 1e-2**1.1, rel=1e-9)
+
+
+def test_the_first_mesh_is_the_coarsest_that_usually_meets_the_tolerance():
+    usual = [rung.usual for rung in ladder.RUNGS]
+    assert usual == sorted(usual, reverse=True)
+    assert ladder.first_rung(1.0) == 0
+    for i, value in enumerate(usual):
+        assert ladder.first_rung(value) == i
+        assert ladder.first_rung(0.999 * value) == min(i + 1, len(usual) - 1)
