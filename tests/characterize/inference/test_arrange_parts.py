@@ -1,0 +1,119 @@
+"""Likeness, shifts, orders and turns of typed pictures."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference import arrange
+from characterize.inference.arrange import Arrangement
+
+RNG = np.random.default_rng(23)
+
+
+def laid(**more):
+    usual = {
+        "stage_zero_um": 0.0, "shift_px": (0.0, 0.0), "likeness": 1.0, "order": np.array([2, 0, 1]), "reordered": True,
+        "order_seen": True, "orientation": 5, "clearly": True, "alike": (),
+    }  # fmt: skip
+    return Arrangement(**(usual | more))
+
+
+@pytest.mark.parametrize("shift", [(2, -3), (-1, 4), (0, 0)])
+def test_a_shifted_picture_is_alike_at_its_shift(shift):
+    picture = np.zeros((11, 14))
+    picture[4:8, 5:9] = RNG.uniform(1, 3, (4, 4))
+    moved = np.roll(picture, shift, (0, 1))
+    score, found = arrange._likeness(1.7 * moved, picture, 0.0)
+    assert score == pytest.approx(1, rel=1e-9)
+    assert found == shift
+    assert arrange._distance(moved, picture) == pytest.approx(0, abs=1e-9)
+    off = moved.copy()
+    off[0, 0] += 0.5
+    assert arrange._distance(off, picture) == pytest.approx(0.25, rel=1e-6)
+
+
+def test_noise_is_taken_off_the_norm_and_never_more_than_nine_tenths():
+    picture = np.zeros((9, 9))
+    picture[3:6, 3:7] = RNG.uniform(1, 2, (3, 4))
+    other = np.zeros((9, 9))
+    other[3:6, 3:7] = RNG.uniform(1, 2, (3, 4))
+    power, cross = (picture**2).sum(), (picture * other).sum()
+    for noise, left in ((0.3 * power**0.5, 0.91 * power), (5 * power**0.5, 0.1 * power)):
+        want = min(cross / np.sqrt(left * (other**2).sum()), 1.0)
+        assert arrange._likeness(picture, other, noise)[0] == pytest.approx(want, rel=1e-9)
+    assert arrange._likeness(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
+
+
+def test_frames_lose_the_plane_of_their_rim_and_holes_take_the_median():
+    y, x = np.mgrid[-1:1:9j, -1:1:12j]
+    frame = 30 + 2.0 * x - 5 * y
+    frame[4, 5:8] += 70.0
+    frame[3, 3] = np.nan
+    got = arrange._prepare(np.stack([frame, 2 * frame]))
+    want = np.zeros((9, 12))
+    want[4, 5:8] = 70.0
+    want[3, 3] = np.nanmedian(frame) - (30 + 2 * x - 5 * y)[3, 3]
+    assert got == pytest.approx(np.stack([want, 2 * want]), abs=1e-9)
+
+
+@pytest.mark.parametrize("orientation", range(8))
+def test_turned_pictures_are_turned_back(orientation):
+    """The turn that is found brings the frames onto what is expected."""
+    expected = RNG.uniform(0, 1, (3, 12, 12)) ** 4
+    expected[:, :3] = expected[:, -3:] = expected[:, :, :3] = expected[:, :, -3:] = 0
+    back = {
+        k: next(j for j in range(8) if np.array_equal(arrange.turn(arrange.turn(expected, k), j), expected))
+        for k in range(8)
+    }
+    light = arrange.turn(expected, back[orientation])
+    found, clearly = arrange._orientation(light, expected, np.zeros(3))
+    assert (found, clearly) == (orientation, orientation != 0)
+    if orientation % 2:
+        wide = np.pad(expected, ((0, 0), (0, 0), (2, 2)))
+        assert arrange._orientation(wide, wide, np.zeros(3)) == (0, False)
+
+
+def test_turns_by_hand():
+    frame = np.array([[[1, 2, 3], [4, 5, 6]]])
+    assert arrange.turn(frame, 1)[0].tolist() == [[3, 6], [2, 5], [1, 4]]
+    assert arrange.turn(frame, 4)[0].tolist() == [[3, 2, 1], [6, 5, 4]]
+    assert arrange.turn(frame, 5)[0].tolist() == [[1, 4], [2, 5], [3, 6]]
+    assert arrange.turn(frame, 3)[0].tolist() == [[4, 1], [5, 2], [6, 3]]
+    stack = np.concatenate([frame, frame + 10, frame + 20])
+    both = arrange.rearranged(stack, laid())
+    assert both[0].tolist() == [[21, 24], [22, 25], [23, 26]]
+    assert arrange.rearranged(stack, laid(clearly=False))[1].tolist() == frame[0].tolist()
+    assert arrange.rearranged(stack, laid(reordered=False))[0].tolist() == [[1, 4], [2, 5], [3, 6]]
+
+
+def spots(widths, level=40.0):
+    y, x = np.mgrid[:15, :17] - np.array([7.0, 8.0])[:, None, None]
+    return np.array([level * np.exp(-(y**2 + 1.6 * x**2) / (2 * w**2)) / w**2 for w in widths])
+
+
+def groups(*members):
+    return SimpleNamespace(groups=[SimpleNamespace(index=np.array(m)) for m in members])
+
+
+def test_shuffled_frames_are_put_where_they_are_expected():
+    """Widths tell depths; frames of two field angles are not exchanged."""
+    expected = spots([1.0, 1.3, 1.7, 2.2, 2.9, 3.6])
+    shuffle = np.array([3, 0, 2, 1, 5, 4])  # within 0 to 3, and 4 to 5
+    light = 0.7 * expected[np.argsort(shuffle)]  # frame k is that of depth where shuffle is k
+    noise = np.full(6, 0.5)
+    order, reordered, seen = arrange._order(light, expected, noise, groups([0, 1, 2, 3], [4, 5]))
+    assert (reordered, seen) == (True, True)
+    assert light[order] == pytest.approx(0.7 * expected)
+    order, reordered, seen = arrange._order(0.7 * expected, expected, noise, groups([0, 1, 2, 3], [4, 5]))
+    assert order.tolist() == [0, 1, 2, 3, 4, 5]
+    assert not reordered
+    alike = spots([1.5] * 6)
+    _, reordered, seen = arrange._order(alike[::-1], alike, noise, groups([0, 1, 2, 3], [4, 5]))
+    assert (reordered, seen) == (False, False)
+
+
+def test_the_other_end_of_the_stage_is_at_each_angle():
+    model = groups([0, 2, 4], [1, 3])
+    model.setting = SimpleNamespace(depth_um=np.array([5.0, 9.0, 7.0, 8.0, 6.0]))
+    assert arrange._reversed(model).tolist() == [2, 3, 0, 1, 4]
