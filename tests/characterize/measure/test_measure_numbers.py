@@ -171,3 +171,45 @@ def test_the_airy_pattern_falls_to_nothing_at_its_first_ring():
     assert other[30, 30] < 2e-3  # half the wavelength, half the ring
     wide = frames.airy(design, capture(pixel_um=ring / 4), (7, 9))
     assert wide[3, 4] == pytest.approx(pattern[18:23, 28:33].mean(), abs=2e-3)
+
+
+def test_frames_are_measured_along_their_own_axes():
+    """Gaussians of 2.1 and 3.4 pixels along x and y on a background, at two depths and angles; a reference beam."""
+    pixel, (sx, sy) = 1.9, (2.1, 3.4)
+    y, x = np.mgrid[:61, :67] - np.array([28.0, 35.0])[:, None, None]
+    spot = np.exp(-(x**2) / (2 * sx**2) - y**2 / (2 * sy**2))
+    peaks = (30000.0, 12000.0)
+    shots = Capture(
+        np.array([500 + 0.5 * p * spot for p in peaks]), np.array([18e3, 25e3]), np.array([[0.0, 0.0], [0.1, 0.3]]),
+        np.full(2, np.nan), ("near", "far"), 16, pixel_um=pixel, about={"gain_e": 2.0},
+    )  # fmt: skip
+    total = [2 * math.pi * sx * sy * p for p in peaks]
+    made = frames.measure(shots, reference_e=1.6 * total[0])
+    assert made.step_um == pixel
+    for row, name, depth, angle, peak, light in zip(
+        made.frames, ("near", "far"), (18e3, 25e3), (0.0, math.degrees(0.1)), peaks, total, strict=True
+    ):
+        assert (row.name, row.depth_um) == (name, depth)
+        assert row.angle_deg == pytest.approx(angle)
+        assert row.peak_e == pytest.approx(peak, rel=1e-6)
+        assert row.spot.centroid_um == pytest.approx((2 * pixel, -2 * pixel), abs=0.02)
+        assert row.spot.d4sigma_um == pytest.approx((4 * sy * pixel, 4 * sx * pixel), rel=0.02)
+        for got, sigma in ((row.mtf50_x_per_um, sx), (row.mtf50_y_per_um, sy)):  # exp(-2 π² f² s²) = 1/2
+            assert got == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * sigma * pixel), rel=0.01)
+        assert row.circle_um == pytest.approx(3 * row.spot.fwhm_um)
+        radius = row.circle_um / 2 / pixel
+        inside = spot[np.hypot(x, y) <= radius].sum() / spot.sum()
+        assert row.efficiency == pytest.approx(inside * light / (1.6 * total[0]), rel=0.03)  # pixels cut by the circle
+        assert math.isnan(row.strehl)
+    assert made.best_depth_um == {}
+    assert made.light[1].max() == pytest.approx(peaks[1], rel=1e-6)
+    with pytest.raises(CaptureError, match="pixel_um"):
+        frames.measure(capture())
+
+
+def test_pixels_per_side_of_the_rim_take_part_alike():
+    """Every border counts once: levels 10, 20, 30, 40 along top, bottom, left, right of 5 x 7 pixels."""
+    frame = np.full((5, 7), 999.0)
+    frame[0], frame[-1], frame[1:-1, 0], frame[1:-1, -1] = 10, 20, 30, 40
+    light = frames._above(frame, np.ones(frame.shape, bool))
+    assert light[0, 0] == 10 - np.median([10] * 7 + [20] * 7 + [30] * 3 + [40] * 3)

@@ -58,6 +58,8 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
 def test_answers_travel_in_micrometres_radians_and_one():
     made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9})
     assert made.answers() == pytest.approx([-7e-3, 0.013, math.radians(0.9)], rel=1e-12)
+    assert not State.of().amounts.any()
+    assert len(State.of().amounts) == len(CAUSES)
 
 
 def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
@@ -176,12 +178,12 @@ class Line:
 
 
 def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
-    d = np.array([0.05, 0.2, 0.36, 1.2])
-    phase = np.array([7 * 0.1 + 20 * 0.01 - 0.05 * 11, 7 * 0.2 + 20 * 0.04, 7 * 0.3 + 1.8 + 0.06 * 19, 0.0]) + 0.1
-    level = np.array([0.85, 0.7, 0.54, 0.0])
+    d = np.array([0.05, 0.2, 0.36, 1.2, -0.3])
+    phase = np.array([7 * 0.1 + 20 * 0.01 - 0.05 * 11, 7 * 0.2 + 20 * 0.04, 7 * 0.3 + 1.8 + 0.06 * 19]) + 0.1
+    level = np.array([0.85, 0.7, 0.54])
     got = response.designed(Line(), d, 0.85, angle_rad=0.1)
-    assert got[:3] == pytest.approx((level * np.exp(1j * phase))[:3], rel=1e-12)
-    assert got[3] == 0  # held within 0 and 1
+    assert got[:3] == pytest.approx(level * np.exp(1j * phase), rel=1e-12)
+    assert np.abs(got[3:]) == pytest.approx([0, 1], abs=1e-12)  # held within 0 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
     changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0]), angle_rad=0.1)
@@ -201,9 +203,9 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
     proxy = response.designed(Line(), at[1:3], 0.85)
     assert made.factor(amounts) * proxy == pytest.approx(want * np.exp(0.15j - 0.03), rel=1e-9)
-    beyond = response.answer(Line(), slopes, np.array([0.3]))
-    end = response.designed(Line(), at[3:], 0.85)
-    assert beyond.factor(np.zeros(3)) == pytest.approx(powers[0, 0, 3:] / end, rel=1e-9)
+    beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
+    ends = response.designed(Line(), at[[0, 3]], 0.85)
+    assert beyond.factor(np.zeros(3)) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
