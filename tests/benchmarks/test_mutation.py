@@ -1,0 +1,104 @@
+"""The runner of mutants on a module of its own: what changes, what runs a line, what takes its place in memory."""
+
+import importlib.util
+
+import pytest
+
+from benchmarks.mutation import reach, rules, server
+from benchmarks.mutation.reach import Reach
+
+MODULE = '''"""Numbers."""
+import math
+
+SCALE = 2.0
+
+
+def sigma_of(values, axis=0):
+    """Spread."""
+    if axis > 3:
+        raise ValueError("no")
+    total = sum(v * v for v in values)
+    return math.sqrt(total / len(values)) - SCALE
+
+
+class Box:
+    def width(self, x):
+        return abs(x) + 1e-300
+'''
+
+
+@pytest.fixture
+def tree(tmp_path):
+    (tmp_path / "metalens").mkdir()
+    (tmp_path / "metalens" / "numbers_of.py").write_text(MODULE)
+    return tmp_path
+
+
+def test_mutants_are_of_what_is_computed_and_of_nothing_else(tree):
+    path = tree / "metalens" / "numbers_of.py"
+    made = rules.mutants(tree, path)
+    changed = {(m.was, m.became, m.rule) for m in made}
+    assert ("v * v", "((v) / (v))", "factor") in changed
+    assert ("math.sqrt(total / len(values)) - SCALE", "((math.sqrt(total / len(values))) + (SCALE))", "sign") in changed
+    assert ("math.sqrt(total / len(values))", "(total / len(values))", "dropped term") in changed
+    assert ("2.0", "(4.0)", "constant") in changed
+    assert not any(m.was == "3" or "axis" in m.was for m in made)  # a refusal
+    assert not any(m.was == "1e-300" for m in made)  # a guard
+    assert {m.line for m in made if m.bar} == {11, 12}  # of a function named so
+    one = next(m for m in made if m.was == "v * v" and m.became == "((v) / (v))")
+    assert one.applied(MODULE) == MODULE.replace("v * v", "((v) / (v))")
+
+
+def test_lines_are_known_by_their_function(tree):
+    path = tree / "metalens" / "numbers_of.py"
+    assert reach.home(path, 12) == ("sigma_of", 7)
+    assert reach.home(path, 17) == ("Box.width", 16)
+    assert reach.home(path, 4) == ("", 0)
+    seen = Reach()
+    test = tree / "test_x.py"
+    test.write_text("")
+    seen.add(tree, "test_x.py", {"test_x.py::a": (0.5, [("metalens/numbers_of.py", 12)]), "test_x.py::b": (0.1, [])})
+    where = "metalens/numbers_of.py"
+    assert seen.tests(tree, where, 12, 9.0) == ["test_x.py::a", "test_x.py::b"]  # and what else its file holds
+    assert seen.tests(tree, where, 12, 0.2) == ["test_x.py::a"]
+    assert seen.tests(tree, where, 11, 0.2) == ["test_x.py::a"]  # no line of its own: its function's
+    assert seen.tests(tree, where, 17, 9.0) == []
+    path.write_text(MODULE.replace("SCALE = 2.0\n", "SCALE = 2.0\n\n\n"))  # all lines move
+    reach._functions.cache_clear()
+    assert seen.tests(tree, where, 14, 0.2) == ["test_x.py::a"]
+    seen.add(tree, "test_x.py", {})
+    assert seen.tests(tree, where, 14, 9.0) == []
+
+
+def test_changed_functions_run_their_new_code_in_memory(tree):
+    path = str(tree / "metalens" / "numbers_of.py")
+    spec = importlib.util.spec_from_file_location("numbers_of", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    held, box = module.sigma_of, module.Box()
+    functions = server._functions({})[path]
+    assert held([3.0, 5.0]) == pytest.approx(17**0.5 - 2)
+    assert server.patched(functions, path, MODULE.replace("len(values)) - SCALE", "len(values)) + SCALE")) == 1
+    assert held([3.0, 5.0]) == pytest.approx(17**0.5 + 2)
+    assert box.width(-2) == 2
+    assert server.patched(functions, path, MODULE.replace("SCALE = 2.0", "SCALE = 4.0")) == 1  # back to what was
+    assert server.patched(functions, path, MODULE.replace("SCALE = 2.0", "SCALE = 4.0")) == 0  # no function holds it
+
+
+def test_a_watched_test_tells_its_lines(tree):
+    (tree / "test_it.py").write_text(
+        "import sys\nsys.path.insert(0, 'metalens')\n"
+        "import numbers_of\ndef test_a():\n    numbers_of.Box().width(3)\n"
+        "def test_b():\n    assert numbers_of.sigma_of([1.0]) > 0\n"
+    )
+    answer = server.Server(tree, ["test_it.py"])
+    seen = answer.seen("test_it.py")
+    assert list(seen) == ["test_it.py::test_a"]  # the other fails
+    assert seen["test_it.py::test_a"][1] == [["metalens/numbers_of.py", 17]]
+    path = "metalens/numbers_of.py"
+    assert answer.outcome(path, MODULE, ["test_it.py::test_a"], 60.0) is None
+    wrong = MODULE.replace("abs(x) + 1e-300", "[][x]")
+    assert answer.outcome(path, wrong, ["test_it.py::test_a"], 60.0)[0] == "failed"
+    other = MODULE.replace("abs(x)", "(x)")
+    assert answer.outcome(path, other, ["test_it.py::test_a"], 60.0)[0] == "passed"
+    answer.close()
