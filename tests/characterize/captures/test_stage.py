@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from characterize.captures import stage
+from metalens.ground.errors import CaptureError
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,32 @@ def test_other_names_and_units_of_a_description_are_taken(tmp_path):
     assert found == pytest.approx({"pixel_um": 0.065, "step_um": -0.2, "wavelength_um": 0.52})
     (tmp_path / "capture.toml").write_text("voxel_um = [0.3, 0.11, 0.12]\nstep_um = 0.4\n")
     assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.12}
+
+
+def test_a_name_in_the_right_unit_goes_before_another(tmp_path):
+    (tmp_path / "capture.json").write_text(
+        json.dumps({"pixel_um": 0.2, "pixel_size_um": 0.3, "voxel_um": [0.4, 5, 0.6]})
+    )
+    assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.2, "pixel_size_um": 0.3}
+    (tmp_path / "capture.json").write_text(json.dumps({"bits": True}))
+    with pytest.raises(CaptureError, match="bits = True"):
+        stage.read_about(tmp_path)
+
+
+def test_rows_are_named_as_an_editor_counts_them(tmp_path):
+    (tmp_path / "stage.csv").write_text("file,depth_um\na.tif,1\nb.tif,x\n")
+    with pytest.raises(CaptureError, match="row 3: depth_um is 'x'"):
+        stage.read_stage(tmp_path)
+    (tmp_path / "stage.csv").write_text("file,depth_um\na.tif,1\n,2\n")
+    with pytest.raises(CaptureError, match="row 3: no 'file'"):
+        stage.read_stage(tmp_path)
+
+
+def test_frames_of_which_only_names_are_known():
+    rows = stage.Rows.unknown(("a", "b", "c"))
+    assert rows.page == (0, 0, 0)
+    assert rows.angle_rad.tolist() == [[0, 0]] * 3
+    assert np.isnan(rows.position_um).tolist() == np.isnan(rows.exposure_s).tolist() == [True] * 3
 
 
 def test_planes_of_ome_xml_carry_their_unit():

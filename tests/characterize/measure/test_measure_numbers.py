@@ -143,6 +143,43 @@ def test_the_sharpest_depth_is_the_top_of_a_parabola_in_its_inverse():
     assert made[5.0] == pytest.approx(18e3)
 
 
+@pytest.mark.parametrize("best", [19e3, 23.5e3, 29e3])
+def test_the_parabola_goes_through_the_sharpest_three_of_many(best):
+    """Sharpness falls as a parabola near its top and no further: only neighbours of the top tell it."""
+    depths = np.array([17e3, 18.5e3, 20e3, 22e3, 24.5e3, 27e3, 31e3])
+    sharp = 3 - 4e9 * (1 / depths - 1 / best) ** 2
+    near = np.argsort(np.abs(1 / depths - 1 / depths[sharp.argmax()]))[:1][0]
+    for i in range(7):
+        if abs(i - np.clip(near, 1, 5)) > 1:
+            sharp[i] = 0.7 + 0.01 * i
+    rows = [row(z, 2.0, s**-0.5) for z, s in zip(depths, sharp, strict=True)]
+    assert frames._best(rows)[2.0] == pytest.approx(best, rel=1e-6)
+    unknown = [*rows[:-1], row(math.nan, 2.0, 1.0)]
+    assert frames._best(unknown) == {}
+
+
+def test_two_places_that_fit_alike_are_not_clear():
+    """The mask repeats itself after five rows but for a little; once it repeats less, the place is clear."""
+    site = np.stack(np.meshgrid(np.arange(4), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    block = RNG.uniform(0.1, 0.3, (5, 6))
+    for change, clear in ((0.0012, False), (0.03, True)):
+        drawn = np.concatenate([block, block + change * RNG.normal(size=block.shape)])
+        made = drawn[site[:, 0], site[:, 1]] * 1e3 + RNG.normal(0, 4.0, len(site))
+        laid = overlay.overlay(found(made, site), DiameterMap(drawn, 0.4))
+        assert laid.clearly == clear
+        assert laid.column == 0
+        assert not clear or laid.row == 0
+
+
+def test_knots_hold_six_pillars_at_least():
+    drawn, none = RNG.uniform(100, 300, 17), np.zeros(17, bool)
+    table = overlay.bias_table(overlay.Overlay(drawn, drawn * 0.01, 0, 0, clearly=True, outlier=none))
+    assert [row[3] for row in table] == [9, 8]  # 17 // 6 = 2, though seven are asked for
+    many = np.sort(RNG.uniform(100, 300, 84))
+    table = overlay.bias_table(overlay.Overlay(many, many, 0, 0, clearly=True, outlier=np.zeros(84, bool)))
+    assert [row[3] for row in table] == [12] * 7
+
+
 def test_distortion_is_the_place_over_that_of_a_straight_ray_relative_to_the_smallest_angle():
     design = SimpleNamespace(sensor_distance_um=1900.0)
     place = {a: 1900 * math.tan(math.radians(a)) * (0.98 + 1e-3 * a**2) for a in (-7.0, 4.0, 11.0)}
