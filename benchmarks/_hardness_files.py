@@ -16,9 +16,10 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from benchmarks import _hardness_bytes as damage
 from benchmarks import _hardness_samples as samples
@@ -32,21 +33,30 @@ MUTATORS: dict[str, Mutator] = {
     ".tif": damage.head, ".npy": damage.head, ".mat": damage.head, ".gds": damage.plain,
 }  # fmt: skip
 # kinds whose reader has a process of its own: one copy for so many of the others
-SLOW = {"mat5": 200} | {kind: 3 for kind, (name, _) in samples.READERS.items() if name.endswith(".h5")}
+_OF_HDF5 = {kind: 20 for kind, (name, _) in samples.READERS.items() if name.endswith(".h5")}
+SLOW = {"mat5": 200, "mat73": 20, "gdsii": 4} | _OF_HDF5
+Begun = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """What came of so many copies of a kind: read, refused, and failures in words with the number of the copy."""
+    """What came of so many copies of a kind: refused, and failures in words by the number of the copy.
+
+    last: number of the last one.
+    """
 
     kind: str
     copies: int
     refused: int
-    failures: tuple[str, ...]
+    failures: dict[int, str]
+    last: int
 
 
-def counted(folder: Path, copies: int, kinds: Sequence[str] = ()) -> Iterator[Count]:
-    """Share ``copies`` among the kinds (all of them, if none is named); a count a kind."""
+def counted(folder: Path, copies: int, kinds: Sequence[str] = (), begun: Begun | None = None) -> Iterator[Count]:
+    """Share ``copies`` among the kinds (all of them, if none is named); a count a kind.
+
+    begun: {kind: {"done": copies before, "failed": {number: words}}}: those that failed come again, then the next.
+    """
     samples.write(folder)
     kinds = sorted(kinds or samples.READERS)
     weight = {kind: 1 / SLOW.get(kind, 1) for kind in kinds}
@@ -55,37 +65,41 @@ def counted(folder: Path, copies: int, kinds: Sequence[str] = ()) -> Iterator[Co
         name, read = samples.READERS[kind]
         read(folder / kind / name)  # what it imports is inherited by all children
     for kind in kinds:
-        found = _kind(folder, kind, max(1, round(copies * weight[kind] / total)))
-        for failure in found.failures:
-            print(f"{kind}: {failure}", flush=True)
+        before = (begun or {}).get(kind, {"done": 0, "failed": {}})
+        fresh = range(before["done"], before["done"] + max(1, round(copies * weight[kind] / total)))
+        found = _kind(folder, kind, [*map(int, before["failed"]), *fresh])
+        for number, failure in found.failures.items():
+            print(f"{kind}: copy {number}: {failure}", flush=True)
         yield found
 
 
-def _kind(folder: Path, kind: str, copies: int) -> Count:
+def _kind(folder: Path, kind: str, numbers: Sequence[int]) -> Count:
     """All copies of a kind; a child that dies is a failure, and the next goes on after the copy that killed it."""
     journal = folder / f"{kind}.jsonl"
     journal.unlink(missing_ok=True)
     done = refused = 0
-    failures: list[str] = []
+    failures: dict[int, str] = {}
     whole = (folder / kind / samples.READERS[kind][0]).read_bytes()
-    while done < copies:
+    while done < len(numbers):
         child = os.fork()
         if child == 0:
             try:
-                _child(folder, kind, whole, range(done, copies))
+                _child(folder, kind, whole, numbers[done:])
             finally:
                 traceback.print_exc()
                 os._exit(1)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         told = [json.loads(line) for line in journal.read_text().splitlines()]
-        done, refused = told[-1]["copy"] + 1, told[-1]["refused"]
+        journal.unlink()
+        done += sum(not entry["ended"] for entry in told)
+        refused += told[-1]["refused"]
+        failures |= {entry["copy"]: entry["error"] for entry in told if entry["error"]}
         if status:
-            failures.append(f"copy {told[-1]['copy']}: its reader ended with {status}")
-    failures += [entry["error"] for entry in told if entry["error"]]
-    return Count(kind, copies, refused, tuple(failures))
+            failures[told[-1]["copy"]] = f"its reader ended with {status}"
+    return Count(kind, len(numbers), refused, failures, max(numbers))
 
 
-def _child(folder: Path, kind: str, whole: bytes, numbers: range) -> None:
+def _child(folder: Path, kind: str, whole: bytes, numbers: Sequence[int]) -> None:
     """Read damaged copies until the last or until one of them ends this process; never returns."""
     name, read = samples.READERS[kind]
     here, refused, base = folder / kind / name, 0, _peak()
@@ -93,16 +107,14 @@ def _child(folder: Path, kind: str, whole: bytes, numbers: range) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (_address_space() + 6 * MOST_BYTES, resource.RLIM_INFINITY))
     with open(folder / f"{kind}.jsonl", "a", buffering=1) as journal:
         for number in numbers:
-            journal.write(json.dumps({"copy": number, "refused": refused, "error": ""}) + "\n")
+            entry = {"copy": number, "refused": refused, "error": "", "ended": False}
+            journal.write(json.dumps(entry) + "\n")
             damaged(here, whole, random.Random(f"{SEED} {kind} {number}"))
             signal.alarm(PATIENCE)
             typed, error = _outcome(read, here, base)
             refused += typed
             if error or number == numbers[-1]:
-                journal.write(
-                    json.dumps({"copy": number, "refused": refused, "error": error and f"copy {number}: {error[:300]}"})
-                    + "\n"
-                )
+                journal.write(json.dumps(entry | {"refused": refused, "error": error[:300], "ended": True}) + "\n")
     here.write_bytes(whole)
     os._exit(0)
 
@@ -147,7 +159,7 @@ def damaged(path: Path, whole: bytes, chance: random.Random) -> None:
 def summary(counts: list[Count]) -> str:
     """Failures by kind, each with its first example."""
     by = collections.Counter({c.kind: len(c.failures) for c in counts if c.failures})
-    first = {c.kind: c.failures[0] for c in counts if c.failures}
+    first = {c.kind: next(iter(c.failures.values())) for c in counts if c.failures}
     return "\n".join(f"{kind}: {n}, first: {first[kind]}" for kind, n in by.most_common())
 
 

@@ -1,68 +1,111 @@
 """What bad luck and bad input do to the commands: kills, two writers, full disks, damaged files, values out of range.
 
-    python -m benchmarks hardness                                        # small: some minutes on two quiet cores
-    python -m benchmarks.hardness --kills 2000 --writers 200 --disks 200 --mutations 1000000
-    python -m benchmarks.hardness --kills 40 --verbs design scene        # one part alone; the others keep their rows
+    python -m benchmarks hardness                                       # small: some minutes on two quiet cores
+    python -m benchmarks.hardness --kills 40 --writers 10 --disks 20    # so many more of each: runs add up
+    python -m benchmarks.hardness --kills 40 --verbs design scene       # of some commands alone
+    python -m benchmarks.hardness --mutations 1000000 --values --threads
 
 The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes; each is
-printed with what it needs to be had again.
+printed with what it needs to be had again. Trials of commands are numbered; those that failed are tried again first.
 """
 
 import argparse
 import dataclasses
+import itertools
 import json
-import os
+import math
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from benchmarks import Row, _hardness_files, _hardness_runs, _hardness_values
+from benchmarks import Row, _hardness_commands, _hardness_files, _hardness_runs, _hardness_threads, _hardness_values
 from benchmarks.__main__ import table
-from metalens import psf
+from metalens.ground import store
 
-KILLS, WRITERS, DISKS, MUTATIONS = 18, 9, 9, 9000
+KILLS, WRITERS, DISKS, MUTATIONS = 18, 18, 18, 9000
+QUICK = ("design", "psf", "export", "layout", "library", "capture", "measure", "check", "view", "demo")
+OFTEN = 4  # turns of a quick command for one of the others
+WORDS = {"kills": "kills", "writers": "pairs of writers", "disks": "full disks"}
+AGAINST = {
+    "kills": "mixed, lost, or scratch left",
+    "writers": "mixed, or none succeeded",
+    "disks": "crash, part of a result, or scratch left",
+}
+Tried = dict[str, dict[str, dict[str, Any]]]  # kind; verb, or kind of file: trials done, the words of those that failed
 RESULT = Path(__file__).parent / "results" / "hardness.json"
+TRIALS = RESULT.with_name("hardness_trials.json")
 
 
 def rows() -> list[Row]:
     """All parts at their small size."""
-    return [*runs(KILLS, WRITERS, DISKS), mutations(MUTATIONS), bad_values(), threads()]
+    asked = {"kills": KILLS, "writers": WRITERS, "disks": DISKS}
+    return [*runs(asked, tuple(_hardness_commands.VERBS)), mutations(MUTATIONS), bad_values(), threads()]
 
 
-def runs(kills: int, writers: int, disks: int, verbs: Sequence[str] = ()) -> list[Row]:
-    """Commands that are killed, run twice at once, or out of room."""
-    with tempfile.TemporaryDirectory() as name:
-        bench = _hardness_runs.Bench(Path(name), tuple(verbs) or tuple(sorted(_hardness_runs.VERBS)))
+def runs(asked: dict[str, int], verbs: tuple[str, ...], seconds: float = math.inf) -> list[Row]:
+    """Commands that are killed, run twice at once, or out of room: so many more trials of each kind, within a time."""
+    tried = _tried()
+    end = time.perf_counter() + seconds
+    with _hardness_runs.bench(verbs) as bench:
+        if not bench.fills:
+            print("no small file system can be made here: full disks are limits on the size of files alone")
         bench.prepare()
-        over = f"over {', '.join(bench.verbs)}"
-        parts = [
-            (f"{kills} kills", kills, bench.kill, "mixed, lost, or scratch left"),
-            (f"{writers} pairs of writers", writers, bench.pair, "mixed, or none succeeded"),
-            (f"{disks} full disks", disks, bench.fill, "crash, part of a result, or scratch left"),
-        ]
-        found = [
-            _timed(case, over, lambda work=work, count=count: work(count), against)
-            for case, count, work, against in parts
-            if count
-        ]
-    print("\n".join(bench.failures))
-    return found
+        for kind, verb, number in _trials(tried, asked, verbs):
+            found = bench.trial(kind, verb, number)
+            entry = _tried().get(kind, {}).get(verb, {"done": 0, "failed": {}})
+            entry["done"] = max(entry["done"], number + 1)
+            entry["failed"].pop(str(number), None)
+            if found:
+                entry["failed"][str(number)] = found
+                print("\n".join(found), flush=True)
+            tried = _note(kind, verb, entry)
+            if time.perf_counter() > end:
+                break
+    return [_of_trials(kind, tried[kind]) for kind in AGAINST if kind in tried]
+
+
+def _trials(tried: Tried, asked: dict[str, int], verbs: tuple[str, ...]) -> Iterator[tuple[str, str, int]]:
+    """(kind, verb, number) of trials that failed before, then of new ones; quick verbs come round more often."""
+    for kind in asked:
+        by_verb = tried.get(kind, {})
+        yield from [(kind, verb, int(n)) for verb in verbs for n in by_verb.get(verb, {}).get("failed", {})]
+    done = {(kind, verb): tried.get(kind, {}).get(verb, {"done": 0})["done"] for kind in asked for verb in verbs}
+    turns = {kind: itertools.cycle([v for i in range(OFTEN) for v in verbs if v in QUICK or i == 0]) for kind in asked}
+    for turn in range(max(asked.values(), default=0)):
+        for kind, count in asked.items():
+            if turn < count:
+                verb = next(turns[kind])
+                yield kind, verb, done[kind, verb]
+                done[kind, verb] += 1
+
+
+def _of_trials(kind: str, by_verb: dict[str, Any]) -> Row:
+    """The row of all trials of a kind so far."""
+    count, failed = (
+        sum(f(entry) for entry in by_verb.values()) for f in (lambda e: e["done"], lambda e: len(e["failed"]))
+    )
+    return _row(f"{count} {WORDS[kind]}", f"over {', '.join(sorted(by_verb))}", math.nan, failed, AGAINST[kind])
 
 
 def mutations(copies: int) -> Row:
-    """Damaged copies of every kind of file."""
+    """So many more damaged copies of every kind of file."""
+    begun = _tried().get("mutations", {})
     with tempfile.TemporaryDirectory() as name:
         start = time.perf_counter()
-        counts = list(_hardness_files.counted(Path(name), copies))
+        for found in _hardness_files.counted(Path(name), copies, begun=begun):
+            entry = begun.get(found.kind, {"done": 0, "refused": 0, "failed": {}})
+            entry["refused"] += found.refused
+            entry["done"] = max(entry["done"], found.last + 1)
+            entry["failed"] = {str(number): words for number, words in found.failures.items()}
+            begun = _note("mutations", found.kind, entry)["mutations"]
         seconds = time.perf_counter() - start
-    print(_hardness_files.summary(counts))
-    refused, done = sum(c.refused for c in counts), sum(c.copies for c in counts)
-    case = f"{done} damaged files of {len(counts)} kinds"
-    failures = sum(len(c.failures) for c in counts)
-    return _row(case, f"{refused} refused", seconds, failures, "untyped, crash, over 1 GB or 5 s")
+    done, refused = (sum(entry[name] for entry in begun.values()) for name in ("done", "refused"))
+    failures = sum(len(entry["failed"]) for entry in begun.values())
+    case = f"{done} damaged files of {len(begun)} kinds"
+    print(f"{copies} copies in {seconds:.0f} s")
+    return _row(case, f"{refused} refused", math.nan, failures, "untyped, crash, over 1 GB or 5 s")
 
 
 def bad_values() -> Row:
@@ -77,29 +120,31 @@ def bad_values() -> Row:
 
 
 def threads() -> Row:
-    """Results of one command that differ with the number of threads."""
-    found, start = set(), time.perf_counter()
-    with tempfile.TemporaryDirectory() as name:
-        bench = _hardness_runs.Bench(Path(name), ())
-        bench.prepare()
-        for count in (1, 2, 8):
-            told = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(count))
-            status, words = bench.run("psf lens0.h5 --config psf.toml -o out.h5", env=os.environ | told)
-            if status not in (0, 1):
-                raise RuntimeError(words)
-            found.add(np.asarray(psf.load(bench.folder / "out.h5").intensity).tobytes())
-            bench.clear("out.h5")
-    return _row("psf on 1, 2, 8 threads", "as it comes", time.perf_counter() - start, len(found) - 1, "other bytes")
-
-
-def _timed(case: str, method: str, part: Callable[[], int], against: str) -> Row:
+    """Commands whose results differ with the number of threads."""
     start = time.perf_counter()
-    failures = part()
-    return _row(case, method, time.perf_counter() - start, failures, against)
+    with tempfile.TemporaryDirectory() as name:
+        found = dict(_hardness_threads.differing(Path(name)))
+    print("\n".join(f"{verb}: other bytes in {', '.join(names)}" for verb, names in found.items() if names))
+    case = f"{', '.join(found)} on {', '.join(map(str, _hardness_threads.COUNTS))} threads"
+    return _row(case, "bytes of all files", time.perf_counter() - start, sum(map(bool, found.values())), "other bytes")
 
 
 def _row(case: str, method: str, seconds: float, failures: int, against: str) -> Row:
     return Row(case, method, seconds, float(failures), against, goal=f"0: {'met' if failures == 0 else 'missed'}")
+
+
+def _tried() -> Tried:
+    """What was tried so far."""
+    found: Tried = json.loads(TRIALS.read_text("utf-8")) if TRIALS.is_file() else {}
+    return found
+
+
+def _note(kind: str, name: str, entry: dict[str, Any]) -> Tried:
+    """Put an entry into what was tried so far; all of that."""
+    tried = _tried()
+    tried.setdefault(kind, {})[name] = entry
+    store.write_text(TRIALS, json.dumps(tried, indent=1) + "\n")
+    return tried
 
 
 def keep(found: list[Row]) -> None:
@@ -108,21 +153,22 @@ def keep(found: list[Row]) -> None:
     new = [dataclasses.asdict(row) for row in found]
     parts = {row["against"] for row in new}
     kept = [row for row in held if row["against"] not in parts]
-    RESULT.write_text(json.dumps({"rows": kept + new}, indent=1) + "\n", encoding="utf-8")
+    store.write_text(RESULT, json.dumps({"rows": kept + new}, indent=1) + "\n")
 
 
 def main() -> None:
     """The parts that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    for name in ("kills", "writers", "disks", "mutations"):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in (*AGAINST, "mutations"):
         parser.add_argument(f"--{name}", type=int, default=0)
     for name in ("values", "threads"):
         parser.add_argument(f"--{name}", action="store_true")
-    parser.add_argument("--verbs", nargs="*", choices=sorted(_hardness_runs.VERBS), default=())
+    parser.add_argument("--seconds", type=float, default=math.inf, help="no new trial of a command after so long")
+    parser.add_argument("--verbs", nargs="*", choices=list(_hardness_commands.VERBS), default=())
     asked = parser.parse_args()
-    found = []
-    if asked.kills or asked.writers or asked.disks:
-        found += runs(asked.kills, asked.writers, asked.disks, asked.verbs)
+    found, trials = [], {kind: getattr(asked, kind) for kind in AGAINST}
+    if any(trials.values()):
+        found += runs(trials, tuple(asked.verbs) or tuple(_hardness_commands.VERBS), asked.seconds)
     found += [mutations(asked.mutations)] if asked.mutations else []
     found += [bad_values()] if asked.values else []
     found += [threads()] if asked.threads else []

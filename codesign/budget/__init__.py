@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from codesign.budget import links as links
     from codesign.budget import page as page
     from codesign.budget import plan as plan
+    from codesign.budget.journal import Journal as Journal
     from codesign.budget.links import Entry as Entry
     from codesign.budget.links import Given as Given
     from codesign.budget.plan import Chain as Chain
@@ -21,6 +22,7 @@ __getattr__, __dir__, __all__ = attach(
         "Chain": "plan",
         "Entry": "links",
         "Given": "links",
+        "Journal": "journal",
         "Pilot": "plan",
         "Plan": "plan",
         "PlanConfig": "plan",

@@ -7,7 +7,7 @@ computed here or measured in a file that is given.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, state
 from codesign.budget import task
+from codesign.budget.journal import Journal
 from codesign.budget.task import Linear, TaskSetting
 from codesign.eye import face_axes
 from codesign.optics import Aperture, Numerics, Window, kernels, psf_difference
@@ -103,17 +104,21 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     return Bench(lens, given, setting, aperture, finest, window, eyes, reference, reader)
 
 
-def entries(about: Bench) -> Iterator[Entry]:
+def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
     """The budget, link by link in the order of the chain, ending with the sum of squares.
+
+    Args:
+        journal: of the links that an interrupted run has done.
 
     Raises:
         LensError: the as-built file is of another lens.
     """
-    found = []
+    journal, found = journal or Journal(), list[Entry]()
     for part in (_pillars, _neighbours, _mask, _spread, _calibration, _numerics, _network):
-        for entry in part(about):
-            found.append(entry)
-            yield entry
+        done = journal.part(part.__name__, lambda part=part: [astuple(entry) for entry in part(about)])  # type: ignore[misc]
+        links = [Entry(*values) for values in done]
+        found += links
+        yield from links
     yield _total(found)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from codesign.budget import task
+from codesign.budget.journal import Journal
 from codesign.budget.task import TaskSetting, Views
 from codesign.optics import Aperture, Numerics, Window, kernels
 from metalens import design, library
@@ -167,22 +168,38 @@ class Chain:
         )[0]
 
 
-def pilot(chain: Chain) -> Pilot:
-    """Measure every setting of every knob alone. The finest library is sampled at a few diameters, not computed."""
-    start = time.perf_counter()
-    exact, solving = _exact(chain)
+def pilot(chain: Chain, journal: Journal | None = None) -> Pilot:
+    """Measure every setting of every knob alone. The finest library is sampled at a few diameters, not computed.
+
+    Args:
+        journal: of the knobs that an interrupted run has measured.
+    """
+    start, journal = time.perf_counter(), journal or Journal()
+    real, imaginary, solving = journal.part("exact", lambda: _listed(chain))
+    exact = np.array(real) + 1j * np.array(imaginary)
     base = chain.optics(exact, PILOT)
     errors, seconds = {}, {}
     for knob, levels in chain.levels.items():
-        if knob == "library_tolerance":
-            errors[knob], seconds[knob] = _library_knob(chain, base, solving)
-        elif knob == "diameter_step_nm":
-            errors[knob], seconds[knob] = _mask_knob(chain, base, exact)
-        else:
-            errors[knob], seconds[knob] = _optics_knob(chain, exact, knob)
+
+        def measure(knob: str = knob) -> list[Any]:
+            if knob == "library_tolerance":
+                found = _library_knob(chain, base, solving)
+            elif knob == "diameter_step_nm":
+                found = _mask_knob(chain, base, exact)
+            else:
+                found = _optics_knob(chain, exact, knob)
+            return [part.tolist() for part in found]
+
+        errors[knob], seconds[knob] = map(np.array, journal.part(knob, measure))
         chain.say(f"{knob}: {', '.join(f'{v:g}' for v in levels)}")
     noise = task.linear(chain.eyes, base, chain.config.task).noise_rad
     return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start)
+
+
+def _listed(chain: Chain) -> list[Any]:
+    """Real and imaginary parts of the exact table, and its seconds."""
+    table, seconds = _exact(chain)
+    return [table.real.tolist(), table.imag.tolist(), seconds]
 
 
 def _exact(chain: Chain) -> tuple[Array, float]:

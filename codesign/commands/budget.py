@@ -1,4 +1,7 @@
-"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each with how it was found."""
+"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each with how it was found.
+
+Links that are done are kept beside the output (NAME.resume): after an interruption the same command goes on.
+"""
 
 import dataclasses
 import json
@@ -11,11 +14,11 @@ import numpy as np
 import tyro
 
 from characterize.inference import asbuilt
-from codesign.budget import Entry, Given
+from codesign.budget import Entry, Given, Journal
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
 from codesign.optics import Numerics
-from metalens import lens, library
+from metalens import __version__, lens, library
 from metalens.commands import Common, Output
 from metalens.ground import config, manifest, store
 from metalens.ground.errors import ConfigError
@@ -59,10 +62,16 @@ def run(options: Options) -> int:
         raise ConfigError(f"{target}: need a name that ends in .h5")
     made, given = lens.load_plain(options.lens), _given(options)
     with options.claim(target, beside=(".html", ".png")) as draft:
-        rows = list(options.console.track(budget.entries(budget.bench(made, given)), total=9, label="links"))
-        save(draft.path, rows, _provenance(options, given))
+        about = _provenance(options, given)
+        journal = Journal(
+            target.with_name(target.name + ".resume"), f"{__version__}\n{about.config}{about.inputs}{given.slip_mm}"
+        )
+        links = budget.entries(budget.bench(made, given), journal)
+        rows = list(options.console.track(links, total=9, label="links"))
+        save(draft.path, rows, about)
         budget_page.write(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
+    journal.finish()
     values = {"rows": [dataclasses.asdict(row) for row in rows], "gaze_error_deg": math.degrees(rows[-1].gaze_rad)}
     options.console.result(_plain(values), text(rows))
     return 0

@@ -1,4 +1,7 @@
-"""Which tolerances, depths and wavelengths suffice for a gaze error, at the least cost: settings files ready to run."""
+"""Which tolerances, depths and wavelengths suffice for a gaze error, at the least cost: settings files ready to run.
+
+What is measured is kept beside the output (NAME.resume): after an interruption the same command goes on.
+"""
 
 import json
 import math
@@ -6,7 +9,8 @@ import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from codesign.budget import Chain, Pilot, Plan, PlanConfig, plan
+from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, plan
+from metalens import __version__
 from metalens.commands import Common, Output
 from metalens.ground import config, report, store
 from metalens.ground.errors import ConfigError
@@ -54,9 +58,11 @@ def run(options: Options) -> int:
     target = options.output
     with options.claim_folder(target) as draft:
         chain = Chain(wanted, options.console.say)
-        measured = plan.pilot(chain)
+        journal = Journal(target.with_name(target.name + ".resume"), f"{__version__}\n{config.dumps(wanted)}")
+        measured = plan.pilot(chain, journal)
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)
+    journal.finish()
     options.console.result(values(best, measured), text(best, measured, target))
     return 0 if best.met else 1
 

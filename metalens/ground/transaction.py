@@ -63,8 +63,10 @@ def file(target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()) ->
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
+    names = [target.stem + end for end in beside]
+    if target.name in names:
+        raise OutputError(f"{target}: a file of that name is written beside the result; give another ending, as .h5")
     with _claimed(target, terms, is_folder=False):
-        names = [target.stem + end for end in beside]
         _refuse(target, names, terms, is_folder=False)
         with _scratch(target) as scratch:
             (scratch / "new").mkdir()

@@ -1,0 +1,72 @@
+"""Work that is interrupted goes on where it stopped, however often, and ends in the same numbers."""
+
+import math
+
+import pytest
+
+from codesign.budget import Journal, links
+from codesign.budget.links import Entry
+
+
+def parts(path, title, *, until=99):
+    """Three parts of work that dies at number ``until``; the values, and which were computed."""
+    computed, journal = [], Journal(path, title)
+
+    def work(k):
+        if k == until:
+            raise KeyboardInterrupt
+        computed.append(k)
+        return [k / 3, [math.nan, 1e-300], f"part {k}"]
+
+    found = [journal.part(f"part {k}", lambda k=k: work(k)) for k in range(3)]
+    journal.finish()
+    return found, computed
+
+
+def test_cut_twice_in_the_middle_of_a_line_it_goes_on(tmp_path):
+    path = tmp_path / "out.resume"
+    whole, _ = parts(None, "a")
+    for until in (1, 2):
+        with pytest.raises(KeyboardInterrupt):
+            parts(path, "a", until=until)
+        with open(path, "ab") as file:
+            file.write(b'["part 2", [0.1, [1')  # what a kill leaves of the next line
+    found, computed = parts(path, "a")
+    assert computed == [2]
+    assert repr(found) == repr(whole)
+    assert not path.exists()
+
+
+def test_the_journal_of_other_work_and_damaged_lines_are_not_read(tmp_path):
+    path = tmp_path / "out.resume"
+    with pytest.raises(KeyboardInterrupt):
+        parts(path, "a", until=2)
+    path.write_text(path.read_text().replace('["part 0"', "[[[["))
+    with pytest.raises(KeyboardInterrupt):
+        parts(path, "a", until=0)
+    assert parts(path, "b")[1] == [0, 1, 2]
+
+
+def test_links_of_a_budget_are_computed_once(tmp_path, monkeypatch):
+    calls = []
+
+    def link(name, *, dies=False):
+        def part(about):
+            calls.append(name)
+            if dies:
+                raise KeyboardInterrupt
+            yield Entry(name, 0.25, math.nan, 1e-3 / 7, "by hand")
+
+        part.__name__ = name
+        return part
+
+    names = ("_pillars", "_neighbours", "_mask", "_spread", "_calibration", "_numerics", "_network")
+    for name in names:
+        monkeypatch.setattr(links, name, link(name, dies=name == "_spread"))
+    with pytest.raises(KeyboardInterrupt):
+        list(links.entries(None, Journal(tmp_path / "j", "t")))
+    monkeypatch.setattr(links, "_spread", link("_spread"))
+    found = list(links.entries(None, Journal(tmp_path / "j", "t")))
+    assert calls == [*names[:4], *names[3:]]
+    assert [entry.link for entry in found] == [*names, "all links"]
+    assert found[-1].gaze_rad == pytest.approx(math.sqrt(7) * 1e-3 / 7, rel=1e-12)
