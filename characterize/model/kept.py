@@ -25,10 +25,12 @@ MOST = 64  # files of one title; the least recently used go first
 _ENDING = ".npz"
 
 
-def folder() -> Path:
-    """Where they are: ``metalens`` in $XDG_CACHE_HOME, or in ~/.cache where that is no absolute path."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path(os.path.expanduser("~")) / ".cache") / "metalens"
+def folder() -> Path | None:
+    """Where they are: ``metalens`` in $XDG_CACHE_HOME, or in ~/.cache; None for somebody without a home."""
+    base, home = os.environ.get("XDG_CACHE_HOME", ""), os.path.expanduser("~")
+    if os.path.isabs(base):
+        return Path(base) / "metalens"
+    return Path(home) / ".cache" / "metalens" if os.path.isabs(home) and os.path.isdir(home) else None
 
 
 def kept(
@@ -40,13 +42,15 @@ def kept(
         title: first part of the file's name. about: all that the arrays depend on, as text.
         packages: names of the packages whose source files enter too.
     """
+    place = folder()
+    if place is None:
+        return make()
     told = "\n".join([title, about, _sources(tuple(packages)), np.__version__, scipy.__version__])
-    path = folder() / f"{title}_{hashlib.sha256(told.encode()).hexdigest()[:40]}{_ENDING}"
+    path = place / f"{title}_{hashlib.sha256(told.encode()).hexdigest()[:40]}{_ENDING}"
     found = _read(path)
     if found is None:
         found = make()
-        if path.is_absolute():  # somebody without a home keeps nothing
-            _write(path, title, found)
+        _write(path, title, found)
     return found
 
 

@@ -2,6 +2,7 @@
 
 import os
 import stat
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,10 +71,14 @@ def test_a_home_that_cannot_be_written_costs_time_alone(tmp_path, monkeypatch):
         assert made == 1
         assert found["t"].tobytes() == MADE["t"].tobytes()
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
     monkeypatch.chdir(tmp_path)
-    assert asked()[1] == 1
-    assert not (tmp_path / "~").exists()
+    for home in ("~", str(tmp_path / "nobody")):
+        monkeypatch.setattr(os.path, "expanduser", lambda path, home=home: home)
+        assert kept.folder() is None
+        assert asked()[1] == 1
+        assert not Path(home).exists()
+    monkeypatch.setattr(os.path, "expanduser", lambda path: str(tmp_path))
+    assert kept.folder() == tmp_path / ".cache" / "metalens"
 
 
 def test_the_oldest_files_go(home, monkeypatch):
