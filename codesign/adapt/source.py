@@ -69,7 +69,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = sorted(
             json.loads(path.read_text("utf-8"))["rows"], key=lambda r: r["budget_mmacs"]
         )
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise TrainingError(f"{path}: cut short or of another version ({error!r}); resume the run") from None
     if not rows:
         raise TrainingError(f"{path}: holds no network; resume the run")

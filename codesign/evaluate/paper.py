@@ -173,7 +173,9 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, Measured]:
     """Fig. 8 a from the rows of result.json of the proposed and the hyperbolic run: errors at equal budgets."""
     if not {"proposed", "hyperbolic"} <= rows.keys():
         return {}
-    ours, theirs = ({r["budget_mmacs"]: r for r in rows[name]} for name in ("proposed", "hyperbolic"))
+    ours, theirs = (
+        {r["budget_mmacs"]: r for r in rows[name] if "axial_slip_mm" in r} for name in ("proposed", "hyperbolic")
+    )
     shared = sorted(ours.keys() & theirs.keys())
     if not shared:
         return {}

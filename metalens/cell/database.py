@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from metalens.ground.arrays import Array
-from metalens.ground.errors import MaterialError
+from metalens.ground.errors import DAMAGE, MaterialError
 
 LEAST = {1: 3, 2: 3, 3: 3, 4: 5, 5: 3, 6: 3, 7: 2, 8: 3, 9: 3}  # coefficients without which a formula says nothing
 
@@ -114,20 +114,22 @@ def read(text: str, where: str) -> tuple[Part, Part | None, str]:
     """
     try:
         page = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise MaterialError(f"{where}: not YAML: {str(error).splitlines()[0]}") from None
+    except (yaml.YAMLError, *DAMAGE) as error:  # nested too deep, endless integers and dates that are none as well
+        raise MaterialError(f"{where}: not YAML: {next(iter(str(error).splitlines()), 'no words')}") from None
     blocks = page.get("DATA") if isinstance(page, dict) else None
     if not isinstance(blocks, list):
         raise MaterialError(f"{where}: no list DATA; need a page of refractiveindex.info")
     n: Part | None = None
     k: Part | None = None
-    for block in blocks:
-        kind = str(block.get("type", ""))
+    for i, block in enumerate(blocks, 1):
+        if not isinstance(block, dict):
+            raise MaterialError(f"{where}: entry {i} of DATA is no table; need type and data, or type and coefficients")
+        kind = _words(block, "type")
         if kind.startswith("formula"):
             n = _formula(block, kind, where)
         elif kind.startswith("tabulated"):
             columns = kind.split()[-1]
-            table = _rows(str(block.get("data", "")), len(columns) + 1, f"{where}, {kind}")
+            table = _rows(_words(block, "data"), len(columns) + 1, f"{where}, {kind}")
             if columns not in ("nk", "n", "k"):
                 raise MaterialError(f"{where}: type {kind!r}, need tabulated nk, n or k")
             n = Table(table[:2]) if "n" in columns else n
@@ -137,9 +139,15 @@ def read(text: str, where: str) -> tuple[Part, Part | None, str]:
     return n, k, _source(page)
 
 
+def _words(block: dict[str, Any], key: str) -> str:
+    """A text or number; '' for anything else, such as lists of lists by reference, whose text would have no end."""
+    value = block.get(key, "")
+    return str(value) if isinstance(value, str | int | float) else ""
+
+
 def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
-    numbers = str(block.get("coefficients", "")).split()
-    span = str(block.get("wavelength_range", block.get("range", ""))).split()
+    numbers = _words(block, "coefficients").split()
+    span = (_words(block, "wavelength_range") or _words(block, "range")).split()
     try:
         number, values, ends = int(kind.split()[-1]), tuple(map(float, numbers)), tuple(map(float, span))
     except ValueError:
@@ -174,7 +182,7 @@ def _source(page: dict[str, Any]) -> str:
     """References and comments without markup, in one line."""
     import re
 
-    parts = [str(page.get(key, "")) for key in ("REFERENCES", "COMMENTS")]
+    parts = [_words(page, key) for key in ("REFERENCES", "COMMENTS")]
     plain = re.sub(r"<[^>]+>", "", " ".join(parts))
     return " ".join(plain.split()) or "a page of refractiveindex.info"
 

@@ -260,6 +260,11 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
         ("DATA:\n  - type: formula 1\n    wavelength_range: 0.4 0.9\n    coefficients: 1 x 3\n", "not numbers"),
         ("DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5\n", "row 1"),
         ("DATA: [", "not YAML"),
+        ("DATA: " + "[" * 3000, "not YAML"),
+        ("DATA: 2001-99-99", "not YAML"),
+        ("DATA: " + "9" * 5000, "not YAML"),
+        ("DATA:\n  - x\n", "entry 1 of DATA is no table"),
+        ("DATA:\n  - type: [formula, 1]\n    data: 3\n", "neither a formula"),
         ("DATA:\n  - type: tabulated k\n    data: |\n        0.5 0.1\n        0.6 0.1\n", "neither a formula"),
     ],
 )
@@ -268,6 +273,15 @@ def test_a_bad_page_is_refused(tmp_path: Path, text, message):
     file.write_text(text)
     with pytest.raises(MaterialError, match=message):
         materials.index(str(file), 0.55)
+
+
+def test_a_page_of_lists_of_lists_by_reference_is_not_written_out(tmp_path: Path):
+    """Ten lists, each of ten times the one before: their text would have 10^10 words."""
+    lists = [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10) if i else 'x'}]" for i in range(11)]
+    data = "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5 0\n        0.6 1.4 0\n"
+    file = tmp_path / "bomb.yml"
+    file.write_text("\n".join([*lists, "REFERENCES: *l10", data]))
+    assert materials.index(str(file), 0.55) == pytest.approx(1.45)
 
 
 def test_blends_and_offsets():
