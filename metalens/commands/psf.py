@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from metalens import lens, propagate, psf
+from metalens import design, lens, propagate, psf
 from metalens.commands.common import Common, Output
 from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
@@ -47,6 +47,8 @@ class Settings:
     spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose product is the spectrum (LED,
         filter, sensor).
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
+    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell, for the error budget (seconds to a
+        minute); without it those terms are rough, of the default cell.
     """
 
     depths_mm: tuple[float, float, float] = (16.0, 26.0, 0.5)
@@ -59,6 +61,7 @@ class Settings:
     polarisation: psf.Polarisation = "scalar"
     spectrum: tuple[Path, ...] = ()
     layers: Layers | None = None
+    own_cell: bool = False
 
     def __post_init__(self) -> None:
         near, far, step = self.depths_mm
@@ -106,8 +109,8 @@ class Options(Common):
         output: the PSF file to write, .h5 (which all other commands read), .tif or .mat; plots are written beside it as
             NAME_xz.png and so on.
         config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance,
-            polarisation, spectrum, [[layers.front]] and [[layers.behind]]; without it 16 to 26 mm in steps of 0.5 mm at
-            0, 10 and 20 degrees.
+            polarisation, spectrum, own_cell, [[layers.front]] and [[layers.behind]]; without it 16 to 26 mm in steps of
+            0.5 mm at 0, 10 and 20 degrees.
         tolerance: relative L2 error, in place of the one in the settings.
         report: also write NAME.html.
     """
@@ -153,7 +156,7 @@ def _stack(path: Path, settings: Settings) -> psf.PsfStack:
     """PSFs of a lens file, or of another kind of file that the command line knows a source for."""
     kind, provenance = store.load(path).kind, Provenance(config.dumps(settings), {path.name: store.sha256(path)})
     if kind in SOURCES:
-        for name in ("led_fwhm_nm", "spectrum", "layers"):
+        for name in ("led_fwhm_nm", "spectrum", "layers", "own_cell"):
             if getattr(settings, name):
                 raise ConfigError(
                     f"{path}: {name} is for a design; this {kind} file has the wavelength and layers that were fitted"
@@ -173,7 +176,15 @@ def _stack(path: Path, settings: Settings) -> psf.PsfStack:
         spectrum=_spectrum(made, settings),
         provenance=replace(provenance, inputs=inputs),
         polarisation=settings.polarisation,
+        left_out=_own_cell(made, settings) if settings.own_cell else None,
     )
+
+
+def _own_cell(made: lens.Lens, settings: Settings) -> psf.LeftOut:
+    """Neighbours and angle of the lens's own pillars, at the largest aperture and angle of the view."""
+    apertures = [psf.aperture(made, angle) for angle in settings.view.angles_rad]
+    incidence = max(float(np.arctan(np.hypot(*np.tan(angle)))) for angle in settings.view.angles_rad)
+    return design.left_out(made, aperture=max(apertures), incidence_rad=incidence)
 
 
 def _spectrum(made: lens.Lens, settings: Settings) -> spectrum.Nodes | None:

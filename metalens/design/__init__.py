@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from metalens.design.of_phase import make as make
     from metalens.design.of_phase import phase_of as phase_of
     from metalens.design.of_phase import printable as printable
+    from metalens.design.own_cell import left_out as left_out
     from metalens.design.profiles import Cubic as Cubic
     from metalens.design.profiles import DoubleHelix as DoubleHelix
     from metalens.design.profiles import Focus as Focus
@@ -41,6 +42,7 @@ __getattr__, __dir__, __all__ = attach(
         "field_angle": "of_phase",
         "focuses": "focusing",
         "hyperbolic": "profiles",
+        "left_out": "own_cell",
         "make": "of_phase",
         "make_turned": "turned",
         "neighbours": "",

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from metalens.field.points import psfs as psfs
     from metalens.field.subset import node_light as node_light
     from metalens.field.subset import surrogate as surrogate
-    from metalens.field.subset import with_light as with_light
     from metalens.field.waves import PillarWave as PillarWave
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
@@ -47,7 +46,6 @@ __getattr__, __dir__, __all__ = attach(
         "psfs": "points",
         "surrogate": "subset",
         "trial": "engine",
-        "with_light": "subset",
         "with_psfs": "forming",
     },
 )

@@ -12,8 +12,6 @@ the gradient of the loss itself. Wavelengths are drawn by their weights, points 
 import torch
 from torch import Tensor
 
-from metalens.field.engine import normalised
-from metalens.field.forming import Imager, with_psfs
 from metalens.field.plan import Plan, spectral
 from metalens.field.points import Optics, psfs
 
@@ -23,11 +21,6 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
     with torch.no_grad():
         light = spectral(optics, _places(plan), plan.depths_um, plan.waves, plan.window)
     return light.reshape(len(plan.y_um), len(plan.x_um), *light.shape[1:]).requires_grad_()
-
-
-def with_light(made: Imager, optics: Optics, light: Tensor) -> Imager:
-    """The imager with other light at its nodes, differentiable in it."""
-    return with_psfs(made, *normalised(light, optics, made.plan))
 
 
 def surrogate(

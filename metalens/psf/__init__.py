@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from metalens.psf import plots as plots
     from metalens.psf import spectrum as spectrum
     from metalens.psf.budget import Budget as Budget
+    from metalens.psf.budget import LeftOut as LeftOut
     from metalens.psf.budget import scalar_error as scalar_error
     from metalens.psf.of_lens import Polarisation as Polarisation
     from metalens.psf.of_lens import View as View
-    from metalens.psf.of_lens import depth_samples as depth_samples
+    from metalens.psf.of_lens import aperture as aperture
     from metalens.psf.of_lens import from_lens as from_lens
     from metalens.psf.pixels import on_pixels as on_pixels
     from metalens.psf.record import PsfStack as PsfStack
@@ -30,12 +31,13 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Budget": "budget",
+        "LeftOut": "budget",
         "Nodes": "spectrum",
         "Polarisation": "of_lens",
         "PsfStack": "record",
         "Source": "spectrum",
         "View": "of_lens",
-        "depth_samples": "of_lens",
+        "aperture": "of_lens",
         "export": "",
         "from_lens": "of_lens",
         "load": "record",

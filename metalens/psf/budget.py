@@ -9,7 +9,6 @@ and, for both polarisations, Ex, Ey, Ez of rays turned by the lens (Richards and
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import jv
@@ -20,6 +19,24 @@ from metalens.ground.arrays import Array
 # -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
 NEIGHBOURS = (-0.28j, -0.55)
 ANGLE = 2.5  # relative change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst pillar
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """What is known of pillars that the model of a lens leaves out; by default rough, of another cell.
+
+    neighbours: (a, b) of the factor 1 + a s + b s² on light that unlike neighbours turn by the sine s.
+    angle: relative change of t over sin² of the incidence. of: whose numbers they are.
+    """
+
+    neighbours: tuple[complex, complex] = NEIGHBOURS
+    angle: float = ANGLE
+    of: str = ""
+
+    @property
+    def words(self) -> str:
+        """For a person."""
+        return f"neighbours and angle: of {self.of or 'the default cell, rough'}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +100,14 @@ def _largest(values: list[float]) -> float:
 
 
 def with_model(
-    budget: Budget, *, aperture: float, vector: bool, incidence_rad: float, has_angles: bool, ghost: float
+    budget: Budget,
+    *,
+    aperture: float,
+    vector: bool,
+    incidence_rad: float,
+    has_angles: bool,
+    ghost: float,
+    left_out: LeftOut,
 ) -> Budget:
     """The budget with what the model of a lens leaves out.
 
@@ -94,8 +118,8 @@ def with_model(
     return replace(
         budget,
         polarisation=0.0 if vector else scalar_error(aperture),
-        neighbours=_difference(_scalar(aperture, _factor), _scalar(aperture)),
-        angle=0.0 if has_angles else min(1.0, ANGLE * math.sin(incidence_rad) ** 2),
+        neighbours=_difference(_scalar(aperture, left_out.neighbours), _scalar(aperture)),
+        angle=0.0 if has_angles else min(1.0, left_out.angle * math.sin(incidence_rad) ** 2),
         glass=ghost,
     )
 
@@ -103,10 +127,6 @@ def with_model(
 def scalar_error(aperture: float) -> float:
     """Relative L2 difference between the scalar PSF and that of both polarisations, perfect lens of this aperture."""
     return _difference(_scalar(aperture), _vectorial(aperture))
-
-
-def _factor(p: Array) -> Array:
-    return np.asarray(1 + NEIGHBOURS[0] * p + NEIGHBOURS[1] * p * p)
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:
@@ -117,10 +137,10 @@ def _nodes(aperture: float) -> tuple[Array, Array, Array]:
     return p, w * p * edge / 2, np.linspace(0, 30 / edge, 240)
 
 
-def _scalar(aperture: float, factor: Any = None) -> Array:
-    """(ρ,) |U|²."""
+def _scalar(aperture: float, factor: tuple[complex, complex] = (0, 0)) -> Array:
+    """(ρ,) |U|² through a factor 1 + a p + b p²."""
     p, weight, at = _nodes(aperture)
-    level = weight / (1 - p * p) * (1 if factor is None else factor(p))
+    level = weight / (1 - p * p) * (1 + factor[0] * p + factor[1] * p * p)
     return np.asarray(np.abs(level @ jv(0, np.outer(p, at))) ** 2)
 
 

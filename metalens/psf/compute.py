@@ -72,9 +72,10 @@ def intensity(
     float64, since the estimate knows rounding as noise of a mean size only.
     """
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
-    choices = [choose(case, tolerance, differentiable=needs_grad) for case in cases]
-    if all(choice.method == "exact" for choice in choices) and phase.device.type == "cpu":
-        return _exact(phase, level, cases, weights, choices[0].reason)
+    if not needs_grad and phase.device.type == "cpu":  # at the setting that the windowed method begins with
+        choices = [choose(case, max(tolerance / 2, FINEST)) for case in cases]
+        if all(choice.method == "exact" for choice in choices):
+            return _exact(phase, level, cases, weights, choices[0].reason)
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
     if cases[0].samples[0] * cases[0].samples[1] < FEW:
         first = torch.float64

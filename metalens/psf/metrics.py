@@ -37,11 +37,21 @@ def encircled(stack: PsfStack, *, radii_um: Array, of_window: bool = True) -> Ar
     dy = stack.y_um[:, None] - cy[..., None, None]
     dx = stack.x_um - cx[..., None, None]
     distance = np.hypot(dy, dx)
-    out = np.empty((*plain.intensity.shape[:-2], len(radii_um)))
-    for i, radius in enumerate(radii_um):
-        inside = np.clip((radius - distance) / stack.step_um + 0.5, 0, 1)
-        out[..., i] = (plain.intensity * inside).sum((-1, -2))
+    flat = plain.intensity.reshape(-1, distance.shape[-2] * distance.shape[-1])
+    pairs = zip(flat, distance.reshape(flat.shape), strict=True)
+    found = [_within(light, away, np.asarray(radii_um, float), stack.step_um) for light, away in pairs]
+    out = np.reshape(found, (*plain.intensity.shape[:-2], len(radii_um)))
     return out if of_window else out * plain.energy_um2[..., None]
+
+
+def _within(light: Array, distance_um: Array, radii_um: Array, step_um: float) -> Array:
+    """(radius,) Σ light · clip((radius - distance) / step + 1/2, 0, 1), by sums along the distance."""
+    order = np.argsort(distance_um)
+    away, power = distance_um[order], light[order].astype(float)
+    sums = np.concatenate([[0.0], np.cumsum(power)]), np.concatenate([[0.0], np.cumsum(power * away)])
+    whole, part = (np.searchsorted(away, radii_um + sign * step_um / 2) for sign in (-1, 1))
+    edge = ((radii_um / step_um + 0.5) * (sums[0][part] - sums[0][whole])) - (sums[1][part] - sums[1][whole]) / step_um
+    return np.asarray(sums[0][whole] + edge)
 
 
 def centroid(stack: PsfStack) -> tuple[Array, Array]:

@@ -9,10 +9,9 @@ import numpy as np
 import torch
 
 from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
-from metalens.psf.budget import Budget, scalar_error, with_model, worst
+from metalens.psf.budget import Budget, LeftOut, scalar_error, with_model, worst
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
@@ -42,6 +41,7 @@ def from_lens(
     spectrum: Nodes | None = None,
     provenance: Provenance | None = None,
     polarisation: Polarisation = "scalar",
+    left_out: LeftOut | None = None,
 ) -> PsfStack:
     """PSFs of a lens, (angle, depth, y, x), float32 where the tolerance allows it.
 
@@ -53,6 +53,7 @@ def from_lens(
         spectrum: wavelengths and weights; by default the design wavelength alone. Its error is in the budget.
         polarisation: one scalar, Ex, Ey, Ez of both polarisations, or ``auto``: the scalar where its error
             (:func:`metalens.psf.scalar_error`) is below the tolerance.
+        left_out: of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough numbers.
 
     Raises:
         DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`.
@@ -60,10 +61,11 @@ def from_lens(
     nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
-    budgets, parts = [], []
+    budgets, parts, seen, own = [], [], math.nan, left_out or LeftOut()
     for angle in view.angles_rad:
-        maps = [pillar_maps(lens, float(w), angle) for w in nodes.wavelengths_um]
-        phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in maps]) for i in (0, 1))
+        if seen != (tilt := incidence(lens, angle)):  # without angles in the library all directions share the maps
+            maps, seen = _all_maps(lens, nodes, angle, dtype), tilt
+        phase, level = maps
         parts.append(
             psf_stack(
                 phase,
@@ -81,14 +83,17 @@ def from_lens(
                 vector=_vectorial(lens, angle, polarisation, tolerance),
             ).numpy()
         )
-        budgets.append(_budget(lens, angle, parts[-1], nodes, _vectorial(lens, angle, polarisation, tolerance)))
+        budgets.append(_budget(lens, angle, parts[-1], nodes, _vectorial(lens, angle, polarisation, tolerance), own))
     stack = _joined(parts, provenance or Provenance())
     found = worst(budgets)
-    words = stack.reason if not found.angle else f"{stack.reason}; {AT_NORMAL}"
+    words = f"{stack.reason}; {AT_NORMAL}" if found.angle else stack.reason
+    words = f"{words}; {own.words}"
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
 
 
-def _budget(lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, vector: bool) -> Budget:
+def _budget(
+    lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, vector: bool, left_out: LeftOut
+) -> Budget:
     """Of one direction: what was computed, and what the model of a lens leaves out."""
     made = stack.budget or Budget(stack.error)
     return with_model(
@@ -98,6 +103,7 @@ def _budget(lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Node
         incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
         has_angles=lens.proxy.max_angle_rad > 0,
         ghost=lens.layers.ghost(lens.wavelength_um),
+        left_out=left_out,
     )
 
 
@@ -117,36 +123,25 @@ def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
+def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
+    """Angle in rad at which the pillars are asked for light from a direction: 0 where their library has no angles."""
+    return float(np.arctan(np.hypot(*np.tan(angle_rad)))) if lens.proxy.max_angle_rad > 0 else 0.0
+
+
+def _all_maps(
+    lens: Lens, nodes: Nodes, angle_rad: tuple[float, float], dtype: torch.dtype
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(wavelength, y, x) phase and transmission of every pillar for light from a direction."""
+    maps = [pillar_maps(lens, float(w), angle_rad) for w in nodes.wavelengths_um]
+    phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in maps]) for i in (0, 1))
+    return phase, level
+
+
 def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:
     """(phase wrapped to ±π, transmission) of every pillar for light from a direction; 0 where there is no pillar."""
-    tilt = float(np.arctan(np.hypot(*np.tan(angle_rad))))
-    tilt = tilt if lens.proxy.max_angle_rad > 0 else 0.0
+    tilt = incidence(lens, angle_rad)
     turns = lens.phase_rad(wavelength_um, tilt) / (2 * np.pi)
     return (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(wavelength_um, tilt)
-
-
-def depth_samples(
-    near_um: float, far_um: float, *, radius_um: float, wavelength_um: float, tolerance: float, most_um: float = 500.0
-) -> Array:
-    """Depths so close that a PSF between two of them is their linear mixture within ``tolerance`` (relative L2).
-
-    Even in 1/z. A step of Δφ = πR²Δ(1/z)/λ in the defocus at the rim leaves Δφ²/24 (measured on round apertures in and
-    out of focus, with a margin); no step exceeds ``most_um``.
-
-    Raises:
-        PropagationError: depths that are not 0 < near < far, or tolerance not above 0.
-    """
-    if not (0 < near_um < far_um < np.inf and tolerance > 0):
-        raise PropagationError(
-            f"depths {near_um} to {far_um} um at tolerance {tolerance}: need 0 < near < far, tolerance > 0"
-        )
-    phase = np.pi * radius_um**2 / wavelength_um * (1 / near_um - 1 / far_um)
-    count = int(np.ceil(phase / np.sqrt(24 * tolerance)))
-    while True:
-        depths = 1 / np.linspace(1 / near_um, 1 / far_um, max(count, 1) + 1)
-        if np.diff(depths).max() <= most_um:
-            return depths
-        count = int(np.ceil(count * np.diff(depths).max() / most_um)) + 1
 
 
 def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:

@@ -1,6 +1,7 @@
 """metalens psf: file, pictures, exit codes, and the way from pillars through the proxy."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,6 +68,29 @@ def test_command_writes_stack_pictures_and_report(folder, capsys):
     )
     want = power**2 / (power**2).sum((1, 2), keepdims=True)
     assert np.linalg.norm(stack.intensity[1] - want) < 1e-4 * np.linalg.norm(want)
+
+
+def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(folder, monkeypatch):
+    """Rows and tilted pillars are solved at its own aperture and the largest angle; without them it says rough."""
+    asked = []
+
+    def rows(_, *, counts):
+        asked.append(counts)
+        return SimpleNamespace(a=0.0, b=0.0)
+
+    monkeypatch.setattr("metalens.design.own_cell.neighbours", rows)
+    monkeypatch.setattr("metalens.design.own_cell.angle_change", lambda _, tilt: 0.03 * np.sin(tilt))
+    assert command(folder, "--quiet") == 0
+    rough = psf.load(folder / "psf.h5")
+    (folder / "psf.toml").write_text(SETTINGS + "own_cell = true\n")
+    assert command(folder, "--quiet", "--force") == 0
+    own = psf.load(folder / "psf.h5")
+    assert asked == [(12, 8)]  # NA 0.11: 19 pillars in a zone, more than a row takes
+    assert rough.budget.neighbours > 0
+    assert own.budget.neighbours == pytest.approx(0.0, abs=1e-12)
+    assert own.budget.angle == pytest.approx(0.03 * np.sin(np.deg2rad(15.0)))
+    assert "rough" in rough.reason
+    assert "own cell" in own.reason
 
 
 def test_nothing_is_overwritten_without_force(folder):

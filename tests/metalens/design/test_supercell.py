@@ -85,6 +85,31 @@ def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     assert found.at(0.0) == pytest.approx(1.0)  # nothing turned, nothing changed
 
 
+def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(monkeypatch):
+    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t. Neighbours: through their rows."""
+    monkeypatch.setattr("metalens.design.own_cell.DIAMETERS", 2)
+    lens, tilt = _lens(), 0.3
+    found = design.left_out(lens, aperture=0.5, incidence_rad=tilt)
+    rows = supercell.neighbours(lens, counts=(6, 4))  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim, and 3.8
+    at = rows.sine[0]
+    assert 1 + found.neighbours[0] * at + found.neighbours[1] * at**2 == pytest.approx(rows.factor[0], abs=1e-9)
+    changes = []
+    for side in ("s", "p"):
+        flat, tilted = (
+            np.array(
+                [
+                    modal.solve(CELL, d, WAVE, angle_rad=angle, polarization=side, tolerance=5e-3).t
+                    for d in supercell.printed(lens)
+                ]
+            )
+            for angle in (0.0, tilt)
+        )
+        common = (flat.conj() @ tilted) / (flat.conj() @ flat)
+        changes.append((np.abs(tilted - common * flat) ** 2).sum() / (np.abs(tilted) ** 2).sum())
+    assert found.angle * np.sin(tilt) ** 2 == pytest.approx(np.sqrt(np.mean(changes)), abs=1.5e-2)
+    assert found.angle > 0.1
+
+
 @pytest.mark.parametrize(
     ("cell", "row"),
     [

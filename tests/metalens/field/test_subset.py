@@ -13,8 +13,8 @@ from metalens.field import (
     imager,
     node_light,
     node_psfs,
+    normalised,
     surrogate,
-    with_light,
     with_psfs,
 )
 from metalens.field.subset import term
@@ -51,7 +51,7 @@ def _pulled(made, frames):
     strength = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
     optics = _optics(strength)
     light = node_light(optics, made.plan)
-    (with_light(made, optics, light)(frames) ** 2).sum().backward()
+    (with_psfs(made, *normalised(light, optics, made.plan))(frames) ** 2).sum().backward()
     return strength, optics, light.grad
 
 

@@ -162,19 +162,6 @@ def test_axial_information_under_each_named_normalisation():
         psf_metrics.axial_information(dataclasses.replace(stack, depths_um=np.array([1.0, 1.0])), normalisation="sum")
 
 
-@pytest.mark.parametrize("tolerance", [3e-2, 3e-3])
-def test_depth_samples_allow_linear_mixture(tolerance):
-    phase, level = focus(96)
-    depths = psf.depth_samples(800.0, 2500.0, radius_um=19.0, wavelength_um=0.85, tolerance=tolerance, most_um=1e9)
-    middle = 2 / (1 / depths[1:] + 1 / depths[:-1])
-    at, between = (psf.psf_stack(phase, level, **GEOMETRY | dict(depths_um=z), **WINDOW) for z in (depths, middle))
-    mixed = (at.intensity[1:] + at.intensity[:-1]) / 2
-    error = np.linalg.norm(mixed - between.intensity, axis=(1, 2)) / np.linalg.norm(between.intensity, axis=(1, 2))
-    assert error.max() <= tolerance
-    assert error.max() > tolerance / 20  # not much finer than needed
-    assert np.diff(psf.depth_samples(16e3, 26e3, radius_um=1.0, wavelength_um=0.85, tolerance=1.0)).max() <= 500
-
-
 def test_gauss_rule_is_exact_for_polynomials_under_the_weight():
     """Eigenvalues and first components are rounded to eps times the matrix and its size, and a moment of order n moves
     by n times that: of a span of the line, to the power n."""
@@ -284,20 +271,6 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     assert level == pytest.approx(np.where(sizes > 0, sizes * 3 - tilt, 0), abs=1e-12)
     Tilted.max_angle_rad = 0.0  # a library of normal incidence alone
     assert pillar_maps(lens, 0.94, (0.17, -0.31))[1] == pytest.approx(sizes * 3, abs=1e-12)
-
-
-def test_depths_are_even_in_their_inverse_and_no_closer_than_needed():
-    from metalens.psf.of_lens import depth_samples
-
-    near, far, radius, wavelength, tolerance = 9e3, 31e3, 270.0, 0.94, 0.013
-    found = depth_samples(near, far, radius_um=radius, wavelength_um=wavelength, tolerance=tolerance, most_um=1e9)
-    assert (found[0], found[-1]) == pytest.approx((near, far))
-    steps = -np.diff(1 / found)
-    assert steps == pytest.approx(np.full(len(steps), steps[0]), rel=1e-9)
-    phase = np.pi * radius**2 / wavelength * steps[0]
-    assert phase**2 / 24 <= tolerance < (phase * len(steps) / (len(steps) - 1)) ** 2 / 24
-    close = depth_samples(near, far, radius_um=radius, wavelength_um=wavelength, tolerance=tolerance, most_um=700.0)
-    assert 550 < np.diff(close).max() <= 700
 
 
 def test_metrics_of_an_oblong_spot_off_the_middle():

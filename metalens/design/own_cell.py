@@ -1,0 +1,67 @@
+"""What a lens's own pillars leave out of its PSF: unlike neighbours and the angle of the light, solved for its cell.
+
+A few rows of unlike pillars (:mod:`metalens.design.neighbours`) with the zones that the lens has at its rim and
+beyond, and some of its diameters at normal incidence and at an angle. Seconds to a minute.
+"""
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from metalens import rcwa
+from metalens.design.neighbours import neighbours, printed
+from metalens.ground.arrays import Array
+from metalens.lens import Lens
+from metalens.psf import LeftOut
+
+FEWEST, MOST = 4, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
+DIAMETERS = 5
+TOLERANCE = 1e-2  # of t
+
+
+def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
+    """The terms of the error budget that belong to the lens's own cell.
+
+    Args:
+        aperture: sine of the largest angle by which the lens turns light.
+        incidence_rad: of the light on the pillars; 0 leaves the term of the angle at 0.
+
+    Raises:
+        CellError: the cell has films or tilted walls, whose rows no solver here knows.
+
+    Accuracy: the factor c(s) = 1 + a s + b s² goes through the rows; a few 1e-2 of it are truncation.
+    """
+    rim = lens.wavelength_um / (lens.cell.pitch_um * aperture)
+    long = int(np.clip(round(rim), FEWEST + 1, MOST))
+    found = neighbours(lens, counts=(long, max(FEWEST, round(long / 1.5))))
+    angle = angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2 if incidence_rad else 0.0
+    return LeftOut((found.a, found.b), angle, "the lens's own cell")
+
+
+def angle_change(lens: Lens, incidence_rad: float) -> float:
+    """Root mean square relative change of t at an angle over diameters and both polarisations.
+
+    A factor that all pillars share is taken out: it changes no PSF of sum 1.
+    """
+    low, high = printed(lens)
+    diameters = np.linspace(low, high, DIAMETERS)
+    changes = []
+    both: tuple[Literal["s", "p"], ...] = ("s", "p")
+    for polarization in both:
+        flat, tilted = (_answers(lens, diameters, angle, polarization) for angle in (0.0, incidence_rad))
+        common = np.vdot(flat, tilted) / np.vdot(flat, flat)
+        changes.append(np.linalg.norm(tilted - common * flat) ** 2 / np.linalg.norm(tilted) ** 2)
+    return float(np.sqrt(np.mean(changes)))
+
+
+def _answers(lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]) -> Array:
+    found = rcwa.solve_many(
+        lens.cell,
+        tuple(diameters_um.tolist()),
+        lens.wavelength_um,
+        angle_rad=angle_rad,
+        polarization=polarization,
+        tolerance=TOLERANCE,
+    )
+    return np.array([one.t for one in found])
