@@ -86,8 +86,7 @@ def from_lens(
         budgets.append(_budget(lens, angle, parts[-1], nodes, _vectorial(lens, angle, polarisation, tolerance), own))
     stack = _joined(parts, provenance or Provenance())
     found = worst(budgets)
-    words = f"{stack.reason}; {AT_NORMAL}" if found.angle else stack.reason
-    words = f"{words}; {own.words}"
+    words = "; ".join([stack.reason, *([AT_NORMAL] if found.angle else []), own.words])
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
 
 

@@ -47,7 +47,7 @@ def test_nothing_of_another_kind_is_taken(trials):
     assert _taken(trials, "table", "deep", "NUL", "control", "lists", "mixed") == set()
     assert _taken(trials, "empty") == {("process", "die.label")}  # no label
     hints = _leaves(_taken(trials, "true"))
-    assert hints == {"hole", "add_focus", "conjugate", "budget"}
+    assert hints == {"hole", "add_focus", "conjugate", "budget", "own_cell"}
 
 
 def test_what_is_good_is_taken():
