@@ -247,8 +247,8 @@ def test_error_of_the_nodes_is_the_worst_over_the_paths():
 
 
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
-    from types import SimpleNamespace
-
+    from metalens.cell import Cell
+    from metalens.lens import DiameterMap, Lens
     from metalens.psf.of_lens import pillar_maps
 
     class Tilted:
@@ -261,7 +261,7 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
             return d * 3 - tilt
 
     sizes = np.array([[0.1, 0.0], [0.3, 0.22]])
-    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=sizes), proxy=Tilted())
+    lens = Lens(DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), Tilted(), 0.85, 120.0, 1300.0, "map")
     phase, level = pillar_maps(lens, 0.94, (0.17, -0.31))
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
     tilt = np.arccos(1 / np.linalg.norm(direction))
