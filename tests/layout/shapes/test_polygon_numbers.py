@@ -91,14 +91,14 @@ def test_no_single_step_of_a_vertex_makes_an_outline_better(diameter, vertices):
         assert polygon._cost(moved[None], diameter)[0] >= here - 1e-12
 
 
-@pytest.mark.parametrize("diameter", [21.0, 38.4, 80.0, 151.0, 233.7])
+@pytest.mark.parametrize("diameter", [21.0, 38.4, *np.arange(47.0, 260.0, 11.3).tolist()])
 def test_octagon_is_the_cheapest_of_all_near_the_regular_one(diameter):
     """Half width a, cut corner c = a - b; area from the outline. Regular: area 8 (√2 - 1) a², c = (2 - √2) a."""
     goal = math.pi * diameter**2 / 4
     regular = math.sqrt(goal / 8 / (math.sqrt(2) - 1))
     best = (math.inf, 0, 0)
-    for a in range(max(2, int(regular) - 6), int(regular) + 8):
-        for b in range(1, a):
+    for a in range(max(2, int(regular) - 4), int(regular) + 6):
+        for b in range(max(1, int(0.41 * regular) - 16), min(a, int(0.41 * regular) + 17)):
             error = abs(area([(a, b)]) / goal - 1)
             off = (a - regular) ** 2 + ((a - b - (2 - math.sqrt(2)) * regular) / 2) ** 2
             best = min(best, (4 * max(error / 5e-4 - 1, 0) ** 2 + 100 * error + off, a, b))
@@ -136,3 +136,21 @@ def test_frontier_is_the_worst_error_and_the_mean_count_over_the_diameters():
         assert found.edge_error_nm == pytest.approx(grid * max(edges), abs=1e-4)
         assert found.corners == pytest.approx(np.mean([len(m.points) for m in made]))
         assert found.shots == pytest.approx(np.mean([len(set(m.points[:, 1].tolist())) - 1 for m in made]))
+
+
+@pytest.mark.parametrize(("count", "diagonal"), [(5, False), (5, True), (4, False), (2, True), (1, False)])
+def test_trial_moves_are_small_steps_of_one_or_two_coordinates_or_all_of_few(count, diagonal):
+    """Up to four free coordinates: all steps to 2; up to eight: to 1; beyond, one or two steps by 1."""
+    free = 2 * count - diagonal
+    if free <= 8:
+        reach = 2 if free <= 4 else 1
+        want = set(itertools.product(range(-reach, reach + 1), repeat=free))
+    else:
+        unit = [tuple(s * (i == k) for i in range(free)) for k in range(free) for s in (1, -1)]
+        pairs = {tuple(np.add(a, b).tolist()) for a, b in itertools.combinations(unit, 2)}
+        want = set(unit) | pairs
+    found = polygon._moves(count, diagonal).reshape(-1, 2 * count)
+    if diagonal:
+        assert np.array_equal(found[:, -1], found[:, -2])  # it stays on the diagonal
+        found = found[:, :-1]
+    assert set(map(tuple, found.tolist())) == want
