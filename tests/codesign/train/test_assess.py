@@ -43,3 +43,38 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.2) / 6)
     assert got.iou == pytest.approx((1 / 3 + 1 + 1) / 3)  # two empty masks agree
     assert [len(part) for part in assess.parts(seen)] == [2, 1]
+
+
+def test_standard_deviations_come_in_millimetres(monkeypatch):
+    """exp of the logarithm times the scale of each axis; two batches in a row; depths as they are told."""
+    log_sd = torch.tensor([[-1.0, 0.3, 0.5], [0.2, -0.4, 1.1], [0.0, 0.7, -2.0]])
+    depth = torch.arange(3 * 2 * 4.0).reshape(3, 2, 2, 2)
+    scale = torch.tensor([0.5, 2.0, 4.0])
+
+    class Sure(Typed):
+        def forward(self, frames, architecture):
+            part = slice(self.at, self.at + len(frames))
+            found = super().forward(frames, architecture)
+            return Prediction(found.mask_logits, found.centre, found.slip, depth[part], log_sd[part])
+
+    seen = Seen(torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2)
+    net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
+    got = assess.predict(net, None, seen, SimpleNamespace(slip_scale_mm=tuple(scale.tolist())))
+    assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
+    assert torch.allclose(got.slip_mm, scale.expand(3, 3))
+    assert torch.equal(got.depth, depth)
+    plain = assess.predict(
+        Typed(torch.ones(3, 3), -torch.ones(3, 5, 5)), None, seen, SimpleNamespace(slip_scale_mm=(1.0,) * 3)
+    )
+    assert plain.slip_sd_mm is None
+    assert plain.depth is None
+
+
+@pytest.mark.parametrize(("frames", "used"), [(1, [1]), (2, [2]), (5, [2]), (8, [2, 2]), (10, [2, 2])])
+def test_batch_statistics_come_from_the_first_half_of_the_batches(monkeypatch, frames, used):
+    told = []
+    monkeypatch.setattr(assess, "recalibrate", lambda net, architecture, batches: told.extend(map(len, batches)))
+    seen = Seen(torch.zeros(frames, 1, 5, 5), torch.zeros(frames, 5, 5), torch.zeros(frames, 3), batch=2)
+    net = Typed(torch.zeros(frames, 3), -torch.ones(frames, 5, 5))
+    assess.assess(net, None, seen, SimpleNamespace(slip_scale_mm=(1.0, 1.0, 1.0)))
+    assert told == used
