@@ -25,7 +25,7 @@ BUDGET = ("budget", "lens.h5", "--library", "library.h5", "--process", "process.
 EVALUATE = ("evaluate", "experiment", "run", "-o", "experiment")
 OTHERS = (
     Stage("", "", BUDGET, ("gaze_error_deg", "deg of gaze from all links")),
-    Stage("", "", ("plan", "--gaze-error", "0.1deg", "-o", "plan"), ("predicted_deg", "deg of gaze, predicted")),
+    Stage("", "", ("plan", "--gaze-error", "2deg", "-o", "plan"), ("predicted_deg", "deg of gaze, predicted")),
     Stage("", "", ("scene", "-o", "scene"), ("", "no error")),
     Stage("", "", ("evaluate", "optics", "lens.h5", "-o", "optics"), ("", "no error")),
     Stage("", "", EVALUATE, ("", "no error")),

@@ -45,6 +45,7 @@ rate = {rate}
 start = 0.12
 end = 0.8
 [optics]
+image = "uniform"
 sample_um = {pitch_um}
 window_samples = {window}
 depth_count = 16

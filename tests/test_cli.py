@@ -113,6 +113,7 @@ CHAIN = {
         run = { pitch_um = 12.0, budgets_mmacs = [4.0] }
 
         [optics]
+        image = "uniform"
         aperture_mm = 0.2
         sensor_distance_mm = 1.0
         sample_um = 12.0

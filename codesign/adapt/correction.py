@@ -49,7 +49,17 @@ class Proposal:
     light: float
 
 
-def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: int = 13) -> Correction:
+@dataclass(frozen=True, eq=False, slots=True)
+class Table:
+    """A bias table, (knots,) each: see :class:`Correction`."""
+
+    drawn_nm: Array
+    bias_nm: Array
+    designed_um: Array
+    wanted_um: Array
+
+
+def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias) -> Correction:
     """The correction that fitted parameters ask for.
 
     Args:
@@ -58,8 +68,27 @@ def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: 
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
     """
-    printed = design.diameters.diameter_um[design.diameters.diameter_um > 0]
-    designed = np.linspace(float(printed.min()), float(printed.max()), knots)
+    made = table(design, x, response=response, old=old, range_um=printed_um(design))
+    return Correction(
+        made.drawn_nm, made.bias_nm, old.at(made.drawn_nm), made.designed_um, made.wanted_um, _evened(design, x)
+    )
+
+
+def printed_um(design: Lens) -> tuple[float, float]:
+    """(least, largest) diameter of the design's pillars."""
+    diameter = design.diameters.diameter_um
+    return float(diameter.min(where=diameter > 0, initial=np.inf)), float(diameter.max())
+
+
+def table(
+    design: Lens, x: Array, *, response: Sensitivity, old: Bias, range_um: tuple[float, float], knots: int = 13
+) -> Table:
+    """The bias table alone, without a look at the pillars: what many draws of a posterior are asked for.
+
+    Raises:
+        ConfigError: the table would be steeper than the layout can invert.
+    """
+    designed = np.linspace(*range_um, knots)
     wanted = _wanted_um(design, designed, x, response)
     drawn = old.drawn_nm(wanted * 1e3 - state(x)["bias_nm"])
     bias = designed * 1e3 - drawn
@@ -69,7 +98,7 @@ def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias, knots: 
             f"the table would change by {np.abs(slope).max():.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
             "lens is too far from its design for a table; correct height or index in the process instead"
         )
-    return Correction(drawn, bias, old.at(drawn), designed, wanted, _evened(design, x))
+    return Table(drawn, bias, designed, wanted)
 
 
 def next_lenses(made: MadeLens, plan: Correction, x_fit: Array, x_true: Array) -> list[Proposal]:
@@ -78,15 +107,15 @@ def next_lenses(made: MadeLens, plan: Correction, x_fit: Array, x_true: Array) -
     Args:
         x_fit: what the correction was made from. x_true: what the process really does; both all parameters.
     """
-    table = _drawn_with(made.design, plan, x_fit)
-    full = _drawn_with(plan.lens, plan, x_fit)
+    tabled = _drawn_with(made.design, plan, x_fit)
+    full = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
     placed = x_true.copy()
     placed[PLACE["distance_um"]] -= x_fit[PLACE["distance_um"]]
     cases = (
         ("as made", made, x_true),
-        ("new bias table", made.redrawn(table), x_true),
-        ("table and corrected map", made.redrawn(full), x_true),
-        ("and the spacer set right", made.redrawn(full), placed),
+        ("new bias table", made.redrawn(tabled), x_true),
+        ("table and corrected map", full, x_true),
+        ("and the spacer set right", full, placed),
     )
     goal = made.wave()
     out = []

@@ -91,19 +91,6 @@ def architecture_of(entry: dict[str, Any], run: Run, folder: Path) -> Architectu
         raise TrainingError(f"{folder}/result.json: its network is of another version ({error})") from None
 
 
-def check_image(source: Source) -> None:
-    """Refuse to retrain a run of the true image: a made lens is known by its PSFs on axis.
-
-    Raises:
-        TrainingError: naming the setting.
-    """
-    if source.settings.optics.image == "true":
-        raise TrainingError(
-            "the run was trained with optics.image = 'true', and a made lens is known by its PSFs on axis alone: "
-            "retraining needs a run of optics.image = 'uniform'"
-        )
-
-
 def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
     """Refuse an as-built record of another lens, or of a fit that failed its own checks.
 

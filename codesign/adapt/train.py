@@ -16,7 +16,7 @@ from characterize.bench import Truth
 from characterize.inference import AsBuilt
 from codesign.adapt import reading
 from codesign.adapt.reading import Accuracy
-from codesign.adapt.source import Source, architecture_of, check_image, check_lens, load, rows_of
+from codesign.adapt.source import Source, architecture_of, check_lens, load, rows_of
 from codesign.batches import TEST
 from codesign.network import Supernet, recalibrate
 from codesign.optics import MadeLens, Stack, built
@@ -295,7 +295,7 @@ def retrain(
 
 
 __all__ = [
-    "Accuracy", "Held", "Lenses", "Outcome", "RetrainConfig", "Source", "architecture_of", "check_image", "check_lens",
+    "Accuracy", "Held", "Lenses", "Outcome", "RetrainConfig", "Source", "architecture_of", "check_lens",
     "fine_tuning", "held", "job", "jobs", "judge", "lenses", "load", "network", "outcome", "retrain", "rows_of",
     "train", "trainer",
 ]  # fmt: skip

@@ -8,13 +8,18 @@ import torch
 from torch import Tensor
 
 from codesign.batches.batch import Batch
-from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, render
+from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, Trait, render
 from codesign.eye import population as eye
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames
 
 # streams of the random generator: frames of one are never seen by another
 TRAINING, VALIDATION, TEST, EXPERIMENT = 0, 1, 2, 9
+ALBEDOS = ("iris", "sclera", "skin", "pupil", "exposure")
+LOOKS = (
+    *ALBEDOS, "iris_contrast", "veins", "pores", "lashes", "brow", "glint", "ambient", "fissure_upper_um",
+    "fissure_lower_um",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +31,9 @@ class SceneConfig:
         pinhole image, so that size does not tell depth; see :func:`decoupled`.
     slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
     depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image tells it from slippage.
+    variety: factor on how far looks spread about the population's mean: albedos and texture of iris, sclera and skin,
+        lashes, brow, pupil, glints, ambient light, exposure, opening of the lids. 1 is the population as published;
+        2 and more train a network for faces, lamps and cameras that nobody modelled.
     pool: frames that training draws from again and again, at another scale each time; 0 renders every frame anew.
     """
 
@@ -35,6 +43,7 @@ class SceneConfig:
     slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
     gaze_deg: tuple[float, float] = (18.0, 13.0)
     depth_sd_mm: float = 0.0
+    variety: float = 1.0
     pool: int = 0
 
     def __post_init__(self) -> None:
@@ -43,8 +52,11 @@ class SceneConfig:
                 f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
                 "margin below them, and a scale below 0.5"
             )
-        if self.pool < 0 or not self.depth_sd_mm >= 0:
-            raise ConfigError(f"pool = {self.pool}, depth_sd_mm = {self.depth_sd_mm}: need both 0 or more")
+        if self.pool < 0 or not self.depth_sd_mm >= 0 or not 0 <= self.variety <= 4:
+            raise ConfigError(
+                f"pool = {self.pool}, depth_sd_mm = {self.depth_sd_mm}, variety = {self.variety}: need the first two 0 "
+                "or more, and a variety of 0 to 4"
+            )
 
     @property
     def motion(self) -> Motion:
@@ -52,7 +64,8 @@ class SceneConfig:
         depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)
         return replace(
             Motion(),
-            population={**POPULATION, "depth_um": depth},
+            population={**POPULATION, **looks(self.variety), "depth_um": depth},
+            aperture=(max(1 - (1 - Motion().aperture[0]) * self.variety, 0.1), Motion().aperture[1]),
             gaze_x_rad=math.radians(self.gaze_deg[0]),
             gaze_y_rad=math.radians(self.gaze_deg[1]),
             slip_um=(self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3),
@@ -107,6 +120,17 @@ class EyeScenes:
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step, as training takes them."""
         return as_batch(self.rendered(step, size), self.margin)
+
+
+def looks(variety: float) -> dict[str, Trait]:
+    """Traits of :data:`LOOKS`, spread and limits widened about the mean; at least 0, albedos at most 0.95."""
+    found = {}
+    for name in LOOKS:
+        t = POPULATION[name]
+        high = t.mean + (t.high - t.mean) * variety
+        top = min(high, 0.95) if name in ALBEDOS else high
+        found[name] = replace(t, sd=t.sd * variety, low=max(t.mean - (t.mean - t.low) * variety, 0.0), high=top)
+    return found
 
 
 def decoupled(depth_um: Tensor, range_um: tuple[float, float], spread: float, generator: np.random.Generator) -> Tensor:

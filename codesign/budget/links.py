@@ -1,111 +1,38 @@
 """The error budget of a lens: every link of the chain as phase, PSF and gaze error, each with how it was found.
 
-A link is a change of the optics that the chain believes in. It is carried through the pillars, the PSFs and the images
-of rendered eyes, and read as gaze by the linear estimator of :mod:`codesign.budget.task`. Nothing is added that was not
-computed here or measured in a file that is given.
+From the true pupil to the answer: :mod:`codesign.budget.reading`. From the pillars on, a link is a change of the device
+in the true image, carried through pillars, PSFs and images of rendered eyes, and read by a run's network or, without
+a run, by the linear estimator of :mod:`codesign.budget.task`. Nothing is added that was not computed here or measured
+in a file that is given.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, field, replace
-from typing import Any
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import torch
 
-from characterize.inference import AsBuilt
 from characterize.model import PLACE, state
 from codesign.budget import task
+from codesign.budget.entry import MEASURED, NONE, Entry, total
 from codesign.budget.journal import Journal
-from codesign.budget.task import Linear, TaskSetting
-from codesign.eye import face_axes
-from codesign.optics import Aperture, Numerics, Window, kernels, psf_difference
+from codesign.budget.person import person
+from codesign.budget.prepared import Bench
+from codesign.evaluate import AXIAL
+from codesign.optics import gathered, psf_difference
 from metalens.design import neighbours as supercell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, LensError
-from metalens.image import PsfBasis
-from metalens.lens import Lens
-from metalens.made import Printed, State, draws, sensitivity, transmission
+from metalens.made import State, draws, sensitivity, transmission
 from metalens.pillars import Light, PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again
 FINER = 30.0  # how much more precisely
-NONE = math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One link: rms phase error over the pillars (rad), relative L2 error of the PSFs, gaze error (rad, rms over eyes).
-
-    nan where the link has none. method: how it was found.
-    """
-
-    link: str
-    phase_rad: float
-    psf: float
-    gaze_rad: float
-    method: str
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """What is known beside the lens: each adds its entries.
-
-    numerics: of the chain. fwhm_nm: of the diode. mask: of the PROCESS.toml. library: that the proxy was fitted to.
-    asbuilt: of a fit. slip_mm: mean absolute error of a trained network along x, y, z. draws: of process and fit.
-    """
-
-    numerics: Numerics = field(default_factory=Numerics)
-    fwhm_nm: float = 0.0
-    mask: Printed | None = None
-    library: PillarLibrary | None = None
-    asbuilt: AsBuilt | None = None
-    slip_mm: tuple[float, float, float] | None = None
-    draws: int = 4
-    tolerance: float = 1e-3
-
-
-@dataclass(eq=False, slots=True)
-class Bench:
-    """The finest optics of the lens, the estimator that knows them, and what is compared with them."""
-
-    lens: Lens
-    given: Given
-    setting: TaskSetting
-    aperture: Aperture
-    finest: Numerics
-    window: Window
-    eyes: task.Views
-    reference: PsfBasis
-    reader: Linear
-
-    def basis(self, maps: tuple[torch.Tensor, torch.Tensor], numerics: Numerics, **moved: Any) -> PsfBasis:
-        """Kernels of the lens with these pillar maps; ``moved``: shift_um, offset_um."""
-        return kernels(self.lens, maps, numerics, self.window, fwhm_nm=self.given.fwhm_nm, **moved)
-
-    def shift(self, optics: PsfBasis) -> torch.Tensor:
-        """(scenes, unknowns) error of the answer to images through these optics."""
-        return self.reader.shift(task.electrons(self.eyes.anchor, optics, self.setting))
-
-
-def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench:
-    """Render the eyes and compute the reference optics: twice the depths (64 at most), ten times the precision."""
-    setting = replace(setting or TaskSetting(), sensor_distance_um=lens.sensor_distance_um)
-    eyes, aperture, n = task.views(setting), Aperture(lens), given.numerics
-    finest = Numerics(
-        min(2 * n.depth_count, 64),
-        n.wavelength_count + 6 if given.fwhm_nm else 1,
-        min(n.psf_tolerance / 10, 1e-5),
-        min(n.basis_tolerance / 10, 1e-4),
-    )
-    window = Window(*eyes.depths_um, setting.pitch_um)
-    reference = kernels(lens, aperture.maps(aperture.designed()), finest, window, fwhm_nm=given.fwhm_nm)
-    reader = task.linear(eyes, reference, setting)
-    return Bench(lens, given, setting, aperture, finest, window, eyes, reference, reader)
 
 
 def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
-    """The budget, link by link in the order of the chain, ending with the sum of squares.
+    """The budget, link by link from the answered gaze back to the pillars, ending with the sum.
 
     Args:
         journal: of the links that an interrupted run has done.
@@ -114,34 +41,67 @@ def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
         LensError: the as-built file is of another lens.
     """
     journal, found = journal or Journal(), list[Entry]()
-    for part in (_pillars, _neighbours, _mask, _spread, _calibration, _numerics, _network):
+    if about.reading is not None:  # later links are judged with the persons that these calibrate
+        for entry in about.reading.path():
+            found.append(entry)
+            yield entry
+    first = (_answer,) if about.reading is None else ()
+    for part in (*first, _optics, _pillars, _neighbours, _mask, _spread, _calibration, _numerics):
         done = journal.part(part.__name__, lambda part=part: [astuple(entry) for entry in part(about)])  # type: ignore[misc]
         links = [Entry(*values) for values in done]
         found += links
         yield from links
-    yield _total(found)
+    yield from _measured(about)
+    yield total(found)
 
 
-def _total(found: list[Entry]) -> Entry:
-    def together(name: str) -> float:
-        return math.sqrt(sum(getattr(e, name) ** 2 for e in found if math.isfinite(getattr(e, name))))
+def _answer(about: Bench) -> Iterator[Entry]:
+    """From the true pupil to the answer where no run was given: what no reader changes."""
+    yield from person(about.given.frames, about.setting.rig)
+    yield Entry("reader", NONE, NONE, NONE, "not known: no run was given (--run)")
+    noise = about.reader.noise_rad * math.sqrt(math.pi) / 2  # rms to mean of a Gaussian in the plane
+    yield Entry("sensor noise", NONE, NONE, noise, "one frame: Cramér-Rao bound of the linear estimator")
+    said = "known to the estimator, switched off; not in the sum"
+    here = about.device
+    cases = [("field", here.one_psf()), ("radiometry", here.evenly_lit())]
+    if about.given.fwhm_nm:
+        cases.append(("spectrum", here.one_wavelength(about.lens.wavelength_um)))
+    for link, optics in cases:
+        yield replace(about.entry(link, optics, said), counted=False)
+    if not about.given.fwhm_nm:
+        yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
 
-    return Entry(
-        "all links", together("phase_rad"), together("psf"), together("gaze_rad"), "root of the sum of squares"
-    )
+
+def _optics(about: Bench) -> Iterator[Entry]:
+    """Pillars in place of the smooth phase, films, both polarisations."""
+    if about.reading is not None:
+        said = "pillars of the lens file in place of the run's smooth phase without films"
+        smooth = about.device.image(wave=about.reading.true.wave, layers=about.reading.true.layers)
+        yield about.reading.changed("pillars on a lattice", about.device.whole, smooth, said)
+    films = about.lens.layers.films
+    if films:
+        bare = about.device.image(layers=replace(about.lens.layers, front=(), behind=()))
+        yield about.entry("glass", bare, f"{len(films)} films of the lens file taken away")
+    else:
+        yield Entry("glass", NONE, 0.0, 0.0, "the lens file holds no film")
+    said = "Ex, Ey, Ez of both polarisations in place of one scalar"
+    yield about.entry("polarisation", about.device.both_polarisations(), said)
+
+
+def _measured(about: Bench) -> Iterator[Entry]:
+    """What the virtual experiment measures on the same frames."""
+    if about.reading is None:
+        return
+    gaze = math.radians(about.reading.measured_deg[AXIAL])
+    said = f"virtual experiment on these {about.given.frames.frames} frames, mean under axial slippage"
+    yield Entry(MEASURED, NONE, NONE, gaze, said, counted=False)
 
 
 def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
     """The entry of other pillars: a table t(D) against the designed one."""
     turn = np.angle(table / about.aperture.designed())
-    optics = about.basis(about.aperture.maps(table), about.finest)
-    return _entry(about, link, (_spread_of(turn, about.aperture.share), optics), method)
-
-
-def _entry(about: Bench, link: str, found: tuple[float, PsfBasis], method: str) -> Entry:
-    phase, optics = found
-    psf = psf_difference(optics, about.reference, about.window)
-    return Entry(link, phase, psf, task.gaze_rms(about.shift(optics)), method)
+    optics = about.device.image(wave=gathered(about.lens, *about.aperture.maps(table)))
+    return about.entry(link, optics, method, phase_rad=_spread_of(turn, about.aperture.share))
 
 
 def _spread_of(turn_rad: Array, share: Array) -> float:
@@ -206,12 +166,8 @@ def _neighbours(about: Bench) -> Iterator[Entry]:
         f"rows of {', '.join(str(round(about.lens.wavelength_um / s / about.lens.cell.pitch_um)) for s in found.sine)}"
     )
     said = f"{counts} unlike pillars solved as one cell; factor carried over the aperture by the angle of turning"
-    yield _entry(
-        about,
-        "local periodic approximation",
-        (float(turn.std()), about.basis((maps[0] * torch.from_numpy(built), maps[1]), about.finest)),
-        said,
-    )
+    optics = about.device.image(wave=gathered(about.lens, maps[0] * torch.from_numpy(built), maps[1]))
+    yield about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
 def _mask(about: Bench) -> Iterator[Entry]:
@@ -232,11 +188,10 @@ def _spread(about: Bench) -> Iterator[Entry]:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A made lens on its sensor: its causes, and how far distance and window are off."""
+    """A made lens on its sensor: its causes, and how far the distance is off. (A decentre moves the image alike.)"""
 
     state: State
     shift_um: float = 0.0
-    offset_um: tuple[float, float] = (0.0, 0.0)
 
 
 def _drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
@@ -254,10 +209,9 @@ def _drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
         if made.state.bends():
             phase = phase + torch.from_numpy(made.state.phase_rad(u, v).astype(np.float32) * built)
         turn = phase[torch.from_numpy(built)].numpy() - base
-        optics = about.basis((phase, level), about.finest, shift_um=made.shift_um, offset_um=made.offset_um)
-        flat = np.full(turn.size, 1 / turn.size)
-        psf = psf_difference(optics, about.reference, about.window)
-        rows.append((_spread_of(turn, flat), psf, task.gaze_rms(about.shift(optics))))
+        optics = about.device.image(wave=gathered(about.lens, phase, level), shift_um=made.shift_um)
+        found = about.entry(link, optics, method, phase_rad=_spread_of(turn, np.full(turn.size, 1 / turn.size)))
+        rows.append((found.phase_rad, found.psf, found.gaze_rad))
     rms = [math.sqrt(sum(v * v for v in column) / len(rows)) for column in zip(*rows, strict=True)]
     return Entry(link, rms[0], rms[1], rms[2], method)
 
@@ -276,15 +230,17 @@ def _calibration(about: Bench) -> Iterator[Entry]:
     made = []
     for row in fitted.samples(about.given.draws, seed=3):
         off = fitted.parameters(row) - best
-        shift, *offset = (float(off[PLACE[name]]) for name in ("distance_um", "decentre_x_um", "decentre_y_um"))
-        made.append(Made(state(off), shift, (offset[0], offset[1])))
+        made.append(Made(state(off), float(off[PLACE["distance_um"]])))
     said = f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"
-    yield _drawn(about, "calibration uncertainty", made, said)
+    yield _drawn(about, "calibration of the lens", made, said)
 
 
 def _numerics(about: Bench) -> Iterator[Entry]:
-    """Propagation, depths, wavelengths and kernels: each at its setting, the rest at its finest."""
-    maps, n = about.aperture.maps(about.aperture.designed()), about.given.numerics
+    """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its setting, the rest at its finest.
+
+    Read by the linear estimator, run or not: they are the settings of ``metalens psf`` and of the planner.
+    """
+    n = about.given.numerics
     cases = [
         ("propagation", {"psf_tolerance": n.psf_tolerance}, f"tolerance {n.psf_tolerance:g}"),
         ("depth sampling", {"depth_count": n.depth_count}, f"{n.depth_count} depths"),
@@ -293,32 +249,8 @@ def _numerics(about: Bench) -> Iterator[Entry]:
     if about.given.fwhm_nm:
         count = n.wavelength_count
         cases.insert(2, ("wavelength sampling", {"wavelength_count": count}, f"{count} wavelengths"))
+    finest = about.basis(about.finest)
     for link, change, said in cases:
-        optics = about.basis(maps, replace(about.finest, **change))  # type: ignore[arg-type]
-        yield _entry(about, link, (NONE, optics), f"{said} against the finest setting")
-    noise = about.reader.noise_rad
-    yield Entry(
-        "sensor noise", NONE, NONE, noise, "one frame: Cramér-Rao bound of the linear estimator, subject unknown"
-    )
-
-
-def _network(about: Bench) -> Iterator[Entry]:
-    """A trained network's slippage error as gaze, through the spherical eye."""
-    if about.given.slip_mm is None:
-        return
-    from codesign.gaze import mean_geometry, optical_axis, pupil_of
-
-    rig = about.setting.rig
-    geometry = mean_geometry(rig)
-    random = torch.Generator().manual_seed(1)
-    turn = (torch.rand(256, 2, generator=random, dtype=torch.float64) - 0.5) * torch.tensor([0.6, 0.45])
-    right, down, out = face_axes(rig.elevation_rad)
-    looks = torch.sin(turn[:, :1]) * right + torch.sin(turn[:, 1:]) * down + out
-    looks = looks / looks.norm(dim=1, keepdim=True)
-    slip = torch.zeros(256, 3, dtype=torch.float64)
-    sigma = torch.tensor(about.given.slip_mm, dtype=torch.float64) * math.sqrt(math.pi / 2)  # of a mean absolute error
-    wrong = torch.randn(256, 3, generator=random, dtype=torch.float64) * sigma
-    seen = optical_axis(pupil_of(looks, slip, geometry), wrong, geometry).direction
-    gaze = float(torch.arccos((seen * looks).sum(1).clamp(-1, 1)).pow(2).mean().sqrt())
-    said = "slippage error of the trained run, through the spherical eye, no personal calibration"
-    yield Entry("network", NONE, NONE, gaze, said)
+        optics = about.basis(replace(about.finest, **change))  # type: ignore[arg-type]
+        psf, gaze = psf_difference(optics, finest, about.window), task.gaze_mean(about.shift(optics, finest))
+        yield Entry(link, NONE, psf, gaze, f"{said} against the finest setting; linear estimator")

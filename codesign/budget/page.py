@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from codesign.budget.links import Entry
+from codesign.budget.entry import MEASURED, TOTAL, Entry
 from metalens.ground import report
 
 
@@ -11,12 +11,20 @@ def write(path: Path, rows: list[Entry]) -> None:
     """One page: chart, table, how each number was found."""
     keys = [
         report.KeyFigure("gaze error of all links", f"{math.degrees(rows[-1].gaze_rad):.2g}°"),
-        report.KeyFigure("largest", max(rows[:-1], key=lambda r: r.gaze_rad).link),
+        report.KeyFigure("largest", max(counted(rows[:-1]), key=lambda r: r.gaze_rad).link),
     ]
+    for row in rows:
+        if row.link == MEASURED:
+            keys.insert(1, report.KeyFigure("measured on the same frames", f"{math.degrees(row.gaze_rad):.2g}°"))
     lead = (
         "What each link of the chain costs, carried through pillars, PSFs and images of eyes to the gaze that is read."
     )
     report.write(path, "Error budget", [section(rows)], lead=lead, key_figures=keys)
+
+
+def counted(rows: list[Entry]) -> list[Entry]:
+    """Those that the sum holds and that are known."""
+    return [r for r in rows if r.counted and not math.isnan(r.gaze_rad)]
 
 
 def section(rows: list[Entry]) -> report.Section:
@@ -31,18 +39,24 @@ def section(rows: list[Entry]) -> report.Section:
     ]
     head = ("link", "phase / rad", "PSF, relative", "gaze / deg", "how it was found")
     words = (
-        "Each link is changed alone. Gaze is read by the linear estimator of least variance that knows the lens and "
-        "the population but not the subject: a network has its own, larger, error and reacts in its own way."
+        "From the true pupil to the answer one cause more at a time, from there to the pillars each changed alone in "
+        "the true image. The method of a row says who read the gaze: the run's network, or the linear estimator of "
+        "least variance that knows the lens and the population but not the subject. What a reader was trained with is "
+        "shown switched off and is not in the sum."
     )
     picture = report.Figure(chart(rows), "Gaze error of each link, log scale.", wide=True)
-    return report.Section("Error budget", words, (picture, report.Table(head, cells, "Root mean squares over eyes.")))
+    return report.Section(
+        "Error budget",
+        words,
+        (picture, report.Table(head, cells, "Mean angles over eyes; the sum is the root of their squares.")),
+    )
 
 
 def chart(rows: list[Entry]) -> bytes:
     """Bars of the gaze error, the largest on top."""
-    shown = sorted((r for r in rows if r.gaze_rad > 0), key=lambda r: r.gaze_rad)
+    shown = sorted((r for r in rows if r.gaze_rad > 0 and (r.counted or r.link == MEASURED)), key=lambda r: r.gaze_rad)
     figure, axes = report.canvas(size=(7.5, 0.5 + 0.32 * len(shown)))
-    colours = ["#444" if r.link == rows[-1].link else "#1f6feb" for r in shown]
+    colours = ["#444" if r.link in (MEASURED, TOTAL) else "#1f6feb" for r in shown]
     axes.barh([r.link for r in shown], [math.degrees(r.gaze_rad) for r in shown], color=colours)
     axes.set(xscale="log", xlabel="gaze error / deg")
     axes.grid(axis="y", visible=False)

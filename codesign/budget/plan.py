@@ -1,4 +1,7 @@
-"""The planner: the tolerances, depths and wavelengths that keep the numerical gaze error of a run below a goal.
+"""The planner: the tolerances, depths and wavelengths that keep the whole gaze error of a run below a goal.
+
+What no setting changes (the person, fixation, noise, the reader of a run) is the floor: a goal below it is refused, one
+above it leaves the rest of the squares to the settings.
 
 A pilot measures, for every setting of every knob alone, the gaze error it makes for each eye and the time it takes: an
 estimator that believes in these optics reads images through those of the knob's finest setting. Errors of several knobs
@@ -7,6 +10,7 @@ run. All combinations are compared, and the cheapest that meets the goal is take
 finest setting of every knob.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,6 +21,8 @@ import numpy as np
 import torch
 
 from codesign.budget import task
+from codesign.budget.entry import NONE, Entry, total
+from codesign.budget.floor import allowance_rad
 from codesign.budget.journal import Journal
 from codesign.budget.task import TaskSetting, Views
 from codesign.optics import Aperture, Numerics, Window, kernels
@@ -92,13 +98,17 @@ class Choice:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pilot:
-    """What was measured for every knob: errors (levels, scenes, 2) in rad, and seconds (levels,) that depend on it."""
+    """What was measured for every knob: errors (levels, scenes, 2) in rad, and seconds (levels,) that depend on it.
+
+    floor: links that no setting changes: the person, fixation, noise, and the reader where a run was given.
+    """
 
     levels: dict[str, tuple[float, ...]]
     errors: dict[str, Array]
     seconds: dict[str, Array]
     noise_rad: float
     spent_seconds: float
+    floor: tuple[Entry, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +178,11 @@ class Chain:
         )[0]
 
 
-def pilot(chain: Chain, journal: Journal | None = None) -> Pilot:
+def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, ...] = ()) -> Pilot:
     """Measure every setting of every knob alone. The finest library is sampled at a few diameters, not computed.
 
     Args:
-        journal: of the knobs that an interrupted run has measured.
+        journal: of the knobs that an interrupted run has measured. floor: see :class:`Pilot`.
     """
     start, journal = time.perf_counter(), journal or Journal()
     real, imaginary, solving = journal.part("exact", lambda: _listed(chain))
@@ -193,7 +203,10 @@ def pilot(chain: Chain, journal: Journal | None = None) -> Pilot:
         errors[knob], seconds[knob] = map(np.array, journal.part(knob, measure))
         chain.say(f"{knob}: {', '.join(f'{v:g}' for v in levels)}")
     noise = task.linear(chain.eyes, base, chain.config.task).noise_rad
-    return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start)
+    if floor and not any(entry.link == "sensor noise" for entry in floor):
+        mean = noise * math.sqrt(math.pi) / 2  # rms to mean of a Gaussian in the plane
+        floor = (*floor, Entry("sensor noise", NONE, NONE, mean, "one frame: Cramér-Rao bound"))
+    return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start, floor)
 
 
 def _listed(chain: Chain) -> list[Any]:
@@ -277,20 +290,26 @@ def _misread(chain: Chain, truth: PsfBasis, believed: PsfBasis) -> Array:
 
 
 def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
-    """The cheapest combination whose predicted error meets the goal; the finest where none does."""
+    """The cheapest combination whose predicted error, with the floor, meets the goal; the finest where none does.
+
+    Raises:
+        ConfigError: the goal is not above the floor.
+    """
+    allowed = allowance_rad(goal_rad, measured.floor)
     names = list(measured.levels)
     grids = np.meshgrid(*(np.arange(len(measured.levels[n])) for n in names), indexing="ij")
     places = np.stack([g.ravel() for g in grids], 1)
-    total = np.sum([measured.errors[n][places[:, i]] for i, n in enumerate(names)], axis=0)
-    vector = (total**2).sum(-1).mean(-1)
+    summed = np.sum([measured.errors[n][places[:, i]] for i, n in enumerate(names)], axis=0)
+    vector = (summed**2).sum(-1).mean(-1)
     apart = np.sum([(measured.errors[n] ** 2).sum(-1).mean(-1)[places[:, i]] for i, n in enumerate(names)], axis=0)
     error = np.sqrt(np.maximum(vector, apart))
     cost = _cost(measured, places, names, config)
-    good = np.flatnonzero(error <= goal_rad)
+    good = np.flatnonzero(error <= allowed)
     best = int(good[cost[good].argmin()]) if len(good) else len(places) - 1
     values: list[Any] = [measured.levels[n][k] for n, k in zip(names, places[best], strict=True)]
     values = [int(v) if n.endswith("count") else v for n, v in zip(names, values, strict=True)]
-    return Plan(goal_rad, Choice(*values), float(error[best]), float(cost[best]), float(cost[-1]), bool(len(good)))
+    predicted = math.hypot(float(error[best]), total(list(measured.floor)).gaze_rad)
+    return Plan(goal_rad, Choice(*values), predicted, float(cost[best]), float(cost[-1]), bool(len(good)))
 
 
 def _cost(measured: Pilot, places: Array, names: list[str], config: PlanConfig) -> Array:

@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from codesign.eye import POPULATION, Camera, Motion, Rig, States, render
 from codesign.eye import population as eye
-from metalens.image import Frames, PsfBasis, Sensor, scene, sensor
+from metalens.image import Frames, Imager, PsfBasis, Sensor, scene, sensor
 
 MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z", "scale")
 STEPS = (math.radians(0.02), math.radians(0.02), 5.0, 5.0, 5.0, 1e-3)  # rad, um, 1: half the central difference
@@ -134,10 +134,13 @@ def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
     return replace(states, traits=traits)
 
 
-def electrons(frames: Frames, optics: PsfBasis, setting: TaskSetting) -> Tensor:
-    """(scenes, pixels) expected electrons through these optics, float64."""
-    prepared = scene.uniform_imager(optics, (setting.size, setting.size), margin=setting.margin)
-    light = scene.image(frames, prepared, margin=setting.margin)
+def electrons(frames: Frames, optics: PsfBasis | Imager, setting: TaskSetting) -> Tensor:
+    """(scenes, pixels) expected electrons through these optics, float64: one PSF a depth, or the true image."""
+    if isinstance(optics, PsfBasis):
+        prepared = scene.uniform_imager(optics, (setting.size, setting.size), margin=setting.margin)
+        light = scene.image(frames, prepared, margin=setting.margin)
+    else:
+        light = optics(frames)
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     return sensor.mean_electrons(light, setting.pitch_um, sensor=chip).flatten(1).double()
 
@@ -165,7 +168,7 @@ class Linear:
         return float(self.covariance[:, :2, :2].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
 
 
-def linear(seen: Views, optics: PsfBasis, setting: TaskSetting) -> Linear:
+def linear(seen: Views, optics: PsfBasis | Imager, setting: TaskSetting) -> Linear:
     """The estimator that knows these optics."""
     image = electrons(seen.anchor, optics, setting)
     slopes = [
@@ -186,6 +189,11 @@ def linear(seen: Views, optics: PsfBasis, setting: TaskSetting) -> Linear:
 def gaze_rms(shift: Tensor) -> float:
     """Root mean square over eyes (and draws) of the gaze error, rad, from shifts (..., unknowns)."""
     return float(shift[..., :2].pow(2).sum(-1).mean().sqrt())
+
+
+def gaze_mean(shift: Tensor) -> float:
+    """Mean over eyes (and draws) of the gaze error, rad, from shifts (..., unknowns)."""
+    return float(shift[..., :2].pow(2).sum(-1).sqrt().mean())
 
 
 def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, seen: Views, steps: int) -> Tensor:

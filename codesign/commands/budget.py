@@ -4,9 +4,8 @@ Links that are done are kept beside the output (NAME.resume): after an interrupt
 """
 
 import dataclasses
-import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,15 @@ import numpy as np
 import tyro
 
 from characterize.inference import asbuilt
-from codesign.budget import Entry, Given, Journal
+from codesign.adapt import train as retraining
+from codesign.budget import MEASURED, Entry, Given, Journal, bench
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
+from codesign.evaluate import ExperimentConfig
 from codesign.optics import Numerics
 from metalens import __version__, lens, library
 from metalens.commands import Common, Output
-from metalens.ground import config, manifest, store
+from metalens.ground import config, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.reading import reader
 from metalens.made import of_process
@@ -36,8 +37,10 @@ class Options(Common):
         library: library.h5 that the lens was made from: parts solver and proxy.
         process: PROCESS.toml: adds mask grid and process spread.
         asbuilt: asbuilt.h5 of the same lens: adds the calibration uncertainty.
-        run: RUN_DIR of a co-design run: adds its network.
-        led_fwhm_nm: width of the diode; adds wavelength sampling.
+        run: RUN_DIR of a co-design run: its network reads the frames of the virtual experiment, and the sum is held
+            against the error measured on them.
+        frames: subjects, stimuli, slippage states, calibration: those of the experiment.
+        led_fwhm_nm: width of the diode; 0 for that of the run.
         depths: number of PSFs over depth. wavelengths: over the diode's line.
         tolerance: of the PSF engine. kernels: of the kernels that images are formed with.
     """
@@ -48,6 +51,7 @@ class Options(Common):
     process: Path | None = None
     asbuilt: Path | None = None
     run: Path | None = None
+    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=lambda: ExperimentConfig(subjects=5))
     led_fwhm_nm: float = 0.0
     depths: int = 24
     wavelengths: int = 3
@@ -63,25 +67,34 @@ def run(options: Options) -> int:
     made, given = lens.load_plain(options.lens), _given(options)
     with options.claim(target, beside=(".html", ".png")) as draft:
         about = _provenance(options, given)
-        journal = Journal(
-            target.with_name(target.name + ".resume"), f"{__version__}\n{about.config}{about.inputs}{given.slip_mm}"
-        )
-        links = budget.entries(budget.bench(made, given), journal)
-        rows = list(options.console.track(links, total=9, label="links"))
+        title = f"{__version__}\n{about.config}{about.inputs}{given.frames}"
+        journal = Journal(target.with_name(target.name + ".resume"), title)
+        links = budget.entries(bench(made, given), journal)
+        rows = list(options.console.track(links, total=18, label="links"))
         save(draft.path, rows, about)
         budget_page.write(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
     journal.finish()
-    values = {"rows": [dataclasses.asdict(row) for row in rows], "gaze_error_deg": math.degrees(rows[-1].gaze_rad)}
+    values = {"rows": [dataclasses.asdict(row) for row in rows], **summary(rows)}
     options.console.result(_plain(values), text(rows))
     return 0
+
+
+def summary(rows: list[Entry]) -> dict[str, float]:
+    """The sum, what was measured on the same frames and the ratio of the two, where a run was given."""
+    found = {"gaze_error_deg": math.degrees(rows[-1].gaze_rad)}
+    for row in rows:
+        if row.link == MEASURED:
+            found |= {"measured_deg": math.degrees(row.gaze_rad), "closure": rows[-1].gaze_rad / row.gaze_rad}
+    return found
 
 
 def save(path: Path, rows: list[Entry], provenance: store.Provenance) -> None:
     """Write a budget file (kind ``budget``)."""
     numbers = {name: np.array([getattr(r, name) for r in rows]) for name in ("phase_rad", "psf", "gaze_rad")}
     words = {name: np.array([getattr(r, name) for r in rows]) for name in ("link", "method")}
-    store.save(path, "budget", numbers | words, provenance=provenance)
+    counted = {"counted": np.array([r.counted for r in rows], np.uint8)}
+    store.save(path, "budget", numbers | words | counted, provenance=provenance)
 
 
 @reader
@@ -93,7 +106,8 @@ def load(path: Path) -> list[Entry]:
     """
     arrays = store.load(path, "budget").arrays
     words = {n: [w.decode() if isinstance(w, bytes) else str(w) for w in arrays[n]] for n in ("link", "method")}
-    columns = (words["link"], *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")), words["method"])
+    counted = [bool(c) for c in arrays.get("counted", np.ones(len(words["link"])))]
+    columns = (words["link"], *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")), words["method"], counted)
     return [Entry(*row) for row in zip(*columns, strict=True)]
 
 
@@ -106,24 +120,6 @@ def text(rows: list[Entry]) -> str:
     return "\n".join(lines)
 
 
-def slip_of(folder: Path) -> tuple[float, float, float]:
-    """Slippage errors of the best row of a run, mm.
-
-    Raises:
-        ConfigError: no finished run.
-    """
-    manifest.check(folder)
-    path = folder / "result.json"
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
-        best = min(rows, key=lambda row: row["axial_slip_mm"])
-        return float(best["lateral_slip_mm"]), float(best["lateral_slip_mm"]), float(best["axial_slip_mm"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(
-            f"{path}: no result of a finished run ({error}); finish it with metalens codesign --resume"
-        ) from None
-
-
 def _given(options: Options) -> Given:
     wide = options.led_fwhm_nm > 0
     numerics = Numerics(options.depths, options.wavelengths if wide else 1, options.tolerance, options.kernels)
@@ -133,12 +129,14 @@ def _given(options: Options) -> Given:
         mask=of_process(options.process) if options.process else None,
         library=library.load(options.library) if options.library else None,
         asbuilt=asbuilt.load(options.asbuilt) if options.asbuilt else None,
-        slip_mm=slip_of(options.run) if options.run else None,
+        run=retraining.load(options.run) if options.run else None,
+        frames=options.frames,
     )
 
 
 def _provenance(options: Options, given: Given) -> store.Provenance:
-    files = [options.lens, options.library, options.process, options.asbuilt]
+    weights = options.run / "checkpoint.safetensors" if options.run else None
+    files = [options.lens, options.library, options.process, options.asbuilt, weights]
     return store.Provenance(
         config=config.dumps(given.numerics) + f"fwhm_nm = {given.fwhm_nm}\n",
         inputs={f.name: store.sha256(f) for f in files if f is not None},

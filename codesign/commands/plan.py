@@ -6,10 +6,14 @@ What is measured is kept beside the output (NAME.resume): after an interruption 
 import json
 import math
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, plan
+import tyro
+
+from codesign.adapt import train as retraining
+from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, total
+from codesign.evaluate import ExperimentConfig
 from metalens import __version__
 from metalens.commands import Common, Output
 from metalens.ground import config, report, store
@@ -23,13 +27,17 @@ class Options(Common):
     """Options of ``metalens plan``.
 
     Attributes:
-        gaze_error: the goal, with its unit: 0.1deg, 5arcmin, 2mrad. It is the error that finite tolerances may add.
+        gaze_error: the goal, with its unit: 1deg, 50arcmin, 20mrad; of the whole error, from pillar to answered gaze.
+        run: RUN_DIR of a co-design run: its reader is part of the floor; without one the floor is that of the person.
+        frames: that the floor is measured on: subjects, stimuli, calibration, as those of the experiment.
         config: PLAN.toml of the lens and the run; left out: a 1 mm lens, 200 PSF stacks, 10 000 images.
         output: folder for cell.toml, psf.toml, run.toml, process.toml, plan.json and report.html.
     """
 
     gaze_error: str
     config: Path | None = None
+    run: Path | None = None
+    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=lambda: ExperimentConfig(subjects=5))
     output: Output = Path("plan")
 
 
@@ -52,14 +60,22 @@ def angle_rad(text: str) -> float:
 
 
 def run(options: Options) -> int:
-    """Measure, choose, write; exit 1 where even the finest settings miss the goal."""
+    """Measure, choose, write; exit 1 where even the finest settings miss the goal.
+
+    Raises:
+        ConfigError: the goal is below what no setting changes.
+    """
     goal = angle_rad(options.gaze_error)
     wanted = PlanConfig() if options.config is None else config.load(options.config, PlanConfig)
     target = options.output
     with options.claim_folder(target) as draft:
+        rig = replace(wanted.task.rig, sensor_distance_um=wanted.focus.sensor_distance_um)
+        run = retraining.load(options.run) if options.run else None
+        least = floor.floor(rig, run, options.frames, fwhm_nm=wanted.led_fwhm_nm)
+        floor.allowance_rad(goal, least)
         chain = Chain(wanted, options.console.say)
         journal = Journal(target.with_name(target.name + ".resume"), f"{__version__}\n{config.dumps(wanted)}")
-        measured = plan.pilot(chain, journal)
+        measured = plan.pilot(chain, journal, floor=least)
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)
     journal.finish()
@@ -78,6 +94,7 @@ def values(best: Plan, measured: Pilot) -> dict[str, object]:
         "finest_seconds": best.finest_seconds,
         "pilot_seconds": measured.spent_seconds,
         "noise_deg": math.degrees(measured.noise_rad),
+        "floor_deg": {entry.link: math.degrees(entry.gaze_rad) for entry in measured.floor},
     }
 
 
@@ -134,8 +151,8 @@ def _page(path: Path, best: Plan, measured: Pilot) -> None:
         "Seconds: of a library, a stack, an image, a mask.",
     )
     words = (
-        "Every setting was measured alone in a pilot; errors add as vectors over the eyes. The goal bounds what finite "
-        "tolerances add; noise, the process and the network come on top (metalens budget)."
+        "Every setting was measured alone in a pilot; errors add as vectors over the eyes. What no setting changes is "
+        f"the floor: {floor_words(measured)}. The process comes on top (metalens budget)."
     )
     report.write(path, "Plan of a run", [report.Section("Settings", words, (table,))], key_figures=keys)
 
@@ -150,5 +167,11 @@ def text(best: Plan, measured: Pilot, folder: Path) -> str:
         + "\n".join(rows)
         + f"\n{verdict}  run {best.seconds:.0f} s, everything at its finest {best.finest_seconds:.0f} s; "
         f"the pilot took {measured.spent_seconds:.0f} s\n"
-        f"  noise of one frame alone: {math.degrees(measured.noise_rad):.2g} deg"
+        f"  floor, whatever the settings: {floor_words(measured)}"
     )
+
+
+def floor_words(measured: Pilot) -> str:
+    """The floor and its links."""
+    links = ", ".join(f"{entry.link} {math.degrees(entry.gaze_rad):.2g} deg" for entry in measured.floor)
+    return f"{math.degrees(total(list(measured.floor)).gaze_rad):.2g} deg ({links or 'no links'})"

@@ -72,7 +72,6 @@ Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
 def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 0."""
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
-    retraining.check_image(source)
     result = asbuilt.load(options.asbuilt)
     design = lens.load_plain(options.run_dir / "lens.h5")
     retraining.check_lens(design, result, insist=options.insist)
@@ -90,18 +89,25 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
     """Train on, judge, correct and write into the folder."""
     source, result, design, truth, old = given
     made = MadeLens(design, source.settings.optics, response=result.response)
+    console = options.console
+    console.say(f"lenses: the design, the fit and {options.settings.draws} draws of its posterior")
     found = retraining.lenses(made, result, options.settings, truth)
     trained = {name: _train(options, folder, (recipe, source, found), name) for name in retraining.jobs(found)}
+    console.say(f"judging: {len(retraining.jobs(found)) + 2} cases on the same frames")
     outcome = retraining.outcome(source, options.settings, found, trained)
     plan = correction.propose(design, result.parameters(), response=made.response, old=old)
     true = (
         truth.vector() if truth else list(posterior(result, options.settings.draws + 1, seed=options.settings.seed))[-1]
     )
     proposals, frames = [], retraining.held(source, options.settings)
-    for state in correction.next_lenses(made, plan, result.parameters(), true):
+    states = correction.next_lenses(made, plan, result.parameters(), true)
+    for state in console.track(states, total=len(states), label="next lens"):
         error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,), frames=frames)
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
-    sure = judge(result, lambda x: correction.propose(design, x, response=made.response, old=old).bias_nm)
+    printed = correction.printed_um(design)
+    sure = judge(
+        result, lambda x: correction.table(design, x, response=made.response, old=old, range_um=printed).bias_nm
+    )
     apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
     story = retrain_report.Story(
         outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found, sure)

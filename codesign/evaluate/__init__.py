@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from codesign.evaluate import experiment_plots as experiment_plots
+    from codesign.evaluate import gaze_experiment as gaze_experiment
     from codesign.evaluate import optics as optics
     from codesign.evaluate import paper as paper
     from codesign.evaluate import paper_runs as paper_runs
@@ -40,6 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "Setting": "optics",
         "experiment": "gaze_experiment",
         "experiment_plots": "",
+        "gaze_experiment": "",
         "judged": "reader",
         "optics": "",
         "paper": "",

@@ -18,7 +18,7 @@ from codesign.adapt import Source, network
 from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
-from codesign.gaze import angle_deg, personal
+from codesign.gaze import PersonalGaze, angle_deg, personal
 from codesign.network import recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, read_out
@@ -40,6 +40,7 @@ class ExperimentConfig:
     share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
         at random or spread over the field, as a calibration screen would show them.
     hidden: neurons of the regressor. fixation_deg: standard deviation of where a subject really looks.
+    image: "true", what the device shows, whatever the run was trained on; "trained", the image that the run knows.
     pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
     snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
     """
@@ -56,6 +57,7 @@ class ExperimentConfig:
     pupil_sd: float = 0.05
     seed: int = 0
     snr_db: float | None = None
+    image: Literal["true", "trained"] = "true"
 
     def __post_init__(self) -> None:
         points = self.grid[0] * self.grid[1]
@@ -162,9 +164,15 @@ def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tupl
 
 
 def through(
-    source: Source, made: Rendered, prepared: UniformImager | Imager, *, seed: int, snr_db: float | None = None
+    source: Source,
+    made: Rendered,
+    prepared: UniformImager | Imager,
+    *,
+    seed: int,
+    snr_db: float | None = None,
+    quiet: bool = False,
 ) -> Seen:
-    """Rendered frames through a run's lens and sensor, with noise of a seed; dimmed with ``snr_db``."""
+    """Rendered frames through a run's lens and sensor, with noise of a seed or ``quiet``; dimmed with ``snr_db``."""
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
@@ -174,7 +182,7 @@ def through(
     if snr_db is not None:
         at = replace(sensor, pitch_um=float(pitch))
         sensor = replace(low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um)
-    pixels = read_out(light, trainer.optics.sample_um, pitch, sensor, generator=noise)
+    pixels = read_out(light, trainer.optics.sample_um, pitch, sensor, generator=noise, quiet=quiet)
     return Seen(pixels, batch.mask, batch.slip_mm, trainer.inner.batch)
 
 
@@ -195,7 +203,7 @@ def experiment(
     prepared, trials = [], []
     answers: list[list[Answers]] = [[] for _ in sources]
     for source in sources:
-        prepared.append(ready(source))
+        prepared.append(ready(source, image=config.image))
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
@@ -205,15 +213,20 @@ def experiment(
             kept.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
         if subject + 1 < config.subjects:
             yield subject + 1, []
-    joined = Trial(*(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__))
+    whole = joined(trials)
     labels = names or [f"run {i + 1}" for i in range(len(sources))]
     yield (
         config.subjects,
         [
-            _result(label, source, kept, joined, config)
+            _result(label, source, kept, whole, config)
             for label, source, kept in zip(labels, sources, answers, strict=True)
         ],
     )
+
+
+def joined(trials: Sequence[Trial]) -> Trial:
+    """Frames of several subjects, one after the other."""
+    return Trial(*(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__))
 
 
 def _check(sources: Sequence[Source]) -> None:
@@ -228,14 +241,19 @@ def _check(sources: Sequence[Source]) -> None:
         )
 
 
-def ready(source: Source) -> UniformImager | Imager:
-    """The imager of a run's lens, true or uniform as it trained; its network set to statistics of training frames."""
+def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> UniformImager | Imager:
+    """The imager of a run's lens; its network set to statistics of training frames, as they were formed.
+
+    Raises:
+        SceneError: the true image of this lens cannot be formed at the run's ``optics.image_tolerance``.
+    """
     trainer = source.run.trainer
     measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
     recalibrate(network(trainer), source.architecture, assess.parts(measured))
-    size = source.settings.scenes.pixels + 2 * source.settings.scenes.margin
-    margin = source.settings.scenes.margin
-    return formed.imager(trainer.optics, trainer.model.coefficients_rad, size, margin=margin)
+    settings, scenes = trainer.optics, source.settings.scenes
+    seen = replace(settings, image="true") if image == "true" else settings
+    size = scenes.pixels + 2 * scenes.margin
+    return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin)
 
 
 def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig) -> Result:
@@ -253,7 +271,35 @@ def calibrated(
     pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
 ) -> tuple[Array, Array]:
     """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
-    predicted, judged = np.empty((len(pupil_mm), 2)), np.ones(len(pupil_mm), bool)
+    people = taught(pupil_mm, slip_mm, trial, config, rig=rig)
+    return answered(people, pupil_mm, slip_mm, trial), ~np.isin(np.arange(len(pupil_mm)), calibrating(trial, config))
+
+
+def taught(
+    pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
+) -> dict[int, PersonalGaze]:
+    """Every subject's calibration by number, fitted to the stimuli of :func:`calibrating`."""
+    known, people = calibrating(trial, config), {}
+    for subject in np.unique(trial.subject):
+        rows = known[trial.subject[known] == subject]
+        people[int(subject)] = personal.fit(
+            pupil_mm[rows], slip_mm[rows], trial.stimulus_deg[rows], rig=rig, hidden=config.hidden, seed=config.seed
+        )
+    return people
+
+
+def answered(people: dict[int, PersonalGaze], pupil_mm: Array, slip_mm: Array, trial: Trial) -> Array:
+    """(n, 2) gaze of frames, each by its subject's calibration."""
+    predicted = np.empty((len(pupil_mm), 2))
+    for subject in np.unique(trial.subject):
+        rows = np.flatnonzero(trial.subject == subject)
+        predicted[rows] = people[int(subject)](pupil_mm[rows], slip_mm[rows])
+    return predicted
+
+
+def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
+    """Numbers of the frames that subjects are calibrated on: a share of their stimuli, in every slippage state."""
+    known = []
     for subject in np.unique(trial.subject):
         rows = np.flatnonzero(trial.subject == subject)
         points = np.unique(trial.stimulus[rows])
@@ -263,14 +309,8 @@ def calibrated(
             chosen = spread(config.stimuli_deg[points], count, first=int(rng.integers(len(points))))
         else:
             chosen = rng.choice(len(points), count, replace=False)
-        seen = np.isin(trial.stimulus[rows], points[chosen])
-        known = rows[seen]
-        person = personal.fit(
-            pupil_mm[known], slip_mm[known], trial.stimulus_deg[known], rig=rig, hidden=config.hidden, seed=config.seed
-        )
-        predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
-        judged[known] = False
-    return predicted, judged
+        known.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
+    return np.concatenate(known)
 
 
 def spread(places: Array, count: int, *, first: int) -> Array:

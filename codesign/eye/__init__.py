@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from codesign.eye.population import Motion as Motion
     from codesign.eye.population import Rig as Rig
     from codesign.eye.population import States as States
+    from codesign.eye.population import Trait as Trait
     from codesign.eye.population import face_axes as face_axes
     from codesign.eye.population import mean_eye_um as mean_eye_um
     from codesign.eye.population import parameters as parameters
@@ -37,6 +38,7 @@ __getattr__, __dir__, __all__ = attach(
         "Rendered": "renderer",
         "Rig": "population",
         "States": "population",
+        "Trait": "population",
         "Triplets": "dataset",
         "ambiguity_pairs": "dataset",
         "dataset": "",

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from codesign.gaze.axis import optical_axis as optical_axis
     from codesign.gaze.axis import pupil_of as pupil_of
     from codesign.gaze.bench import GazeErrors as GazeErrors
+    from codesign.gaze.personal import PersonalGaze as PersonalGaze
     from codesign.gaze.personal import angle_deg as angle_deg
     from codesign.gaze.personal import mean_geometry as mean_geometry
 
@@ -19,6 +20,7 @@ __getattr__, __dir__, __all__ = attach(
     {
         "EyeGeometry": "axis",
         "GazeErrors": "bench",
+        "PersonalGaze": "personal",
         "angle_deg": "personal",
         "bench": "",
         "mean_geometry": "personal",

@@ -20,11 +20,16 @@ if TYPE_CHECKING:
     from codesign.optics.numerics import psf_difference as psf_difference
     from codesign.optics.stack import OpticsConfig as OpticsConfig
     from codesign.optics.stack import Stack as Stack
+    from codesign.optics.true_lens import Device as Device
+    from codesign.optics.true_lens import device as device
+    from codesign.optics.true_lens import gathered as gathered
+    from codesign.optics.true_lens import image_difference as image_difference
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Aperture": "numerics",
+        "Device": "true_lens",
         "LensError": "lens_errors",
         "LensErrors": "lens_errors",
         "MadeLens": "built",
@@ -33,7 +38,10 @@ __getattr__, __dir__, __all__ = attach(
         "Stack": "stack",
         "Window": "numerics",
         "built": "",
+        "device": "true_lens",
         "formed": "",
+        "gathered": "true_lens",
+        "image_difference": "true_lens",
         "kernels": "numerics",
         "posterior": "built",
         "psf_difference": "numerics",

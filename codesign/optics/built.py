@@ -16,7 +16,9 @@ from torch import Tensor
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, state, vector
 from codesign.optics.stack import OpticsConfig, Stack
+from codesign.optics.true_lens import PillarCells
 from metalens.design import Focus, profiles
+from metalens.field import Optics
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 from metalens.ground.paths import path_difference
@@ -82,9 +84,11 @@ class MadeLens:
         distance = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
         pupil = self._pupil(distance)
         nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
-        field = self._on_nodes(self._gathered(state(known)), nodes_x, nodes_y)
+        cells = self._gathered(state(known))
+        field = self._on_nodes(cells, nodes_x, nodes_y)
         phase = profiles.hyperbolic(nodes_x, nodes_y, self.focus) + self._aberration(state(known), nodes_x, nodes_y)
-        return Stack(self._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil), self.settings.depths_um)
+        light = self._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil)
+        return Stack(light, self.settings.depths_um, Optics(self._plane(known, cells), self.design.layers, distance))
 
     def wave(self, x: Array | None = None) -> Array:
         """(nodes, nodes) complex wave behind the lens, its focusing phase taken off, on nodes of the design's pupil.
@@ -104,6 +108,20 @@ class MadeLens:
     def redrawn(self, lens: Lens) -> "MadeLens":
         """The same for a lens of other diameters."""
         return MadeLens(lens, self.settings, response=self.response)
+
+    def _plane(self, known: Array, cells: Array) -> PillarCells:
+        """The lens plane as rays of any direction see it."""
+        d, filled, made = self.design.diameters, _filled(cells), state(known)
+        step = self._block * d.pitch_um
+        half = filled.shape[1] * step / 2, filled.shape[0] * step / 2
+        centre = tuple(float(first) - d.pitch_um / 2 + h for first, h in zip((d.x_um[0], d.y_um[0]), half, strict=True))
+
+        def added(x_um: Tensor, y_um: Tensor) -> Tensor:
+            return torch.from_numpy(self._aberration(made, x_um.numpy(), y_um.numpy()))
+
+        parts = torch.from_numpy(np.stack([filled.real, filled.imag])).float()
+        bent = added if made.bends() else None
+        return PillarCells(self.focus, d.radius_um + d.pitch_um / 2, parts, half, (centre[0], centre[1]), bent)
 
     def _aberration(self, known: State, nodes_x: Array, nodes_y: Array) -> Array:
         rim = self.design.diameters.radius_um
@@ -133,7 +151,7 @@ class MadeLens:
     def _on_nodes(self, cells: Array, nodes_x: Array, nodes_y: Array) -> Array:
         """The field of the cells at the pupil's nodes; beyond the rim it goes on as at the rim."""
         d, b = self.design.diameters, self._block
-        filled = np.where(cells == 0, _nearest(cells), cells)
+        filled = _filled(cells)
         place = [
             (nodes - (first + (b - 1) / 2 * d.pitch_um)) / (b * d.pitch_um)
             for nodes, first in ((nodes_y, d.y_um[0]), (nodes_x, d.x_um[0]))
@@ -176,8 +194,8 @@ class MadeLens:
         return harmonics, wave.to(torch.complex64)
 
 
-def _nearest(cells: Array) -> Array:
-    """The value of the nearest filled cell, everywhere."""
+def _filled(cells: Array) -> Array:
+    """Empty cells with the value of the nearest filled one."""
     rows, columns = ndimage.distance_transform_edt(cells == 0, return_distances=False, return_indices=True)
     return np.asarray(cells[rows, columns])
 

@@ -66,23 +66,31 @@ def imager(
     """What images frames of ``frame`` samples, margin included.
 
     Args:
-        error: one draw of the lenses that are made. made: PSFs of a lens on axis in place of the coefficients.
+        error: one draw of the lenses that are made. made: a lens that is made in place of the coefficients.
 
     Raises:
-        TrainingError: PSFs of one chief ray are given where the settings ask for the true image.
+        TrainingError: of the lens that is made only PSFs of one chief ray are known, and the true image is asked for.
     """
     if settings.image == "uniform":
         found = made or lens.stack(settings, coefficients_rad, error=error)
         return lens.prepared(settings, found, frame, margin=margin)
     if made is not None:
-        raise TrainingError(
-            "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
-            "use a run of optics.image = 'uniform' for it"
-        )
+        return _made(settings, made, frame, margin)
     key = tuple(coefficients_rad.detach().tolist())
     if error is None:
         return _still(settings, key, frame, margin)
     return _hazy(settings, _formed(settings, key, frame, margin, error), error)
+
+
+@functools.lru_cache(maxsize=32)
+def _made(settings: OpticsConfig, made: Stack, frame: int, margin: int) -> Imager:
+    """The true image of a lens that is made: formed once for all who look at it."""
+    if made.plane is None:
+        raise TrainingError(
+            "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
+            "use a run of optics.image = 'uniform' for it"
+        )
+    return _through(settings, made.plane, frame, margin)
 
 
 @functools.lru_cache(maxsize=3)
@@ -94,12 +102,21 @@ def _still(settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: i
 def _formed(
     settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int, error: LensError | None
 ) -> Imager:
+    wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
+    return _through(settings, Optics(wave, Layers(), settings.sensor_distance_mm * 1e3), frame, margin)
+
+
+@torch.no_grad()
+def _through(settings: OpticsConfig, plane: Optics, frame: int, margin: int) -> Imager:
+    """The image through a lens plane in its surroundings, in the settings' light."""
     whole = field_imager(
-        wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error),
+        plane.wave,
         grid_of(settings, frame, margin),
         spectrum=source_of(settings),
+        layers=plane.layers,
         field=(math.radians(settings.angle_deg), 0.0),
         tolerance=settings.image_tolerance,
+        distance_um=plane.distance_um,
     )
     if settings.passed == 1:
         return whole

@@ -18,6 +18,7 @@ from codesign.optics import families
 from codesign.optics.families import Family, Start
 from codesign.optics.lens_errors import LensError, LensErrors, variance_rad2, wave_front_rad
 from metalens.design import Focus, PhaseOf, profiles
+from metalens.field import Optics
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.ground.paths import source_path
@@ -149,11 +150,13 @@ class OpticsConfig:
 class Stack:
     """PSFs over depth on the grid of the image.
 
-    intensity: (depths, h, w) share of the light. depths_um: (depths,).
+    intensity: (depths, h, w) share of the light. depths_um: (depths,). plane: of a lens that is made, what forms its
+    true image; None of a lens whose PSFs on axis alone are known.
     """
 
     intensity: Tensor
     depths_um: Tensor = field(repr=False)
+    plane: Optics | None = field(default=None, repr=False)
 
     def basis(self, tolerance: float) -> PsfBasis:
         """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1)."""

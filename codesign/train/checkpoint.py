@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -120,13 +119,3 @@ def _merge(tree: Any, tensors: dict[str, Tensor]) -> Any:
             return tensors[tree[_TENSOR]]
         return {k: _merge(v, tensors) for k, v in tree["items"]}
     return tree
-
-
-def random_state() -> dict[str, Any]:
-    """State of torch's global generator."""
-    return {"torch": torch.get_rng_state()}
-
-
-def set_random_state(state: dict[str, Any]) -> None:
-    """Restore what :func:`random_state` gave."""
-    torch.set_rng_state(state["torch"])

@@ -21,6 +21,7 @@ def read_out(
     generator: torch.Generator | None,
     exact: bool = True,
     resized: bool = False,
+    quiet: bool = False,
 ) -> Tensor:
     """(batch, 1, rows, columns) standardised frames as the network sees them: pixels, noise, quantisation.
 
@@ -34,13 +35,16 @@ def read_out(
             is lost), still Poisson where the mean is below 20 electrons.
         resized: the frames will be averaged to a coarser grid, whose cells, not the pixels, are then the box: the
             gradient in the pitch is that of the reads alone.
+        quiet: the expected electrons, without noise.
     """
     here, moves = float(pitch_um.detach()), pitch_um.requires_grad
     pixel = replace(sensor, pitch_um=here)  # the full well is that of this pitch
     box, grid_um = (pitch_um, here) if moves and not resized else (pitch_um.detach(), None)
     mean = camera.mean_electrons(irradiance, sample_um, sensor=pixel, pitch_um=box, grid_um=grid_um)
     reads = (here / pitch_um) ** 2
-    if not exact and float(mean.detach().mean()) > 20:
+    if quiet:
+        electrons = mean.clamp(max=pixel.full_well_e * float(camera.kappa(here, pixel.base_pitch_um)))
+    elif not exact and float(mean.detach().mean()) > 20:
         electrons = _normal(mean, pixel, generator, reads)
     else:
         electrons = camera.expose(mean, sensor=pixel, generator=generator, reads=reads)

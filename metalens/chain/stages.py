@@ -109,10 +109,10 @@ def _given(files: ChainFiles) -> Iterator[tuple[str, Path]]:
 def stages(files: ChainFiles) -> Iterator[Stage]:
     """The chain, in order."""
     yield from _making(files)
-    if files.budget:
-        yield _budget(files)
     if files.run:
         yield _codesign()
+    if files.budget:
+        yield _budget(files)
     if files.bench_truth:
         yield from _bench(files)
         if files.run:
@@ -168,12 +168,13 @@ def _mask() -> Stage:
 
 
 def _budget(files: ChainFiles) -> Stage:
+    lens = ("run/lens.h5", "--run", "run") if files.run else ("lens.h5", "--library", "library.h5")
     return Stage(
         "Error budget",
-        "Each link of the chain is changed alone and carried through pillars, PSFs and images of rendered eyes to the "
-        "gaze that the linear estimator of least variance reads. It knows the population but not the subject; a "
-        "network has its own, larger, error.",
-        ("budget", "lens.h5", "--library", "library.h5", "--process", "process.toml", "-o", "budget.h5"),
+        "Every link from pillar to answered gaze, each changed or switched off alone on the frames of the virtual "
+        "experiment, and their sum beside the error that the experiment measures there. Without a network the gaze is "
+        "read by the linear estimator of least variance, which knows the population but not the subject.",
+        ("budget", *lens, "--process", "process.toml", "-o", "budget.h5"),
         ("gaze_error_deg", "deg of gaze from all links together"),
         (("budget.png", "Gaze error of each link, log scale."),),
     )
@@ -227,7 +228,7 @@ def _retrain() -> Stage:
         "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
         "made. In a study of a hundred hidden lenses of 1 mm before a larger network (docs/loop.md) the slippage error "
         "rose from 0.44 mm to 0.59 mm in the median, and retraining won it back.",
-        (*words, "-o", "retrained"),
+        (*words, "--steps", "60", "--test-batches", "8", "-o", "retrained"),
         ("slip_mm", "mm of slippage error after retraining"),
         (("retrained/cases.png", "Slippage error with the lens as designed, as made, and after retraining."),),
     )

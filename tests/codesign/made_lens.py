@@ -40,6 +40,7 @@ population = 2
 tournament = 1
 rounds = 2
 [optics]
+image = "uniform"
 aperture_mm = 0.12
 sensor_distance_mm = 0.3
 focus_mm = 3.0

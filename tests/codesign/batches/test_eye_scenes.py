@@ -1,5 +1,7 @@
 """Training frames: the same step gives the same frames, streams never share one, labels are those of the renderer."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -50,3 +52,19 @@ def test_scale_ambiguity_moves_depth_but_not_the_pinhole_image():
 def test_impossible_settings_are_refused():
     with pytest.raises(ConfigError, match="scale"):
         SceneConfig(scale=0.6)
+
+
+def test_variety_widens_looks_and_nothing_else():
+    """Twice the spread of a trait whose limits are far; geometry and the subject's size stay."""
+    plain, wide = (
+        EyeScenes(replace(SceneConfig(), variety=v), 9.0, 2000.0, seed=3).states(0, 4000) for v in (1.0, 2.0)
+    )
+    for name, most in (("skin", 0.95), ("iris", 0.95), ("lashes", 9.0)):
+        ratio = float(wide.trait(name).std() / plain.trait(name).std())
+        assert 1.75 < ratio < 2.05  # 2, less what the limits cut off
+        assert 0 <= float(wide.trait(name).min()) <= float(wide.trait(name).max()) <= most
+    for name in ("size", "cornea_radius_um", "pupil_radius_um"):
+        assert torch.equal(wide.trait(name), plain.trait(name))
+    assert float(wide.aperture.min()) < 0.52 < 0.74 < float(plain.aperture.min())
+    with pytest.raises(ConfigError, match="variety = 5"):
+        SceneConfig(variety=5.0)

@@ -1,6 +1,5 @@
 """The error budget: entries of known changes, files, and refusals."""
 
-import json
 import math
 
 import numpy as np
@@ -8,8 +7,8 @@ import pytest
 
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
-from codesign.budget import task
-from codesign.budget.links import Entry, Given
+from codesign.budget.entry import MEASURED, TOTAL, Entry, total
+from codesign.budget.prepared import Given, bench
 from codesign.commands import budget as command_budget
 from codesign.optics.numerics import Aperture, Numerics, Window, kernels, psf_difference
 from metalens import design
@@ -73,27 +72,23 @@ def test_a_common_phase_is_no_error():
     assert budget._spread_of(np.array([0.1, 0.0, -0.1]) + 3, share) == pytest.approx(0.1 * math.sqrt(0.5), rel=1e-3)
 
 
-def test_the_total_is_the_root_of_the_squares():
-    rows = [Entry("a", 3.0, math.nan, 3e-3, ""), Entry("b", math.nan, 1.0, 4e-3, "")]
-    total = budget._total(rows)
-    assert (total.phase_rad, total.psf, total.gaze_rad) == pytest.approx((3.0, 1.0, 5e-3))
-
-
-def test_a_network_without_error_costs_nothing(lens):
-    class Stub:
-        given = Given(slip_mm=(0.0, 0.0, 0.0))
-        setting = task.TaskSetting()
-
-    (entry,) = budget._network(Stub)
-    assert entry.gaze_rad < 1e-6
-    Stub.given = Given(slip_mm=(0.3, 0.3, 0.0))
-    (entry,) = budget._network(Stub)
-    # 0.376 mm rms on each axis, across an eye of 9.55 mm: 0.376 sqrt(2) / 9.55 rad, more where it looks aside
-    assert 0.04 < entry.gaze_rad < 0.12
+def test_the_total_is_the_root_of_the_squares_of_what_counts():
+    rows = [
+        Entry("a", 3.0, math.nan, 3e-3, ""),
+        Entry("b", math.nan, 1.0, 4e-3, ""),
+        Entry("known", 7.0, 2.0, 9e-3, "", counted=False),
+        Entry("reader", math.nan, math.nan, math.nan, ""),
+    ]
+    found = total(rows)
+    assert (found.phase_rad, found.psf, found.gaze_rad) == pytest.approx((3.0, 1.0, 5e-3))
+    assert found.method.endswith("without reader")
 
 
 def test_files_come_back_as_they_were(tmp_path):
-    rows = [Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"), Entry("sensor noise", math.nan, math.nan, 1e-3, "bound")]
+    rows = [
+        Entry("mask grid", 0.1, 0.2, 1e-4, "rounded", counted=False),
+        Entry("sensor noise", math.nan, math.nan, 1e-3, "bound"),
+    ]
     command_budget.save(tmp_path / "b.h5", rows, command_budget.store.Provenance(config="x = 1\n"))
     assert [str(r) for r in command_budget.load(tmp_path / "b.h5")] == [str(r) for r in rows]
     with pytest.raises(StoreError):
@@ -109,10 +104,14 @@ def test_spread_and_run_are_read_or_refused(tmp_path):
     (tmp_path / "q.toml").write_text("[spread]\nbais_nm = 2.0\n")
     with pytest.raises(ConfigError, match="bias_nm"):
         of_process(tmp_path / "q.toml")
-    with pytest.raises(ConfigError, match="no result"):
-        command_budget.slip_of(tmp_path)
-    (tmp_path / "result.json").write_text(json.dumps({"rows": [{"lateral_slip_mm": 0.2, "axial_slip_mm": 0.4}]}))
-    assert command_budget.slip_of(tmp_path) == (0.2, 0.2, 0.4)
+
+
+def test_the_sum_stands_beside_what_was_measured():
+    rows = [Entry(MEASURED, math.nan, math.nan, 4e-3, "", counted=False), Entry(TOTAL, 0.0, 0.0, 5e-3, "")]
+    assert command_budget.summary(rows) == pytest.approx(
+        {"gaze_error_deg": math.degrees(5e-3), "measured_deg": math.degrees(4e-3), "closure": 1.25}
+    )
+    assert set(command_budget.summary(rows[1:])) == {"gaze_error_deg"}
 
 
 def test_a_budget_of_few_depths_is_refused():
@@ -123,12 +122,15 @@ def test_a_budget_of_few_depths_is_refused():
 @pytest.mark.slow
 def test_the_whole_budget_of_a_small_lens(lens):
     given = Given(Numerics(12, 1, 1e-3, 1e-2), mask=Printed(), draws=2)
-    rows = list(budget.entries(budget.bench(lens, given)))
+    rows = list(budget.entries(bench(lens, given)))
     found = {r.link: r for r in rows}
     assert set(found) == {
-        "pillar solver and proxy", "local periodic approximation", "mask grid", "process spread", "propagation",
-        "depth sampling", "image kernels", "sensor noise", "all links",
+        "subject and calibration", "fixation", "reader", "sensor noise", "field", "radiometry", "spectrum", "glass",
+        "polarisation", "pillar solver and proxy", "neighbours", "mask grid", "process spread", "propagation",
+        "depth sampling", "image kernels", TOTAL,
     }  # fmt: skip
-    assert all(r.gaze_rad >= 0 and r.method for r in rows)
+    assert math.isnan(found.pop("reader").gaze_rad)
+    assert all(r.gaze_rad >= 0 and r.method for r in found.values())
+    assert not found["field"].counted
     # 2 nm of rounding: uniform within 1 nm, at 55 rad a um
     assert found["mask grid"].phase_rad == pytest.approx(55e-3 / math.sqrt(3), rel=0.2)

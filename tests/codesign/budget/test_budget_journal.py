@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from codesign.budget import Journal, links
-from codesign.budget.links import Entry
+from codesign.budget import Entry, Journal, links
 
 
 def parts(path, title, *, until=99):
@@ -60,13 +59,16 @@ def test_links_of_a_budget_are_computed_once(tmp_path, monkeypatch):
         part.__name__ = name
         return part
 
-    names = ("_pillars", "_neighbours", "_mask", "_spread", "_calibration", "_numerics", "_network")
+    class About:
+        reading = None
+
+    names = ("_answer", "_optics", "_pillars", "_neighbours", "_mask", "_spread", "_calibration", "_numerics")
     for name in names:
         monkeypatch.setattr(links, name, link(name, dies=name == "_spread"))
     with pytest.raises(KeyboardInterrupt):
-        list(links.entries(None, Journal(tmp_path / "j", "t")))
+        list(links.entries(About, Journal(tmp_path / "j", "t")))
     monkeypatch.setattr(links, "_spread", link("_spread"))
-    found = list(links.entries(None, Journal(tmp_path / "j", "t")))
-    assert calls == [*names[:4], *names[3:]]
+    found = list(links.entries(About, Journal(tmp_path / "j", "t")))
+    assert calls == [*names[:6], *names[5:]]
     assert [entry.link for entry in found] == [*names, "all links"]
-    assert found[-1].gaze_rad == pytest.approx(math.sqrt(7) * 1e-3 / 7, rel=1e-12)
+    assert found[-1].gaze_rad == pytest.approx(math.sqrt(8) * 1e-3 / 7, rel=1e-12)

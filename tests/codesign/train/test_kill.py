@@ -24,6 +24,7 @@ end = 0.9
 [inner.pitch]
 rate = 0.01
 [optics]
+image = "uniform"
 aperture_mm = 0.3
 sensor_distance_mm = 1.0
 depth_count = 4

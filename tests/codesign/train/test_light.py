@@ -101,6 +101,11 @@ def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp
     assert float(run.coefficients(whole).abs().max()) > 1e-3
     with pytest.raises(TrainingError, match=r'optics\.image: "true" -> "uniform"'):
         run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, image="uniform")))
+    with pytest.raises(TrainingError, match=r"optics\.fwhm_nm: 0\.0 -> 30\.0"):
+        run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, fwhm_nm=30.0)))
+    pixel = replace(settings.run, pitch_um=settings.run.pitch_um * 1.5)
+    with pytest.raises(TrainingError, match=r"run\.pitch_um: "):
+        run.resume(tmp_path / "part", replace(settings, run=pixel))
 
 
 def test_a_made_lens_known_on_axis_alone_is_no_true_image():

@@ -37,6 +37,7 @@ rounds = 3
 [run]
 budgets_mmacs = [2.0]
 [optics]
+image = "uniform"
 aperture_mm = 0.3
 sensor_distance_mm = 1.0
 depth_count = 4

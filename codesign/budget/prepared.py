@@ -1,0 +1,122 @@
+"""What the links of a budget are judged with: the lens as a device, its eyes, and the reader of its images."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from characterize.inference import AsBuilt
+from codesign.adapt import Source as Run
+from codesign.budget import task
+from codesign.budget.entry import NONE, Entry
+from codesign.budget.reading import Reading
+from codesign.budget.task import Linear, TaskSetting
+from codesign.evaluate import ExperimentConfig
+from codesign.optics import Aperture, Device, Numerics, Window, device, gathered, image_difference, kernels
+from metalens.ground.errors import LensError
+from metalens.image import Grid, Imager, PsfBasis
+from metalens.lens import Lens
+from metalens.made import Printed
+from metalens.pillars import PillarLibrary
+from metalens.psf import Source
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What is known beside the lens: each adds its entries.
+
+    numerics: of the chain. fwhm_nm: of the light source. mask: of the PROCESS.toml. library: that the proxy was fitted
+    to. asbuilt: of a fit. run: of a finished co-design run, whose reader answers. frames: that it is shown. draws: of
+    process and fit.
+    """
+
+    numerics: Numerics = field(default_factory=Numerics)
+    fwhm_nm: float = 0.0
+    mask: Printed | None = None
+    library: PillarLibrary | None = None
+    asbuilt: AsBuilt | None = None
+    run: Run | None = None
+    frames: ExperimentConfig = field(default_factory=lambda: ExperimentConfig(subjects=5))
+    draws: int = 4
+    tolerance: float = 1e-3
+
+
+@dataclass(eq=False, slots=True)
+class Bench:
+    """The lens as a device, who reads its images, and the finest one-PSF optics that numerics are compared with.
+
+    device: the true image of the designed pillars. reader: the linear estimator that knows it. reading: of a run's
+    network instead, where one is given.
+    """
+
+    lens: Lens
+    given: Given
+    setting: TaskSetting
+    aperture: Aperture
+    finest: Numerics
+    window: Window
+    eyes: task.Views
+    device: Device
+    reader: Linear
+    reading: Reading | None
+
+    def basis(self, numerics: Numerics) -> PsfBasis:
+        """One-PSF kernels of the designed lens."""
+        maps = self.aperture.maps(self.aperture.designed())
+        return kernels(self.lens, maps, numerics, self.window, fwhm_nm=self.given.fwhm_nm)
+
+    def shift(self, optics: PsfBasis | Imager, base: PsfBasis | Imager) -> torch.Tensor:
+        """(scenes, unknowns) change of the linear estimator's answer between images through two optics."""
+        one, other = (task.electrons(self.eyes.anchor, o, self.setting) for o in (optics, base))
+        return self.reader.shift(one) - self.reader.shift(other)
+
+    def entry(self, link: str, optics: Imager, method: str, *, phase_rad: float = NONE) -> Entry:
+        """The entry of a change of the device, before the network or the linear estimator."""
+        base = self.device.whole
+        if self.reading is not None:
+            return self.reading.changed(link, optics, base, method, phase_rad=phase_rad)
+        gaze = task.gaze_mean(self.shift(optics, base))
+        return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
+
+
+def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench:
+    """Render the eyes, prepare the device and its reader; the finest optics have twice the depths (64 at most).
+
+    Raises:
+        LensError: the run's lens is another than the one given.
+    """
+    setting = replace(setting or TaskSetting(), sensor_distance_um=lens.sensor_distance_um)
+    eyes, aperture, n = task.views(setting), Aperture(lens), given.numerics
+    finest = Numerics(
+        min(2 * n.depth_count, 64),
+        n.wavelength_count + 6 if given.fwhm_nm else 1,
+        min(n.psf_tolerance / 10, 1e-5),
+        min(n.basis_tolerance / 10, 1e-4),
+    )
+    window = Window(*eyes.depths_um, setting.pitch_um)
+    if given.run is not None:
+        _same(lens, given.run)
+    wave = gathered(lens, *aperture.maps(aperture.designed()))
+    reading, known = None, None
+    if given.run is not None:
+        reading = Reading(given.run, given.frames, fwhm_nm=given.fwhm_nm)
+        seen = reading.stands(wave, lens.layers, lens.sensor_distance_um)
+        known = kernels(lens, aperture.maps(aperture.designed()), finest, window, fwhm_nm=given.fwhm_nm)
+    else:
+        grid = Grid((setting.pixels,) * 2, setting.pitch_um, eyes.depths_um, setting.margin, 2 * setting.margin + 1)
+        line = Source(lens.wavelength_um * 1e3, given.fwhm_nm) if given.fwhm_nm else None
+        seen = device(wave, grid, layers=lens.layers, distance_um=lens.sensor_distance_um, spectrum=line)
+    reader = task.linear(eyes, known or seen.whole, setting)
+    return Bench(lens, given, setting, aperture, finest, window, eyes, seen, reader, reading)
+
+
+def _same(lens: Lens, run: Run) -> None:
+    """Refuse a reader that was trained before another lens."""
+    optics = run.settings.optics
+    mine = lens.sensor_distance_um * 1e-3, lens.wavelength_um * 1e3, 2e-3 * lens.diameters.radius_um
+    its = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
+    if any(abs(a - b) > 0.02 * b for a, b in zip(mine, its, strict=True)):
+        raise LensError(
+            "the run's reader was trained before another lens: sensor distance, wavelength, aperture are "
+            f"{its[0]:g} mm, {its[1]:g} nm, {its[2]:g} mm there and {mine[0]:g} mm, {mine[1]:g} nm, {mine[2]:g} mm in "
+            "the lens file; give the lens.h5 of the run"
+        )

@@ -1,0 +1,227 @@
+"""A trained reader before the frames of the virtual experiment: what every cause adds on the way to the answered gaze.
+
+    true pupil and slippage -> the person's calibration          subject and calibration
+    where the person really looks                                fixation
+    pupil and slippage read from noiseless frames                reader, pupil and slippage
+    noise of the sensor                                          sensor noise
+    what training left out of its image                          field, radiometry, spectrum
+
+Each state has the causes of the one before and one more; persons are calibrated in every state anew, as they would be
+on such a device. A cause adds what the mean error has more than in the state before, in quadrature. The last state is
+the virtual experiment itself. Changes of the optics behind it (:meth:`Reading.changed`) add the mean angle by which
+they turn the answers: independent of the rest, that adds in quadrature too. What a reader was trained with is no error
+of its answer: the cause is then switched off to see what the reader makes of it, and does not count.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from codesign.adapt import Source, network
+from codesign.batches import EXPERIMENT
+from codesign.budget.entry import NONE, Entry
+from codesign.budget.person import told
+from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
+from codesign.eye import Rendered, render
+from codesign.gaze import PersonalGaze, angle_deg
+from codesign.optics import Device, OpticsConfig, device, formed, image_difference
+from codesign.train import assess
+from metalens.ground.arrays import Array
+from metalens.image import Imager, UniformImager
+from metalens.lens import Layers
+
+THINNED = 320  # frames that small changes of the optics are judged on
+
+Read = tuple[Array, Array]  # pupil (n, 2) on the sensor and slippage (n, 3), mm
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stand:
+    """Persons calibrated on the device as it is, and the frames on which a change of the optics is judged."""
+
+    people: dict[int, PersonalGaze]
+    frames: tuple[Rendered, ...]
+    trial: gaze_experiment.Trial
+
+
+class Reading:
+    """A run's network with its frames; ``measured_deg`` is there once :meth:`path` is through."""
+
+    def __init__(self, source: Source, config: ExperimentConfig, *, fwhm_nm: float) -> None:
+        self.source, self.config = source, config
+        self.scenes = source.run.scenes(EXPERIMENT)
+        believed = source.run.trainer.optics
+        width = fwhm_nm or believed.fwhm_nm
+        self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
+        self.believed = gaze_experiment.ready(source, image="trained")
+        self.subjects: list[Rendered] = []
+        trials = []
+        for subject in range(config.subjects):
+            states, trial = gaze_experiment.states_of(config, subject, self.scenes)
+            self.subjects.append(render(states, rig=self.scenes.rig, camera=self.scenes.camera))
+            trials.append(trial)
+        self.trial = gaze_experiment.joined(trials)
+        self.true = self._device(self.optics)
+        self.measured_deg = {AXIAL: NONE, gaze_experiment.LATERAL: NONE}
+        self._stand: Stand | None = None
+        self._error_rad = 0.0
+
+    @property
+    def frame(self) -> int:
+        """Samples of a frame along a side, margin included."""
+        return self.source.settings.scenes.pixels + 2 * self.source.settings.scenes.margin
+
+    def _device(self, settings: OpticsConfig) -> Device:
+        margin = self.source.settings.scenes.margin
+        coefficients = self.source.run.trainer.model.coefficients_rad.detach()
+        whole = formed.imager(settings, coefficients, self.frame, margin=margin)
+        if not isinstance(whole, Imager):
+            raise TypeError("a device is imaged truly")
+        return Device(formed.wave_of(settings, coefficients), Layers(), settings.sensor_distance_mm * 1e3, whole)
+
+    def stands(self, wave: object, layers: Layers, distance_um: float) -> Device:
+        """The device of another lens plane behind films, on the frames of this run."""
+        settings, margin = self.optics, self.source.settings.scenes.margin
+        return device(
+            wave,  # type: ignore[arg-type]
+            formed.grid_of(settings, self.frame, margin),
+            layers=layers,
+            distance_um=distance_um,
+            spectrum=formed.source_of(settings),
+            field_rad=float(np.radians(settings.angle_deg)),
+            tolerance=settings.image_tolerance,
+        )
+
+    def path(self) -> Iterator[Entry]:
+        """Entries from the true pupil to the answered gaze, and what was measured at its end."""
+        still = replace(self.config, fixation_deg=0.0)
+        people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
+        yield self._grown("subject and calibration", told(still, self.scenes), f"true pupil and slippage; {people}")
+        true = told(self.config, self.scenes)
+        yield self._grown("fixation", true, f"scatter of {self.config.fixation_deg:g} deg about the stimulus")
+        said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
+        read = self._read(self.believed, quiet=True)
+        yield self._grown("reader, pupil", (read[0], true[1]), said)
+        yield self._grown("reader, slippage", read, said)
+        read = self._read(self.believed)
+        yield self._grown("sensor noise", read, "frames with the sensor's noise")
+        for link, optics, psf, said in self._unknown():
+            read = self._read(optics)
+            yield replace(self._grown(link, read, said), psf=psf)
+        self._settle(read)
+        yield from self._known()
+
+    def _grown(self, link: str, read: Read, method: str) -> Entry:
+        """The entry of one more cause: what the error has more than before, in quadrature; 0 where it has less."""
+        before, self._error_rad = self._error_rad, self._off(angle_deg(self._answers(read), self.trial.stimulus_deg))
+        gap = self._error_rad**2 - before**2
+        return Entry(link, NONE, NONE, math.sqrt(max(gap, 0.0)), method)
+
+    def _unknown(self) -> Iterator[tuple[str, Imager, float, str]]:
+        """What the reader's training left out of its image, one more in each."""
+        believed = self.source.run.trainer.optics
+        if believed.image == "true" and believed.fwhm_nm == self.optics.fwhm_nm:
+            return
+        if believed.image == "true":
+            said = f"{self.optics.fwhm_nm:g} nm before a reader trained at {believed.fwhm_nm:g} nm"
+            yield "spectrum", self.true.whole, self._broadened(), said
+            return
+        one = self._device(replace(self.optics, fwhm_nm=0.0, filter_nm=0.0))
+        said = "the whole field before a reader trained on the PSFs of one chief ray"
+        yield "field", one.evenly_lit(), image_difference(one.one_psf(), one.whole), said
+        yield "radiometry", one.whole, 0.0, "cos⁴ and vignetting before a reader trained on even light"
+        if self.optics.fwhm_nm:
+            said = f"{self.optics.fwhm_nm:g} nm before a reader trained on one wavelength"
+            yield "spectrum", self.true.whole, self._broadened(), said
+
+    def _broadened(self) -> float:
+        """Relative L2 change of the PSFs from one wavelength to the light of the device."""
+        narrow = self.true.one_wavelength(self.optics.wavelength_nm * 1e-3)
+        return image_difference(narrow, self.true.whole)
+
+    def _known(self) -> Iterator[Entry]:
+        """What the reader was trained with, switched off."""
+        believed, here = self.source.run.trainer.optics, self.true
+        said = "known to the reader, switched off: what it answers then; not in the sum"
+        if believed.image == "true":
+            yield replace(self.changed("field", here.one_psf(), here.whole, said), counted=False)
+            yield replace(self.changed("radiometry", here.evenly_lit(), here.whole, said), counted=False)
+        if not self.optics.fwhm_nm:
+            yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
+        elif believed.image == "true" and believed.fwhm_nm == self.optics.fwhm_nm:
+            narrow = here.one_wavelength(self.optics.wavelength_nm * 1e-3)
+            yield replace(self.changed("spectrum", narrow, here.whole, said), counted=False)
+
+    def changed(self, link: str, optics: Imager, base: Imager, method: str, *, phase_rad: float = NONE) -> Entry:
+        """The entry of a change of the optics after the persons were calibrated: the turn of their answers."""
+        gaze = self.turned(optics, base)
+        return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
+
+    def turned(self, optics: Imager, base: Imager) -> float:
+        """Mean angle, rad, between the answers to frames through two optics; the persons stay calibrated."""
+        stand = self._stand
+        if stand is None:
+            raise RuntimeError("changes are judged once the path is through")
+        one, other = (
+            gaze_experiment.answered(stand.people, *self._frames(stand.frames, o), stand.trial) for o in (optics, base)
+        )
+        return float(np.radians(angle_deg(one, other).mean()))
+
+    def _settle(self, read: Read) -> None:
+        """Keep the persons of the last state, what it measured, and a thin sample of the judged frames."""
+        people = gaze_experiment.taught(*read, self.trial, self.config, rig=self.scenes.rig)
+        error = angle_deg(gaze_experiment.answered(people, *read, self.trial), self.trial.stimulus_deg)
+        judged = self._judged()
+        for kind in self.measured_deg:
+            self.measured_deg[kind] = float(error[judged & self.trial.group(kind)].mean())
+        rows = np.flatnonzero(judged & self.trial.group(AXIAL))
+        rows = rows[:: max(1, len(rows) // THINNED)]
+        frames = tuple(
+            _part(made, torch.from_numpy(rows[self.trial.subject[rows] == s] - first))
+            for s, (made, first) in enumerate(zip(self.subjects, self._starts(), strict=True))
+        )
+        fields = (getattr(self.trial, f)[rows] for f in gaze_experiment.Trial.__slots__)
+        self._stand = Stand(people, frames, gaze_experiment.Trial(*fields))
+
+    def _starts(self) -> Array:
+        return np.cumsum([0, *(len(made.labels.slip_um) for made in self.subjects[:-1])])
+
+    def _off(self, angles_deg: Array) -> float:
+        """Mean over the judged frames under axial slippage, rad."""
+        return float(np.radians(angles_deg[self._judged() & self.trial.group(AXIAL)].mean()))
+
+    def _judged(self) -> Array:
+        return ~np.isin(np.arange(len(self.trial.subject)), gaze_experiment.calibrating(self.trial, self.config))
+
+    def _answers(self, read: Read) -> Array:
+        """(n, 2) gaze, every person calibrated on what was read."""
+        people = gaze_experiment.taught(*read, self.trial, self.config, rig=self.scenes.rig)
+        return gaze_experiment.answered(people, *read, self.trial)
+
+    def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> Read:
+        return self._frames(self.subjects, optics, quiet=quiet)
+
+    @torch.no_grad()
+    def _frames(
+        self, subjects: list[Rendered] | tuple[Rendered, ...], optics: Imager | UniformImager, *, quiet: bool = False
+    ) -> Read:
+        """What the network reads of frames through these optics; noise of the experiment's seeds."""
+        found = []
+        net, inner = network(self.source.run.trainer), self.source.settings.inner
+        for subject, made in enumerate(subjects):
+            seen = gaze_experiment.through(
+                self.source, made, optics, seed=gaze_experiment.NOISE + subject, snr_db=self.config.snr_db, quiet=quiet
+            )
+            found.append(assess.predict(net, self.source.architecture, seen, inner))
+        centre, slip = (torch.cat([getattr(a, f) for a in found]).double().numpy() for f in ("centre", "slip_mm"))
+        return centre * self.source.run.window_um * 1e-3, slip
+
+
+def _part(made: Rendered, rows: torch.Tensor) -> Rendered:
+    """Some of the frames with their labels."""
+    frames = type(made.frames)(*(getattr(made.frames, f)[rows] for f in type(made.frames).__slots__))
+    labels = type(made.labels)(*(getattr(made.labels, f)[rows] for f in type(made.labels).__slots__))
+    return replace(made, frames=frames, labels=labels, pupil=made.pupil[rows])

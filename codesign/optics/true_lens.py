@@ -1,0 +1,235 @@
+"""The device: pillars on a lattice before their sensor as a true image, any one cause changed or left out.
+
+All images of a device share one plan of field points, depths and wavelengths and one set of patches, so that two of
+them differ by the cause and not by how either was approximated.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.design import Focus
+from metalens.field import Layers, Optics, Plan, SmoothWave, Wave, node_light, normalised, psfs, with_psfs
+from metalens.ground.arrays import Array
+from metalens.image import Grid, Imager
+from metalens.image import imager as field_imager
+from metalens.lens import Lens
+from metalens.psf import Nodes, Source
+
+CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
+ROWS = 256  # of pillars at a time
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PillarCells:
+    """A lens plane of given pillars: mean of t exp(-i focus) over cells of a few micrometres, interpolated to the rays.
+
+    cells: (2, y, x) real and imaginary part. half_um, centre_um: (x, y) half width of the cells, and their middle.
+    added_rad: (x_um, y_um) to a phase that bends the wave front as a whole; None for none.
+    """
+
+    focus: Focus
+    radius_um: float
+    cells: Tensor
+    half_um: tuple[float, float]
+    centre_um: tuple[float, float] = (0.0, 0.0)
+    added_rad: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """The hyperbolic phase that the design aims at."""
+        return SmoothWave(self.focus, self.radius_um).carrier_rad(x_um, y_um)
+
+    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+        """The cells at the rays; pillars answer as at the design wavelength and straight on."""
+        at = ((v - c) / h for v, c, h in zip((x_um, y_um), self.centre_um, self.half_um, strict=True))
+        place = torch.stack(list(at), -1).to(self.cells)
+        found = torch.nn.functional.grid_sample(
+            self.cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
+        )
+        mean = torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+        if self.added_rad is None:
+            return mean
+        added = torch.remainder(self.added_rad(x_um, y_um), 2 * math.pi).to(torch.float32)
+        return mean * torch.polar(torch.ones_like(added), added)
+
+
+def gathered(lens: Lens, phase: Tensor, level: Tensor) -> PillarCells:
+    """The lens plane of pillars of these phases and amplitudes.
+
+    Args:
+        phase, level: (y, x) of every site, float32; level 0 where there is no pillar.
+    """
+    d = lens.diameters
+    radius = d.radius_um + d.pitch_um / 2
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    smooth, block = SmoothWave(focus, radius), max(1, round(CELL_UM / d.pitch_um))
+    x = torch.as_tensor(d.x_um, dtype=torch.float64)
+    parts = []
+    for rows in range(0, len(d.y_um), ROWS):
+        part = slice(rows, rows + ROWS)
+        ideal = smooth.carrier_rad(x, torch.as_tensor(d.y_um[part], dtype=torch.float64)[:, None])
+        rest = torch.remainder(phase[part].double() - ideal, 2 * math.pi).float()
+        whole = torch.polar(level[part], rest)
+        parts.append(torch.stack([whole.real, whole.imag, (level[part] > 0).float()]))
+    cells = _averaged(torch.cat(parts, 1), block)
+    half_y, half_x = (n * block * d.pitch_um / 2 for n in cells.shape[-2:])
+    return PillarCells(focus, radius, cells, (half_x, half_y))
+
+
+def _averaged(layers: Tensor, block: int) -> Tensor:
+    """(2, cells, cells) mean of the first two layers where the third, whether a pillar stands, is 1."""
+    spare = [(-n) % block for n in layers.shape[-2:]]
+    pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
+    mean = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], block)[0]
+    near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
+    filled = torch.where(mean[2] > 0, mean[:2], near[:2])
+    return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
+
+
+@dataclass(eq=False)
+class Device:
+    """A lens plane, its films and its sensor, imaged truly over field, depth and spectrum."""
+
+    wave: Wave
+    layers: Layers
+    distance_um: float
+    whole: Imager = field(repr=False)
+
+    def image(self, *, wave: Wave | None = None, layers: Layers | None = None, shift_um: float = 0.0) -> Imager:
+        """The image with another lens plane, other films, or the sensor moved away by ``shift_um``."""
+        return self._imaged(Optics(wave or self.wave, layers or self.layers, self.distance_um + shift_um))
+
+    @torch.no_grad()
+    def _imaged(self, optics: Optics, plan: Plan | None = None) -> Imager:
+        nodes = plan or self.whole.plan
+        return with_psfs(self.whole, *normalised(node_light(optics, nodes).detach(), optics, nodes))
+
+    def one_psf(self) -> Imager:
+        """The image by the PSFs of the middle of the field alone."""
+        rows, columns = (n // 2 for n in self.whole.stack.shape[:2])
+        stack = self.whole.stack[rows, columns].expand_as(self.whole.stack).contiguous()
+        return with_psfs(self.whole, stack, self.whole.energy)
+
+    def evenly_lit(self) -> Imager:
+        """The image of a lens that collects as much light from every direction: no cos⁴, no vignetting."""
+        level = self.whole.energy.mean().expand_as(self.whole.energy).contiguous()
+        return with_psfs(self.whole, self.whole.stack, level)
+
+    def one_wavelength(self, wavelength_um: float) -> Imager:
+        """The image in light of one wavelength."""
+        plan = replace(self.whole.plan, waves=Nodes(np.array([wavelength_um]), np.ones(1), 0.0))
+        return self._imaged(Optics(self.wave, self.layers, self.distance_um), plan)
+
+    def both_polarisations(self) -> Imager:
+        """The image by Ex, Ey, Ez of both polarisations of light whose rays the lens turns.
+
+        What they change is computed on a grid of at most 5 x 5 field points and interpolated: it is small and smooth.
+        """
+        plan, optics = self.whole.plan, Optics(self.wave, self.layers, self.distance_um)
+        y, x = (_few(axis) for axis in (plan.y_um, plan.x_um))
+        light = node_light(optics, plan).detach()
+        with torch.no_grad():
+            coarse = replace(plan, y_um=y, x_um=x)
+            places = [torch.stack([b, a]) for a in y for b in x]
+            turned = torch.stack([self._vectorial(place) for place in places]).reshape(len(y), len(x), *light.shape[2:])
+            change = turned - node_light(optics, coarse).detach()
+            to_y, to_x = (_hats(wanted, axis).to(change) for wanted, axis in ((plan.y_um, y), (plan.x_um, x)))
+            light = light + torch.einsum("ya,xb,abzhw->yxzhw", to_y, to_x, change)
+            return with_psfs(self.whole, *normalised(light, optics, plan))
+
+    def _vectorial(self, place: Tensor) -> Tensor:
+        """(depths, h, w) light of one field point: six components, each imaged as a scalar."""
+        plan, total = self.whole.plan, torch.zeros(())
+        for number in range(6):
+            optics = Optics(_Turned(self.wave, place, self.distance_um, number), self.layers, self.distance_um)
+            for um, weight in zip(plan.waves.wavelengths_um.tolist(), plan.waves.weights.tolist(), strict=True):
+                seen: dict[str, Any] = {"depths_um": plan.depths_um, "wavelength_um": um, "window": plan.window}
+                total = total + weight / 2 * psfs(optics, place[None], **seen)[0]
+        return total
+
+
+def device(
+    wave: Wave,
+    grid: Grid,
+    *,
+    layers: Layers,
+    distance_um: float,
+    spectrum: Source | None = None,
+    field_rad: float = 0.0,
+    tolerance: float = 0.03,
+) -> Device:
+    """A device whose image is prepared.
+
+    Raises:
+        SceneError: the tolerance cannot be met; PropagationError: films thicker than the gap.
+    """
+    with torch.no_grad():
+        whole = field_imager(
+            wave, grid, spectrum=spectrum, layers=layers, field=(field_rad, 0.0), tolerance=tolerance,
+            distance_um=distance_um,
+        )  # fmt: skip
+    return Device(wave, layers, distance_um, whole)
+
+
+def _few(axis: Tensor) -> Tensor:
+    """At most five places from the first to the last."""
+    return torch.linspace(float(axis[0]), float(axis[-1]), min(5, len(axis)), dtype=axis.dtype)
+
+
+def _hats(wanted: Tensor, axis: Tensor) -> Tensor:
+    """(wanted, axis) weights of the linear interpolation between evenly spaced places."""
+    return (1 - (wanted[:, None] - axis).abs() / (axis[1] - axis[0])).clamp_min(0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Turned:
+    """One of the six components (2 polarisations x Ex, Ey, Ez) of a wave on its way to one place of the sensor.
+
+    R e = e - (a + b)(b·e) / (1 + a·b): the field of a ray that comes along a and leaves along b (Richards and Wolf
+    1959); of unit length, so the six squares keep the light of the scalar.
+    """
+
+    wave: Wave
+    place_um: Tensor
+    distance_um: float
+    number: int
+
+    @property
+    def radius_um(self) -> float:
+        return self.wave.radius_um
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        return self.wave.carrier_rad(x_um, y_um)
+
+    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor:
+        chief = torch.cat([self.place_um, self.place_um.new_tensor([self.distance_um])])
+        a = chief / chief.norm()
+        b = torch.stack([self.place_um[0] - x_um, self.place_um[1] - y_um, torch.full_like(x_um, self.distance_um)])
+        b = b / b.norm(dim=0)
+        e = torch.eye(3, dtype=a.dtype)[self.number // 3]
+        axis = a + torch.tensor([0.0, 0.0, 1.0], dtype=a.dtype)
+        e = e - axis * (a @ e) / (1 + a[2])
+        along = torch.einsum("i,iyx->yx", e, b) / (1 + torch.einsum("i,iyx->yx", a, b))
+        part = self.number % 3
+        turned = (e[part] - (a[part] + b[part]) * along).to(torch.complex64)
+        plain = self.wave.factor(x_um, y_um, wavelength_um, angle_rad)
+        whole: Tensor = turned if plain is None else turned * plain
+        return whole
+
+
+def image_difference(one: Imager, other: Imager) -> float:
+    """Relative L2 difference of the PSFs of two images over field and depth, each PSF of sum 1."""
+    return float((one.stack - other.stack).norm() / other.stack.norm())
+
+
+def turn_of(lens: Lens, phase: Tensor, base: Tensor) -> Array:
+    """Phase differences over the pillars of a lens, about their mean, rad."""
+    built = torch.from_numpy(lens.diameters.diameter_um > 0)
+    turn = (phase - base)[built].double().numpy()
+    mean = np.angle(np.exp(1j * turn).mean())
+    return np.asarray(np.angle(np.exp(1j * (turn - mean))))

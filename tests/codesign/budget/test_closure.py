@@ -1,0 +1,108 @@
+"""The budget of a trained reader closes: its links add up to what the virtual experiment measures."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.adapt import train as retraining
+from codesign.budget import floor, total
+from codesign.budget.entry import Entry
+from codesign.budget.person import person
+from codesign.budget.prepared import Given, bench
+from codesign.budget.reading import Reading
+from codesign.evaluate import AXIAL, ExperimentConfig, experiment
+from codesign.eye.population import Rig
+from codesign.optics import Aperture, device, formed, gathered, image_difference
+from metalens.ground.errors import ConfigError, LensError
+
+FRAMES = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("closure") / "run"
+    m.finished_run(folder)
+    return retraining.load(folder)
+
+
+@pytest.fixture(scope="module")
+def reading(source):
+    return Reading(source, FRAMES, fwhm_nm=0.0)
+
+
+def test_the_links_add_up_to_what_the_experiment_measures(source, reading):
+    """A reader trained on one PSF before the whole field; the experiment is computed beside it, by its own loop."""
+    rows = list(reading.path())
+    names = [row.link for row in rows]
+    assert names == [
+        "subject and calibration", "fixation", "reader, pupil", "reader, slippage", "sensor noise", "field",
+        "radiometry", "spectrum",
+    ]  # fmt: skip
+    *_, (_, (found,)) = experiment([source], FRAMES)
+    assert reading.measured_deg[AXIAL] == pytest.approx(found.gaze(AXIAL), rel=1e-6)
+    together = math.degrees(total(rows).gaze_rad)
+    assert 1 / 1.5 < together / found.gaze(AXIAL) < 1.5
+    change = reading.changed("nothing", reading.true.whole, reading.true.whole, "")
+    assert change.gaze_rad < 1e-7
+    assert change.psf == 0
+
+
+def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
+    optics = source.run.trainer.optics
+    source.run.trainer.optics = replace(optics, image="true")
+    try:
+        rows = {row.link: row for row in Reading(source, FRAMES, fwhm_nm=0.0).path()}
+    finally:
+        source.run.trainer.optics = optics
+    assert not rows["field"].counted
+    assert rows["field"].psf > 0.05
+    assert rows["sensor noise"].counted
+
+
+def test_fixation_alone_is_its_own_scatter():
+    """Told the truth, a person errs by the scatter of the gaze: two normal angles have a mean of sd sqrt(pi / 2).
+
+    Budget: calibration on 9 stimuli of the same scatter, 7 unknowns each: up to 30 %.
+    """
+    frames = replace(FRAMES, subjects=4, grid=(6, 5), fixation_deg=0.6)
+    subject, fixation = person(frames, Rig())
+    assert math.degrees(fixation.gaze_rad) == pytest.approx(0.6 * math.sqrt(math.pi / 2), rel=0.3)
+    assert 0 < math.degrees(subject.gaze_rad) < 1.5
+
+
+def test_a_goal_below_the_floor_is_refused_with_its_largest_link():
+    links = (Entry("subject and calibration", math.nan, math.nan, 3e-3, ""), Entry("fixation", 0, 0, 4e-3, ""))
+    with pytest.raises(ConfigError, match=r"0.286 deg, most of it fixation with 0.229 deg"):
+        floor.allowance_rad(4.9e-3, links)
+    assert floor.allowance_rad(13e-3, links) == pytest.approx(12e-3)
+
+
+def test_the_reader_of_another_lens_is_refused(source):
+    run = replace(source.run.settings, optics=replace(source.run.settings.optics, sensor_distance_mm=0.4))
+    kept, source.run.settings = source.run.settings, run
+    try:
+        with pytest.raises(LensError, match=r"0\.4 mm.*lens file"):
+            bench(m.small(), Given(run=source, frames=FRAMES))
+    finally:
+        source.run.settings = kept
+
+
+def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(source):
+    """NA 0.2: both polarisations change the PSF by about sin^2 / 4 = 1 %; the lattice adds the noise of its cells."""
+    lens, settings = m.small(), source.run.settings.optics
+    maps = Aperture(lens).maps(Aperture(lens).designed())
+    grid = formed.grid_of(settings, 56, 4)
+    made = device(gathered(lens, *maps), grid, layers=lens.layers, distance_um=lens.sensor_distance_um, tolerance=0.1)
+    smooth = made.image(wave=formed.wave_of(settings, torch.zeros(0)))
+    assert image_difference(made.whole, smooth) < 0.1
+    assert 1e-4 < image_difference(made.both_polarisations(), made.whole) < 0.03
+    assert image_difference(made.image(shift_um=20.0), made.whole) > 0.02
+    assert float(np.ptp(made.evenly_lit().energy.numpy())) == 0
