@@ -3,7 +3,8 @@
     python -m benchmarks hardness                                       # small: some minutes on two quiet cores
     python -m benchmarks.hardness --kills 40 --writers 10 --disks 20    # so many more of each: runs add up
     python -m benchmarks.hardness --kills 40 --verbs design scene       # of some commands alone
-    python -m benchmarks.hardness --mutations 1000000 --values --threads
+    python -m benchmarks.hardness --mutations 100000 --kinds tiff png   # more damaged files, of some kinds alone
+    python -m benchmarks.hardness --values --threads
 
 The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes; each is
 printed with what it needs to be had again. Trials of commands are numbered; those that failed are tried again first.
@@ -16,11 +17,19 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import Row, _hardness_commands, _hardness_files, _hardness_runs, _hardness_threads, _hardness_values
+from benchmarks import (
+    Row,
+    _hardness_commands,
+    _hardness_files,
+    _hardness_runs,
+    _hardness_samples,
+    _hardness_threads,
+    _hardness_values,
+)
 from benchmarks.__main__ import table
 from metalens.ground import store
 
@@ -89,12 +98,12 @@ def _of_trials(kind: str, by_verb: dict[str, Any]) -> Row:
     return _row(f"{count} {WORDS[kind]}", f"over {', '.join(sorted(by_verb))}", math.nan, failed, AGAINST[kind])
 
 
-def mutations(copies: int) -> Row:
-    """So many more damaged copies of every kind of file."""
+def mutations(copies: int, kinds: Sequence[str] = ()) -> Row:
+    """So many more damaged copies of every kind of file, or of those that are named."""
     begun = _tried().get("mutations", {})
     with tempfile.TemporaryDirectory() as name:
         start = time.perf_counter()
-        for found in _hardness_files.counted(Path(name), copies, begun=begun):
+        for found in _hardness_files.counted(Path(name), copies, kinds, begun):
             entry = begun.get(found.kind, {"done": 0, "refused": 0, "failed": {}})
             entry["refused"] += found.refused
             entry["done"] = max(entry["done"], found.last + 1)
@@ -165,11 +174,12 @@ def main() -> None:
         parser.add_argument(f"--{name}", action="store_true")
     parser.add_argument("--seconds", type=float, default=math.inf, help="no new trial of a command after so long")
     parser.add_argument("--verbs", nargs="*", choices=list(_hardness_commands.VERBS), default=())
+    parser.add_argument("--kinds", nargs="*", choices=sorted(_hardness_samples.READERS), default=())
     asked = parser.parse_args()
     found, trials = [], {kind: getattr(asked, kind) for kind in AGAINST}
     if any(trials.values()):
         found += runs(trials, tuple(asked.verbs) or tuple(_hardness_commands.VERBS), asked.seconds)
-    found += [mutations(asked.mutations)] if asked.mutations else []
+    found += [mutations(asked.mutations, asked.kinds)] if asked.mutations else []
     found += [bad_values()] if asked.values else []
     found += [threads()] if asked.threads else []
     print(table(found))

@@ -129,7 +129,7 @@ def _guarded(words: list[str], *, debug: bool) -> int:
             raise
         return _refuse(told_of)
     except KeyboardInterrupt as error:
-        return _refuse(_said(error, "interrupted; the output is as it was before"), 130)
+        return _refuse(_said(error, "interrupted; the output is as it was before, or new if it was finished"), 130)
     except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
         return _refuse(f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}")
     finally:

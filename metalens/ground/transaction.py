@@ -201,11 +201,15 @@ def _something(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _scratch(target: Path) -> Iterator[Path]:
-    scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
+    scratch = None
     try:
+        with lock.undisturbed():  # a signal that comes here is answered inside the block that clears up
+            scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
         yield scratch
     finally:
-        _recover(scratch, target)
+        with lock.undisturbed():
+            if scratch is not None:
+                _recover(scratch, target)
 
 
 def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Terms) -> None:
