@@ -110,3 +110,36 @@ def test_a_run_at_one_wavelength_is_planned():
     assert best.met
     assert best.choice.wavelength_count == 1
     assert 0 < best.predicted_rad < math.radians(0.1)
+
+
+def test_the_cost_of_a_run_is_a_library_its_stacks_its_images_and_its_mask():
+    """Unlike seconds for every knob: times of a stack multiply, relative to the pilot's; a goal that all meet."""
+    measured = _pilot()
+    seconds = {name: np.array([0.3 + k, 5.0 + 2 * k]) for k, name in enumerate(measured.levels)}
+    measured = Pilot(measured.levels, measured.errors, seconds, 1e-3, 5.0)
+    names = list(measured.levels)
+    places = np.array([[1, 0, 1, 0, 1, 0][: len(names)], [0, 1, 1, 1, 0, 1][: len(names)]])
+    got = plan._cost(measured, places, names, CONFIG)
+    for found, place in zip(got, places, strict=True):
+        cost = {n: seconds[n][i] for n, i in zip(names, place, strict=True)}
+        pilot = {
+            n: seconds[n][measured.levels[n].index(getattr(plan.PILOT, n))]
+            for n in ("wavelength_count", "psf_tolerance")
+        }
+        stack = cost["depth_count"] * cost["wavelength_count"] / pilot["wavelength_count"]
+        stack *= cost["psf_tolerance"] / pilot["psf_tolerance"]
+        want = cost["library_tolerance"] + 10 * stack + 100 * cost["kernel_tolerance"] + cost["diameter_step_nm"]
+        assert found == pytest.approx(want, rel=1e-12)
+
+
+def test_errors_count_over_both_angles_and_all_scenes():
+    """Vectors of all knobs added scene by scene, squared over both angles, averaged; and no less than apart."""
+    measured = _pilot()
+    rng = np.random.default_rng(2)
+    for name in measured.errors:
+        measured.errors[name][0] = rng.normal(0, 1e-3, (3, 2))
+    best = plan.choose(measured, 1.0, CONFIG)
+    total = sum(measured.errors[n][0] for n in measured.levels)
+    together = (total**2).sum(1).mean()
+    apart = sum((measured.errors[n][0] ** 2).sum(1).mean() for n in measured.levels)
+    assert best.predicted_rad == pytest.approx(math.sqrt(max(together, apart)), rel=1e-12)
