@@ -39,6 +39,9 @@ class LeftOut:
         return f"neighbours and angle: of {self.of or 'the default cell, rough'}"
 
 
+ROUGH = LeftOut()
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is not known.
@@ -107,7 +110,7 @@ def with_model(
     incidence_rad: float,
     has_angles: bool,
     ghost: float,
-    left_out: LeftOut,
+    left_out: LeftOut = ROUGH,
 ) -> Budget:
     """The budget with what the model of a lens leaves out.
 
