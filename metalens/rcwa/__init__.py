@@ -11,6 +11,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from metalens.rcwa import anchored as anchored
+    from metalens.rcwa.any_shape import SAFETY as SAFETY
     from metalens.rcwa.any_shape import Jones as Jones
     from metalens.rcwa.any_shape import jones as jones
     from metalens.rcwa.any_shape import most_harmonics as most_harmonics
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "SAFETY": "any_shape",
         "Jones": "any_shape",
         "anchored": "",
         "derivatives": "verbs",

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from metalens.rcwa.waves import Waves
 _FIRST = 3  # orders of the first truncation
 _LAST = {4: 15, 2: 10, 1: 7}  # by the number of operations: about a second a solve
 _COMPARED = 4
-_SAFETY = 3.0
+SAFETY = 3.0
 _ROUNDING = 1e-13
 _STRAIGHT = 1e-12
 _COARSE = 3  # orders that suffice to see what the collocation of a tilted wall leaves
@@ -37,6 +37,8 @@ class Jones:
     t_error: estimate of the largest |t - exact|, not below the true error; it serves for r as well.
     energy: (2,) power of all propagating orders, for each polarisation that comes.
     orders: harmonics of the finest truncation. converged, reason: whether the tolerance is met, and why it ended.
+    earlier: (k, 2, 2) t of the up to four truncations before. A number that follows from t has as error bar, like t
+        itself, ``SAFETY`` times its farthest change over them.
     """
 
     basis: tuple[str, str]
@@ -47,6 +49,7 @@ class Jones:
     orders: int
     converged: bool
     reason: str
+    earlier: Array = field(default_factory=lambda: np.empty((0, 2, 2), complex))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +123,8 @@ def jones(
     error = min(error, 2.0)
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    return dataclasses.replace(found, t_error=error, converged=met, reason=reason)
+    earlier = np.array(history[-1 - _COMPARED : -1]).reshape(-1, 2, 2)
+    return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
 
 
 def _light(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> _Light:
@@ -136,7 +140,7 @@ def _moved(history: list[Array]) -> float:
     """Error of the last truncation: three times the farthest of the four before it."""
     before = history[-1 - _COMPARED : -1]
     farthest = max((float(np.abs(history[-1] - t).max()) for t in before), default=1.0)
-    return _SAFETY * farthest + _ROUNDING
+    return SAFETY * farthest + _ROUNDING
 
 
 @dataclass(frozen=True, slots=True)

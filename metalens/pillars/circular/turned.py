@@ -8,6 +8,7 @@ solved, not guessed.
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from metalens.cell import Cell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
+from metalens.rcwa import SAFETY, jones
 
 STEPS = 3  # turns that are solved, evenly up to half the angle after which the lattice repeats
 
@@ -24,7 +26,8 @@ class Turned:
     """Solved cells of one pillar, turned in its lattice.
 
     size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one period of the lattice.
-    t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver.
+    t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver. earlier: (n, k, 2, 2) t of coarser
+    truncations: shares of the light have three times their farthest change over them as error bar.
     """
 
     size_um: float
@@ -32,24 +35,29 @@ class Turned:
     angle_rad: Array
     t: Array
     t_error: Array
+    earlier: Array
 
     def converted(self, hand: float) -> Array:
         """(n,) amplitude that leaves with the other hand, without the geometric phase; hand +1: x + iy comes."""
         return np.asarray(circular(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad))
 
+    def _share(self, of: Callable[["Turned"], float]) -> tuple[float, float]:
+        """A number that follows from t, and its error bar."""
+        here = of(self)
+        before = [of(dataclasses.replace(self, t=self.earlier[:, k])) for k in range(self.earlier.shape[1])]
+        return here, SAFETY * max((abs(value - here) for value in before), default=1.0)
+
     def efficiency(self, hand: float) -> tuple[float, float]:
         """Share of the light in the converted wave, averaged over all turns, and the error bar of it.
 
         |mean over the turns of the converted amplitude, its geometric phase taken off|²: what its spread over the turns
-        scatters is no part of it. The bar is that of the solver, 2 |t| e + e².
+        scatters is no part of it.
         """
-        mean, bar = abs(self.converted(hand).mean()), float(self.t_error.max())
-        return float(mean**2), 2 * mean * bar + bar**2
+        return self._share(lambda one: float(abs(one.converted(hand).mean()) ** 2))
 
     def unconverted(self, hand: float) -> tuple[float, float]:
         """Share of the light that keeps its hand, the mean over all turns, and its error bar."""
-        kept, bar = np.abs(circular(self.t, hand)[0]), float(self.t_error.max())
-        return float((kept**2).mean()), float(2 * kept.mean() * bar + bar**2)
+        return self._share(lambda one: float((np.abs(circular(one.t, hand)[0]) ** 2).mean()))
 
     @property
     def model_error(self) -> float:
@@ -59,13 +67,13 @@ class Turned:
     def to_arrays(self) -> dict[str, Array]:
         """Everything as arrays, for a store file."""
         at = np.array([self.size_um, self.wavelength_um])
-        return {"at": at, "angle_rad": self.angle_rad, "t": self.t, "t_error": self.t_error}
+        return {"at": at} | {name: getattr(self, name) for name in ("angle_rad", "t", "t_error", "earlier")}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Array]) -> "Turned":
         """Inverse of :meth:`to_arrays`."""
         size, wavelength = arrays["at"].tolist()
-        return cls(size, wavelength, arrays["angle_rad"], arrays["t"], arrays["t_error"])
+        return cls(size, wavelength, *(arrays[name] for name in ("angle_rad", "t", "t_error", "earlier")))
 
 
 def isolated(t_x: Array, t_y: Array, angle_rad: Array) -> Array:
@@ -115,8 +123,6 @@ def solve(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float)
     Raises:
         CellError: a shape that cannot be turned (see :func:`check`), or that meets its neighbours when turned.
     """
-    from metalens.rcwa import jones
-
     check(cell, size_um)
     period = period_rad(cell)
     angles = np.arange(STEPS + 1) / (2 * STEPS) * period
@@ -125,6 +131,7 @@ def solve(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float)
         shape = dataclasses.replace(cell.shape, angle_rad=angle)
         found.append(jones(dataclasses.replace(cell, shape=shape), size_um, wavelength_um, tolerance=tolerance))
     t, error = np.array([one.t for one in found]), np.array([one.t_error for one in found])
+    earlier = np.array([one.earlier for one in found])
     back = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
     return Turned(
         size_um,
@@ -132,4 +139,5 @@ def solve(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float)
         np.concatenate([angles, -angles[back]]),
         np.concatenate([t, mirrored(t[back])]),
         np.concatenate([error, error[back]]),
+        np.concatenate([earlier, mirrored(earlier[back])]),
     )

@@ -38,7 +38,8 @@ def folder(tmp_path_factory):
     t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
     proxy = Proxy(np.array([[np.angle(c), 0.0]]), np.array([[abs(c), 0.0]]), (0.2, 0.26), (0.94, 0.94), 0.0, 0.0)
     angles = np.radians([0, 15, 30, 45, -30, -15])
-    turned = Turned(0.23, 0.94, angles, isolated(T_X, T_Y, angles), np.full(6, 0.01))
+    solved = isolated(T_X, T_Y, angles)
+    turned = Turned(0.23, 0.94, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None])
     cell, sweep = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5)), library.Sweep((0.94,), light="circular")
     small = np.full(t.shape, 1e-3)
     about = (t, t * 0, small, small, np.empty((0, 5)), "rcwa", 1, proxy)

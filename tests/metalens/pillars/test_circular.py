@@ -57,14 +57,16 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     angle = np.array([0.0, 0.4, -0.4])
     t = isolated(0.9, -0.8, angle)
     t[1] = t[1] + 0.02 * np.array([[0, 1], [1, 0]])
-    found = Turned(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]))
+    before = np.stack([0.99 * t, 1.02 * t], axis=1)  # coarser truncations: their shares are 0.9801 and 1.0404 of it
+    found = Turned(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
     amplitude = [0.85, 0.85 + 0.02j * np.exp(-0.8j), 0.85]  # <R| (0 1; 1 0) |L> = i
     assert found.efficiency(1.0)[0] == pytest.approx(abs(np.mean(amplitude)) ** 2)
-    assert found.efficiency(1.0)[1] == pytest.approx(2 * abs(np.mean(amplitude)) * 0.02 + 0.02**2)
+    assert found.efficiency(1.0)[1] == pytest.approx(3 * 0.0404 * abs(np.mean(amplitude)) ** 2)
     assert found.unconverted(-1.0)[0] == pytest.approx(0.05**2)
     assert found.model_error == pytest.approx(0.02)
     again = Turned.from_arrays(found.to_arrays())
     assert (again.size_um, again.model_error) == (found.size_um, found.model_error)
+    assert again.efficiency(1.0) == found.efficiency(1.0)
 
 
 @pytest.mark.parametrize("shape", [Circle(), Square(), Cross(0.4), Rectangle(1.0), Rectangle(0.5, angle_rad=0.2)])
@@ -113,7 +115,7 @@ def test_its_proxy_is_that_of_the_converted_light(made, tmp_path):
     got = fitted.proxy.transmission(at, 0.74) * np.exp(1j * fitted.proxy.phase_rad(at, 0.74))
     assert np.abs(got - want).max() < 2e-4  # both tolerances
     assert high - low > 0.05
-    turned = Turned(size, 0.74, np.zeros(1), np.zeros((1, 2, 2), complex), np.ones(1))
+    turned = Turned(size, 0.74, np.zeros(1), np.zeros((1, 2, 2), complex), np.ones(1), np.zeros((1, 0, 2, 2)))
     library.save(tmp_path / "a.h5", dataclasses.replace(known, proxy=fitted.proxy, turned=turned))
     read = library.load(tmp_path / "a.h5")
     assert read.turned is not None
