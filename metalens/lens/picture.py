@@ -31,7 +31,8 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
     from matplotlib.colors import Normalize
 
     d = lens.diameters
-    field = mean_field(lens, max(1, -(-max(d.diameter_um.shape) // _PIXELS)))
+    least = 2 if d.lattice.centred else 1  # every other site of the map is none of the lattice
+    field = mean_field(lens, max(least, -(-max(d.diameter_um.shape) // _PIXELS)))
     colour = colormaps["twilight"](np.mod(np.angle(field), 2 * np.pi) / (2 * np.pi))
     colour[..., 3] = np.minimum(1, np.abs(field))
     edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
@@ -57,7 +58,7 @@ def mean_field(lens: Lens, sites: int) -> Array:
         band[: len(rows), : rows.shape[1]] = rows
         angle[: len(rows), : rows.shape[1]] = lens.geometric_rad(at)
         phase = lens.proxy.phase_rad(np.where(band > 0, band, lens.proxy.domain_um[0]), lens.wavelength_um)
-        field = np.where(band > 0, np.exp(1j * (phase + angle)), 0) * (2 if centred and sites > 1 else 1)
+        field = np.where(band > 0, np.exp(1j * (phase + angle)), 0) * (2 if centred else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean
 
