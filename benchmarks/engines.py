@@ -17,7 +17,7 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 from metalens.ground.errors import CellError
 
-COUNT, SEED = 200, 5077
+COUNT, SEED = 200, 6143  # the factors of RCWA at few orders were chosen on seed 5077
 TOLERANCES = (1e-2, 2e-2)  # of the modal method and of RCWA
 
 

@@ -65,9 +65,17 @@ class PillarWave:
     diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in.
 
     Light that single pillars scatter out of their cell's mean is lost to the image; it lands far outside the window.
+
+    Raises:
+        SceneError: another lattice than a square one, or turned pillars.
     """
 
     def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
+        if not lens.diameters.plain:
+            raise SceneError(
+                f"pillars on a {lens.diameters.lattice.kind} lattice{', turned one by one' if lens.hand else ''}: the "
+                "image of the whole field knows square lattices of pillars that are not turned (metalens.psf takes any)"
+            )
         self.lens = lens
         self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
         d = lens.diameters

@@ -56,7 +56,8 @@ def from_lens(
         left_out: of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough numbers.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`.
+        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``vector`` for a lens
+            of turned pillars (``auto`` takes the scalar there; its error is in the budget).
     """
     nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
@@ -107,6 +108,12 @@ def _budget(
 
 
 def _vectorial(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> bool:
+    if lens.hand:
+        if polarisation == "vector":
+            raise PropagationError(
+                "polarisation = 'vector' is for light along x and y; this lens is for circular light: take 'scalar'"
+            )
+        return False
     if polarisation == "auto":
         return scalar_error(aperture(lens, angle)) > tolerance
     return polarisation == "vector"

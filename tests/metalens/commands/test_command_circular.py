@@ -11,6 +11,7 @@ from metalens import library
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
+from metalens.ground.errors import PropagationError, SceneError
 from metalens.pillars import Proxy
 from metalens.pillars.circular import Turned, isolated
 
@@ -74,6 +75,17 @@ def test_the_image_is_that_of_the_converted_light(folder):
     stack = psf.from_lens(lens, psf.View((math.inf,), window_um=24.0, samples=121), tolerance=1e-3)
     given = np.count_nonzero(lens.diameters.diameter_um) * 0.41**2 * abs(T_X - T_Y) ** 2 / 4
     assert 0.94 < float(stack.energy_um2[0, 0]) / given < 1.0
+
+
+def test_vectors_and_the_image_of_the_field_are_refused_by_name(folder):
+    from metalens import psf
+    from metalens.field.waves import PillarWave
+
+    lens = lenses.load(folder / "right.h5")
+    with pytest.raises(PropagationError, match="circular light"):
+        psf.from_lens(lens, psf.View((math.inf,)), polarisation="vector")
+    with pytest.raises(SceneError, match="turned one by one"):
+        PillarWave(lens)
 
 
 def test_what_knows_only_fixed_pillars_refuses_the_lens(folder, capsys):

@@ -61,7 +61,7 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     found = Turned(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
     amplitude = [0.85, 0.85 + 0.02j * np.exp(-0.8j), 0.85]  # <R| (0 1; 1 0) |L> = i
     assert found.efficiency(1.0)[0] == pytest.approx(abs(np.mean(amplitude)) ** 2)
-    assert found.efficiency(1.0)[1] == pytest.approx(3 * 0.0404 * abs(np.mean(amplitude)) ** 2)
+    assert found.efficiency(1.0)[1] == pytest.approx(rcwa.SAFETY * 0.0404 * abs(np.mean(amplitude)) ** 2)
     assert found.unconverted(-1.0)[0] == pytest.approx(0.05**2)
     assert found.model_error == pytest.approx(0.02)
     again = Turned.from_arrays(found.to_arrays())
@@ -135,4 +135,4 @@ def test_s_and_p_of_an_unlike_cell_are_its_axes_at_normal_incidence():
     bar = made.t_error[:, 0, 0, 7].max() + own.t_error
     assert abs(made.t[0, 0, 0, 7] - own.t[1, 1]) <= bar  # s
     assert abs(made.t[1, 0, 0, 7] - own.t[0, 0]) <= bar  # p
-    assert abs(own.t[0, 0] - own.t[1, 1]) > 3 * bar  # they differ
+    assert abs(own.t[0, 0] - own.t[1, 1]) > 1.5 * bar  # they differ
