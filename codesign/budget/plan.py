@@ -72,8 +72,6 @@ class PlanConfig:
                 f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}: need 0.02 to 4 mm, "
                 "and 1 or more of both"
             )
-        if self.cell.lattice.kind != "square":
-            raise ConfigError(f"cell.lattice.kind = {self.cell.lattice.kind!r}: the budget knows square lattices")
 
     @property
     def focus(self) -> Focus:

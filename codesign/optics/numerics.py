@@ -57,10 +57,15 @@ class Aperture:
     """A lens as places in a table of diameters.
 
     diameter_um: (entries,) of the table. place: (y, x) into it, -1 where there is no pillar.
+
+    Raises:
+        LensError: another lattice than a square one, or turned pillars.
     """
 
     def __init__(self, lens: Lens) -> None:
         d = lens.diameters.diameter_um
+        if not lens.diameters.plain:
+            raise LensError(f"pillars on a {lens.diameters.lattice.kind} lattice: need a square one, none turned")
         built = d[d > 0]
         low, high = float(built.min()) - SLACK_UM, float(built.max()) + SLACK_UM
         self.lens = lens

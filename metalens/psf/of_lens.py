@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
 from metalens.psf.budget import Budget, LeftOut, scalar_error, with_model, worst
