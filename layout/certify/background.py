@@ -6,7 +6,9 @@ much. None of this is shared with the correction, whose doses it judges.
 """
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +16,8 @@ from layout.process import compiled
 from metalens.ground.arrays import Array
 
 _PIXELS = 4  # along the range of a wide Gaussian
-_CUT = 4.5  # ranges at which its kernel ends: exp(-20)
+_CUT = 4.0  # ranges at which its kernel ends: exp(-16)
+_THREADS = 2
 _REACH = 4.0  # ranges at which a neighbour no longer counts: exp(-16)
 
 
@@ -64,7 +67,9 @@ class Raster:
         kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / narrow)
         kernel *= 1 / (math.sqrt(math.pi * narrow) * self.pixel_um)
         out = np.empty_like(image)
-        _blur(image, kernel.astype(image.dtype), out)
+        edges = np.linspace(0, self.rows, _THREADS + 1).astype(int).tolist()
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(partial(_blur, image, kernel.astype(image.dtype), out), edges[:-1], edges[1:]))
         return out
 
     def take(self, x_um: Array, y_um: Array, image: Array) -> Array:
@@ -131,30 +136,34 @@ def _take(x: Array, y: Array, left: float, bottom: float, pixel: float, image: A
 
 
 @compiled
-def _blur(image: Array, kernel: Array, out: Array) -> None:
-    """Along the rows, then across them, a ring of blurred rows at a time; zero outside."""
+def _blur(image: Array, kernel: Array, out: Array, first: int, end: int) -> None:
+    """Rows ``first`` to ``end`` of ``out``: along the rows, then across a ring of blurred rows; zero outside."""
     rows, columns = image.shape
     taps = kernel.shape[0]
     reach = taps // 2
     ring = np.zeros((taps, columns), image.dtype)
-    for row in range(rows + reach):
+    padded = np.zeros(columns + 2 * reach, image.dtype)
+    for row in range(max(0, first - reach), min(rows, end) + reach):
         if row < rows:
+            padded[reach : reach + columns] = image[row]
             line = ring[row % taps]
             line[:] = 0
-            for k in range(taps):
-                shift = k - reach
-                low, high = max(0, -shift), min(columns, columns - shift)
-                weight = kernel[k]
-                for c in range(low, high):
-                    line[c] += weight * image[row, c + shift]
-        done = row - reach
-        if done >= 0:
-            target = out[done]
-            target[:] = 0
-            for other in range(max(0, done - reach), min(rows, done + reach + 1)):
-                weight, line = kernel[other - done + reach], ring[other % taps]
+            for k in range(0, taps - 2, 3):
+                one, two, three = kernel[k], kernel[k + 1], kernel[k + 2]
                 for c in range(columns):
-                    target[c] += weight * line[c]
+                    line[c] += one * padded[c + k] + two * padded[c + k + 1] + three * padded[c + k + 2]
+            for k in range(taps - taps % 3, taps):
+                for c in range(columns):
+                    line[c] += kernel[k] * padded[c + k]
+        done = row - reach
+        if done < first:
+            continue
+        target = out[done]
+        target[:] = 0
+        for other in range(max(0, done - reach), min(rows, done + reach + 1)):
+            weight, line = kernel[other - done + reach], ring[other % taps]
+            for c in range(columns):
+                target[c] += weight * line[c]
 
 
 @compiled

@@ -23,7 +23,7 @@ WIDE_UM = 2.0  # Gaussians from here on are summed on pixels
 _LEVELS = 256  # of the table of edges for each shape
 _MOST_PIXELS = 1 << 25  # that are kept of the whole mask; wider ones are made band by band
 _BAND = 1 << 20  # sites at once
-_SAMPLED = 16  # bands, for the densest place
+_SAMPLED = 16  # strips, for the densest place
 _SPOTS = 8  # along the range, of a polygon on pixels
 _THREADS = 2
 
@@ -182,15 +182,11 @@ class Simulation:
         return np.asarray(np.pi * raster.range_um**2 * raster.take(*place, image) - 1)  # less itself
 
     def _densest(self, alone: Wide) -> float:
-        """Neighbours at the densest place: of all pillars, or those of some bands, one in a thousand has more."""
-        bands = self._bands()
-        some = np.unique(np.linspace(0, len(bands) - 1, _SAMPLED).round().astype(int))
-        parts = [self.scene.places.part(*bands[k]) for k in some]
-        return float(
-            np.quantile(
-                np.concatenate([self._near(alone, bands[k], p[:2]) for k, p in zip(some, parts, strict=True)]), 0.999
-            )
-        )
+        """Neighbours at the densest place: of the pillars of some strips, one in a thousand has more."""
+        places = self.scene.places
+        some = np.unique(np.linspace(0, places.strips - 1, _SAMPLED).round().astype(int)).tolist()
+        near = [self._near(alone, (k, k + 1), places.part(k, k + 1)[:2]) for k in some]
+        return float(np.quantile(np.concatenate(near), 0.999))
 
     def _isolation(self, alone: Wide | None, strips: tuple[int, int], place: tuple[Array, Array]) -> Array | float:
         """How alone each pillar stands: what its neighbours lack of the densest place's."""

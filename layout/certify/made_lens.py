@@ -7,10 +7,13 @@ import numpy as np
 from layout.certify.certificate import Certificate
 from layout.certify.exposed import Band
 from layout.mask import MaskPlan
+from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
 from metalens.lens import DiameterMap, Lens
+
+_OFF = 0.01  # pitches that a pillar may stand off its site
 
 
 class MadeRows:
@@ -34,15 +37,12 @@ class MadeRows:
 
     def place(self, x_um: Array, y_um: Array, made_nm: Array, layer: Array) -> None:
         """As :meth:`take`, from arrays (n,)."""
-        lens, l = np.isin(layer, self._layers), self._lattice
-        column = (x_um[lens] / self._unit - l.x0) / l.pitch
-        row = (y_um[lens] / self._unit - l.y0) / l.pitch + l.rows - 1  # the map's first row is the lowest
-        i, j = np.rint(row).astype(np.int32), np.rint(column).astype(np.int32)
-        inside = (i >= 0) & (i < l.rows) & (j >= 0) & (j < l.columns)
-        off = max(np.abs(row - i).max(initial=0.0), np.abs(column - j).max(initial=0.0))
-        if not inside.all() or off > 0.01:
+        l = self._lattice
+        lens = np.zeros(1 << 16, bool)
+        lens[self._layers] = True
+        site = l.x0, l.y0, l.pitch, self._unit
+        if _fill(x_um, y_um, made_nm, layer, lens, *site, self._diameter_um):
             raise ProcessError("pillars of the written file do not stand on the lattice of the lens")
-        self._diameter_um[i, j] = made_nm[lens] * np.float32(nm)
 
     def lens(self, designed: Lens) -> Lens:
         """``designed`` with these diameters; profile ``as-written``.
@@ -68,3 +68,30 @@ def as_made(designed: Lens, plan: MaskPlan, found: Certificate) -> Lens:
     rows = MadeRows(plan)
     rows.place(found.x_um, found.y_um, found.made_nm, found.layer)
     return rows.lens(designed)
+
+
+@compiled
+def _fill(
+    x: Array,
+    y: Array,
+    made_nm: Array,
+    layer: Array,
+    lens: Array,
+    x0: int,
+    y0: int,
+    pitch: int,
+    unit: float,
+    diameter_um: Array,
+) -> int:
+    """Put diameters on their sites, the map's first row the lowest; number of pillars that stand on none."""
+    rows, columns, wrong = diameter_um.shape[0], diameter_um.shape[1], 0
+    for n in range(x.shape[0]):
+        if not lens[layer[n]]:
+            continue
+        column, row = (x[n] / unit - x0) / pitch, (y[n] / unit - y0) / pitch + rows - 1
+        i, j = int(np.rint(row)), int(np.rint(column))
+        if 0 <= i < rows and 0 <= j < columns and abs(row - i) <= _OFF and abs(column - j) <= _OFF:
+            diameter_um[i, j] = made_nm[n] * 1e-3
+        else:
+            wrong += 1
+    return wrong

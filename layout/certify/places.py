@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from layout.mask import Lattice
+from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 
@@ -138,21 +139,46 @@ class OnLattices:
 
     def part(self, first: int, end: int) -> tuple[Array, Array, Array]:
         """(n,) x, y and kind of the pillars of some strips."""
-        bottom, unit = self._ends[0], self.unit_nm * nm
+        bottom = self._ends[0]
         low, high = bottom + max(first, 0) * self.height, bottom + end * self.height
         found = [self._of(l, low, high) for l in self.lattices]
         x, y, kind = (np.concatenate([each[k] for each in found]) for k in range(3))
-        centre = self.centre_um[kind]
-        return x * unit + centre[:, 0], y * unit + centre[:, 1], kind
+        return x, y, kind
 
     def _of(self, lattice: Lattice, low: int, high: int) -> tuple[Array, Array, Array]:
-        """Pillars of a lattice with low <= y < high, by their sites."""
+        """Pillars of a lattice whose sites have low <= y < high."""
         top = max(0, math.floor((lattice.y0 - high) / lattice.pitch) + 1)
         end = min(lattice.rows, math.floor((lattice.y0 - low) / lattice.pitch) + 1)
         if end <= top:
-            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int32)
-        block = lattice.source(top, end)
-        kinds = self.kinds[block]
-        row, column = np.nonzero(kinds >= 0)
-        kind = kinds[row, column]
-        return lattice.x0 + column * lattice.pitch, lattice.y0 - (top + row) * lattice.pitch, kind
+            return np.empty(0), np.empty(0), np.empty(0, np.int32)
+        block, unit = np.ascontiguousarray(lattice.source(top, end)), self.unit_nm * nm
+        x, y, kind = np.empty(block.size), np.empty(block.size), np.empty(block.size, np.int32)
+        at = lattice.x0, lattice.y0 - top * lattice.pitch, lattice.pitch
+        count = _sites(block, self.kinds, self.centre_um, *at, unit, x, y, kind)
+        return x[:count], y[:count], kind[:count]
+
+
+@compiled
+def _sites(
+    block: Array,
+    kinds: Array,
+    centre: Array,
+    x0: int,
+    y0: int,
+    pitch: int,
+    unit: float,
+    x: Array,
+    y: Array,
+    kind: Array,
+) -> int:
+    """Places and kinds of the pillars of a block of rows; how many there are."""
+    count = 0
+    for row in range(block.shape[0]):
+        for column in range(block.shape[1]):
+            k = kinds[block[row, column]]
+            if k >= 0:
+                x[count] = (x0 + column * pitch) * unit + centre[k, 0]
+                y[count] = (y0 - row * pitch) * unit + centre[k, 1]
+                kind[count] = k
+                count += 1
+    return count
