@@ -79,28 +79,41 @@ class Raster:
         return out
 
 
-def reach_um(range_um: float) -> float:
-    """How far neighbours count through a narrow Gaussian, with room for their radii."""
-    return _REACH * (range_um + 1.0)
-
-
 def beside(at: tuple[Array, Array, Array, Array], around: tuple[Array, Array, Array, Array], range_um: float) -> Array:
     """(n,) exposure of each rim by the other shapes within four ranges; discs as Gaussians of their second moment.
 
     Args:
         at, around: x, y, mass and radius of those that are looked at, and of all near them, themselves too.
     """
-    bin_um = _REACH * range_um
-    left, bottom = around[0].min(), around[1].min()
-    column, row = ((v - low) // bin_um for v, low in ((around[0], left), (around[1], bottom)))
-    columns = int(column.max()) + 1
-    cell = (row * columns + column).astype(np.int64)
-    order = np.argsort(cell, kind="stable")
-    starts = np.searchsorted(cell[order], np.arange((int(row.max()) + 1) * columns + 1))
-    x, y, mass, radius = (v[order] for v in around)
+    bins = Bins.of(around[0], around[1], _REACH * range_um)
+    x, y, mass, radius = (v[bins.order] for v in around)
     out = np.zeros(len(at[0]))
-    _neighbours(*at, x, y, mass, radius, range_um, starts, columns, left, bottom, bin_um, out)
+    place = bins.columns, bins.left_um, bins.bottom_um, bins.side_um
+    _neighbours(*at, x, y, mass, radius, range_um, bins.starts, *place, out)
     return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Bins:
+    """Places sorted into squares: order (n,) and starts (squares + 1,), rows of ``columns`` squares from the bottom."""
+
+    order: Array
+    starts: Array
+    columns: int
+    left_um: float
+    bottom_um: float
+    side_um: float
+
+    @classmethod
+    def of(cls, x_um: Array, y_um: Array, side_um: float) -> "Bins":
+        """Squares of ``side_um`` around some places."""
+        left, bottom = float(x_um.min()), float(y_um.min())
+        column, row = (v // side_um for v in (x_um - left, y_um - bottom))
+        columns = int(column.max()) + 1
+        cell = (row * columns + column).astype(np.int64)
+        order = np.argsort(cell, kind="stable")
+        starts = np.searchsorted(cell[order], np.arange((int(row.max()) + 1) * columns + 1))
+        return cls(order, starts, columns, left, bottom, side_um)
 
 
 @compiled

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.certify import background, outlines
+from layout.certify import background, neighbours, outlines
 from layout.certify.background import Raster
 from layout.certify.gathered import Exposed
 from layout.certify.places import Places, strip_of
@@ -88,6 +88,7 @@ class Simulation:
     _alone: Wide | None = field(init=False, default=None)
     _full: float = field(init=False, default=0.0)
     _edges: "_EdgeTable" = field(init=False)
+    _pairs: dict[float, neighbours.Pairs] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         kinds, box = self.scene.kinds, self._box()
@@ -166,10 +167,20 @@ class Simulation:
             self.far_of_points[here] += weight * raster.take(points[:, 0], points[:, 1], image)
         for range_um, weight in self.terms:
             if 0.05 * float(kinds.size_um.max()) < range_um < WIDE_UM:
-                more = int(np.ceil(background.reach_um(range_um) / places.height_um))
-                around = places.part(strips[0] - more, strips[1] + more)
-                far += weight * background.beside(self._discs(pillars), self._discs(around), range_um)
+                far += weight * self._beside(strips, pillars, range_um)
         return far
+
+    def _beside(self, strips: tuple[int, int], pillars: tuple[Array, Array, Array], range_um: float) -> Array:
+        """(n,) exposure of each rim by its neighbours through a narrow Gaussian."""
+        places, size = self.scene.places, self.scene.kinds.size_um
+        reach = neighbours.reach_um(range_um, float(size.max()))
+        more = int(np.ceil(reach / places.height_um))
+        around = places.part(strips[0] - more, strips[1] + more)
+        if range_um > neighbours.WIDER * float(size.max()):
+            return background.beside(self._discs(pillars), self._discs(around), range_um)
+        if range_um not in self._pairs:
+            self._pairs[range_um] = neighbours.Pairs.of(size / 2, range_um)
+        return self._pairs[range_um](self._discs(pillars), self._discs(around))
 
     def _discs(self, pillars: tuple[Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         x, y, kind = pillars

@@ -93,12 +93,18 @@ class Job:
         found += [f"{name} does not read back as planned" for name, outcome in self.compared.items() if not outcome.ok]
         if self.process.exposure.corrected and self.options.dose:
             found += [
-                f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm"
+                f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm{self._too_few}"
                 for name, c in self.certified.items()
                 if not c.ok
             ]
         broken = ", ".join(f"{count} {rule}" for rule, count in self.drc.counts.items() if count)
         return found + ([f"design rules broken: {broken}"] if broken else [])
+
+    @property
+    def _too_few(self) -> str:
+        """That the writer holds fewer doses than the tolerance needs; empty where it holds enough."""
+        needed, most = 0 if self.made.dose is None else self.made.dose.needed, self.process.exposure.maximum_classes
+        return f" ({needed} doses are needed, exposure.maximum_classes = {most})" if needed > most else ""
 
     @property
     def sheet(self) -> str:

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.dose.bodies import NONE, Body, Ranges, Rects, Table
-from layout.dose.exposure import CLEARS
+from layout.dose.exposure import CLEARS, PointExposure
 from layout.dose.nodes import Convolution, Grid, spread
 from layout.dose.uniformity import Tally, Uniformity
 from layout.process import Exposure, compiled
 from metalens.ground.arrays import Array
 
 _NOTHING = np.zeros((0, 0), np.float32)
+_ROUNDED = 0.75  # of the tolerance, for doses rounded to classes
+_SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -89,35 +91,47 @@ class Assigned:
 def ladder(fields: Fields, settings: Exposure) -> tuple[Ladder, int]:
     """The doses, and how many the tolerance needs.
 
-    A fifth of it is left for the background of rounded doses and for what changes across a piece of a mark.
+    A quarter of it is left for the background of rounded doses and for what changes across a piece of a mark. Where the
+    edge is so soft that the tolerance moves it by more than a nanometre of width, as much finer steps are taken.
     """
-    span = np.array([np.inf, 0.0, 0.0])  # least and most dose, largest share of the own exposure
-    t = fields.table
+    span = np.array([np.inf, 0.0, 0.0])  # least and most dose, largest log step that is the other way round
+    t, most = fields.table, settings.tolerance
     for number, body in enumerate(fields.bodies):
         for first, block in body.blocks():
-            _span(block, fields.at(fields.far, number, first, len(block), fields.near), t.own, CLEARS * t.goal, span)
+            field = fields.at(fields.far, number, first, len(block), fields.near)
+            _span(block, field, t.own, CLEARS * t.goal, _SOFTEST_UM * t.slope / 2, most, span)
     if len(fields.own):
-        left = CLEARS * fields.rects.goal - fields.of_rects(fields.far)
+        goal = CLEARS * fields.rects.goal
+        left = goal - fields.of_rects(fields.far)
         dose = left / fields.own
-        shared = float((left / (CLEARS * fields.rects.goal)).max())
-        span = np.array([min(span[0], dose.min()), max(span[1], dose.max()), max(span[2], shared)])
-    least, most, share = span.tolist()
-    allowed = np.log1p(0.8 * settings.tolerance / share)
-    needed = max(1, int(np.ceil(np.log(most / least) / (2 * allowed) - 1e-9)))
+        rise = fields.ranges.near if len(fields.ranges.near.widths_um) else fields.ranges.middle
+        allowed = np.minimum(most, straight_edge_error(rise) * dose / fields.rects.goal)
+        span = np.array(
+            [min(span[0], dose.min()), max(span[1], dose.max()), max(span[2], (left / goal / allowed).max())]
+        )
+    least, most_dose, share = span.tolist()
+    needed = max(1, int(np.ceil(np.log(most_dose / least) / (2 * np.log1p(_ROUNDED / share)) - 1e-9)))
     count = min(needed, settings.maximum_classes)
-    return Ladder(least * (most / least) ** ((np.arange(count) + 0.5) / count)), needed
+    return Ladder(least * (most_dose / least) ** ((np.arange(count) + 0.5) / count)), needed
+
+
+def straight_edge_error(point: PointExposure) -> float:
+    """Relative error of the exposure that moves both edges of a line of dose 1 by what rounded doses may."""
+    steep = float((point.weights / point.widths_um).sum()) / np.sqrt(np.pi)
+    return float(_SOFTEST_UM * steep / 2 / CLEARS)
 
 
 @compiled
-def _span(block: Array, field: Array, own: Array, goal: Array, span: Array) -> None:
+def _span(block: Array, field: Array, own: Array, goal: Array, soft: Array, most: float, span: Array) -> None:
     for row in range(block.shape[0]):
         for column in range(block.shape[1]):
             k = block[row, column]
             if k:
                 left = goal[k] - field[row, column]
-                span[0] = min(span[0], left / own[k])
-                span[1] = max(span[1], left / own[k])
-                span[2] = max(span[2], left / goal[k])
+                dose = left / own[k]
+                span[0] = min(span[0], dose)
+                span[1] = max(span[1], dose)
+                span[2] = max(span[2], left / goal[k] / min(most, soft[k] * dose / goal[k]))
 
 
 def classes(fields: Fields, number: int, first: int, block: Array, steps: Ladder) -> Array:

@@ -17,6 +17,7 @@ from layout.dose.assign import Ladder
 from layout.dose.bodies import Body, Ranges, Rects, Table
 from layout.dose.exposure import CLEARS, PointExposure
 from layout.dose.nodes import Convolution, Grid, convolution, gather, spread
+from layout.dose.pieces import cut as cut_pieces
 from layout.dose.sampled import sampled_error
 from layout.dose.uniformity import Uniformity
 from layout.process import Exposure, Process
@@ -26,7 +27,6 @@ from metalens.lens import DiameterMap
 
 _UNIT_UM = 1e-4  # resolution of the diameters in the table
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
-_PIECES = 16  # of a rectangle, along the narrowest far Gaussian
 _SPOTS = 10  # of a piece on the nodes, along the same
 
 
@@ -92,7 +92,7 @@ def solve(
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
         diameter_um, goal: (entries,) of the table, entry 0 for none.
-        cut: rectangles, none with a side beyond a sixteenth of the narrowest far Gaussian (:func:`piece_um`).
+        cut: rectangles along whose outer sides the background hardly changes (:func:`pieces`).
 
     Raises:
         ProcessError: as :func:`correct`.
@@ -162,10 +162,16 @@ def refuse_negative(process: Process) -> None:
         )
 
 
-def piece_um(settings: Exposure) -> float:
-    """Largest side of a rectangle that may have one dose."""
-    widths = exposure.point_exposure(settings).widths_um
-    return float(widths[widths > 1.0].min(initial=np.inf)) / _PIECES
+def pieces(boxes: Array, parts: Sequence[Body], settings: Exposure, *, step_um: float) -> tuple[Array, Array]:
+    """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and (m,) the box of each.
+
+    Raises:
+        ProcessError: too many pieces.
+    """
+    around = np.array([body.box_um for body in parts])
+    point = exposure.point_exposure(settings)
+    most = min(settings.tolerance, assign.straight_edge_error(point))
+    return cut_pieces(boxes, around, step_um=step_um, point=point, tolerance=most)
 
 
 def _box(parts: Sequence[Body], cut: Rects) -> tuple[float, float, float, float]:
@@ -181,17 +187,13 @@ def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> 
         np.r_[ranges.near.widths_um, ranges.middle.widths_um], np.r_[ranges.near.weights, ranges.middle.weights]
     )
     own, points, piece = rects.own(cut, beside)
-    spots, area, of = rects.samples(cut, width / _SPOTS)
+    pads = _Pads(cut, own, (points, piece), rects.samples(cut, width / _SPOTS), grid)
     plain, wanted, goal = _masses(parts, drawn, grid)
-    if len(spots):
-        per_own = area / own[of]
-        plain += grid.deposit(spots[:, 0], spots[:, 1], area)
-        wanted += grid.deposit(spots[:, 0], spots[:, 1], per_own)
-        goal += grid.deposit(spots[:, 0], spots[:, 1], per_own * cut.goal[of])
+    plain += pads.deposited(np.ones(len(own)))
     reach = convolution(grid.shape, grid.x.spacing_um, point=ranges.far, hollow=False)
     middles = [_middle(body, ranges) for body in parts] if len(ranges.middle.widths_um) else []
     alone = [_times(body, drawn.area_um2, middle) for body, middle in zip(parts, middles, strict=False)]
-    field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles)
+    field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles, pads)
     return assign.Fields(
         parts,
         drawn,
@@ -207,8 +209,37 @@ def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> 
         own,
         points,
         piece,
-        (spots, area, of),
+        pads.spots,
     )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Pads:
+    """Pieces of marks as masses on the nodes; the dose of each is the one that its outer edges need.
+
+    own: (pieces,) exposure by its shape at unit dose; edges: points (n, 2), and the piece of each; spots: points,
+    areas and pieces that stand for them.
+    """
+
+    rects: Rects
+    own: Array
+    edges: tuple[Array, Array]
+    spots: tuple[Array, Array, Array]
+    grid: Grid
+
+    def deposited(self, dose: Array) -> Array:
+        """(y, x) masses of doses (pieces,)."""
+        points, area, of = self.spots
+        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[of])
+
+    def wanted(self, field: Array) -> Array:
+        """(y, x) masses of the doses that a background (y, x) asks for."""
+        if not len(self.own):
+            return np.zeros(self.grid.shape)
+        points, piece = self.edges
+        number = np.bincount(piece, minlength=len(self.own))
+        around = np.bincount(piece, self.grid.sample(field, *points.T), minlength=len(self.own)) / number
+        return self.deposited((CLEARS * self.rects.goal - around) / self.own)
 
 
 def _masses(parts: Sequence[Body], drawn: Table, grid: Grid) -> tuple[Array, Array, Array]:
@@ -248,10 +279,11 @@ def _backgrounds(
     reach: Convolution,
     masses: tuple[Array, Array],
     middles: Sequence[Convolution],
+    pads: _Pads,
 ) -> tuple[Array, list[Array]]:
     """Far field on the nodes and middle field on the sites that belong to the wanted doses, in turn until they rest."""
     wanted, goal = masses
-    field = _relaxed(reach, wanted, CLEARS * goal)
+    field = _relaxed(reach, wanted, CLEARS * goal, pads=pads)
     near: list[Array] = []
     per_own = np.divide(drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used)
     for _ in range(12 if middles else 0):
@@ -268,20 +300,26 @@ def _backgrounds(
             rows, columns = np.nonzero(index)
             x, y = body.columns_um[columns], body.rows_um(0, body.rows)[rows]
             taken += grid.deposit(x, y, (own * mass)[rows, columns])
-        before, field = field, _relaxed(reach, wanted, CLEARS * goal - taken)
+        before, field = field, _relaxed(reach, wanted, CLEARS * goal - taken, pads=pads)
         if np.abs(field - before).max() < 1e-7:
             break
     return field, near
 
 
-def _relaxed(reach: Convolution, mass: Array, drive: Array, *, bound_below: float = 0.0) -> Array:
-    """B = K * [drive - B mass], to 1e-8; eigenvalues of K * mass lie between -bound_below and the largest row sum."""
-    bound = float(reach(mass).max())
+def _relaxed(
+    reach: Convolution, mass: Array, drive: Array, *, bound_below: float = 0.0, pads: _Pads | None = None
+) -> Array:
+    """B = K * [drive - B mass + pads(B)], to 1e-8; eigenvalues of K * mass lie between -bound_below and the largest
+    row sum.
+    """
+    all_mass = mass if pads is None else mass + pads.deposited(1 / pads.own)
+    bound = float(reach(all_mass).max())
     step = 2 / (2 + bound - bound_below)
     rate = max(1 - step * (1 - bound_below), step * (1 + bound) - 1, 1e-3)
     field = np.zeros_like(mass)
     for _ in range(int(np.ceil(np.log(1e-8) / np.log(rate)))):
-        change = reach(drive - field * mass) - field
+        given = drive - field * mass
+        change = reach(given if pads is None else given + pads.wanted(field)) - field
         field += step * change
         if np.abs(change).max() < 1e-9:
             break

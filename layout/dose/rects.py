@@ -1,14 +1,14 @@
 """Exposure by rectangles: marks, labels, verniers and boxes, cut into pieces small enough for one dose each."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from layout.dose.bodies import Rects
 from layout.dose.exposure import PointExposure
+from layout.process import compiled
 from metalens.ground.arrays import Array
 
 _OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
+_AT_ONCE = 1_000_000  # pairs
 _CORNER = 4.0  # widths of the core: edges that short are round
 
 
@@ -19,60 +19,106 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
         (pieces,) mean exposure of the outer edges of each piece by its whole group at unit dose (an inner piece: of
         its middle, less half), and the points (n, 2) of the outer edges with (n,) the piece of each.
     """
-    exposure = np.zeros(len(rects.box_um))
-    points: list[Array] = []
-    piece: list[int] = []
-    corner_um = _CORNER * float(near.widths_um.min(initial=0.0))
-    for group in np.unique(rects.group):
-        members = np.flatnonzero(rects.group == group)
-        around = _around(rects.box_um[members], near)
-        for n, box, beside in zip(members.tolist(), rects.box_um[members], around, strict=True):
-            boxes = rects.box_um[members[beside]]
-            edge = _outer(box, boxes, corner_um)
-            inside = not len(edge)
-            at = np.array([[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]) if inside else edge
-            exposure[n] = of_boxes(at, boxes, near).mean() / (2 if inside else 1)
-            points.extend(at)
-            piece.extend([n] * len(at))
-    return exposure, np.array(points).reshape(-1, 2), np.array(piece, np.int64)
+    boxes, count = rects.box_um, len(rects.box_um)
+    if not count:
+        return np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
+    one, two = pairs_near(boxes, boxes, near)
+    same = rects.group[one] == rects.group[two]
+    one, two = one[same], two[same]
+    starts = np.searchsorted(one, np.arange(count + 1))
+    points, piece = _outer(boxes, starts, two, _CORNER * float(near.widths_um.min(initial=0.0)))
+    inner = np.bincount(piece, minlength=count) == 0
+    at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
+    of = np.concatenate([piece, np.flatnonzero(inner)])
+    total = np.bincount(of, sums_of_boxes(at, of, boxes, (one, two), near), minlength=count)
+    exposure = total / np.bincount(of, minlength=count)
+    return np.where(inner, exposure / 2, exposure), at, of
 
 
-def _around(boxes: Array, near: PointExposure) -> list[list[int]]:
-    """For each box, those that touch it or lie within six widths (exp(-36)) of it."""
+def pairs_near(some: Array, boxes: Array, point: PointExposure) -> tuple[Array, Array]:
+    """Pairs (row of ``some``, row of ``boxes``), sorted, that touch or lie within six widths (exp(-36))."""
     from scipy.spatial import cKDTree
 
-    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
-    across = float(np.hypot(*(boxes[:, 2:] - boxes[:, :2]).T).max())
-    reach = across + 6 * float(near.widths_um.max(initial=0.0)) + _OUTSIDE_UM
-    return list(cKDTree(middle).query_ball_point(middle, reach))
+    middles, halves = zip(*(((b[:, :2] + b[:, 2:]) / 2, (b[:, 2:] - b[:, :2]) / 2) for b in (some, boxes)), strict=True)
+    apart = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
+    size = np.frexp(np.hypot(*halves[1].T))[1]  # boxes of like size together, so that a long one pairs only itself
+    ones, twos = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for level in np.unique(size).tolist():
+        members = np.flatnonzero(size == level)
+        far = np.hypot(*halves[0].T) + np.hypot(*halves[1][members].T).max() + apart
+        found = cKDTree(middles[1][members]).query_ball_point(middles[0], far)
+        one, two = (
+            np.repeat(np.arange(len(some)), [len(f) for f in found]),
+            np.concatenate([*found, []]).astype(np.int64),
+        )
+        kept = (
+            np.abs(middles[0][one] - middles[1][members[two]]) <= halves[0][one] + halves[1][members[two]] + apart
+        ).all(1)
+        ones.append(one[kept])
+        twos.append(members[two[kept]])
+    one, two = np.concatenate(ones), np.concatenate(twos)
+    order = np.lexsort((two, one))
+    return one[order], two[order]
 
 
-def _outer(box: Array, boxes: Array, least_um: float) -> Array:
-    """Middles of those parts of the sides of a piece that no other piece of the shape covers.
+def sums_of_boxes(at_um: Array, row: Array, boxes_um: Array, pairs: tuple[Array, Array], point: PointExposure) -> Array:
+    """(n,) exposure at points by those boxes of unit dose that ``pairs`` (sorted) hold for the row of each point."""
+    from scipy.special import erf
 
-    Parts up to ``least_um`` long, which lie in a corner, are left out.
+    one, two = pairs
+    first, last = np.searchsorted(one, row), np.searchsorted(one, row, side="right")
+    total = np.zeros(len(at_um))
+    for part in np.array_split(np.arange(len(at_um)), max(1, int((last - first).sum()) // _AT_ONCE)):
+        count = (last - first)[part]
+        n = np.repeat(part, count)
+        box = boxes_um[
+            two[np.arange(len(n)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first[part], count)]
+        ]
+        value = np.zeros(len(n))
+        for width, weight in zip(point.widths_um.tolist(), point.weights.tolist(), strict=True):
+            x, y = (
+                (erf((box[:, k + 2] - at_um[n, k]) / width) - erf((box[:, k] - at_um[n, k]) / width)) / 2
+                for k in (0, 1)
+            )
+            value += weight * x * y
+        total += np.bincount(n, value, minlength=len(total))
+    return total
+
+
+def _outer(boxes: Array, starts: Array, near: Array, least_um: float) -> tuple[Array, Array]:
+    """Middles (n, 2) of those parts of the sides of each piece that no other piece of its shape covers, and the piece.
+
+    near: numbers of the pieces around each, from ``starts`` on. Parts up to ``least_um`` long, in a corner, are left
+    out.
     """
-    found: list[tuple[float, float]] = []
-    for across in (0, 1):
-        low, high = float(box[1 - across]), float(box[3 - across])
-        for at, step in ((float(box[across]), -_OUTSIDE_UM), (float(box[across + 2]), _OUTSIDE_UM)):
-            beyond = boxes[(boxes[:, across] <= at + step) & (boxes[:, across + 2] >= at + step)]
-            for start, end in _free(low, high, beyond[:, [1 - across, 3 - across]]):
-                if end - start > least_um:
-                    along = (start + end) / 2
-                    found.append((along, at) if across else (at, along))
-    return np.array(found).reshape(-1, 2)
+    room = 4 * (len(near) + len(boxes))
+    points, piece = np.empty((room, 2)), np.empty(room, np.int64)
+    count = _free(boxes, starts, near, least_um, _OUTSIDE_UM, points, piece)
+    return points[:count].copy(), piece[:count].copy()
 
 
-def _free(low: float, high: float, covered: Array) -> Iterator[tuple[float, float]]:
-    """Parts of an interval that none of some others (n, 2) covers."""
-    for start, end in sorted(covered.tolist()):
-        if start > low:
-            yield low, min(start, high)
-        low = max(low, end)
-        if low >= high:
-            return
-    yield low, high
+@compiled
+def _free(boxes: Array, starts: Array, near: Array, least: float, step: float, points: Array, piece: Array) -> int:
+    """Fill in the free parts of all sides; how many there are."""
+    count = 0
+    for n in range(boxes.shape[0]):
+        beside = boxes[near[starts[n] : starts[n + 1]]]
+        for side in range(4):  # left, bottom, right, top
+            across, along = side % 2, 1 - side % 2
+            at = boxes[n, side]
+            outside = at - step if side < 2 else at + step
+            over = beside[(beside[:, across] <= outside) & (beside[:, across + 2] >= outside)]
+            over = over[np.argsort(over[:, along])]
+            low, high = boxes[n, along], boxes[n, along + 2]
+            for k in range(over.shape[0] + 1):
+                end = over[k, along] if k < over.shape[0] else high
+                if low < high and min(end, high) - low > least:
+                    points[count, along], points[count, across] = (low + min(end, high)) / 2, at
+                    piece[count] = n
+                    count += 1
+                if k < over.shape[0]:
+                    low = max(low, over[k, along + 2])
+    return count
 
 
 def of_boxes(points_um: Array, boxes_um: Array, point: PointExposure) -> Array:
@@ -89,24 +135,12 @@ def of_boxes(points_um: Array, boxes_um: Array, point: PointExposure) -> Array:
     return total
 
 
-def _cut(box: Array, side_um: float) -> Array:
-    xs, ys = (
-        np.linspace(low, high, max(1, int(np.ceil((high - low) / side_um - 1e-9))) + 1)
-        for low, high in ((box[0], box[2]), (box[1], box[3]))
-    )
-    left, bottom = (v.ravel() for v in np.meshgrid(xs[:-1], ys[:-1]))
-    right, top = (v.ravel() for v in np.meshgrid(xs[1:], ys[1:]))
-    return np.stack([left, bottom, right, top], -1)
-
-
 def samples(rects: Rects, step_um: float) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the rectangle of each (n,)."""
-    if not len(rects.box_um):
-        return np.empty((0, 2)), np.empty(0), np.empty(0, np.int64)
-    sides = rects.box_um[:, 2:] - rects.box_um[:, :2]
-    small = (sides.max(1) <= step_um * (1 + 1e-9)).tolist()
-    parts = [box[None] if one else _cut(box, step_um) for box, one in zip(rects.box_um, small, strict=True)]
-    cut = np.concatenate(parts)
-    middle = (cut[:, :2] + cut[:, 2:]) / 2
-    area = (cut[:, 2] - cut[:, 0]) * (cut[:, 3] - cut[:, 1])
-    return middle, area, np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+    box = rects.box_um
+    counts = np.maximum(np.ceil((box[:, 2:] - box[:, :2]) / step_um - 1e-9), 1).astype(np.int64)
+    of = np.repeat(np.arange(len(box)), counts.prod(1))
+    within = np.arange(len(of)) - np.repeat(np.cumsum(counts.prod(1)) - counts.prod(1), counts.prod(1))
+    cell = np.stack([within % counts[of, 0], within // counts[of, 0]], -1)
+    side = (box[:, 2:] - box[:, :2]) / counts
+    return box[of, :2] + (cell + 0.5) * side[of], side.prod(1)[of], of

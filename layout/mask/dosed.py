@@ -1,7 +1,7 @@
 """A mask with its doses: everything that is exposed together is corrected together, a datatype for each dose."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
     parts = [Body(l.rows, l.columns, l.pitch * unit, l.x0 * unit, l.y0 * unit, l.source) for l in plan.lattices]
     diameters = np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
     goals = np.array([1.0, *(made.goal for made in plan.classes)])
-    boxes, of, group = _pieces(plan, process)
+    boxes, of, group = _pieces(plan, parts, process)
     cut = Rects(boxes * unit, group, np.ones(len(boxes)))
     found = dose.solve(parts, diameters, goals, process.exposure, cut=cut)
     classes, lookup, names = _classes(plan, found, process)
@@ -71,23 +71,23 @@ def title(kind: str, level: float) -> str:
     return f"{kind}_dose_{level:.4f}"
 
 
-def _pieces(plan: MaskPlan, process: Process) -> tuple[Array, Array, Array]:
+def _pieces(plan: MaskPlan, parts: Sequence[Body], process: Process) -> tuple[Array, Array, Array]:
     """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer number, (n,) shape."""
-    side = dose.piece_um(process.exposure) / (plan.unit_nm * nm)
-    boxes, of, group = [np.empty((0, 4), np.int64)], [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
+    whole, of, group = [np.empty((0, 4), np.int64)], [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     shapes = 0
     for f, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:
             continue
         for m, polygons in enumerate(figure.polygons.values()):
-            whole = np.concatenate([rectilinear.rectangles(p) for p in polygons])
-            made, box = rectilinear.cut(whole, side, plan.grid)
-            boxes.append(made)
-            of.append(np.tile([f, m], (len(made), 1)))
-            near = _touching(whole)
-            group.append(shapes + near[box])
-            shapes += int(near.max()) + 1
-    return np.concatenate(boxes), np.concatenate(of), np.concatenate(group)
+            boxes = np.concatenate([rectilinear.rectangles(p) for p in polygons])
+            whole.append(boxes)
+            of.append(np.tile([f, m], (len(boxes), 1)))
+            group.append(shapes + _touching(boxes))
+            shapes = int(group[-1].max()) + 1
+    every = np.concatenate(whole)
+    step_um = plan.grid * plan.unit_nm * nm
+    made, box = dose.pieces(every // plan.grid, parts, process.exposure, step_um=step_um)
+    return made * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
 
 
 def _touching(boxes: Array) -> Array:

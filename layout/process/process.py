@@ -137,7 +137,8 @@ class Exposure:
     gamma_um, nu: a third Gaussian between them (range, ratio of its energy to the forward one), where you have it.
     csv: a measured radial point-exposure function instead (radius in um, energy density in any unit).
     tolerance: largest relative exposure error at a pillar's edge that the dose classes may leave.
-    maximum_classes: how many doses the writer can hold in one job.
+    maximum_classes: how many doses the writer can hold in one job, at most 255; no more than the tolerance needs are
+        used.
     correct: whether the mask carries corrected doses (a datatype each) or a single one; left out: where a point
         exposure is given.
     """
@@ -150,7 +151,7 @@ class Exposure:
     nu: float = 0.0
     csv: Path | None = None
     tolerance: float = 0.01
-    maximum_classes: int = 64
+    maximum_classes: int = 255
     correct: bool | None = None
 
     def __post_init__(self) -> None:

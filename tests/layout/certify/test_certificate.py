@@ -41,9 +41,12 @@ def written(process, furnished=True):
         return plan, layout.read_oasis(Path(folder) / "m.oas"), doses.read(Path(folder) / "doses.csv")
 
 
-@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
+@pytest.mark.parametrize(
+    "third",
+    [{}, {"gamma_um": 0.45, "nu": 0.12}, {"alpha_um": 0.055}, {"alpha_um": 0.03, "gamma_um": 0.16, "nu": 0.3}],
+)
 def test_exposures_are_those_of_the_direct_sum(third):
-    process = Process(exposure=Exposure(**BEAM, **third, correct=False))
+    process = Process(exposure=Exposure(**{**BEAM, **third}, correct=False))
     _, content, table = written(process, furnished=False)
     found = certify(content, table, process)
     centres = np.stack([found.x_um, found.y_um], -1)
@@ -96,6 +99,26 @@ def test_the_edges_of_marks_and_labels_are_judged(third):
     assert wrong.edges.shift_nm[wrong.edges.layer == 4].min() < -0.3
 
 
+@pytest.mark.parametrize(
+    ("alpha_um", "beta_um", "eta"),
+    [
+        (0.0503, 33.42, 0.2),  # a soft core: 1 nm asks for more than 1 %
+        pytest.param(0.01, 12.0, 1.2, marks=pytest.mark.slow),  # more classes than 64
+        # drawn at random between 4 and 60 nm, 2.5 and 60 um, 0.2 and 1.5
+        pytest.param(0.0224, 5.89, 0.25, marks=pytest.mark.slow),
+        pytest.param(0.0042, 33.15, 1.39, marks=pytest.mark.slow),
+        pytest.param(0.0207, 25.4, 0.91, marks=pytest.mark.slow),
+        pytest.param(0.009, 9.58, 0.24, marks=pytest.mark.slow),
+    ],
+)
+def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_needs(alpha_um, beta_um, eta):
+    process = Process(exposure=Exposure(alpha_um=float(alpha_um), beta_um=float(beta_um), eta=float(eta)))
+    plan, content, table = written(process)
+    found = survey(content, plan, table, process)
+    assert found.ok, (found.worst_exposure, found.worst_nm)
+    assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 30_000
+
+
 @pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
 def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(third, monkeypatch):
     process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
@@ -110,7 +133,8 @@ def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(th
     assert bands.edges.exposure == pytest.approx(whole.edges.exposure, rel=1e-5)
     assert bands.tally.bins.sum() == whole.tally.bins.sum()
     assert bands.worst_nm == pytest.approx(whole.worst_nm, rel=1e-4)
-    assert np.nansum(bands.map_nm) == pytest.approx(np.nansum(whole.map_nm), rel=1e-3)
+    off = np.abs(bands.map_nm - whole.map_nm)[np.isfinite(whole.map_nm)]
+    assert off.max() < 1e-3  # nm: float32 diameters of 300 nm, and 1e-5 of the exposure
 
 
 def test_without_a_point_exposure_nothing_is_certified():

@@ -1,0 +1,122 @@
+"""Rectangles of marks and labels cut into pieces of one dose each: short where the background changes, long elsewhere.
+
+The background along a straight edge changes next to its ends and next to other shapes only, over a range of the
+Gaussian; so the number of pieces goes with the number of corners, and not with area over range squared.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.dose.exposure import CLEARS, PointExposure
+from layout.dose.rects import pairs_near, sums_of_boxes
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+MOST_PIECES = 500_000
+_SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
+_SHORTEST = 64  # pieces along the range, at most
+_LONGEST = 4.0  # ranges: of a piece at first
+_BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
+_FEW = 3.0  # ranges at which a lens no longer counts
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Pieces:
+    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these sides the box has of its shape.
+
+    of: (n,) the box it was cut from.
+    """
+
+    box: Array
+    outer: Array
+    of: Array
+
+    def some(self, which: Array) -> "_Pieces":
+        return _Pieces(self.box[which], self.outer[which], self.of[which])
+
+    def halved(self, axis: int) -> "_Pieces":
+        """Both halves of each, cut across ``axis`` (0: x)."""
+        middle = (self.box[:, axis] + self.box[:, axis + 2]) // 2
+        low, high = self.box.copy(), self.box.copy()
+        low[:, axis + 2], high[:, axis] = middle, middle
+        first, second = self.outer.copy(), self.outer.copy()
+        first[:, axis + 2], second[:, axis] = False, False
+        return _joined([_Pieces(low, first, self.of), _Pieces(high, second, self.of)])
+
+
+def cut(
+    boxes: Array, lattices: Array, *, step_um: float, point: PointExposure, tolerance: float
+) -> tuple[Array, Array]:
+    """Boxes (n, 4) on the grid cut to pieces (m, 4) on the grid, and (m,) the box of each.
+
+    Args:
+        boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the pillars, um.
+        tolerance: of the exposure; the background changes by a fifth of it between middle and end of a side, or
+            the piece is a 64th of the range short.
+
+    Raises:
+        ProcessError: more than 500 000 pieces.
+    """
+    wide = point.widths_um > 4 * point.widths_um.min()
+    if not wide.any() or not len(boxes):
+        return np.asarray(boxes, np.int64), np.arange(len(boxes))
+    around = PointExposure(point.widths_um[wide], point.weights[wide])
+    least, core = float(around.widths_um.min()), float(point.widths_um.min())
+    shortest = max(least / _SHORTEST, core / 2) / step_um
+    done: list[_Pieces] = []
+    open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
+    while len(open_.box):
+        count = len(open_.box) + sum(len(p.box) for p in done)
+        if count > MOST_PIECES:
+            raise ProcessError(
+                f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
+                f"backscatter ranges {least:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
+            )
+        longest = _longest(open_, lattices, step_um, around)
+        change = _change(open_, boxes, step_um, around) / (_SHARE * tolerance * CLEARS)
+        side = open_.box[:, 2:] - open_.box[:, :2]
+        split = (side >= 2 * shortest) & ((side > longest[:, None] / step_um) | (change > 1))
+        across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))  # the longer side where both need it
+        done.append(open_.some(np.asarray(~split.any(1))))
+        open_ = _joined([open_.some(across[:, 0]).halved(0), open_.some(across[:, 1] & ~across[:, 0]).halved(1)])
+    every = _joined(done)
+    order = np.argsort(every.of, kind="stable")
+    return every.box[order], every.of[order]
+
+
+def _joined(parts: list[_Pieces]) -> _Pieces:
+    return _Pieces(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("box", "outer", "of")))
+
+
+def _longest(pieces: _Pieces, lattices: Array, step_um: float, around: PointExposure) -> Array:
+    """(n,) largest side, um."""
+    box = pieces.box * step_um
+    out = np.full(len(box), _LONGEST * float(around.widths_um.min()))
+    for width in np.sort(around.widths_um)[::-1].tolist():
+        for left, bottom, right, top in np.asarray(lattices, float).tolist():
+            x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)
+            y = np.maximum(np.maximum(bottom - box[:, 3], box[:, 1] - top), 0)
+            out[np.hypot(x, y) < _FEW * width] = width / _BESIDE
+    return out
+
+
+def _change(pieces: _Pieces, boxes: Array, step_um: float, around: PointExposure) -> Array:
+    """(n, 2) half the change of the background of all boxes at unit dose along x and y: along outer sides, and from
+    one outer side to the opposite one.
+    """
+    box, every = pieces.box * step_um, np.asarray(boxes) * step_um
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    xs = np.stack([box[:, 0], middle[:, 0], box[:, 2]], -1)
+    ys = np.stack([box[:, 1], middle[:, 1], box[:, 3]], -1)
+    at = np.stack(np.broadcast_arrays(xs[:, None, :], ys[:, :, None]), -1)  # (n, y, x, 2)
+    one, two = pairs_near(box, every, around)
+    rows = np.repeat(np.arange(len(box)), 9)
+    field = sums_of_boxes(at.reshape(-1, 2), rows, every, (one, two), around).reshape(-1, 3, 3)
+    along_x, along_y = (np.ptp(field, axis=axis) / 2 for axis in (2, 1))  # of the lines bottom to top, left to right
+    held = pieces.outer
+    x = np.maximum(along_x[:, 0] * held[:, 1], along_x[:, 2] * held[:, 3])
+    y = np.maximum(along_y[:, 0] * held[:, 0], along_y[:, 2] * held[:, 2])
+    over = np.abs(field[:, :, 2] - field[:, :, 0]).max(1) / 2 * (held[:, 0] & held[:, 2])
+    up = np.abs(field[:, 2] - field[:, 0]).max(1) / 2 * (held[:, 1] & held[:, 3])
+    return np.stack([np.maximum(x, over), np.maximum(y, up)], -1)

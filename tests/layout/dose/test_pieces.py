@@ -1,0 +1,58 @@
+"""Pieces of marks: they tile their boxes on the grid, and are short only where the background changes."""
+
+import numpy as np
+import pytest
+
+from layout.dose import pieces, rects
+from layout.dose.exposure import PointExposure
+from metalens.ground.errors import ProcessError
+
+STEP_UM = 1e-3
+CROSS = np.array([[0, 0, 10_003, 45_001], [-44_000, 45_001, 55_007, 55_011], [0, 55_011, 10_003, 100_009]])
+NOTHING = np.empty((0, 4))
+
+
+def beam(beta_um, eta=0.7):
+    return PointExposure(np.array([0.01, beta_um]), np.array([1.0, eta]) / (1 + eta))
+
+
+@pytest.mark.parametrize("beta_um", [5.0, 31.0])
+def test_pieces_tile_their_boxes(beta_um):
+    made, of = pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=beam(beta_um), tolerance=0.01)
+    for n, box in enumerate(CROSS):
+        mine = made[of == n]
+        assert (mine[:, :2] >= box[:2]).all()
+        assert (mine[:, 2:] <= box[2:]).all()
+        area = ((mine[:, 2] - mine[:, 0]) * (mine[:, 3] - mine[:, 1])).sum()
+        assert area == (box[2] - box[0]) * (box[3] - box[1])
+
+
+def test_the_number_of_pieces_goes_with_corners_and_not_with_area():
+    count = [
+        len(pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=beam(b), tolerance=0.01)[0]) for b in (20.0, 10.0, 5.0)
+    ]
+    assert count[2] < 3 * count[0]  # squares of a 16th of the range would be sixteen times as many
+
+
+def test_the_background_hardly_changes_along_the_outer_side_of_a_piece():
+    point = beam(8.0)
+    made, _ = pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=point, tolerance=0.01)
+    box, far = made * STEP_UM, PointExposure(point.widths_um[1:], point.weights[1:])
+    bottom = box[(made[:, 1] == 45_001) & (made[:, 0] < -500)]  # of the left arm
+    ends = [rects.of_boxes(bottom[:, [k, 1]], CROSS * STEP_UM, far) for k in (0, 2)]
+    long = bottom[:, 2] - bottom[:, 0] > 2 * 8.0 / 64
+    assert long.any()
+    assert np.abs(ends[0] - ends[1])[long].max() <= 2 * 0.2 * 0.01 * 0.5 * (1 + 1e-9)
+
+
+def test_next_to_a_lens_pieces_stay_short():
+    lens = np.array([[60.0, -20.0, 90.0, 20.0]])
+    near, _ = pieces.cut(CROSS, lens, step_um=STEP_UM, point=beam(12.0), tolerance=0.01)
+    right = near[near[:, 2] > 50_000]
+    assert ((right[:, 2:] - right[:, :2]).max() * STEP_UM) <= 12.0 / 8
+
+
+def test_too_many_pieces_are_refused_by_name(monkeypatch):
+    monkeypatch.setattr(pieces, "MOST_PIECES", 100)
+    with pytest.raises(ProcessError, match=r"more than 100 pieces .* backscatter ranges 5 um"):
+        pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=beam(5.0), tolerance=0.01)
