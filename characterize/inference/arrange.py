@@ -13,6 +13,9 @@ from metalens.ground.arrays import Array
 TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
 _ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
 _TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
+_SURE = 0.9  # likeness from which on the nominal lens explains the frames
+_ZEROS = 17
+_DISTANCES = 17  # of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at NA 0.25
 MIRRORED = tuple("mirrored, then " + words for words in TURNS)
 
 
@@ -20,7 +23,7 @@ MIRRORED = tuple("mirrored, then " + words for words in TURNS)
 class Arrangement:
     """What the nominal lens says about the frames.
 
-    stage_zero_um: best of the scan; shift_px: (y, x) mean displacement of the light.
+    stage_zero_um, distance_um: best of the scan; shift_px: (y, x) mean displacement of the light.
     likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage zero.
     order: (n,) frame that fits the i-th stated depth best; reordered: whether it clearly differs from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
@@ -29,6 +32,7 @@ class Arrangement:
     """
 
     stage_zero_um: float
+    distance_um: float
     shift_px: tuple[float, float]
     likeness: float
     order: Array
@@ -50,26 +54,71 @@ def turn(frames: Array, orientation: int) -> Array:
     return np.rot90(turned, orientation % 4, axes=(-2, -1))
 
 
-def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | None = None) -> Arrangement:
-    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth, in all eight orientations."""
-    light = _prepare(np.where(data.usable, data.electrons, np.nan))
-    noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
-    clipped = data.saturated.mean((1, 2))
+def arrange(
+    model: ForwardModel, data: Data, *, scan_um: float, start: Array | None = None, reach_um: float = 0.0
+) -> Arrangement:
+    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth, in all eight orientations.
+
+    Where the frames then seem out of order or hardly alike, the lens-sensor distance is scanned over +-``reach_um``
+    too: it shifts the whole stack through focus, as no stage zero does, and a stack shifted by a depth or two looks
+    like one in another order. What needs less putting right and is as much alike is taken.
+    """
+    frames = _Frames.of(model, data)
     start = vector() if start is None else start.copy()
     nearest = float(model.setting.depth_um.min())
-    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, 17) if scan_um > 0 else np.zeros(1)
+    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS) if scan_um > 0 else np.zeros(1)
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
-    scores, rough, back = [], model.rough(_ROUGH), _reversed(model)
-    for zero in zeros:
-        start[PLACE["stage_zero_um"]] = zero
-        expected = _expected(rough, start, clipped)
-        ways = (light, expected, noise), (light[back], expected, noise[back])
-        stated, turned_round = (_mean_likeness(*way) for way in ways)
-        scores.append(max(stated, turned_round - _TWIN))
-    best = int(np.argmax(scores))
-    start[PLACE["stage_zero_um"]] = zeros[best]
-    expected = _expected(model, start, clipped)
-    order, reordered, seen = _order(light, expected, noise, model)
+    plain, score = frames.scanned(start, zeros)
+    found = _laid(frames, plain, score)
+    if reach_um > 0 and (found.reordered or found.clearly or score < _SURE):
+        distances = start[PLACE["distance_um"]] + reach_um * np.linspace(-1, 1, _DISTANCES)
+        moved, _ = frames.scanned(start, zeros[:: _ZEROS // 4], distances)
+        moved, better = frames.scanned(moved, zeros)
+        other = _laid(frames, moved, better)
+        simpler = (other.reordered, other.clearly) < (found.reordered, found.clearly)
+        if better >= score and (simpler or (better > score + _TWIN and not other.reordered)):
+            return other
+    return found
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Frames:
+    """What is compared: light (n, y, x) less its rim, noise and share of clipped pixels (n,), frames end to end."""
+
+    model: ForwardModel
+    rough: ForwardModel
+    light: Array
+    noise: Array
+    clipped: Array
+    back: Array
+
+    @classmethod
+    def of(cls, model: ForwardModel, data: Data) -> "_Frames":
+        light = _prepare(np.where(data.usable, data.electrons, np.nan))
+        noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
+        return cls(model, model.rough(_ROUGH), light, noise, data.saturated.mean((1, 2)), _reversed(model))
+
+    def scanned(self, start: Array, zeros: Array, distances_um: Array | None = None) -> tuple[Array, float]:
+        """Parameters at the best stage zero (and distance) for frames as stated or end to end; likeness there."""
+        best, found = -math.inf, start
+        for distance in start[PLACE["distance_um"], None] if distances_um is None else distances_um:
+            for zero in zeros:
+                x = start.copy()
+                x[PLACE["stage_zero_um"]], x[PLACE["distance_um"]] = zero, distance
+                expected = _expected(self.rough, x, self.clipped)
+                stated = _mean_likeness(self.light, expected, self.noise)
+                turned_round = _mean_likeness(self.light[self.back], expected, self.noise[self.back])
+                score = max(stated, turned_round - _TWIN)
+                if score > best:
+                    best, found = score, x
+        return found, best
+
+
+def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
+    """Order and orientation of the frames, judged against the images at some parameters."""
+    light, noise = frames.light, frames.noise
+    expected = _expected(frames.model, x, frames.clipped)
+    order, reordered, seen = _order(light, expected, noise, frames.model)
     orientation, clearly = _orientation(light, expected, noise)
     if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
         reordered, clearly = _plainest(light, expected, noise, order, orientation)
@@ -79,15 +128,16 @@ def arrange(model: ForwardModel, data: Data, *, scan_um: float, start: Array | N
     turned = {k: _mean_likeness(turn(expected, k), expected, 0 * noise) for k in possible}
     shift = np.median([s for _, s in found], axis=0)
     return Arrangement(
-        stage_zero_um=float(zeros[best]),
+        stage_zero_um=float(x[PLACE["stage_zero_um"]]),
+        distance_um=float(x[PLACE["distance_um"]]),
         shift_px=(float(shift[0]), float(shift[1])),
-        likeness=float(scores[best]),
+        likeness=likeness,
         order=order,
         reordered=reordered,
         order_seen=seen,
         orientation=orientation,
         clearly=clearly,
-        alike=tuple(k for k, likeness in turned.items() if likeness >= 0.997),
+        alike=tuple(k for k, value in turned.items() if value >= 0.997),
     )
 
 

@@ -73,7 +73,7 @@ def fit(
     model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
     start = vector({name: k.value for name, k in known.items()})
     scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
-    found = arrange(model, data, scan_um=scan, start=start)
+    found = arrange(model, data, scan_um=scan, start=start, reach_um=_reach_um(known, lens))
     _check_likeness(found, lens)
     cautions = [*frames.corrections, *_arranged_words(found)]
     if model.response.error > 0.1:
@@ -94,6 +94,12 @@ def fit(
     result = _result(capture, task, explore.explore(task, ends), cautions, frames.gain)
     _refuse(result.problems, options)
     return result
+
+
+def _reach_um(known: dict[str, Known], lens: Lens) -> float:
+    """Half the range of distances that is looked at: two sigma of what is known, within the bounds."""
+    prior = search.prior_of(("distance_um",), known, lens.sensor_distance_um)
+    return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
 def _refuse(problems: Sequence[str], options: Options) -> None:

@@ -218,6 +218,7 @@ def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list
         task.start,
         {
             "stage_zero_um": found.stage_zero_um,
+            "distance_um": found.distance_um,
             "decentre_x_um": float(np.clip(-found.shift_px[1] * pixel, -50, 50)),
             "decentre_y_um": float(np.clip(-found.shift_px[0] * pixel, -50, 50)),
             "background_e": level,

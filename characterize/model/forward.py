@@ -37,7 +37,7 @@ GEOMETRY = (
     "glass_tilt_y_deg",
 )
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
-_SLOPE_TOLERANCE = 2e-2  # of derivatives: it slows the last steps of a fit, and moves nothing
+_SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 _STEP: dict[str, Callable[[Bench], float]] = {
     "distance_um": lambda bench: bench.distance_um,

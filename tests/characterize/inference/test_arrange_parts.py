@@ -7,13 +7,15 @@ import pytest
 
 from characterize.inference import arrange
 from characterize.inference.arrange import Arrangement
+from characterize.inference.leastsquares import Data
+from characterize.model import PLACE, vector
 
 RNG = np.random.default_rng(23)
 
 
 def laid(**more):
     usual = {
-        "stage_zero_um": 0.0, "shift_px": (0.0, 0.0), "likeness": 1.0, "order": np.array([2, 0, 1]), "reordered": True,
+        "stage_zero_um": 0.0, "distance_um": 0.0, "shift_px": (0.0, 0.0), "likeness": 1.0, "order": np.array([2, 0, 1]), "reordered": True,
         "order_seen": True, "orientation": 5, "clearly": True, "alike": (),
     }  # fmt: skip
     return Arrangement(**(usual | more))
@@ -117,3 +119,44 @@ def test_the_other_end_of_the_stage_is_at_each_angle():
     model = groups([0, 2, 4], [1, 3])
     model.setting = SimpleNamespace(depth_um=np.array([5.0, 9.0, 7.0, 8.0, 6.0]))
     assert arrange._reversed(model).tolist() == [2, 3, 0, 1, 4]
+
+
+class _Stack:
+    """Images whose width goes with depth; a longer lens-sensor distance moves the whole stack, 25 um by one frame."""
+
+    def __init__(self, count=9):
+        self.setting = SimpleNamespace(depth_um=100.0 * np.arange(5, 5 + count))
+        self.groups = groups(range(count)).groups
+
+    def rough(self, _):
+        return self
+
+    def images(self, x):
+        at = np.arange(9) + x[PLACE["distance_um"]] / 25 + x[PLACE["stage_zero_um"]] / 1e4
+        return (spots(1.1 + 0.24 * np.abs(at - 3.0) + 0.06 * (at > 3), level=4e4),)
+
+
+def _seen(frames):
+    shape = frames.shape
+    return Data(frames, np.ones(shape, bool), np.zeros(shape, bool), np.full(shape, 4e-4), np.ones(shape))
+
+
+@pytest.mark.parametrize("distance_um", [75.0, -50.0])
+def test_a_wrong_distance_is_not_taken_for_another_order(distance_um):
+    model = _Stack()
+    frames = model.images(vector({"distance_um": distance_um}))[0]
+    blind = arrange.arrange(model, _seen(frames), scan_um=30.0)
+    assert blind.reordered  # by the stage alone the stack seems shuffled
+    found = arrange.arrange(model, _seen(frames), scan_um=30.0, reach_um=200.0)
+    assert (found.reordered, found.clearly) == (False, False)
+    assert found.distance_um == pytest.approx(distance_um)
+    assert found.likeness > 0.999
+
+
+def test_frames_that_are_shuffled_are_put_in_order_at_any_distance():
+    model = _Stack()
+    shuffle = np.array([4, 7, 1, 0, 8, 2, 6, 3, 5])
+    found = arrange.arrange(model, _seen(model.images(vector())[0][shuffle]), scan_um=30.0, reach_um=200.0)
+    assert found.reordered
+    assert shuffle[found.order].tolist() == list(range(9))
+    assert found.distance_um == 0.0

@@ -1,7 +1,12 @@
 """Pages served to this machine: they follow what grows, and show nothing outside the folder."""
 
+import functools
 import http.client
+import signal
+import subprocess
+import sys
 import threading
+import urllib.request
 from contextlib import contextmanager
 
 import numpy as np
@@ -107,14 +112,10 @@ def test_a_taken_port_and_options_that_do_nothing_are_refused(tmp_path):
 
 
 def test_the_command_serves_a_folder_until_it_is_interrupted(tmp_path):
-    import signal
-    import subprocess
-    import sys
-    import urllib.request
-
     _lens(tmp_path / "lens.h5", 0.21)
     words = [sys.executable, "-P", "-m", "metalens", "view", str(tmp_path), "--serve"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as running:
+    heard = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # jobs in the background inherit a deaf ear
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, preexec_fn=heard) as running:
         address = running.stdout.readline().split(" at ")[1].split()[0]
         with urllib.request.urlopen(address + "lens.h5") as answer:
             assert b"lens.h5 (lens)" in answer.read()
