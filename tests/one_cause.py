@@ -89,17 +89,17 @@ def budget():
     import made_lens as m
 
     from codesign.budget import links
+    from codesign.budget.entry import Entry
+    from codesign.budget.prepared import Given
     from codesign.optics import Aperture
     from metalens.made import Printed, Spread
 
     lens = m.small()
     about = SimpleNamespace(
-        aperture=Aperture(lens), lens=lens, finest=None, window=None, reference=None,
-        given=links.Given(mask=Printed(spread=Spread.only(lean_nm=4.0)), draws=60),
-        basis=lambda maps, finest, **moved: None, shift=lambda optics: None,
+        aperture=Aperture(lens), lens=lens, given=Given(mask=Printed(spread=Spread.only(lean_nm=4.0)), draws=60),
+        device=SimpleNamespace(image=lambda **moved: None),
+        entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
     )  # fmt: skip
-    links.psf_difference = lambda *_: 0.0
-    links.task = SimpleNamespace(gaze_rms=lambda _: 0.0)
     (entry,) = links._spread(about)
     built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     slope = lens.proxy.dphase_ddiameter(built, 0.85)

@@ -1,6 +1,7 @@
 """What a command will need is checked before its work begins."""
 
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,7 +48,9 @@ def test_outputs_that_cannot_be_written_are_refused_before_inputs_are_read(tmp_p
 
 def test_a_wavelength_outside_the_library_is_refused_before_the_search(tmp_path, untouched, monkeypatch, capsys):
     proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0)
-    monkeypatch.setattr(design, "_pillars", lambda *_: (Cell(0.3, pillar=Index(3.6)), proxy, {}))
+    swept = SimpleNamespace(cell=Cell(0.3, pillar=Index(3.6)))
+    monkeypatch.setattr(design, "_pillars", lambda *_: (swept, {}))
+    monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
     (tmp_path / "d.toml").write_text('profile = "fisher"\nwavelength_nm = 940.0\naperture_mm = 0.05\n')
     assert main(["design", str(tmp_path / "d.toml"), "-o", str(tmp_path / "l.h5")]) == BAD_INPUT
     assert "um, but the proxy holds from 0.84 to 0.86 um" in capsys.readouterr().err

@@ -15,8 +15,9 @@ RNG = np.random.default_rng(23)
 
 def laid(**more):
     usual = {
-        "stage_zero_um": 0.0, "distance_um": 0.0, "shift_px": (0.0, 0.0), "likeness": 1.0, "order": np.array([2, 0, 1]), "reordered": True,
-        "order_seen": True, "orientation": 5, "clearly": True, "alike": (),
+        "stage_zero_um": 0.0, "distance_um": 0.0, "shift_px": (0.0, 0.0), "likeness": 1.0,
+        "order": np.array([2, 0, 1]), "reordered": True, "order_seen": True, "orientation": 5, "clearly": True,
+        "alike": (),
     }  # fmt: skip
     return Arrangement(**(usual | more))
 

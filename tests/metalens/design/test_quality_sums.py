@@ -11,32 +11,17 @@ from metalens.design.profiles import Focus
 RNG = np.random.default_rng(6)
 
 
-class Typed:
-    """A proxy whose diameters are numbers of typed phases and levels."""
-
-    def __init__(self, phase, level):
-        self.phase, self.level = phase, level
-
-    def phase_rad(self, made, wavelength_um):
-        assert wavelength_um == 0.79
-        return self.phase[made]
-
-    def transmission(self, made, wavelength_um):
-        assert wavelength_um == 0.79
-        return self.level[made]
-
-
 def test_quality_is_that_of_the_sum_of_all_pillars():
     """Wanted and made phases whole turns apart differ by nothing; a phase common to all is an error like any other."""
     error, level = RNG.normal(0.1, 0.35, 40), RNG.uniform(0.4, 0.98, 40)
     error[33] = -2.6
     wanted = RNG.uniform(-20, 20, 40)
-    proxy = Typed(wanted + error + 2 * math.pi * RNG.integers(-4, 5, 40), level)
-    sums = of_phase._Sums()
-    for part in (np.arange(0, 13), np.arange(13, 40)):
-        sums.add(wanted[part], part, proxy, 0.79)
+    made_rad = wanted + error + 2 * math.pi * RNG.integers(-4, 5, 40)
+    sums = of_phase.Sums()
+    for part in (slice(0, 13), slice(13, 40)):
+        sums.add(wanted[part], made_rad[part], level[part])
     focus = Focus(0.79, 1700.0, 23e3)
-    made = sums.quality(focus, 310.0, 2.5)
+    made = sums.quality(focus, 310.0, 2.5, period_um=0.26)
     field = (level * np.exp(1j * error)).sum()
     assert made.pillars == 40
     assert made.turns == 2.5
@@ -47,3 +32,6 @@ def test_quality_is_that_of_the_sum_of_all_pillars():
     assert made.max_phase_error_rad == pytest.approx(2.6, rel=1e-12)
     assert made.numerical_aperture == pytest.approx(310 / math.hypot(310, 1700), rel=1e-12)
     assert made.field_of_view_rad == pytest.approx(2 * of_phase.field_angle(focus, 310.0), rel=1e-12)
+    assert made.sampled_aperture == pytest.approx(0.79 / 0.52, rel=1e-12)
+    steepest = 310 / math.hypot(310, 1700) + 310 / math.hypot(310, 23e3)  # rays at the rim
+    assert made.steepest == pytest.approx(steepest, rel=1e-12)
