@@ -163,7 +163,7 @@ def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> It
             for key, value in base.items():
                 before[PLACE[key]] = after[PLACE[key]] = value
             after[PLACE[name]] += amount
-            with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows
+            with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows, a plate with no room
                 first = model.images(before)[0] if base else image
                 yield cause, amount, name + " {:.3g}", (model.images(after)[0] - first)[None]
     leaning = model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image

@@ -6,6 +6,7 @@ import numpy as np
 
 from characterize.model.parameters import PLACE
 from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 
@@ -23,6 +24,9 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth
     Args:
         tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z = ``depth_um``.
         values: all parameters, of which glass_um and its tilts are used.
+
+    Raises:
+        FitError: the plate does not fit between source and lens.
     """
     t = float(values[PLACE["glass_um"]])
     lean = [math.tan(math.radians(values[PLACE[f"glass_tilt_{a}_deg"]])) for a in "xy"]
@@ -32,6 +36,8 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth
         ray = x + depth_um * tangents[0], y + depth_um * tangents[1]
         r2 = ray[0] ** 2 + ray[1] ** 2 + depth_um**2
         along = ray[0] * normal[0] + ray[1] * normal[1] + depth_um * normal[2]
+        if along.min() <= t:
+            raise FitError(f"{t:.4g} um of glass between lens and source, which leave {along.min():.4g} um for it")
         across = np.sqrt(np.maximum(r2 - along**2, 0.0))
         s = across / np.sqrt(r2)
         for _ in range(3):

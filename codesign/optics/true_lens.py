@@ -15,7 +15,6 @@ from torch import Tensor
 
 from metalens.design import Focus
 from metalens.field import Layers, Optics, Plan, SmoothWave, Wave, node_light, normalised, psfs, with_psfs
-from metalens.ground.arrays import Array
 from metalens.image import Grid, Imager
 from metalens.image import imager as field_imager
 from metalens.lens import Lens
@@ -225,11 +224,3 @@ class _Turned:
 def image_difference(one: Imager, other: Imager) -> float:
     """Relative L2 difference of the PSFs of two images over field and depth, each PSF of sum 1."""
     return float((one.stack - other.stack).norm() / other.stack.norm())
-
-
-def turn_of(lens: Lens, phase: Tensor, base: Tensor) -> Array:
-    """Phase differences over the pillars of a lens, about their mean, rad."""
-    built = torch.from_numpy(lens.diameters.diameter_um > 0)
-    turn = (phase - base)[built].double().numpy()
-    mean = np.angle(np.exp(1j * turn).mean())
-    return np.asarray(np.angle(np.exp(1j * (turn - mean))))

@@ -12,6 +12,7 @@ import bench_lens as b
 
 from characterize.model.glass import INDEX, extra_path
 from characterize.model.parameters import vector
+from metalens.ground.errors import FitError
 
 DEPTH, TANGENTS = 411.0, (0.031, -0.017)
 
@@ -57,3 +58,15 @@ def test_frames_through_glass_are_those_of_every_pillar():
     assert np.abs(scale * found - want).max() < 1e-3 * want.max()  # as without glass
     plain = b.light()
     assert np.abs(plain / plain.max() - want / want.max()).max() > 0.05
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
+def test_a_plate_that_has_no_room_is_refused(tilt_deg):
+    """Along the normal of a tilted plate the source is nearer: 40 cos 30 degrees less than 35 um."""
+    values = vector({"glass_um": 35.0, "glass_tilt_x_deg": tilt_deg})
+    at = np.array([2.0]), np.array([-3.0])
+    if tilt_deg:
+        with pytest.raises(FitError, match=r"35 um of glass between lens and source, which leave 3\d\.\d+ um"):
+            extra_path(*at, tangents=(0.0, 0.0), depth_um=40.0, values=values)
+    else:
+        assert np.isfinite(extra_path(*at, tangents=(0.0, 0.0), depth_um=40.0, values=values)).all()
