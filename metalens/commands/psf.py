@@ -106,8 +106,8 @@ class Options(Common):
 
     Attributes:
         lens: lens.h5, or asbuilt.h5 for the lens that was made (its process and wave front included).
-        output: the PSF file to write, .h5 (which all other commands read), .tif or .mat; plots are written beside it as
-            NAME_xz.png and so on.
+        output: the PSF file to write, .h5 (which all other commands read), .tif, .mat or .fits; plots are written
+            beside it as NAME_xz.png and so on.
         config: PSF.toml with depths_mm, angles_deg, angles_y_deg, window_um, samples, led_fwhm_nm, tolerance,
             polarisation, spectrum, own_cell, [[layers.front]] and [[layers.behind]]; without it 16 to 26 mm in steps of
             0.5 mm at 0, 10 and 20 degrees.

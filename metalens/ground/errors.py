@@ -89,6 +89,7 @@ EXTRAS = {
     "torch": "optics",
     "colour": "optics",
     "nlopt": "optics",
+    "astropy": "fits",
     "cv2": "bench",
     "tifffile": "bench",
     "safetensors": "codesign",

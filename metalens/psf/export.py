@@ -1,4 +1,4 @@
-"""PSF stacks for other programs: HDF5 (the project's own file), TIFF pages, MATLAB arrays."""
+"""PSF stacks for other programs: HDF5 (the project's own file), TIFF pages, MATLAB arrays, FITS images."""
 
 import io
 import json
@@ -12,7 +12,7 @@ from metalens.ground.errors import PropagationError
 from metalens.ground.store import write_bytes
 from metalens.psf.record import PsfStack, save
 
-SUFFIXES = (".h5", ".tif", ".tiff", ".mat")
+SUFFIXES = (".h5", ".tif", ".tiff", ".mat", ".fits")
 _NAMES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
 _NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 
@@ -33,6 +33,8 @@ def write(path: str | Path, stack: PsfStack) -> None:
     ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32 page for every PSF, the last axis
     before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON in the image description.
     ``.mat``: MATLAB 5 variables of the same names and shapes as in the HDF5 file.
+    ``.fits``: the primary image (…, y, x) in float32 with linear x and y axes in um, row 0 first (+y down, which most
+    viewers draw from below), and an image extension of float64 for every axis and for the energies.
 
     Raises:
         PropagationError: another ending.
@@ -42,7 +44,7 @@ def write(path: str | Path, stack: PsfStack) -> None:
     if suffix == ".h5":
         save(path, stack)
     else:
-        write_bytes(path, matlab(stack) if suffix == ".mat" else tiff(stack))
+        write_bytes(path, {".mat": matlab, ".fits": fits}.get(suffix, tiff)(stack))
 
 
 def tiff(stack: PsfStack) -> bytes:
@@ -78,6 +80,27 @@ def matlab(stack: PsfStack) -> bytes:
     file = io.BytesIO()
     savemat(file, values, oned_as="column")
     return b"MATLAB 5.0 MAT-file, metalens PSF stack, um and rad".ljust(116) + file.getvalue()[116:]
+
+
+def fits(stack: PsfStack) -> bytes:
+    """FITS file of all PSFs; needs astropy (extra ``fits``)."""
+    from astropy.io import fits as library
+
+    plain = stack.numpy()
+    image = library.PrimaryHDU(np.asarray(plain.intensity, np.float32))
+    head = image.header
+    for axis, pixels in ((1, plain.intensity.shape[-1]), (2, plain.intensity.shape[-2])):
+        head[f"CTYPE{axis}"], head[f"CUNIT{axis}"] = " xy"[axis], "um"
+        head[f"CRPIX{axis}"], head[f"CRVAL{axis}"], head[f"CDELT{axis}"] = (pixels + 1) / 2, 0.0, plain.step_um
+    head["AXES"] = (_axes(plain), "of the image, slowest first")
+    head["RELERR"] = (plain.error, "relative L2 error of the PSFs")
+    head["TOLERANC"] = (plain.tolerance, "relative L2 error that was asked for")
+    head["SENSDIST"] = (plain.sensor_distance_um, "um from the lens to the sensor")
+    head["CREATOR"] = "metalens"
+    parts = [library.ImageHDU(values, name=name.upper()) for name, values in _arrays(plain).items()]
+    file = io.BytesIO()
+    library.HDUList([image, *parts]).writeto(file, checksum=False)
+    return file.getvalue()
 
 
 def _arrays(plain: PsfStack) -> dict[str, Array]:
