@@ -1,13 +1,9 @@
 """The light of pillars on a small window of the sensor, for many amplitude maps at once, without torch.
 
-The Rayleigh-Sommerfeld sum (first kind, time factor exp(-iwt)) over all pillars j, for a point source at depth z:
-
-    U(u) = sum_j t_j  z/s_j exp(ik (s_j - z))  pitch^2 d / (i lambda r^2) (1 + i / kr) exp(ik (r - d)),
-
-s from the source to the pillar, r from there to the point u of the window, d to the sensor. Its phase is fast
-over the lens, but what differs between depths and window points is slow: with the phase to the middle of the window
-taken off, it is a polynomial on Chebyshev nodes, and the pillars enter only by their sums against that polynomial
-basis: two matrix products for each map, exact to the tolerance that sets the number of nodes.
+The field is that of :mod:`metalens.propagate.paths`, films and all. Its phase is fast over the lens, but what differs
+between depths and window points is slow: with the phase to the middle of the window taken off, it is a polynomial on
+Chebyshev nodes, and the pillars enter only by their sums against that polynomial basis: two matrix products for each
+map, exact to the tolerance that sets the number of nodes.
 """
 
 from dataclasses import dataclass
@@ -16,8 +12,10 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.ground.paths import path_difference, source_path
-from metalens.lens import Lens
+from metalens.lens import Lens, reach
+from metalens.propagate import Case, case, paths
+
+_ON_AXIS = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,12 +42,13 @@ class Window:
 class Focus:
     """Sums over the pillars of a lens, prepared for one window.
 
-    x_um, y_um: positions of the sites. nodes_x_um, nodes_y_um: of the nodes.
+    case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um, nodes_y_um: of the nodes.
     onto_x, onto_y: (nodes, sites) polynomial basis, float32.
     curvature: 1 / depth of the reference source whose phase is taken off.
     """
 
     window: Window
+    case: Case
     x_um: Array
     y_um: Array
     nodes_x_um: Array
@@ -72,37 +71,30 @@ class Focus:
             moments: (maps, nodes y, nodes x) from :meth:`project`.
             shift_um: (x, y) by which the pillars stand off their sites.
         """
-        window, k = self.window, 2 * np.pi / self.window.wavelength_um
-        pitch = self.x_um[1] - self.x_um[0]
+        window, k = self.window, self.case.wavenumber
         nodes_x, nodes_y = self.nodes_x_um + shift_um[0], self.nodes_y_um[:, None] + shift_um[1]
-        slow = np.remainder(self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None]), 2 * np.pi)
-        sources = np.stack([source(nodes_x, nodes_y, depth, window.wavelength_um) for depth in window.depths_um])
-        sources = (sources * np.exp(-1j * slow)).reshape(len(sources), -1)
+        slow = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])
+        inverse = np.array(self.case.inverse_depths_per_um)[:, None, None]
+        sources = np.exp(1j * (self._phase_rad(nodes_x, nodes_y, inverse) - slow)).reshape(len(inverse), -1)
         weights = moments.reshape(len(moments), 1, -1) * sources
         weights = weights.reshape(-1, weights.shape[-1]).T.astype(np.complex64)
         rows = []
         for y in window.y_um:
-            r2 = (window.x_um[:, None, None] - nodes_x) ** 2 + (y - nodes_y) ** 2
-            r = np.sqrt(r2 + window.distance_um**2)
-            level = pitch**2 * window.distance_um / (1j * window.wavelength_um * r**2) * (1 + 1j / (k * r))
-            kernel = level * np.exp(1j * np.remainder(k * path_difference(r2, window.distance_um), 2 * np.pi))
+            level, away = paths.beyond(self.case, nodes_x, nodes_y, window.x_um[:, None, None], y)
+            kernel = self.case.area_um2 * level * np.exp(1j * np.remainder(k * away, 2 * np.pi))
             rows.append(kernel.reshape(len(window.x_um), -1).astype(np.complex64) @ weights)
         field = np.stack(rows).transpose(2, 0, 1)
         return np.asarray(field.reshape(len(moments), len(window.depths_um), *field.shape[1:]))
 
     def _carrier_rad(self, x_um: Array, y_um: Array) -> Array:
         """Phase that is taken off: from the reference source over the lens to the middle of the window."""
-        r2, k = x_um**2 + y_um**2, 2 * np.pi / self.window.wavelength_um
-        path = path_difference(r2, self.window.distance_um) + source_path(x_um, y_um, (0.0, 0.0), self.curvature)
-        return np.asarray(np.remainder(k * path, 2 * np.pi))
+        return self._phase_rad(x_um, y_um, self.curvature)
 
-
-def source(x_um: Array, y_um: Array, depth_um: float, wavelength_um: float) -> Array:
-    """Spherical wave from an axial point at ``depth_um``, 1 at the centre of the lens (paper Eq. 1, exp(+ikr))."""
-    r2 = x_um**2 + y_um**2
-    curvature = 1 / depth_um
-    phase = np.remainder(2 * np.pi / wavelength_um * source_path(x_um, y_um, (0.0, 0.0), curvature), 2 * np.pi)
-    return np.asarray(np.exp(1j * phase) / np.sqrt(1 + r2 * curvature**2))
+    def _phase_rad(self, x_um: Array, y_um: Array, inverse_depth: Array | float) -> Array:
+        path = paths.to_sensor(self.case, x_um, y_um) + paths.from_source(
+            self.case, x_um, y_um, _ON_AXIS, inverse_depth
+        )
+        return np.asarray(np.remainder(self.case.wavenumber * path, 2 * np.pi))
 
 
 def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
@@ -116,29 +108,37 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
     """
     if min(len(window.x_um), len(window.y_um), *lens.diameters.diameter_um.shape) < 2:
         raise PropagationError("the window and the lens need 2 samples and sites a side or more")
-    depths = 1 / np.asarray(window.depths_um, float)
-    middle = float(depths.min() + depths.max()) / 2
+    seen = case(
+        lens.diameters.diameter_um.shape,
+        **lens.diameters.grid._asdict(),
+        wavelength_um=window.wavelength_um,
+        sensor_distance_um=window.distance_um,
+        depths_um=window.depths_um,
+        window_um=1.0,
+        samples=1,
+        layers=lens.layers,
+    )
+    middle = paths.reference_depth(seen)
     x, y = lens.diameters.x_um, lens.diameters.y_um
-    count_x = _count(window, x, float(abs(window.x_um).max()), depths, middle) + margin
-    count_y = _count(window, y, float(abs(window.y_um).max()), depths, middle) + margin
+    count_x = _count(seen, x, float(abs(window.x_um).max()), middle) + margin
+    count_y = _count(seen, y, float(abs(window.y_um).max()), middle) + margin
     (nodes_x, onto_x), (nodes_y, onto_y) = _basis(x, count_x), _basis(y, count_y)
-    return Focus(window, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
+    return Focus(window, seen, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
 
 
 def window(lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0) -> Window:
     """A window around the axis that holds the blur at all depths and ``rings`` diffraction widths around it.
 
-    Samples are lambda d / 4R apart, the Nyquist step of the intensity of a lens of radius R.
+    Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
 
     depths_um: left out: the source distance of the design.
     """
     depths = np.array([lens.source_distance_um] if depths_um is None else depths_um, float)
-    radius, distance = lens.diameters.radius_um, lens.sensor_distance_um
-    step = lens.wavelength_um * distance / (4 * max(radius, lens.diameters.pitch_um))
-    blur = radius * distance * abs(1 / depths - 1 / lens.source_distance_um).max()
+    step = reach.diffraction_um(lens) / 4
+    blur = max(reach.blur_um(lens, depth) for depth in depths)
     half = int(np.ceil((blur + 2 * rings * step) / step))
     axis = np.arange(-half, half + 1) * step
-    return Window(axis, axis, distance, lens.wavelength_um, depths)
+    return Window(axis, axis, lens.sensor_distance_um, lens.wavelength_um, depths)
 
 
 def peak(psf: Array) -> Array:
@@ -165,42 +165,13 @@ def peak(psf: Array) -> Array:
     return np.array(found).reshape(psf.shape[:-2])
 
 
-def direct(lens: Lens, amplitude: Array, window: Window, *, shift_um: tuple[Array, Array] | None = None) -> Array:
-    """(depths, y, x) the same by the plain sum over all pillars in float64: the referee.
-
-    Args:
-        amplitude: (y, x) complex transmission of each site; shift_um: (x, y) of each pillar off its site.
-    """
-    rows, columns = np.nonzero(lens.diameters.diameter_um)
-    x, y, t = lens.diameters.x_um[columns], lens.diameters.y_um[rows], amplitude[rows, columns]
-    if shift_um is not None:
-        x, y = x + shift_um[0][rows, columns], y + shift_um[1][rows, columns]
-    k, d = 2 * np.pi / window.wavelength_um, window.distance_um
-    result = np.zeros((len(window.depths_um), len(window.y_um), len(window.x_um)), complex)
-    lit = [t * source(x, y, depth, window.wavelength_um) for depth in window.depths_um]
-    for i, v in enumerate(window.y_um):
-        for j, u in enumerate(window.x_um):
-            r2 = (u - x) ** 2 + (v - y) ** 2
-            r = np.sqrt(r2 + d**2)
-            kernel = lens.diameters.pitch_um**2 * d / (1j * window.wavelength_um * r**2) * (1 + 1j / (k * r))
-            kernel = kernel * np.exp(1j * k * path_difference(r2, d))
-            result[:, i, j] = [(each * kernel).sum() for each in lit]
-    return result
-
-
-def _count(window: Window, span_um: Array, reach_um: float, curvatures: Array, middle: float) -> int:
+def _count(seen: Case, span_um: Array, reach_um: float, middle: float) -> int:
     """Half the turns of phase across the lens that are left, plus what Chebyshev series need beyond (Bessel decay)."""
     x = np.linspace(span_um[0], span_um[-1], 1001)
-    k, d = 2 * np.pi / window.wavelength_um, window.distance_um
-    paths = [
-        path_difference((x - reach_um) ** 2, d)
-        - path_difference(x**2, d)
-        + source_path(x, 0.0, (0.0, 0.0), c)
-        - source_path(x, 0.0, (0.0, 0.0), middle)
-        for c in curvatures
-    ]
-    slope = max(float(abs(np.gradient(path, x)).max()) for path in paths)
-    turns = k * slope * float(span_um[-1] - span_um[0]) / 2
+    away = paths.beyond(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(seen, x, 0.0, _ON_AXIS, middle)
+    differences = [away + paths.from_source(seen, x, 0.0, _ON_AXIS, c) for c in seen.inverse_depths_per_um]
+    slope = max(float(abs(np.gradient(path, x)).max()) for path in differences)
+    turns = seen.wavenumber * slope * float(span_um[-1] - span_um[0]) / 2
     return int(np.ceil(turns + 4 * turns ** (1 / 3)))
 
 

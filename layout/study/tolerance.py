@@ -10,11 +10,10 @@ from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import Model, curve, missed, reduce
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
-from metalens.lens import Lens
+from metalens.lens import Lens, reach
 from metalens.made import DRAWN, Draw, State, spread
 
-DEPTH_STEP_UM = 200.0  # of the finite difference in the paper's Eq. 11
-DEPTHS_UM = (16e3, 21e3, 26e3)
+STEPS = 50  # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16 to 26 mm
 _BATCH = 25
 
 
@@ -59,7 +58,7 @@ class ToleranceReport:
     """Result of :func:`analyse`.
 
     effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte Carlo.
-    depths_um: of the information; window: where the light was looked at.
+    depths_um: of the information, by differences over step_um; window: where the light was looked at.
     rank: dimensions of the space of t(D). error: largest rms relative error of t over the pillars in any draw.
     """
 
@@ -67,6 +66,7 @@ class ToleranceReport:
     nominal: Outcome
     draws: Outcome
     depths_um: Array
+    step_um: float
     window: Window
     rank: int
     error: float
@@ -82,7 +82,7 @@ def analyse(
     process: Process,
     *,
     sens: Sensitivities | None = None,
-    depths_um: tuple[float, ...] = DEPTHS_UM,
+    depths_um: tuple[float, ...] = (),
     draws: int = 100,
     seed: int = 0,
 ) -> ToleranceReport:
@@ -90,7 +90,8 @@ def analyse(
 
     Args:
         sens: answers to height, wall and index; left out: from the RCWA solver.
-        depths_um: where the axial information is wanted; the design source is always looked at as well.
+        depths_um: where the axial information is wanted; left out: both ends and the middle of the depths at which
+            the lens blurs (:mod:`metalens.lens.reach`). The design source is always looked at as well.
 
     Accuracy: see ``error`` of the report (measured); bands of percentiles carry the sampling error of ``draws``.
 
@@ -100,12 +101,14 @@ def analyse(
     if draws < 10:
         raise ProcessError(f"draws = {draws}: need 10 or more for confidence bands")
     sens = sensitivities(lens) if sens is None else sens
-    every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + DEPTH_STEP_UM))])
+    near, far = reach.depth_range_um(lens)
+    depths_um, step_um = depths_um or (near, (near + far) / 2, far), (far - near) / STEPS
+    every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))])
     focus = prepare(lens, window(lens, depths_um=every))
     model = reduce(lens, sens, focus, process.spread, seed=seed)
     single = [Draw({name: sign * s}) for name, s in process.spread.values().items() for sign in (-1, 1)]
     everything = [Draw({}), *single, *spread.draws(process.spread, draws, seed=seed + 1)]
-    outcome = _outcome(model, [draw.state() for draw in everything])
+    outcome = _outcome(model, [draw.state() for draw in everything], step_um)
     nominal, alone, many = (
         _part(outcome, part) for part in (slice(0, 1), slice(1, 1 + len(single)), slice(1 + len(single), None))
     )
@@ -114,13 +117,15 @@ def analyse(
         for n in range(len(DRAWN))
     )
     error = missed(model, everything)
-    return ToleranceReport(effects, nominal, many, np.array(depths_um), focus.window, len(model.basis), error, seed)
+    return ToleranceReport(
+        effects, nominal, many, np.array(depths_um), step_um, focus.window, len(model.basis), error, seed
+    )
 
 
-def _outcome(model: Model, lenses: list[State]) -> Outcome:
+def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
     """Everything that is looked at, lens by lens; the first is the nominal one."""
     view = model.focus.window
-    incident = model.count.sum() * model.lens.diameters.pitch_um**2
+    incident = model.count.sum() * model.focus.case.area_um2
     parts, reference = [], np.zeros((1, 1))
     for start in range(0, len(lenses), _BATCH):
         light = model.focus.light(model.drawn(lenses[start : start + _BATCH]))
@@ -129,7 +134,7 @@ def _outcome(model: Model, lenses: list[State]) -> Outcome:
         if start == 0:
             reference = design[0]
         unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
-        steps = (unit[:, 1::2] - unit[:, ::2]) / DEPTH_STEP_UM
+        steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
         parts.append(
             (
                 peak(design) / peak(reference),

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from metalens.lens import export as export
     from metalens.lens import media as media
     from metalens.lens import picture as picture
+    from metalens.lens import reach as reach
     from metalens.lens.layers import Layers as Layers
     from metalens.lens.layers import check_gaps as check_gaps
     from metalens.lens.media import Media as Media
@@ -39,6 +40,7 @@ __getattr__, __dir__, __all__ = attach(
         "media": "",
         "parts": "record",
         "picture": "",
+        "reach": "",
         "save": "record",
         "streamed": "record",
     },

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.propagate import paths as paths
     from metalens.propagate.blocks import SHARE as SHARE
     from metalens.propagate.choice import Choice as Choice
     from metalens.propagate.choice import choose as choose
@@ -59,6 +60,7 @@ __getattr__, __dir__, __all__ = attach(
         "field_exact": "direct",
         "field_windowed": "window",
         "kernel": "kernels",
+        "paths": "",
         "plan": "window",
         "relative_error": "estimate",
         "scan": "estimate",

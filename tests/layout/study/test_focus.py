@@ -1,14 +1,17 @@
 """The reduced sum over pillars against the plain Rayleigh-Sommerfeld sum, with every symmetry broken."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from layout.study import focus
 from layout.study.focus import Window
-from metalens.cell.record import Cell
+from metalens.cell import Cell, Film, Index
 from metalens.ground.errors import PropagationError
-from metalens.lens.record import DiameterMap, Lens
+from metalens.lens import DiameterMap, Layers, Lens
 from metalens.pillars.proxy import Proxy
+from tests.referees import films, plain_sum
 
 RNG = np.random.default_rng(4)
 PROXY = Proxy(np.array([[3.0, 2.8, 0.3]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
@@ -30,7 +33,7 @@ def window_of(lens, depths):
 def test_the_reduced_sum_is_the_plain_sum_at_all_depths_and_for_a_collimated_beam():
     lens = random_lens()
     where = window_of(lens, [600.0, 900.0, 1500.0, np.inf])
-    exact = focus.direct(lens, amplitude(lens), where)
+    exact = plain_sum.field(lens, amplitude(lens), where)
     ready = focus.prepare(lens, where)
     fast = ready.light(ready.project(amplitude(lens)[None].astype(np.complex64)))[0]
     assert abs(fast - exact).max() < 3e-6 * abs(exact).max()  # float32 sums of 1e4 terms
@@ -50,7 +53,7 @@ def test_shifted_pillars_send_their_light_from_where_they_are():
     lens = random_lens()
     where = window_of(lens, [900.0])
     ones = np.ones(lens.diameters.diameter_um.shape)
-    exact = focus.direct(lens, amplitude(lens), where, shift_um=(0.05 * ones, -0.03 * ones))
+    exact = plain_sum.field(lens, amplitude(lens), where, shift_um=(0.05 * ones, -0.03 * ones))
     ready = focus.prepare(lens, where)
     fast = ready.light(ready.project(amplitude(lens)[None]), (0.05, -0.03))[0]
     assert abs(fast - exact).max() < 3e-6 * abs(exact).max()
@@ -75,6 +78,25 @@ def test_the_usual_window_holds_the_geometric_blur():
     assert where.x_um[-1] > blur
     assert where.x_um[1] - where.x_um[0] <= 0.85 * 150 / (4 * lens.diameters.radius_um) + 1e-12
     assert (where.x_um == -where.x_um[::-1]).all()
+
+
+def test_light_behind_films_is_that_of_plane_waves_through_them():
+    """Normalised by nothing; budget as in the tests of films: 3e-3 of the field for rays and the mean of s and p."""
+    behind = (Film(Index(1.52), 55.0), Film(Index(2.1), 7.0))
+    lens = random_lens(84, 90, source_um=np.inf)
+    lens = dataclasses.replace(lens, cell=Cell(0.4, cover=Index(1.31)), layers=Layers((), behind))
+    x, y = lens.diameters.x_um, lens.diameters.y_um[:, None]
+    lit = np.hypot(x + 0.6, 1.1 * y) <= 15.5
+    rough = RNG.uniform(0.7, 1.0, lit.shape) * np.exp(1j * RNG.normal(0, 0.2, lit.shape))
+    aimed = rough * np.exp(-2j * np.pi / 0.85 * (x**2 + y**2) / (2 * 104.0)) * lit  # near the focus
+    media = [(1.31, 150.0 - 62.0), (1.52, 55.0), (2.1, 7.0)]
+    stack = films.Stack(media, wavelength=0.85, step=0.4, count=800)
+    at = np.array([395, 398, 399, 402, 407])
+    axis = (at - 399.5) * 0.4
+    want = (np.abs(stack.fields(aimed)) ** 2).mean(0)[np.ix_(at - 3, at)]
+    ready = focus.prepare(lens, Window(axis, axis - 1.2, 150.0, 0.85, np.array([np.inf])))
+    got = np.abs(ready.light(ready.project(aimed[None]))[0, 0]) ** 2
+    assert np.linalg.norm(got - want) < 6e-3 * np.linalg.norm(want)
 
 
 def test_a_window_without_extent_is_refused():

@@ -1,0 +1,55 @@
+"""Ranges that follow a lens: closed forms of paraxial defocus, in air and through films."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from metalens.cell import Cell, Film, Index
+from metalens.lens import DiameterMap, Layers, Lens, reach
+from metalens.pillars import Proxy
+
+PROXY = Proxy(np.array([[3.0, 2.8, 0.3]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+
+
+def lens(sites=2501, source_um=20e3, sensor_um=3000.0, layers=None, cover="air"):
+    """One row of pillars, 1 mm wide at 2501 sites of 0.4 um."""
+    diameters = DiameterMap(np.full((1, sites), 0.2), 0.4)
+    return Lens(diameters, Cell(0.4, cover=cover), PROXY, 0.85, sensor_um, source_um, "map", layers=layers or Layers())
+
+
+def test_an_eye_tracker_of_a_millimetre_looks_from_16_to_26_mm():
+    assert reach.depth_range_um(lens()) == (16e3, 26e3)
+
+
+@pytest.mark.parametrize("source_um", [8e3, 37e3])
+def test_both_ends_are_as_far_out_of_focus(source_um):
+    made = lens(source_um=source_um)
+    near, far = reach.depth_range_um(made, digits=9)
+    waves = [abs(np.hypot(500.0, z) - z - np.hypot(500.0, source_um) + source_um) / 0.85 for z in (near, far)]
+    assert waves == pytest.approx([1.75, 1.75], rel=0.02)  # the next term: (R / 2z)² of it
+    assert near < source_um < far
+
+
+def test_a_lens_for_infinity_looks_from_where_it_blurs_to_ten_times_that():
+    near, far = reach.depth_range_um(lens(source_um=np.inf), digits=6)
+    assert near == pytest.approx(500.0**2 / (2 * 1.75 * 0.85), rel=1e-5)
+    assert far == pytest.approx(10 * near, rel=1e-5)
+
+
+def test_a_lens_of_few_pillars_looks_no_nearer_than_its_width():
+    near, far = reach.depth_range_um(lens(sites=21, source_um=1e3), digits=6)
+    assert near == pytest.approx(8.0)
+    assert far == pytest.approx(80.0)
+
+
+def test_films_count_as_the_air_that_bends_light_as_much():
+    glass = Layers(front=(Film(Index(1.5), 900.0),), behind=(Film(Index(2.0), 600.0),))
+    made = lens(layers=glass, cover=Index(1.25))
+    assert reach.sensor_reach_um(made) == pytest.approx(2400 / 1.25 + 300)
+    assert reach.diffraction_um(made) == pytest.approx(0.85 * (2400 / 1.25 + 300) / 500)
+    assert reach.defocus_per_um(made, 15e3) == pytest.approx(1 / 14.7e3 - 1 / 19.7e3, rel=1e-12)
+    assert reach.blur_um(made, 15e3) == pytest.approx(500 * 2220 * (1 / 14.7e3 - 1 / 19.7e3), rel=1e-12)
+    near, far = reach.depth_range_um(made, digits=9)
+    bare = dataclasses.replace(lens(), source_distance_um=19.7e3)
+    assert (near - 300, far - 300) == pytest.approx(reach.depth_range_um(bare, digits=9), rel=1e-8)
