@@ -4,9 +4,10 @@ Nothing of the fit's reduced model is used: pillars are changed one by one, the 
 :func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
 """
 
+import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy import ndimage, signal
@@ -19,6 +20,8 @@ from metalens.lens import Lens
 from metalens.made import Sensitivity
 
 FINE = 9
+_MARGIN = 4  # pixels about the window that blur may reach in from
+_TOGETHER = 4_000_000  # fine samples of the frames that are computed together
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,55 +119,74 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
         raise FitError(f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens")
     noise = np.random.default_rng(truth.seed + 1).standard_normal(lens.diameters.diameter_um.shape)
     noise *= truth.diameter_noise_nm * 1e-3
-    lines = spectrum(x[PLACE["bandwidth_nm"]])
-    frames = []
-    for z, angle in zip(depth.tolist(), angles, strict=True):
-        colours = [w * _frame(lens, truth, response, (x, offset, noise), (z, angle)) for offset, w in lines]
-        frames.append(np.sum(colours, axis=0) / z**2)
-    return np.stack(frames)
+    frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
+    for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
+        colour = x.copy()
+        colour[PLACE["wavelength_nm"]] += offset_nm
+        some = functools.lru_cache(1)(functools.partial(made.pillars, lens, response, colour, noise_um=noise))
+        for way, index in _alike(lens, truth, colour, depth, angles):
+            frames[index] += weight * _frames(lens, truth, colour, some(angle_rad=way.incidence_rad), way, depth[index])
+    return frames / depth[:, None, None] ** 2
 
 
-def _frame(
-    lens: Lens, truth: Truth, response: Sensitivity, state: tuple[Array, float, Any], at: tuple[float, Array]
-) -> Array:
-    """One frame at one wavelength: every pillar, then blur, then pixels."""
-    (x, offset_nm, noise), (z, angle) = state, at
-    x = x.copy()
-    x[PLACE["wavelength_nm"]] += offset_nm
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """How light comes in and where the window lies: tangents (x, y) of the source, window off its chief ray, um."""
+
+    source: tuple[float, float]
+    shift_um: tuple[float, float]
+    incidence_rad: float
+
+
+def _alike(lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Array) -> Iterator[tuple[_Way, list[int]]]:
+    """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold; through glass one by one."""
+    distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
+    ways: dict[_Way, list[int]] = {}
+    for i, (z, angle) in enumerate(zip(depth_um.tolist(), angles_rad.tolist(), strict=True)):
+        chief = [
+            math.tan(a) + math.tan(math.radians(x[PLACE[f"tilt_{n}_deg"]])) for a, n in zip(angle, "xy", strict=True)
+        ]
+        source = [c - x[PLACE[f"source_{a}_um"]] / z for c, a in zip(chief, "xy", strict=True)]
+        shift = [distance * (c - s) + x[PLACE[f"decentre_{a}_um"]] for c, s, a in zip(chief, source, "xy", strict=True)]
+        incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
+        ways.setdefault(_Way((source[0], source[1]), (shift[0], shift[1]), incidence), []).append(i)
+    fine = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
+    most = 1 if x[PLACE["glass_um"]] else max(1, _TOGETHER // fine)
+    for way, index in ways.items():
+        for first in range(0, len(index), most):
+            yield way, index[first : first + most]
+
+
+def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: Array) -> Array:
+    """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
     camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
-    tilt = [math.radians(x[PLACE[f"tilt_{a}_deg"]]) for a in "xy"]
-    chief = [math.tan(a) + math.tan(b) for a, b in zip(angle, tilt, strict=True)]
-    source = [c - x[PLACE[f"source_{a}_um"]] / z for c, a in zip(chief, "xy", strict=True)]
-    shift = [distance * (c - s) + x[PLACE[f"decentre_{a}_um"]] for c, s, a in zip(chief, source, "xy", strict=True)]
-    incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
-    t = made.pillars(lens, response, x, noise_um=noise, angle_rad=incidence)
+    wavelength_um = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     if x[PLACE["glass_um"]]:
-        d, k = lens.diameters, 2 * math.pi / (lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
-        across, down = np.meshgrid(d.x_um, d.y_um)
-        path = extra_path(across, down, tangents=(source[0], source[1]), depth_um=z, values=x)
-        t = t * np.exp(1j * k * path)
-    margin = 4
-    side = camera.pixels + 2 * margin
+        across, down = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
+        path = extra_path(across, down, tangents=way.source, depth_um=float(depth_um[0]), values=x)
+        t = t * np.exp(2j * math.pi / wavelength_um * path)
+    side = camera.pixels + 2 * _MARGIN
     middle = 0.0 if camera.pixels % 2 else -camera.pixel_um / 2  # the chief ray meets pixel (n // 2, n // 2)
     stack = psf.psf_stack(
         np.angle(t),
         np.abs(t),
         pitch_um=lens.diameters.pitch_um,
-        wavelength_um=lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
+        wavelength_um=wavelength_um,
         sensor_distance_um=distance,
-        depths_um=[z],
-        angle_rad=(math.atan(source[0]), math.atan(source[1])),
+        depths_um=depth_um,
+        angle_rad=(math.atan(way.source[0]), math.atan(way.source[1])),
         window_um=side * camera.pixel_um,
         samples=side * FINE,
         tolerance=1e-5,
-        offset_um=(shift[0] + middle, shift[1] + middle),
+        offset_um=(way.shift_um[0] + middle, way.shift_um[1] + middle),
         layers=lens.layers,
     )
-    light = stack.intensity[0] * stack.energy_um2[0]
-    step = camera.pixel_um / FINE
-    light = _blur(light, x[PLACE["pinhole_um"]] * distance / z / step, x[PLACE["crosstalk_px"]] * FINE)
-    pixels = _cell_means(light).reshape(side, FINE, side, FINE).sum((1, 3))
-    return np.asarray(pixels[margin:-margin, margin:-margin])
+    step, out = camera.pixel_um / FINE, []
+    for light, energy, z in zip(stack.intensity, stack.energy_um2, depth_um, strict=True):
+        disc_px = x[PLACE["pinhole_um"]] * distance / z / step
+        light = _cell_means(_blur(light * energy, disc_px, x[PLACE["crosstalk_px"]] * FINE))
+        out.append(light.reshape(side, FINE, side, FINE).sum((1, 3))[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
+    return np.stack(out)
 
 
 def _cell_means(light: Array) -> Array:
