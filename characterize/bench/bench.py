@@ -126,7 +126,7 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
         some = functools.lru_cache(1)(functools.partial(made.pillars, lens, response, colour, noise_um=noise))
         for way, index in _alike(lens, truth, colour, depth, angles):
             frames[index] += weight * _frames(lens, truth, colour, some(angle_rad=way.incidence_rad), way, depth[index])
-    return frames / depth[:, None, None] ** 2
+    return np.asarray(frames / depth[:, None, None] ** 2)
 
 
 @dataclass(frozen=True, slots=True)
