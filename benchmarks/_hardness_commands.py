@@ -22,7 +22,7 @@ from metalens import cli
 CELL = "[cell]\npitch_um = {}\npillar = {{n = 3.6}}\n[sweep]\nwavelengths_um = [0.85]\nsamples = 40\ntolerance = 0.05\n"
 DESIGN = "aperture_mm = {}\nlibrary = 'library.h5'\n"
 FRAME = "frames = 1\npixels = {}\npitch_um = 60.0\n"
-CAMERA = "dark_frames = 2\nflat_frames = 2\npeak_e = 50000.0\n[camera]\npixel_um = 1.5\npixels = 16\n"
+CAMERA = "dark_frames = 8\nflat_frames = 8\npeak_e = 6000.0\n[camera]\npixel_um = 16.0\npixels = 24\n"
 STUDY = "pitches_um = [{}]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\n"
 OPTICS = (
     "[axial]\ncount = 3\nangles_deg = [0.0]\nbinnings = [1]\nwindow_um = 48.0\n[scenes]\ncount = 1\npixels = 32\n"

@@ -78,6 +78,10 @@ VIEWS = {
 }
 
 
+_AGAIN_S = 0.02  # after which a dropped interrupt comes again
+_OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -96,6 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return SUCCESS
     if words[0] not in VERBS:
         return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
+    try:
+        os.getcwd()
+    except OSError:  # libraries end the process there
+        return _refuse("the current folder does not exist any more; change to another")
     _prepare()
     return _guarded(words, debug=debug)
 
@@ -106,6 +114,9 @@ def _prepare() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _stop)
+    if sys.unraisablehook is not _not_lost:
+        _OTHERWISE[:] = [sys.unraisablehook]
+        sys.unraisablehook = _not_lost
     # Threads of OpenMP that wait give their core away early: beside another busy program training is ten times slower
     # where they spin as long as they do by default; alone it is a tenth slower so.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -213,3 +224,12 @@ def _refuse(message: str, status: int = BAD_INPUT) -> int:
 
 def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt
+
+
+def _not_lost(told: Any) -> None:
+    """An interrupt that came where Python drops every exception (a callback of an import, a finaliser) comes again."""
+    if issubclass(told.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _stop)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+    else:
+        _OTHERWISE[0](told)

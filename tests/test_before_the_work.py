@@ -15,6 +15,8 @@ from metalens import lens
 from metalens.cell.record import Cell, Index
 from metalens.cli import BAD_INPUT, main
 from metalens.commands import design
+from metalens.commands.library import CellFile
+from metalens.ground import config, transaction
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -141,3 +143,116 @@ def test_a_result_does_not_take_the_name_of_its_own_picture(inputs, capsys, word
     assert main(words.split()) == BAD_INPUT
     assert "o.png" in capsys.readouterr().err
     assert not (inputs / "o.png").exists()
+
+
+@pytest.mark.parametrize("verb", sorted(NEEDS))
+def test_no_command_begins_on_a_full_disk(inputs, monkeypatch, capsys, verb):
+    words, work = NEEDS[verb]
+    module, _, name = work.partition(":")
+    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(transaction.shutil, "disk_usage", lambda _: SimpleNamespace(free=transaction.ROOM - 1))
+    before = tree(inputs)
+    assert main([verb, *words.split(), "-o", NAMES.get(verb, "o")]) == BAD_INPUT
+    told = capsys.readouterr().err
+    assert "4.19 MB free, need " in told
+    assert "make room first" in told
+    assert tree(inputs) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "needed"),
+    [
+        ("psf lens.h5 --config psf.toml -o o.h5", 4 * 3 * 2 * 60**2),
+        ("scene scene.toml -o o", 4 * 70 * 90**2),
+        ("capture lens.h5 --truth truth.toml -o o", 2 * (2 + 3 + 5) * 80**2),
+        ("fit captures --design lens.h5 -o o.h5", 2 * 3 * 12 * 14),
+    ],
+)
+def test_the_room_asked_for_is_that_of_the_result(inputs, monkeypatch, capsys, words, needed):
+    """Bytes of what is certainly written, beside what every output may need; one byte less is refused."""
+    (inputs / "psf.toml").write_text("depths_mm = [18.0, 22.0, 2.0]\nangles_deg = [0.0, 7.0]\nsamples = 60\n")
+    (inputs / "scene.toml").write_text("frames = 70\npixels = 90\n")
+    camera = "dark_frames = 3\nflat_frames = 5\n[camera]\npixels = 80\n"
+    (inputs / "truth.toml").write_text(f"depths_um = [20000.0, 24000.0]\n{camera}")
+    for verb in ("psf", "scene", "capture", "fit"):
+        module, _, name = NEEDS[verb][1].partition(":")
+        monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: 1 / 0)
+    for free, told in ((needed - 1, "make room first"), (needed, "ZeroDivisionError")):
+        usage = SimpleNamespace(free=transaction.ROOM + free)
+        monkeypatch.setattr(transaction.shutil, "disk_usage", lambda _, usage=usage: usage)
+        assert main(words.split()) == BAD_INPUT
+        assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "needed"),
+    [
+        ("design design.toml -o o.h5", 20_000),  # 4 bytes for every site of a disc 0.023 mm wide at 0.288 um: 20 039
+        ("layout lens.h5 -o o", 36),
+        ("export lens.h5 -o o.npz", 144),
+        ("export lens.h5 -o o.dat --samples 70", 12 * 70**2),
+    ],
+)
+def test_room_is_asked_for_as_soon_as_the_size_is_known(inputs, monkeypatch, capsys, words, needed):
+    """Here from the lens or the library, after the claim."""
+    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0)
+    swept = SimpleNamespace(cell=Cell(0.288, pillar=Index(3.6)))
+    monkeypatch.setattr(design, "_pillars", lambda *_: (swept, {}))
+    monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
+    (inputs / "design.toml").write_text("aperture_mm = 0.023\n")
+    for name in ("metalens.lens.export:write", "layout.mask.build:prepare", "metalens.commands.design:_phase"):
+        module, _, word = name.partition(":")
+        monkeypatch.setattr(importlib.import_module(module), word, lambda *_, **__: 1 / 0)
+    for free, told in ((0.99 * needed, "make room first"), (1.01 * needed + 50, "ZeroDivisionError")):
+        seen = iter([transaction.ROOM])
+        monkeypatch.setattr(
+            transaction.shutil, "disk_usage", lambda _, s=seen, free=free: SimpleNamespace(free=next(s, free))
+        )
+        assert main(words.split()) == BAD_INPUT
+        assert told in capsys.readouterr().err
+    assert not list(inputs.glob("o*"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "library cell.toml -o o.h5",
+        "design cell.toml -o o.h5",
+        "study cell.toml -o o",
+        "psf lens.h5 --config cell.toml -o o.h5",
+        "codesign cell.toml -o o",
+        "plan --gaze-error 1deg --config cell.toml -o o",
+        "evaluate optics lens.h5 --config cell.toml -o o",
+    ],
+)
+def test_long_work_is_not_begun_from_an_empty_file(inputs, capsys, words):
+    """A file cut to nothing, a device; a comment alone asks for the defaults."""
+    for text in ("", " \n\n", "\ufeff\n"):
+        (inputs / "cell.toml").write_text(text)
+        assert main(words.split()) == BAD_INPUT
+        assert "cell.toml: empty; need settings" in capsys.readouterr().err
+    assert main(words.replace("cell.toml", "/dev/null").split()) == BAD_INPUT
+    assert "/dev/null: empty; need settings" in capsys.readouterr().err
+    assert not list(inputs.glob("o*"))
+
+
+def test_a_comment_asks_for_the_defaults(tmp_path):
+    (tmp_path / "cell.toml").write_text("# the default cell\n")
+    assert config.load(tmp_path / "cell.toml", CellFile, empty=False) == CellFile()
+
+
+def test_folders_made_above_an_output_go_again_after_a_refusal(inputs, monkeypatch, capsys):
+    """What others put there in the meantime stays, and so does a folder that was there before."""
+    monkeypatch.setattr("codesign.commands.codesign._work", lambda *_: 1 / 0)
+    (inputs / "kept").mkdir()
+    assert main(["codesign", "run.toml", "-o", "kept/new/deep/out"]) == BAD_INPUT
+    assert list((inputs / "kept").iterdir()) == []
+
+    def other(*_):
+        (inputs / "kept" / "new" / "mine").write_text("x")
+        raise FloatingPointError
+
+    monkeypatch.setattr("codesign.commands.codesign._work", other)
+    assert main(["codesign", "run.toml", "-o", "kept/new/deep/out"]) == BAD_INPUT
+    assert [p.name for p in (inputs / "kept" / "new").iterdir()] == ["mine"]
+    assert "not foreseen" in capsys.readouterr().err

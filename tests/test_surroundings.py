@@ -52,19 +52,55 @@ def _heard():
 
 
 def test_a_lost_terminal_ends_a_command_and_leaves_nothing(tmp_path):
+    """Of a command that has claimed its output and would go on for minutes."""
     (tmp_path / "study.toml").write_text("pitches_um = [0.3]\nheights_um = [0.7]\n")
     words = [sys.executable, "-m", "metalens", "study", "study.toml", "-o", "out"]
-    quiet = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
-    child = subprocess.Popen(words, cwd=tmp_path, preexec_fn=_heard, **quiet)
-    for _ in range(1200):
-        if child.poll() is not None or list(tmp_path.glob(".out.part-*")):
-            break
+    told = tmp_path.with_name(tmp_path.name + ".told")  # not a pipe: workers hold its end while they last
+    with open(told, "w") as said:
+        child = subprocess.Popen(words, cwd=tmp_path, preexec_fn=_heard, stderr=said, stdout=subprocess.DEVNULL)
+    while child.poll() is None and not list(tmp_path.glob(".out.part-*")):
         time.sleep(0.05)
     child.send_signal(signal.SIGHUP)
-    told = child.communicate()[1]
+    child.wait()
+    told = told.read_text()
     assert child.returncode == 130, told
     assert "interrupted; the output is as it was before" in told
     assert os.listdir(tmp_path) == ["study.toml"]
+
+
+class _Interrupted:
+    """What Python drops the exceptions of."""
+
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def _dropped_and_waiting():
+    _Interrupted()
+    signal.pause()
+
+
+def test_an_interrupt_that_python_drops_comes_again(monkeypatch):
+    """It may come inside a callback of an import, or a finaliser; other dropped exceptions go where they went."""
+    others = []
+    monkeypatch.setattr(sys, "unraisablehook", others.append)
+    before = signal.getsignal(signal.SIGALRM)
+    assert main(["info", "absent.h5"]) == BAD_INPUT
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _dropped_and_waiting()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert not others
+
+
+def test_a_command_in_a_folder_that_was_removed_is_refused(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    words = f"rmdir {gone} && {sys.executable} -m metalens info absent.h5"
+    done = subprocess.run(words, shell=True, cwd=gone, capture_output=True, text=True, check=False)
+    assert done.returncode == BAD_INPUT
+    assert done.stderr == "metalens: error: the current folder does not exist any more; change to another\n"
 
 
 def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):

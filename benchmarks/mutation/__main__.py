@@ -80,10 +80,10 @@ class Worker:
     reach: Reach
 
     @classmethod
-    def begin(cls, trees: list[str], reach: Reach) -> None:
+    def begin(cls, trees: list[str], reach: Reach, tests: str) -> None:
         at = multiprocessing.current_process()._identity[0] - 1
         tree = Path(trees[at % len(trees)])
-        cls.bench, cls.server, cls.graph, cls.reach = Bench(tree), Server(tree), Graph(ROOT), reach
+        cls.bench, cls.server, cls.graph, cls.reach = Bench(tree), Server(tree, (tests,)), Graph(ROOT, tests), reach
 
     @classmethod
     def measure(cls, test: str) -> tuple[str, Seen]:
@@ -128,15 +128,17 @@ def main(words: list[str]) -> int:
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mutant")
     parser.add_argument("--trust", action="store_true", help="take what tests ran at the last measurement")
+    parser.add_argument("--tests", default="tests", help="ask the tests of this folder alone")
+    parser.add_argument("--result", type=Path, default=RESULT, help="file that keeps the table")
     parser.add_argument("--again", action="store_true", help="judge the survivors of the kept result once more")
     asked = parser.parse_args(words)
-    chosen = _survivors() if asked.again else drawn(asked.count, asked.seed, asked.only, asked.bars)
+    chosen = _survivors(asked.result) if asked.again else drawn(asked.count, asked.seed, asked.only, asked.bars)
     load_libraries()
     with contextlib.ExitStack() as stack:
         trees = [str(stack.enter_context(copy_of(ROOT))) for _ in range(asked.jobs)]
-        reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if asked.trust else _measured(trees)
+        reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if asked.trust else _measured(trees, asked.tests)
         rows = []
-        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, (trees, reach)) as pool:
+        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, (trees, reach, asked.tests)) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):
                 rows.append(row)
                 _say(len(rows), len(chosen), row)
@@ -144,9 +146,9 @@ def main(words: list[str]) -> int:
     return _keep(rows, asked, " ".join(words))
 
 
-def _survivors() -> list[rules.Mutant]:
+def _survivors(result: Path) -> list[rules.Mutant]:
     """Those of the kept result that have no reason, found again in the source as it is now."""
-    kept = json.loads(RESULT.read_text(encoding="utf-8"))["mutants"]
+    kept = json.loads(result.read_text(encoding="utf-8"))["mutants"]
     reasons = json.loads(REASONS.read_text(encoding="utf-8"))
     open_ = (r for r in kept if r["outcome"] == "survived" and _reasoned(r) not in reasons)
     left = {(row["path"], row["text"], row["was"], row["became"]) for row in open_}
@@ -158,12 +160,12 @@ def _survivors() -> list[rules.Mutant]:
     return found
 
 
-def _measured(trees: list[str]) -> Reach:
-    """What every test runs; files of tests that are as they were at the last measurement are not asked again."""
+def _measured(trees: list[str], tests: str) -> Reach:
+    """What every test of a folder runs; files that are as they were at the last measurement are not asked again."""
     known = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if SEEN.exists() else Reach()
-    files = {path.relative_to(ROOT).as_posix(): path for path in (ROOT / "tests").rglob("test_*.py")}
+    files = {path.relative_to(ROOT).as_posix(): path for path in (ROOT / tests).rglob("test_*.py")}
     needed = sorted(name for name, path in files.items() if known.files.get(name) != digest(path))
-    with multiprocessing.get_context("fork").Pool(len(trees), Worker.begin, (trees, known)) as pool:
+    with multiprocessing.get_context("fork").Pool(len(trees), Worker.begin, (trees, known, tests)) as pool:
         for done, (test, seen) in enumerate(pool.imap_unordered(Worker.measure, needed), 1):
             known.add(ROOT, test, seen)
             print(
@@ -192,7 +194,7 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
     """The result as JSON and as a table; with --again the judged ones replace their old lines."""
     reasons = json.loads(REASONS.read_text(encoding="utf-8"))
     if asked.again:
-        kept = json.loads(RESULT.read_text(encoding="utf-8"))
+        kept = json.loads(asked.result.read_text(encoding="utf-8"))
         judged = {_identity(row): row for row in rows}
         rows, words = [judged.get(_identity(row), row) for row in kept["mutants"]], kept["command"]
     else:
@@ -202,8 +204,8 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
         reason = reasons.get(_reasoned(row))
         if reason and row["outcome"] != "killed":
             row["reason"] = reason
-    RESULT.write_text(json.dumps({"command": words, "mutants": rows}, indent=1) + "\n", encoding="utf-8")
-    RESULT.with_suffix(".md").write_text(table.markdown(rows, words), encoding="utf-8")
+    asked.result.write_text(json.dumps({"command": words, "mutants": rows}, indent=1) + "\n", encoding="utf-8")
+    asked.result.with_suffix(".md").write_text(table.markdown(rows, words), encoding="utf-8")
     print(table.summary(rows))
     return int(any(row["outcome"] in ("survived", "no test") and "reason" not in row for row in rows))
 

@@ -10,16 +10,16 @@ PACKAGES = ("metalens", "layout", "characterize", "codesign", "benchmarks")
 
 
 class Graph:
-    """Imports of the project under ``root``: modules, tests, and how far each is from each."""
+    """Imports of the project under ``root``: modules, tests in a folder, and how far each is from each."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, tests: str = "tests") -> None:
         self.root = root
         self.modules = {
             path.relative_to(root).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__"): path
             for package in PACKAGES
             for path in (root / package).rglob("*.py")
         }
-        self.tests = sorted((root / "tests").rglob("test_*.py"))
+        self.tests = sorted((root / tests).rglob("test_*.py"))
         self._reach = {test: self._distances(test) for test in self.tests}
 
     @functools.cached_property

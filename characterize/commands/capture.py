@@ -78,7 +78,8 @@ def _shoot(options: Options, path: Path) -> int:
     target = options.output
     truth = config.load(path, Truth)
     design = lenses.load_plain(options.lens)
-    with options.claim_folder(target) as draft:
+    frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
+    with options.claim_folder(target, room=transaction.ROOM + 2 * frames * truth.camera.pixels**2) as draft:
         shots = bench.shoot(design, truth, slopes(design, wanted=[k.name for k in truth.parameter if k.value]))
         _fill(draft.path, shots, truth, design)
     values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}

@@ -15,7 +15,7 @@ from characterize.model import Known
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
 from metalens.commands import Common, Output
-from metalens.ground import config, store
+from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 
 
@@ -72,7 +72,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
     truth = config.load(options.truth, Truth) if options.truth else None
     hidden = {k.name: k.value for k in truth.parameter} if truth else None
-    with options.claim(target, beside=report.BESIDE) as draft:
+    with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
         result = dataclasses.replace(fit(shots, lens, choice), provenance=_provenance(options, design))
         asbuilt.save(draft.path, result)
         report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
@@ -85,7 +85,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
     if spec.mask is not None:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     shots = captures.load(options.capture)
-    with options.claim(target, beside=report.BESIDE) as draft:
+    with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
         found = fit_pupil(shots, spec, insist=options.insist)
         save(draft.path, found, _provenance(options, pupil, *([spec.mask] if spec.mask else [])))
         report.pupil_report(draft.path.with_suffix(".html"), found)

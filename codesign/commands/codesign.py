@@ -73,8 +73,10 @@ def run(options: Options) -> int:
         return _assist(transaction.unfinished(options.output), settings, device)
     with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:
         rows, said = _work(options, settings, device, draft.path)
-    values = {"rows": rows, "folder": str(options.output), "image": said}
-    options.console.result(values, f"{_table(rows)}\n{formed.words(said)}")
+    count = torch.get_num_threads()
+    values = {"rows": rows, "folder": str(options.output), "image": said, "threads": count}
+    words = f"trained on {count} threads; another number changes the last digits, and with them the run"
+    options.console.result(values, f"{_table(rows)}\n{formed.words(said)}\n{words}")
     return 0
 
 
@@ -222,6 +224,7 @@ def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]], sa
     found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
     found |= {"network": settings.network, "frozen": list(settings.run.frozen), "image": said}
     found |= {"pitch_held_um": going.trainer.pitch_held_um}
+    found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
     if going.searches:
         store.write_bytes(folder / "pareto.png", _plot(going))

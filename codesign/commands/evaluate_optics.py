@@ -67,7 +67,7 @@ def run(options: Options) -> int:
     """Measure, print, draw, write."""
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
-    settings = Settings() if options.config is None else config.load(options.config, Settings)
+    settings = Settings() if options.config is None else config.load(options.config, Settings, empty=False)
     if options.scenes is not None:
         settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
     made = [lenses.load_plain(path) for path in options.lenses]

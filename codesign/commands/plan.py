@@ -66,7 +66,7 @@ def run(options: Options) -> int:
         ConfigError: the goal is below what no setting changes.
     """
     goal = angle_rad(options.gaze_error)
-    wanted = PlanConfig() if options.config is None else config.load(options.config, PlanConfig)
+    wanted = PlanConfig() if options.config is None else config.load(options.config, PlanConfig, empty=False)
     target = options.output
     with options.claim_folder(target) as draft:
         rig = replace(wanted.task.rig, sensor_distance_um=wanted.focus.sensor_distance_um)

@@ -11,7 +11,7 @@ import tyro
 from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks, render
 from codesign.referee import pathtraced
 from metalens.commands import Common, Output
-from metalens.ground import config, store
+from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import Provenance
 from metalens.image import scene
@@ -94,7 +94,7 @@ def run(options: Options) -> int:
     if options.referee:
         pathtraced.start()
     folder = options.output
-    with options.claim_folder(folder) as draft:
+    with options.claim_folder(folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2) as draft:
         count = _make(settings, draft.path, referee=options.referee)
     values = {"frames": settings.frames, "layers": count, "folder": str(folder)}
     options.console.result(values, f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png")

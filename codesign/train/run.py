@@ -88,7 +88,7 @@ def load(path: str | Path) -> RunConfig:
     Raises:
         ConfigError: see :func:`metalens.ground.config.load`; an unknown preset.
     """
-    table = config.read(path, RunConfig)
+    table = config.read(path, RunConfig, empty=False)
     preset = preset_table(table.get("preset", "laptop"))
     return config.from_table(config.merged(preset, table), RunConfig, where=str(path))
 

@@ -1,6 +1,7 @@
 """lens.h5 to a mask: quantised, dosed, checked, written, read back and compared, with report and pictures."""
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from layout.process import process as processes
 from layout.rules import check as drc
 from layout.rules import markers
 from metalens import lens as lenses
-from metalens.ground import config, store
+from metalens.ground import config, store, transaction
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
@@ -52,6 +53,7 @@ def _prepare(options: Options) -> Job:
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
         _refuse_beyond_plain(options, source)
+        transaction.check_room(options.output, math.prod(source.diameters.diameter_um.shape))  # a byte each, or more
     with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, with_doses=options.dose)
     with stages("write fields"):

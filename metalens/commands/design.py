@@ -25,7 +25,7 @@ from metalens.design import (
     focuses,
 )
 from metalens.design.free_form import Fisher
-from metalens.ground import config, store
+from metalens.ground import config, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
@@ -108,7 +108,7 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where the light does not focus where it should."""
-    wanted = config.load(options.config, Design)
+    wanted = config.load(options.config, Design, empty=False)
     target, read = options.output, _read(wanted, options.config)
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
@@ -132,6 +132,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     """Design, check and write the lens with its pictures."""
     made_of, inputs = _pillars(wanted, options.config, options.console)
     cell, proxy = made_of.cell, library.proxy_of(made_of)
+    transaction.check_room(options.output, int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2))  # 4 each
     proxy.at(wanted.focus.wavelength_um)  # outside the library it is refused here, not after the search for a phase
     if options.process is not None:
         wanted = replace(wanted, limits=_printable(options.process, cell, wanted.limits))

@@ -7,6 +7,7 @@ import tyro
 
 from metalens import lens
 from metalens.commands.common import Common, Output
+from metalens.ground import transaction
 from metalens.lens import export
 
 
@@ -30,9 +31,13 @@ def run(options: Options) -> int:
     """Write the file; exit 0."""
     export.check(options.output)
     with options.claim(options.output) as draft:
-        error = export.write(draft.path, lens.load(options.lens), samples=options.samples)
+        made = lens.load(options.lens)
+        grid = options.output.suffix.lower() == export.GRID
+        rows, columns = made.diameters.diameter_um.shape
+        transaction.check_room(options.output, 12 * options.samples**2 if grid else 4 * rows * columns)
+        error = export.write(draft.path, made, samples=options.samples)
     how = ""
-    if options.output.suffix.lower() == export.GRID:
+    if grid:
         how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"
     told = {"file": options.output.name, "bytes": options.output.stat().st_size, "interpolation_error_rad": error}
     options.console.result(told, f"{options.output}: {told['bytes']:,} bytes{how}")

@@ -49,7 +49,7 @@ class Options(Distributed):
 
 def run(options: Options) -> int:
     """Sweep, fit, write; exit 1 where an error bar misses the tolerance or no full turn is covered."""
-    wanted = config.load(options.config, CellFile)
+    wanted = config.load(options.config, CellFile, empty=False)
     library.check(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
     with options.claim(target, beside=(".png",)) as draft, options.workers():

@@ -124,7 +124,7 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
-    settings = Settings() if options.config is None else config.load(options.config, Settings)
+    settings = Settings() if options.config is None else config.load(options.config, Settings, empty=False)
     if options.tolerance is not None:
         settings = replace(settings, tolerance=options.tolerance)
     psf_export.check(options.output)

@@ -34,7 +34,7 @@ class Options(Distributed):
 
 def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
-    study = Study() if options.config is None else config.load(options.config, Study)
+    study = Study() if options.config is None else config.load(options.config, Study, empty=False)
     given = "" if options.config is None else f" {options.config.name}"
     if options.process is not None:
         study = _printable(options.process, study)

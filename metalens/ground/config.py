@@ -21,8 +21,11 @@ _EITHER_SIGN = ("_rad", "_deg", "_offset")
 _MOST, _LARGE = (1 << 63) - 1, 1e9  # of a seed; of any other number, in the unit of its key
 
 
-def load(path: str | Path, record: type[Record]) -> Record:
+def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Record:
     """Read a TOML file into ``record``, a frozen dataclass (nested dataclasses are tables).
+
+    Args:
+        empty: whether a file without a word stands for the defaults; long work refuses it.
 
     A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its field says more: ``signed`` (or
     not), ``above`` (more than that), ``most``, ``may_be_inf``. A seed is any whole number from 0. What a record itself
@@ -32,14 +35,14 @@ def load(path: str | Path, record: type[Record]) -> Record:
         ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
             record refuses; the message gives file and key.
     """
-    return from_table(read(path, record), record, where=str(path))
+    return from_table(read(path, record, empty=empty), record, where=str(path))
 
 
-def read(path: str | Path, record: type[Any]) -> dict[str, Any]:
+def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str, Any]:
     """The tables of a TOML file that is to become ``record``.
 
     Raises:
-        ConfigError: missing file, not text, or not TOML.
+        ConfigError: missing file, not text, or not TOML; empty where that is no answer.
     """
     path = Path(path)
     try:
@@ -58,6 +61,8 @@ def read(path: str | Path, record: type[Any]) -> dict[str, Any]:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{str(path)!r}: no name of a file ({error})") from None
+    if not empty and not text.strip():
+        raise ConfigError(f"{path}: empty; need settings ({record.__name__}), or a comment line for all defaults")
     return _parsed(text.replace("\r\n", "\n"), str(path))
 
 

@@ -18,7 +18,7 @@ from metalens.ground.errors import OutputError
 
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")  # words of the command line, for locks and manifests
 _open: set[int] = set()
-_SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, s))
+_SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM") if hasattr(signal, s))
 
 
 @contextlib.contextmanager
@@ -42,6 +42,20 @@ def held(target: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
         os.close(handle)
+
+
+@contextlib.contextmanager
+def parents(target: Path) -> Iterator[None]:
+    """Missing folders above an output; those that are made here and hold nothing go again where the block fails."""
+    missing = [folder for folder in target.parents if not folder.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for folder in missing:
+                folder.rmdir()
+        raise
 
 
 @contextlib.contextmanager

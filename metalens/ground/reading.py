@@ -1,12 +1,14 @@
 """Loaders that fail by type: whatever a damaged or edited file does, the answer is one error that names the file.
 
-The HDF5 library ends its process on some damaged files. So a forked child with little to lose reads a file first.
+The HDF5 library ends its process on some damaged files. So a forked child with little to lose reads a file first; and
+it writes to a file that never refuses, since it may end its process on a full disk too.
 """
 
 import contextlib
 import dataclasses
 import faulthandler
 import functools
+import io
 import os
 import resource
 import typing
@@ -25,6 +27,34 @@ _ROOM, _SECONDS = 600 << 20, 60  # address space beyond what this process has, t
 _DENSEST = 1100  # more of it for a byte of the file: what deflate can do at best, and copies
 _MOST_WORDS = 4000
 _WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
+
+
+class Through(io.FileIO):
+    """A file for the HDF5 library, which may crash the process where a write fails, as on a full disk.
+
+    So no write fails before its eyes: the first refusal is kept for :meth:`check`, nothing is written from then on.
+    """
+
+    refused: OSError | None = None
+
+    def check(self) -> None:
+        """Raise what a write was refused with."""
+        if self.refused is not None:
+            raise self.refused
+
+    def write(self, content: Any) -> int:
+        """All of ``content``."""
+        view = memoryview(content)
+        try:
+            while view and self.refused is None:
+                view = view[super().write(view) :]
+        except OSError as error:
+            self.refused = error
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size of what is still written."""
+        return 0 if self.refused is not None else super().truncate(size)
 
 
 def reader(load: Callable[..., Made]) -> Callable[..., Made]:

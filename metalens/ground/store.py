@@ -4,7 +4,6 @@ import contextlib
 import fcntl
 import hashlib
 import importlib.metadata
-import io
 import os
 import sys
 import tempfile
@@ -168,12 +167,10 @@ def save(
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    # The HDF5 library may crash the process when a disk is full; so it writes to memory, and plain checked writes
-    # bring that to the disk.
-    image = io.BytesIO()
-    _write(image, kind, version, attributes or {}, arrays, provenance or Provenance(), compress)
-    with replacing(path) as part, open(part, "wb") as file:
-        file.write(image.getbuffer())
+    with replacing(path) as part, reading.Through(part, "wb+") as file:
+        with lock.undisturbed():  # an interrupt inside the library is a failed write too
+            _write(file, kind, version, attributes or {}, arrays, provenance or Provenance(), compress)
+        file.check()
 
 
 def load(path: str | Path, kind: str | None = None, *, version: int = 1, without: Collection[str] = ()) -> Stored:
@@ -270,7 +267,7 @@ class _Held(dict[str, Any]):
 
 
 def _write(
-    path: io.BytesIO,
+    through: reading.Through,
     kind: str,
     version: int,
     attributes: Mapping[str, Attribute],
@@ -278,12 +275,13 @@ def _write(
     provenance: Provenance,
     compress: bool,
 ) -> None:
-    with h5py.File(path, "w", track_order=False, libver=_FORMAT) as file:
+    with h5py.File(through, "w", track_order=False, libver=_FORMAT) as file:
         header: dict[str, Attribute] = {"kind": kind, "version": version, "units": _UNITS}
         for name, value in (header | dict(sorted(attributes.items()))).items():
             _write_attribute(file, name, value)
         for name in sorted(arrays):
             _write_array(file, name, np.asarray(arrays[name]), compress)
+            through.check()
         _write_provenance(file, provenance)
 
 

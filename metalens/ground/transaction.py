@@ -117,6 +117,7 @@ def long_work(
         work = unfinished(target)
         if not (resume or grow):
             _refuse(target, (), terms, is_folder=True)
+        check_room(target, terms.room)
         resumed = _open_work(scratch, target, terms, resume=resume or grow, grow=grow)
         try:
             yield Draft(work, target, resumed=resumed)
@@ -140,11 +141,11 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
     """The lock of an output, with leftovers of dead owners cleared."""
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write")
-    if terms.parents:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    if not target.parent.is_dir():
-        raise OutputError(f"{target}: folder {target.parent} does not exist; make it or give another name")
     with contextlib.ExitStack() as held:
+        if terms.parents:
+            held.enter_context(lock.parents(target))
+        if not target.parent.is_dir():
+            raise OutputError(f"{target}: folder {target.parent} does not exist; make it or give another name")
         try:
             held.enter_context(lock.held(target))
         except PermissionError as error:
@@ -187,9 +188,18 @@ def _refuse(target: Path, beside: Iterable[str], terms: Terms, *, is_folder: boo
         why = manifest.foreign(path)
         if why:
             raise OutputError(f"{path} {why}: not overwritten, not even with --force; move it or give another name")
+    check_room(target, terms.room)
+
+
+def check_room(target: Path, room: int) -> None:
+    """Refuse an output of ``room`` bytes that its disk has no room for; for sizes that are known after the claim.
+
+    Raises:
+        OutputError: naming what is free and what is needed.
+    """
     spare = shutil.disk_usage(target.parent).free
-    if spare < terms.room:
-        raise OutputError(f"{target}: {spare / 1e6:.3g} MB free, need {terms.room / 1e6:.3g} MB; make room first")
+    if spare < room:
+        raise OutputError(f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first")
 
 
 def _something(path: Path) -> bool:
@@ -225,7 +235,7 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
         others = {*beside, *made} - {target.name}
         _refuse(target, others, terms, is_folder=False)
         (scratch / _READY).touch()
-        _sync_folder(scratch)
+        store.sync_folder(scratch)
         for name in others:
             if target.with_name(name).exists():
                 target.with_name(name).rename(old / name)
@@ -233,7 +243,7 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
         for name in made:
             if name != target.name:
                 (new / name).replace(target.with_name(name))
-        _sync_folder(target.parent)
+        store.sync_folder(target.parent)
 
 
 def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False) -> None:
@@ -245,7 +255,7 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
         if not whoever:
             _refuse(target, (), terms, is_folder=True)
         (scratch / _READY).write_text(f"{new.stat().st_ino}", encoding="ascii")
-        _sync_folder(scratch)
+        store.sync_folder(scratch)
         _put(scratch, new, target)
 
 
@@ -258,7 +268,7 @@ def _put(scratch: Path, new: Path, target: Path) -> None:
     else:
         target.rename(scratch / "old")
         new.rename(target)
-    _sync_folder(target.parent)
+    store.sync_folder(target.parent)
 
 
 def _open_work(scratch: Path, target: Path, terms: Terms, *, resume: bool, grow: bool) -> bool:
@@ -333,8 +343,4 @@ def _sync(folder: Path) -> None:
                 os.fsync(handle)
             finally:
                 os.close(handle)
-        _sync_folder(Path(place))
-
-
-def _sync_folder(folder: Path) -> None:
-    store.sync_folder(folder)
+        store.sync_folder(Path(place))

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 
 import h5py
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from metalens.ground import store
+from metalens.ground import reading, store
 from metalens.ground.errors import StoreError
 
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "group/b": np.arange(40_000), "names": np.array(["x", "µm"])}
@@ -112,7 +113,7 @@ def test_disk_full_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     script = textwrap.dedent(f"""
         import resource, signal
         import numpy as np
-        from metalens.ground import store
+        from metalens.ground import reading, store
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         try:
@@ -126,13 +127,38 @@ def test_disk_full_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     assert os.listdir(tmp_path) == ["f.h5"]
 
 
+def test_a_file_is_written_without_a_second_copy_in_memory(tmp_path):
+    """Chunks are at most 1 MiB, and the library holds a few of them; a whole image would be 24 MB."""
+    light = np.random.default_rng(7).random(3 * 10**6)
+    tracemalloc.start()
+    store.save(tmp_path / "f.h5", "lens", {"light": light}, compress=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 6 << 20
+    np.testing.assert_array_equal(store.load(tmp_path / "f.h5", "lens").arrays["light"], light)
+
+
+def test_the_library_never_sees_that_a_write_was_refused(tmp_path):
+    """Here by a file that is open for reading alone: after the first refusal, which is told later, none is tried."""
+    (tmp_path / "f").write_bytes(b"abcde")
+    with reading.Through(tmp_path / "f", "rb") as file:
+        assert file.write(bytearray(b"fgh")) == 3
+        first = file.refused
+        assert file.write(bytearray(b"i")) == 1
+        assert file.truncate(2) == 0
+        assert file.refused is first
+        with pytest.raises(OSError, match="not open for writing"):
+            file.check()
+    assert (tmp_path / "f").read_bytes() == b"abcde"
+
+
 def test_terminated_while_writing_leaves_the_old_file_whole(tmp_path):
     path = tmp_path / "f.h5"
     store.save(path, "lens", ARRAYS)
     before = path.read_bytes()
     script = textwrap.dedent(f"""
         import numpy as np, sys, signal
-        from metalens.ground import store
+        from metalens.ground import reading, store
         arrays = {{"x": np.random.default_rng(0).random((4000, 4000))}}
         print("ready", flush=True)
         while True:
