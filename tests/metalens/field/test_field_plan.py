@@ -1,0 +1,162 @@
+"""Choices of nodes on lines of PSFs whose interpolation error is known: base + eps t⁴ · change, change of sum 0."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.field import Grid, forming, patches, plan, subset
+from metalens.field.patches import relative, shares
+from metalens.ground.errors import SceneError
+from metalens.psf import Nodes, Source
+
+draw = np.random.default_rng(21)
+BASE = torch.from_numpy(draw.random((7, 7)) + 0.3)
+BASE /= BASE.sum()
+CHANGE = torch.from_numpy(draw.random((7, 7)))
+CHANGE = CHANGE / CHANGE.sum() - BASE
+RATIO = float(relative(BASE + CHANGE, BASE))  # of change to base, as a 1/f texture sees them
+
+
+def line(eps, length):
+    """PSFs at places 0 … length: base + eps (place / length)⁴ change, brightness falling along the line."""
+
+    def at(places):
+        t = places / length
+        psf = BASE + eps * (t**4)[:, None, None] * CHANGE
+        return (psf * (1.7 - t)[:, None, None])[:, None]
+
+    return at
+
+
+def cubic_error(eps, intervals):
+    """Of t⁴ half-way between even nodes: ∏ (t - t_i) is 0.5625 h⁴, in the first and the last interval 0.9375 h⁴."""
+    mean = (2 * 0.9375**2 + (intervals - 2) * 0.5625**2) / intervals
+    return eps * RATIO * math.sqrt(mean) / intervals**4
+
+
+@pytest.mark.parametrize(("between", "nodes"), [((4, 6), 7), ((6, 8), 9), ((8, 12), 13), ((16, 24), 25)])
+def test_as_few_depths_as_the_error_of_cubics_asks_for(between, nodes):
+    eps = 1e-3  # change of the norm itself: 1e-3 of the error
+    few, enough = (cubic_error(eps, n) for n in between)
+    assert plan._fewest(line(eps, plan.FINE), 1.01 * enough, "depths") == nodes
+    assert plan._fewest(line(eps, plan.FINE), 0.99 * few, "depths") == nodes
+    with pytest.raises(SceneError, match=r"25 depths leave .* of the image"):
+        plan._fewest(line(eps, plan.FINE), 0.99 * cubic_error(eps, 24), "depths")
+
+
+def test_as_few_field_points_as_the_error_of_cubics_asks_for():
+    """Even nodes on an axis of 192 steps; what is tried next comes from how the error falls, so a few may be spared."""
+    eps, span = 1e-3, (0.0, 300.0)
+    for intervals in (8, 12, 16, 24):
+        tolerance = 1.01 * cubic_error(eps, intervals)
+        count, denser = plan._line(line(eps, plan.ALONG), span, tolerance)
+        assert plan._Known(line(eps, plan.ALONG)).error(plan.placed(count, denser, span).int().tolist()) <= tolerance
+        assert count <= 1.5 * intervals + 2
+    with pytest.raises(SceneError, match="field points along an axis leave"):
+        plan._line(line(eps, plan.ALONG), span, 1e-12)
+
+
+def test_a_spectrum_takes_the_rule_that_the_next_one_confirms(monkeypatch):
+    """A fifth power of the wavelength: three nodes of Gauss are exact, two are not; so three are taken, of error 0."""
+
+    def spectral(optics, at, depths, waves, window):
+        share = ((torch.from_numpy(waves.wavelengths_um) - 0.83) / 0.05) ** 5 @ torch.from_numpy(waves.weights)
+        return (BASE + 1e-3 * share * CHANGE).expand(len(at), len(depths), 7, 7)
+
+    monkeypatch.setattr(plan, "spectral", spectral)
+    source, grid = Source(850.0, 41.0), Grid((5, 6), 2.0, (3e3, 9e3), window=7)
+    made = plan.waves_of(None, grid, source, (0.0, 0.0), [4.0, 5.0], 1e-9)
+    assert len(made.wavelengths_um) == 3
+    assert made.error < 1e-12
+    two, three = (plan._coarse(source, n) for n in (2, 3))
+    apart = [float(((n.wavelengths_um - 0.83) / 0.05) ** 5 @ n.weights) for n in (two, three)]
+    error = 1e-3 * abs(apart[0] - apart[1]) * RATIO
+    loose = plan.waves_of(None, grid, source, (0.0, 0.0), [4.0, 5.0], 1.02 * error)
+    assert len(loose.wavelengths_um) <= 2
+    if len(loose.wavelengths_um) == 2:
+        assert loose.error == pytest.approx(error, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("samples", "middle", "folds"), [((6, 6), 0.0, True), ((6, 7), 0.0, False), ((6, 6), 0.0, False)]
+)
+def test_a_field_folds_only_where_it_is_square(monkeypatch, samples, middle, folds):
+    monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
+    monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
+    grid = Grid(samples, 2.0, (3e3, 9e3), window=7)
+    round_lens = folds or samples[0] != samples[1]
+    waves = Nodes(np.array([0.85]), np.array([1.0]), 0.0)
+    made = plan.planned(None, grid, waves, (middle, middle), tolerance=0.01, folds=round_lens)
+    assert made.folds is folds
+    assert [len(made.y_um), len(made.x_um)] == [5, 5]  # the least that is tried
+    half = [(n - 1) / 2 * 2.0 for n in grid.frame]
+    assert [float(made.y_um[-1]), float(made.x_um[-1])] == pytest.approx(half)
+    assert [float(made.y_um[0]), float(made.x_um[0])] == pytest.approx([-h for h in half])
+    assert len(made.depths_um) == 5
+
+
+def test_light_from_one_point_and_one_wavelength_is_drawn_evenly_and_by_weight(monkeypatch):
+    """3000 draws of 12 places: 250 each, sigma 15; of weights 1 : 3."""
+    seen = []
+
+    def term(optics, made, gradient, point, wave):
+        seen.append((point, wave))
+        return torch.tensor(2.5)
+
+    monkeypatch.setattr(subset, "term", term)
+    made = SimpleNamespace(
+        y_um=torch.arange(4.0), x_um=torch.arange(3.0), waves=Nodes(np.array([0.84, 0.86]), np.array([0.2, 0.6]), 0.0)
+    )
+    generator = torch.Generator().manual_seed(4)
+    assert float(subset.surrogate(None, made, None, draws=3000, generator=generator)) == 2.5
+    counts = np.bincount([point for point, _ in seen], minlength=12)
+    assert len(counts) == 12
+    assert abs(counts - 250).max() < 75
+    assert abs(sum(wave for _, wave in seen) - 2250) < 5 * math.sqrt(3000 * 0.25 * 0.75)
+
+
+def test_patches_that_share_no_pixels_have_each_one_whole():
+    made = shares(10, 3, 0)
+    assert [(a, b) for a, b, _ in made] == [(0, 3), (3, 6), (6, 10)]
+    assert all(torch.equal(share, torch.ones_like(share)) for _, _, share in made)
+
+
+def test_patches_that_overlap_share_by_a_sine_squared():
+    """Pixels 8 to 11 of 20 lie within two of the edge at 10: their middles at -3/8, -1/8, 1/8, 3/8 of the overlap."""
+    (a, b, first), (c, d, second) = shares(20, 2, 4)
+    assert (a, b, c, d) == (0, 12, 8, 20)
+    up = [math.sin(math.pi / 2 * (p + 0.5)) ** 2 for p in (-0.375, -0.125, 0.125, 0.375)]
+    assert second[:4].tolist() == pytest.approx(up, rel=1e-12)
+    assert first[8:].tolist() == pytest.approx([1 - u for u in up], rel=1e-12)
+    assert first[:8].tolist() == [1.0] * 8
+
+
+def test_patches_off_the_corner_give_the_psfs_of_their_own_pixels():
+    """Three nodes an axis: a quadratic through them, of which patches lose nothing; 2 by 2 patches."""
+    random = np.random.default_rng(6)
+    stack = torch.from_numpy(random.random((3, 3, 2, 5, 5)))
+    stack /= stack.sum((-1, -2), keepdim=True)
+    grid = Grid((9, 8), 2.0, (3e3, 9e3), margin=2, window=5)
+    rows, columns = grid.frame
+    y, x = (torch.tensor([-1.0, 0.2, 1.0], dtype=torch.float64) * (n - 1) for n in (rows, columns))
+    made = SimpleNamespace(y_um=y, x_um=x, depths_um=torch.tensor([3e3, 9e3], dtype=torch.float64))
+    between = forming.between_nodes(grid, made)
+    energy = torch.ones(3, 3, 2, dtype=torch.float64)
+    cut = patches.cut(stack, energy, between, patches=2, overlap=2, tolerance=1e-12)
+    assert len(cut) == 4
+    optics = SimpleNamespace(stack=stack.float(), plan=made, patches=cut)
+    wanted = [(0, 0), (rows - 1, 3), (5, columns - 1), (rows - 2, columns - 3), (rows // 2, columns // 2)]
+    depth = 1 / (0.3 / 3e3 + 0.7 / 9e3)
+    got = forming.psfs_used(optics, torch.tensor(wanted), torch.tensor([depth], dtype=torch.float64))[:, 0]
+
+    def through(nodes, n, at):
+        place = np.linspace(-(n - 1), n - 1, n)[at]
+        return [np.prod([(place - o) / (p - o) for o in nodes if o != p]) for p in nodes]
+
+    for (row, column), psf in zip(wanted, got, strict=True):
+        wy, wx = through(y.tolist(), rows, row), through(x.tolist(), columns, column)
+        want = np.einsum("a,b,c,abcyx->yx", wy, wx, [0.3, 0.7], stack.numpy())
+        assert np.abs(psf.numpy() - want).max() < 2e-5 * np.abs(want).max()  # float32, and vectors cut at 1e-7
