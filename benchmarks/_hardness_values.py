@@ -12,6 +12,7 @@ from benchmarks import _hardness_samples as samples
 from characterize.bench import Protocol
 from codesign.commands.evaluate_optics import Settings as OpticsSettings
 from codesign.train.run import RunConfig, preset_table
+from layout.arrange import Arrangement
 from layout.process import Process
 from metalens.ground import config
 from metalens.ground.errors import MetalensError
@@ -27,7 +28,8 @@ NEEDED: dict[str, dict[str, Any]] = {
     "Blend": {"base": "SiO2", "other": "air", "share": 0.3}, "Film": {"material": "SiO2", "thickness_um": 0.1},
     "Index": {"n": 1.5}, "Known": {"name": "bias_nm", "value": 3.0}, "Cell": {"pitch_um": 0.3},
     "PhaseMap": {"file": "map.npy", "pitch_um": 0.4}, "Layer": {"height_um": 0.7, "material": "SiO2"},
-    "Schedule": {"rate": 0.01},
+    "Schedule": {"rate": 0.01}, "Into": {"file": "chip.gds"}, "Wafer": {"pitch_um": [4100.0, 3100.0]},
+    "Mark": {"x_mm": -30.0, "y_mm": 0.5},
 }  # fmt: skip
 
 
@@ -48,6 +50,13 @@ class Trial:
         return "FILE" in self.said and any(part in self.said for part in parts[-2:])
 
 
+_ARRANGEMENT = """
+lens = [{file = "lens.h5", name = "A", at = [{columns = 2, step_um = [900.0, 900.0]}]}]
+cell = [{file = "pads.gds", name = "PADS", at = [{x_um = -3.0}]}]
+die = {size_um = [4000.0, 3000.0]}
+"""
+
+
 def roots() -> dict[str, tuple[Any, dict[str, Any]]]:
     """{settings: (record, a good table)} of every settings file of every command."""
     found = {kind: (record, tomllib.loads(text)) for kind, (_, text, record) in samples.TEXTS.items()}
@@ -55,6 +64,7 @@ def roots() -> dict[str, tuple[Any, dict[str, Any]]]:
     found["process"] = (Process, found["process"][1])
     found["protocol"] = (Protocol, {"depths_um": [18000.0, 22000.0]})
     found["optics"] = (OpticsSettings, {})
+    found["arrangement"] = (Arrangement, tomllib.loads(_ARRANGEMENT))
     return found
 
 

@@ -223,7 +223,7 @@ def _certificate_rows(target: Path) -> list[Row]:
     from layout.process.process import Exposure, Process
 
     process = Process(exposure=Exposure(alpha_um=0.012, beta_um=30.0, eta=0.7))
-    made = build.prepare(_lens(1.0, 0.3).diameters, process, furnished=False)
+    made = build.prepare(_lens(1.0, 0.3).diameters, process, furniture="none")
     layout.write_gdsii(made.plan, target / "c.gds")
     doses.write(made.plan, process, target / "c.csv")
     content, table = layout.read_gdsii(target / "c.gds"), doses.read(target / "c.csv")

@@ -76,7 +76,7 @@ plt.show()
 # report.)
 
 # %%
-made = build.prepare(lens, rules, dosed=False)
+made = build.prepare(lens, rules, with_doses=False)
 report = drc.check(made.plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())

@@ -65,7 +65,7 @@ NEEDS = {
     "psf": ("lens.h5", "metalens.commands.psf:_make"),
     "export": ("lens.h5 --samples 9", "metalens.lens.export:write"),
     "scene": ("scene.toml", "codesign.commands.scene:_make"),
-    "layout": ("lens.h5", "layout.commands.layout:_prepare"),
+    "layout": ("lens.h5", "layout.commands.make:_prepare"),
     "capture": ("lens.h5 --truth truth.toml", "characterize.bench.bench:shoot"),
     "measure": ("captures", "characterize.commands.measure:_frames"),
     "fit": ("captures --design lens.h5", "characterize.commands.fit:fit"),

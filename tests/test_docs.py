@@ -36,6 +36,7 @@ def _records():
     from characterize.bench.protocol import Protocol
     from characterize.pupil.record import PupilSpec
     from codesign.budget.plan import PlanConfig
+    from layout.arrange import Arrangement
     from layout.process.process import Process
 
     return {
@@ -48,6 +49,7 @@ def _records():
         "PUPIL.toml": PupilSpec,
         "PLAN.toml": PlanConfig,
         "CHAIN.toml": ChainFiles,
+        "ARRANGEMENT.toml": Arrangement,
     }
 
 

@@ -22,7 +22,7 @@ class Options(Common):
     """Options of ``metalens layout``.
 
     Attributes:
-        lens: the lens file.
+        lens: the lens file, or an ARRANGEMENT.toml of lenses, cells of other files, and a wafer.
         process: PROCESS.toml; left out: 100 kV electron-beam defaults.
         output: folder for the mask and its report.
         oasis: write OASIS (with --gds the default where neither is asked for).

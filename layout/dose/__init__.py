@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.dose import correct as correct
+    from layout.dose import exposure as exposure
     from layout.dose.bodies import Body as Body
     from layout.dose.bodies import Rects as Rects
     from layout.dose.correct import DoseResult as DoseResult
@@ -21,5 +22,6 @@ __getattr__, __dir__, __all__ = attach(
         "Solution": "correct",
         "Uniformity": "uniformity",
         "correct": "",
+        "exposure": "",
     },
 )

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from layout.files import handover as handover
     from layout.files import paths as paths
     from layout.files import verify as verify
+    from layout.files.assembly import Assembly as Assembly
+    from layout.files.assembly import Copies as Copies
+    from layout.files.assembly import arrays as arrays
     from layout.files.content import NOTHING as NOTHING
     from layout.files.content import QUARTERS as QUARTERS
     from layout.files.content import CellContent as CellContent
@@ -31,7 +34,9 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Assembly": "assembly",
         "CellContent": "content",
+        "Copies": "assembly",
         "FARTHEST": "read_loops",
         "Gathered": "content",
         "MaskContent": "content",
@@ -41,6 +46,7 @@ __getattr__, __dir__, __all__ = attach(
         "Sums": "digest",
         "Turn": "content",
         "Window": "dxf",
+        "arrays": "assembly",
         "deltas": "read_loops",
         "doses": "",
         "dxf": "",

@@ -8,9 +8,9 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 from layout.files.content import MaskContent
-from layout.mask import MaskPlan
 from layout.process import LayerNumber, Process
 from metalens.ground import store
 from metalens.ground.errors import MaskFileError
@@ -18,7 +18,21 @@ from metalens.ground.errors import MaskFileError
 HEAD = ("layer", "datatype", "relative_dose", "dose_uC_cm2", "step", "name")
 
 
-def write(plan: MaskPlan, process: Process, path: str | Path) -> None:
+class Dosed(Protocol):
+    """A mask that knows the doses and names of its layers."""
+
+    @property
+    def doses(self) -> Mapping[LayerNumber, float]:
+        """Relative dose of each (layer, datatype) that is exposed."""
+        ...
+
+    @property
+    def layer_names(self) -> Mapping[LayerNumber, str]:
+        """Shown by viewers."""
+        ...
+
+
+def write(plan: Dosed, process: Process, path: str | Path) -> None:
     """Write the table, one line for each (layer, datatype) that is exposed, rising."""
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")

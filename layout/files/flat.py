@@ -60,7 +60,7 @@ def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
         cell = content.cells[name]
         drawn = {layer: list(polygons) for layer, polygons in cell.polygons.items()}
         for layer, circles in cell.circles.items():
-            drawn.setdefault(layer, []).extend(_circle(*circle) for circle in circles)
+            drawn.setdefault(layer, []).extend(circle(*one) for one in circles)
         for layer, polygons in drawn.items():
             alike: dict[int, list[Array]] = {}
             for points in polygons:
@@ -103,7 +103,8 @@ def _number(content: MaskContent, name: str, known: dict[str, int], above: tuple
     return total
 
 
-def _circle(x: int, y: int, radius: int) -> Array:
+def circle(x: int, y: int, radius: int) -> Array:
+    """(64, 2) corners of a polygon of the area of a circle, on whole units."""
     angle = 2 * np.pi * (np.arange(_CIRCLE) + 0.5) / _CIRCLE
     reach = radius * np.sqrt(2 * np.pi / _CIRCLE / np.sin(2 * np.pi / _CIRCLE))
     return np.asarray(np.rint(np.column_stack([x + reach * np.cos(angle), y + reach * np.sin(angle)])), np.int64)

@@ -123,3 +123,14 @@ def _lines(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[st
     yield "Marks (middle x, y; width x height):"
     for x, y, wide, high in marks_um(plan):
         yield f"  ({x:.3f}, {y:.3f}); {wide:.3f} x {high:.3f}"
+    if any(figure.name == "VERNIERS" for figure in plan.figures):
+        die = process.die
+        yield ""
+        yield (
+            f"Verniers and a box in a box at the upper edge: pillars {die.vernier_pitch_um:g} um, aperture "
+            f"{die.vernier_step_nm:g} nm longer from bar to bar"
+        )
+        yield (
+            f"  bars that meet n to the left of the middle one (downwards for y): the aperture lies n x "
+            f"{die.vernier_step_nm:g} nm to the right of the pillars (above them)"
+        )

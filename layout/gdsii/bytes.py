@@ -29,6 +29,7 @@ DATA |= {
 }
 NAMES = {value: name for name, value in list(globals().items()) if name.isupper() and isinstance(value, int)}
 
+TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access: the same bytes for the same mask
 MOST_POINTS = 8190  # of one boundary, closing point included
 
 
@@ -69,3 +70,9 @@ def shorts(kind: int, *values: int) -> bytes:
 def points(xy: Array) -> bytes:
     """XY record of (n, 2) points."""
     return record(XY, xy.astype(">i4").tobytes())
+
+
+def library(name: str, unit_nm: float) -> bytes:
+    """Everything before the first structure; user unit micrometre."""
+    head = shorts(HEADER, 600) + shorts(BGNLIB, *TIMES) + text(LIBNAME, name)
+    return head + record(UNITS, real(unit_nm * 1e-3) + real(unit_nm * 1e-9))

@@ -21,7 +21,6 @@ from metalens.ground.errors import ProcessError
 
 _BLOCK = 1 << 19  # bytes of references made before they are written: within the processor's cache
 _FLUSHED = 16  # pieces after which the disk is given what was written
-_TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access
 MOST_LAYERS = 32767  # layer numbers are signed 16-bit
 
 
@@ -66,36 +65,41 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
 
 
 def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
-    yield gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *_TIMES) + gds.text(gds.LIBNAME, plan.name)
-    yield gds.record(gds.UNITS, gds.real(plan.unit_nm * 1e-3) + gds.real(plan.unit_nm * 1e-9))
+    yield gds.library(plan.name, plan.unit_nm)
     for figure in plan.figures:
         yield _figure_structure(figure)
     counts = np.zeros(len(plan.classes) + 1, np.int64)
     for lattice in plan.lattices:
-        yield _begin(lattice.name)
+        yield begin(lattice.name)
         yield from _references(plan, lattice, counts)
         yield gds.record(gds.ENDSTR)
     yield b"".join(_class_structure(made) for made, n in zip(plan.classes, counts[1:], strict=True) if n)
-    yield _begin(plan.name)
+    yield begin(plan.name)
     yield b"".join(_reference(name) for name in plan.placed_names)
     yield gds.record(gds.ENDSTR) + gds.record(gds.ENDLIB)
 
 
-def _begin(name: str) -> bytes:
-    return gds.shorts(gds.BGNSTR, *_TIMES) + gds.text(gds.STRNAME, name)
+def begin(name: str) -> bytes:
+    """Begin of a structure."""
+    return gds.shorts(gds.BGNSTR, *gds.TIMES) + gds.text(gds.STRNAME, name)
 
 
 def _class_structure(made: PillarClass) -> bytes:
-    shapes = b"".join(_boundary(made.layer, polygon) for polygon in made.polygons)
-    return _begin(made.name) + shapes + gds.record(gds.ENDSTR)
+    shapes = b"".join(boundary(made.layer, polygon) for polygon in made.polygons)
+    return begin(made.name) + shapes + gds.record(gds.ENDSTR)
 
 
 def _figure_structure(figure: Figure) -> bytes:
-    shapes = [_boundary(layer, polygon) for layer, polygons in figure.polygons.items() for polygon in polygons]
-    return _begin(figure.name) + b"".join(shapes) + gds.record(gds.ENDSTR)
+    shapes = [boundary(layer, polygon) for layer, polygons in figure.polygons.items() for polygon in polygons]
+    return begin(figure.name) + b"".join(shapes) + gds.record(gds.ENDSTR)
 
 
-def _boundary(layer: tuple[int, int], polygon: Array) -> bytes:
+def boundary(layer: tuple[int, int], polygon: Array) -> bytes:
+    """A polygon.
+
+    Raises:
+        ProcessError: a layer number or a polygon that the format cannot hold.
+    """
     if len(polygon) + 1 > gds.MOST_POINTS:
         raise ProcessError(
             f"polygon of {len(polygon)} vertices on layer {layer}: GDSII holds {gds.MOST_POINTS - 1}; split it"

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from layout.mask import tone as tone
     from layout.mask.field_figure import with_fields as with_fields
     from layout.mask.fields import FieldPlan as FieldPlan
+    from layout.mask.plan import EXPOSED as EXPOSED
     from layout.mask.plan import UNDRAWN as UNDRAWN
     from layout.mask.plan import Figure as Figure
     from layout.mask.plan import Lattice as Lattice
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "EXPOSED": "plan",
         "FieldPlan": "fields",
         "Figure": "plan",
         "Lattice": "plan",

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from metalens.ground.units import nm
 from metalens.lens import DiameterMap, Lens
 
 UNIT_NM = 1.0
+Furniture = Literal["die", "aperture", "none"]  # marks, label and test structures, or the opening of the lens alone
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,7 +48,7 @@ def plan(source: Lens | DiameterMap, process: Process, *, name: str = "METALENS"
             classes, a die that is too small, coordinates beyond 32 bits, an illegal name.
         LensError: invalid diameters.
     """
-    return prepare(source, process, name=name, furnished=furnished, with_doses=False).plan
+    return prepare(source, process, name=name, furniture="die" if furnished else "none", with_doses=False).plan
 
 
 def prepare(
@@ -54,7 +56,7 @@ def prepare(
     process: Process,
     *,
     name: str = "METALENS",
-    furnished: bool = True,
+    furniture: Furniture = "die",
     with_doses: bool = True,
 ) -> MadePlan:
     """As :func:`plan`, with everything that a report needs; ``with_doses``: with the correction of the process."""
@@ -79,8 +81,10 @@ def prepare(
         axis=axis,
     )
     radius_um = diameters.radius_um + diameters.pitch_um / 2
-    if furnished:
+    if furniture == "die":
         bare = die.furnish(bare, process, radius_um=radius_um, label=_label(source, radius_um))
+    elif furniture == "aperture":
+        bare = die.opened(bare, process, radius_um=radius_um)
     if process.tone == "negative":
         bare = tone.inverted(bare, process)
     solution = None
@@ -88,6 +92,56 @@ def prepare(
         bare, solution = dosed.corrected(bare, process)
     _check_layers(bare, process)
     return MadePlan(bare, found, solution, radius_um)
+
+
+def surroundings(
+    source: Lens | DiameterMap,
+    process: Process,
+    *,
+    name: str,
+    size_um: tuple[float, float],
+    clear_um: float,
+    label: str,
+) -> MadePlan:
+    """Marks, label, dose test and witness cells of the pillars of ``source`` around a die of other things.
+
+    clear_um: half the width, about the middle, that the test structures leave free.
+
+    Raises:
+        ProcessError: as :func:`plan`.
+    """
+    own = dataclasses.replace(process, die=dataclasses.replace(process.die, size_um=size_um, label=label))
+    made = prepare(source, own, name=name, furniture="none", with_doses=False)
+    whole = die.furnish(made.plan, own, radius_um=clear_um, label=label)
+    figures = [f for f in whole.figures if f.name != "APERTURE"]
+    aperture = next(f for f in whole.figures if f.name == "APERTURE")
+    openings = {layer: shapes[1:] for layer, shapes in aperture.polygons.items()}  # without that of the lens
+    bare = whole.replace(
+        lattices=whole.lattices[:0:-1], figures=(dataclasses.replace(aperture, polygons=openings), *figures)
+    )
+    return _dosed(bare, made, own)
+
+
+def wafer_mark(source: Lens | DiameterMap, process: Process, *, name: str, mark_um: float, width_um: float) -> MadePlan:
+    """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
+
+    Raises:
+        ProcessError: as :func:`plan`.
+    """
+    made = prepare(source, process, name=name, furniture="none", with_doses=False)
+    bare = die.wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
+    return _dosed(bare, made, process)
+
+
+def _dosed(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
+    """A plan without its lens, corrected where the process asks for it."""
+    if not all(each.round for each in bare.classes):
+        _refuse_beyond_plain(process, with_doses=True)
+    solution = None
+    if process.exposure.corrected:
+        bare, solution = dosed.corrected(bare, process)
+    _check_layers(bare, process)
+    return MadePlan(bare, made.cells, solution, made.radius_um)
 
 
 def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, tuple[PillarClass, ...]]:

@@ -7,11 +7,11 @@ the openings of an opaque film over the lens, the marks and the test structures.
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask import font
+from layout.mask import font, marks
+from layout.mask.marks import CLEAR_UM, Box, Units
 from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
 from layout.process import Process
 from metalens.ground.arrays import Array
@@ -22,28 +22,7 @@ _BLOCK = 16  # pillars along a block of the dose array
 _WITNESS = 40  # pillars along a witness block
 _SPACE = 8  # empty sites between blocks
 _TESTED, _WITNESSED = 6, 8  # diameters that are repeated in the dose array and in the witness cells
-_CLEAR_UM = 10.0  # between the structures on the die, and of the openings around them
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A rectangle in database units."""
-
-    left: int
-    bottom: int
-    right: int
-    top: int
-
-    @property
-    def polygon(self) -> Array:
-        """Its corners."""
-        return np.array(
-            [[self.left, self.bottom], [self.right, self.bottom], [self.right, self.top], [self.left, self.top]]
-        )
-
-    def grown(self, by: int) -> "Box":
-        """A rectangle that is larger by ``by`` on each side."""
-        return Box(self.left - by, self.bottom - by, self.right + by, self.top + by)
+_ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
 
 
 def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str) -> MaskPlan:
@@ -55,17 +34,20 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str) -
     Raises:
         ProcessError: the die is too small for the aperture and its test structures, or the label cannot be drawn.
     """
-    unit = _Units(plan)
+    unit = Units(plan)
     die = _outline(process, unit, radius_um)
     classes, lattices, windows = _tests(plan, process, unit, radius_um, die)
-    marks, mark_windows = _marks(process, unit, die)
+    crosses, mark_windows = marks.crosses(process, unit, die)
+    scales = marks.scales(process, unit, die)
     words, label_window = _label(process, unit, die, label)
     openings = [disc(radius_um * unit.per_um, plan.axis, plan.grid)]
     openings += [unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)]
+    openings += scales.openings
     layers = process.layers
     figures = (
         Figure("APERTURE", {layers.aperture: tuple(openings)}),
-        Figure("MARKS", {layers.marks: marks}),
+        Figure("MARKS", {layers.marks: crosses}),
+        *([Figure("VERNIERS", {layers.marks: scales.drawn})] if scales.drawn else []),
         Figure("LABEL", {layers.labels: words}),
         Figure("OUTLINE", {layers.outline: (die.polygon,)}),
     )
@@ -78,6 +60,45 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str) -
     )
 
 
+def opened(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
+    """``plan`` (the lens alone) with the opening of its aperture and nothing else."""
+    layer, unit = process.layers.aperture, Units(plan)
+    figure = Figure("APERTURE", {layer: (disc(radius_um * unit.per_um, plan.axis, plan.grid),)})
+    return plan.replace(
+        figures=(*plan.figures, figure),
+        layer_names={**plan.layer_names, layer: "aperture"},
+        doses={**plan.doses, layer: 1.0},
+    )
+
+
+def wafer_mark(plan: MaskPlan, process: Process, *, mark_um: float, width_um: float) -> MaskPlan:
+    """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells between two of its arms.
+
+    plan: of a lens, whose pillars the witness cells repeat.
+    """
+    unit, layers = Units(plan), process.layers
+    sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
+    some = [_variant(made, f"W{n}", layers.witness, 1.0) for n, made in enumerate(_spread(sizes, _ON_WAFER))]
+    sites = _blocks(np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK)
+    middle = unit(mark_um / 4)
+    lattice = _centred("WITNESS", sites, unit, middle)
+    lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
+    half = unit(mark_um / 2)
+    window = unit.snapped(Box(-half, -half, half, half).grown(unit(CLEAR_UM / 2))).polygon
+    figures = (
+        Figure("APERTURE", {layers.aperture: (window,)}),
+        Figure("MARKS", {layers.marks: marks.wafer_cross(unit, mark_um, width_um)}),
+    )
+    names = {layers.aperture: "aperture", layers.marks: "marks", layers.witness: "witness"}
+    return plan.replace(
+        classes=(*plan.classes, *_same_length(some, plan)),
+        lattices=(lattice,),
+        figures=figures,
+        layer_names=names,
+        doses={layers.aperture: 1.0, layers.marks: 1.0, layers.witness: 1.0},
+    )
+
+
 def disc(radius: float, centre: tuple[float, float], grid: int) -> Array:
     """Polygon of the area of a circle whose edges stay within half a grid step of it, at most 8000 vertices."""
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
@@ -87,22 +108,7 @@ def disc(radius: float, centre: tuple[float, float], grid: int) -> Array:
     return np.asarray(np.rint(points / grid) * grid, np.int64)
 
 
-class _Units:
-    """From micrometres to database units on the grid."""
-
-    def __init__(self, plan: MaskPlan) -> None:
-        self.per_um, self.grid, self.pitch = 1e3 / plan.unit_nm, plan.grid, plan.lattices[0].constant
-
-    def __call__(self, length_um: float) -> int:
-        return round(length_um * self.per_um / self.grid) * self.grid
-
-    def snapped(self, box: Box) -> Box:
-        """The box on the grid, no smaller."""
-        g = self.grid
-        return Box(box.left // g * g, box.bottom // g * g, -(-box.right // g) * g, -(-box.top // g) * g)
-
-
-def _outline(process: Process, unit: _Units, radius_um: float) -> Box:
+def _outline(process: Process, unit: Units, radius_um: float) -> Box:
     die = process.die
     size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
     half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
@@ -110,7 +116,7 @@ def _outline(process: Process, unit: _Units, radius_um: float) -> Box:
 
 
 def _tests(
-    plan: MaskPlan, process: Process, unit: _Units, radius_um: float, die: Box
+    plan: MaskPlan, process: Process, unit: Units, radius_um: float, die: Box
 ) -> tuple[list[PillarClass], list[Lattice], list[Box]]:
     """Dose array left of the lens, witness cells right of it: classes, lattices, openings."""
     undosed = {made.diameter_units: made for made in plan.classes}
@@ -128,20 +134,20 @@ def _tests(
     columns = 2 if len(witnesses) > 1 else 1
     numbers = np.arange(first + len(doses), first + len(doses) + len(witnesses))
     witness_map = _blocks(np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns), _WITNESS)
-    inner, outer = unit(radius_um + _CLEAR_UM), die.right - unit(process.die.street_um + _CLEAR_UM)
+    inner, outer = unit(radius_um + CLEAR_UM), die.right - unit(process.die.street_um + CLEAR_UM)
     middle = (inner + outer) // 2
     lattices, windows = [], []
     for name, sites, x in (("DOSETEST", dose_map, -middle), ("WITNESS", witness_map, middle)):
         lattice = _centred(name, sites, unit, x)
         box = _extent(lattice)
         if min(abs(box.left), abs(box.right)) < inner or max(abs(box.left), abs(box.right)) > outer:
-            need = (box.right - box.left) / unit.per_um + 2 * _CLEAR_UM + process.die.street_um
+            need = (box.right - box.left) / unit.per_um + 2 * CLEAR_UM + process.die.street_um
             raise ProcessError(
                 f"the die is too small for {name}: {need:.0f} um are needed between aperture and die edge; "
                 "raise die.margin_um or die.size_um"
             )
         lattices.append(lattice)
-        windows.append(box.grown(unit(_CLEAR_UM / 2)))
+        windows.append(box.grown(unit(CLEAR_UM / 2)))
     return _same_length([*doses, *witnesses], plan), lattices, windows
 
 
@@ -173,7 +179,7 @@ def _blocks(numbers: Array, side: int) -> Array:
     return sites
 
 
-def _centred(name: str, sites: Array, unit: _Units, x: int) -> Lattice:
+def _centred(name: str, sites: Array, unit: Units, x: int) -> Lattice:
     rows, columns = sites.shape
     grid, pitch = unit.grid, unit.pitch
     left, top = x - (columns - 1) * pitch // 2, (rows - 1) * pitch // 2
@@ -186,54 +192,17 @@ def _extent(lattice: Lattice) -> Box:
     return Box(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0).grown(reach)
 
 
-def _marks(process: Process, unit: _Units, die: Box) -> tuple[tuple[Array, ...], list[Box]]:
-    """A cross in each corner, and an F beside the upper left one that no turn or mirror takes to itself."""
-    arm, width = unit(process.die.mark_um / 2), unit(process.die.mark_width_um / 2)
-    inset = unit(process.die.street_um + _CLEAR_UM) + arm
-    shapes: list[Array] = []
-    boxes = []
-    for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-        x, y = sx * (die.right - inset), sy * (die.top - inset)
-        w, a = width, arm
-        cross = [
-            (w, w),
-            (w, a),
-            (-w, a),
-            (-w, w),
-            (-a, w),
-            (-a, -w),
-            (-w, -w),
-            (-w, -a),
-            (w, -a),
-            (w, -w),
-            (a, -w),
-            (a, w),
-        ]
-        shapes.append(np.add(cross, (x, y)))
-        boxes.append(Box(x - a, y - a, x + a, y + a).grown(unit(_CLEAR_UM / 2)))
-    square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
-    left, bottom = die.left + inset + arm + unit(_CLEAR_UM), die.top - inset - arm
-    shapes.append(_letter_f(left, bottom, square))
-    boxes.append(Box(left, bottom, left + 5 * square, bottom + 7 * square).grown(unit(_CLEAR_UM / 2)))
-    return tuple(shapes), boxes
-
-
-def _letter_f(x: int, y: int, s: int) -> Array:
-    corners = [(0, 0), (1, 0), (1, 3), (4, 3), (4, 4), (1, 4), (1, 6), (5, 6), (5, 7), (0, 7)]
-    return np.add(np.multiply(corners, s), (x, y))
-
-
-def _label(process: Process, unit: _Units, die: Box, default: str) -> tuple[tuple[Array, ...], Box]:
+def _label(process: Process, unit: Units, die: Box, default: str) -> tuple[tuple[Array, ...], Box]:
     """Along the lower edge, between the crosses; letters as large as fit, 35 um high at most."""
     words = process.die.label or default
-    inset = unit(process.die.street_um + _CLEAR_UM)
-    room = die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * _CLEAR_UM))
+    inset = unit(process.die.street_um + CLEAR_UM)
+    room = die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * CLEAR_UM))
     square = min(unit(5.0), room // max(1, 6 * len(words)) // unit.grid * unit.grid)
     if square < unit(0.5):
         raise ProcessError(f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um")
     long = font.width(words, square)
     x, y = -(long // 2) // unit.grid * unit.grid, die.bottom + inset
-    box = Box(x, y, x + long, y + 7 * square).grown(unit(_CLEAR_UM / 2))
+    box = Box(x, y, x + long, y + 7 * square).grown(unit(CLEAR_UM / 2))
     return font.text(words, x=x, y=y, square=square), box
 
 

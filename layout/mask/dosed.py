@@ -8,13 +8,12 @@ import numpy as np
 from layout.dose import Body, Rects, Solution
 from layout.dose import correct as dose
 from layout.mask.held import hold
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
+from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 
-EXPOSED = ("MARKS", "LABEL", "VERNIERS")  # figures that are written in the same exposure as the pillars
 _KINDS = {"T": "dose", "W": "witness"}  # by the first letter of a class
 _BLOCK_SITES = 1 << 22
 

@@ -22,6 +22,7 @@ from metalens.ground.errors import ProcessError
 MOST_CLASSES = 65535
 FARTHEST = 2**31 - 1
 UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
+EXPOSED = ("MARKS", "LABEL", "VERNIERS")  # figures that are written in the same exposure as the pillars
 RowSource = Callable[[int, int], Array]  # (first row, end row) -> (rows, columns) class numbers
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from layout.oasis import assemble as assemble
     from layout.oasis import bytes as bytes
     from layout.oasis import read as read
     from layout.oasis import write as write
@@ -15,6 +16,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Cursor": "cursor",
+        "assemble": "",
         "bytes": "",
         "count_classes": "tiles",
         "read": "",

@@ -68,6 +68,31 @@ def encode_tile(tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array
 
 
 @compiled
+def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
+    """Placements in their order: the first at its place, each other relative to the one before; bytes used.
+
+    Args:
+        child: (n,) reference numbers. turn: (n,) quarter turns and mirror, 0 to 7. out: as for :func:`encode_tile`.
+    """
+    out[0] = 15  # XYABSOLUTE
+    at, last_x, last_y = 1, 0, 0
+    for n in range(x.shape[0]):
+        move_x, move_y = n == 0 or x[n] != last_x, n == 0 or y[n] != last_y
+        out[at] = 17  # PLACEMENT
+        out[at + 1] = 0xC0 | (0x20 if move_x else 0) | (0x10 if move_y else 0) | (turn[n] & 3) << 1 | turn[n] >> 2
+        at = put_unsigned(out, at + 2, child[n])
+        if move_x:
+            at = _put_signed(out, at, x[n] - last_x)
+        if move_y:
+            at = _put_signed(out, at, y[n] - last_y)
+        if n == 0:
+            out[at] = 16  # XYRELATIVE
+            at += 1
+        last_x, last_y = x[n], y[n]
+    return at
+
+
+@compiled
 def count_classes(block: Array, counts: Array) -> None:
     """Add the sites of each class number to ``counts``."""
     for row in range(block.shape[0]):

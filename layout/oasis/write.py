@@ -71,20 +71,21 @@ def _write_file(file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool)
     names.distinct(cell_names)
     number = {name: k for k, name in enumerate(cell_names)}
     head = oasis.start(plan.unit_nm)
-    layer_table = b"".join(_layer_name(layer, name) for layer, name in sorted(plan.layer_names.items()))
+    layer_table = b"".join(layer_name(layer, name) for layer, name in sorted(plan.layer_names.items()))
     counts = np.zeros(len(plan.classes) + 1, np.int64)
     written, checksum = 0, 0
     for piece in itertools.chain([head, layer_table], _cells(plan, placed, number, settings, counts)):
         file.write(piece)
         checksum, written = zlib.crc32(piece, checksum), written + len(piece)
     unused = {made.name for made, n in zip(plan.classes, counts[1:], strict=True) if not n}
-    cell_table = b"".join(_cell_name(k, name) for name, k in number.items() if name not in unused)
+    cell_table = b"".join(cell_name(k, name) for name, k in number.items() if name not in unused)
     file.write(cell_table)
     layers_at = len(head) if layer_table else 0
     file.write(oasis.end((written, 0, 0, 0, layers_at, 0), zlib.crc32(cell_table, checksum)))
 
 
-def _cell_name(number: int, name: str) -> bytes:
+def cell_name(number: int, name: str) -> bytes:
+    """Record of a cell's name."""
     return bytes([oasis.CELLNAME_REF]) + oasis.string(name) + oasis.unsigned(number)
 
 
@@ -102,7 +103,8 @@ def _piece_list(lattice: Lattice, fold: bool) -> list[Piece]:
     return pieces(lattice) if fold and is_square_symmetric(lattice) else [Piece(lattice, ((0, False),))]
 
 
-def _layer_name(layer: tuple[int, int], name: str) -> bytes:
+def layer_name(layer: tuple[int, int], name: str) -> bytes:
+    """Record of the name of a layer and datatype."""
     exactly = b"\x03"
     numbers = b"".join(exactly + oasis.unsigned(n) for n in layer)
     return bytes([oasis.LAYERNAME]) + oasis.string(name) + numbers
@@ -113,25 +115,26 @@ def _cells(
 ) -> Iterator[bytes]:
     """All cells, those of the pillar classes that occur last; ``counts`` adds up the sites of each class."""
     for figure in plan.figures:
-        shapes = [_polygon(layer, p) for layer, polygons in figure.polygons.items() for p in polygons]
-        yield _cell(number[figure.name]) + b"".join(shapes)
+        shapes = [polygon(layer, p) for layer, polygons in figure.polygons.items() for p in polygons]
+        yield cell_begin(number[figure.name]) + b"".join(shapes)
     for lattice, parts in zip(plan.lattices, placed, strict=True):
         if len(parts) > 1:
             for part in parts:
-                yield _cell(number[part.lattice.name])
+                yield cell_begin(number[part.lattice.name])
                 yield from _sites(part.lattice, settings, counts)
-            yield _cell(number[lattice.name])
+            yield cell_begin(number[lattice.name])
             yield b"".join(_placement(number[p.lattice.name], turn) for p in parts for turn in p.placed)
         else:
-            yield _cell(number[lattice.name])
+            yield cell_begin(number[lattice.name])
             yield from _sites(lattice, settings, counts)
     used = [made for made, n in zip(plan.classes, counts[1:], strict=True) if n]
-    yield b"".join(_cell(number[made.name]) + _pillar(made, settings.circles) for made in used)
+    yield b"".join(cell_begin(number[made.name]) + _pillar(made, settings.circles) for made in used)
     top = b"".join(_placement(number[name]) for name in plan.placed_names)
-    yield _cell(number[plan.name]) + top
+    yield cell_begin(number[plan.name]) + top
 
 
-def _cell(number: int) -> bytes:
+def cell_begin(number: int) -> bytes:
+    """Begin of a cell."""
     return bytes([oasis.CELL_REF]) + oasis.unsigned(number)
 
 
@@ -141,7 +144,7 @@ def _placement(number: int, turn: tuple[int, bool] = (0, False)) -> bytes:
 
 def _pillar(made: PillarClass, circles: bool) -> bytes:
     if not circles:
-        return b"".join(_polygon(made.layer, polygon) for polygon in made.polygons)
+        return b"".join(polygon(made.layer, points) for points in made.polygons)
     if not made.round:
         raise ProcessError(f"class {made.name} is not round: circles cannot stand for it; leave circles out")
     if made.drawn:
@@ -156,16 +159,17 @@ def _pillar(made: PillarClass, circles: bool) -> bytes:
     return bytes([oasis.CIRCLE, 0b00111011]) + layer + oasis.unsigned(width // 2) + b"\0\0"
 
 
-def _polygon(layer: tuple[int, int], points: Array) -> bytes:
+def polygon(layer: tuple[int, int], points: Array) -> bytes:
     """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last one implied."""
     numbers = oasis.unsigned(layer[0]) + oasis.unsigned(layer[1])
     steps = np.diff(points.astype(np.int64), axis=0)
-    moves = b"".join(_vector(int(dx), int(dy)) for dx, dy in steps)
+    moves = b"".join(vector(int(dx), int(dy)) for dx, dy in steps)
     x, y = (oasis.signed(int(v)) for v in points[0])
     return bytes([oasis.POLYGON, 0b00111011]) + numbers + b"\x04" + oasis.unsigned(len(steps)) + moves + x + y
 
 
-def _vector(dx: int, dy: int) -> bytes:
+def vector(dx: int, dy: int) -> bytes:
+    """A g-delta of any direction."""
     return oasis.unsigned(abs(dx) << 2 | (dx < 0) << 1 | 1) + oasis.signed(dy)
 
 

@@ -212,7 +212,10 @@ class Die:
 
     size_um: (x, y) of the die; left out: the aperture and ``margin_um`` on each side.
     street_um: strip along the edge that stays empty.
-    mark_um, mark_width_um: arm length and line width of the alignment crosses.
+    mark_um, mark_width_um: length and line width of the alignment crosses; fine ones beside them have a fifth of both.
+    verniers: whether verniers and a box in a box show how far pillars and aperture lie apart.
+    vernier_pitch_um: from bar to bar of the scale that is drawn with the pillars.
+    vernier_step_nm: by how much the pitch of the other scale, opened with the aperture, is longer: what a bar reads.
     thickness_um: of the substrate.
     label: text on the die; left out: made from the lens.
     """
@@ -222,11 +225,16 @@ class Die:
     street_um: float = 50.0
     mark_um: float = 100.0
     mark_width_um: float = 5.0
+    verniers: bool = True
+    vernier_pitch_um: float = 8.0
+    vernier_step_nm: float = 50.0
     thickness_um: float = 500.0
     label: str = ""
 
     def __post_init__(self) -> None:
-        _positive(self, "margin_um", "mark_um", "mark_width_um", "thickness_um")
+        _positive(self, "margin_um", "mark_um", "mark_width_um", "thickness_um", "vernier_pitch_um", "vernier_step_nm")
+        if self.vernier_pitch_um < 4:
+            raise ProcessError(f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for bars that can be seen")
         if self.size_um is not None and not all(0 < s < math.inf for s in self.size_um):
             raise ProcessError(f"size_um = {list(self.size_um)}: need two finite lengths above 0")
         if not 0 <= self.street_um < math.inf:

@@ -9,11 +9,13 @@ if TYPE_CHECKING:
     from layout.rules import foreign as foreign
     from layout.rules import markers as markers
     from layout.rules.report import DrcReport as DrcReport
+    from layout.rules.report import Violation as Violation
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "DrcReport": "report",
+        "Violation": "report",
         "check": "",
         "foreign": "",
         "markers": "",

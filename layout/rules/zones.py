@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from layout.mask import Lattice, MaskPlan
+from layout.mask import EXPOSED, Lattice, MaskPlan
 from layout.process import Rules, Zone
 from layout.rules.report import DrcReport, Violation
 from metalens.ground.arrays import Array
@@ -74,7 +74,7 @@ def structures_apart(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
     for lattice in plan.lattices:
         groups.setdefault(lattice.name, []).append(_lattice_box(plan, lattice))
     for figure in plan.figures:
-        if figure.name in ("MARKS", "LABEL"):
+        if figure.name in EXPOSED:
             shapes = itertools.chain.from_iterable(figure.polygons.values())
             groups.setdefault(figure.name, []).extend(_box(np.asarray(shape)) for shape in shapes)
     limit = rules.minimum_gap_nm / plan.unit_nm

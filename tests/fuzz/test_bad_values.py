@@ -6,7 +6,8 @@ from benchmarks import _hardness_values as matrix
 
 # what may be below 0: turns and offsets either way, parameters of a made lens, a stage that runs backwards
 SIGNED = {"n_offset", "k_offset", "angle_rad", "strength_rad", "isolated_nm", "sidewall_deg", "value", "step_um",
-          "elevation_deg", "angle_deg", "gaze_step_deg", "slip_step_mm", "mask_turn_deg"}  # fmt: skip
+          "elevation_deg", "angle_deg", "gaze_step_deg", "slip_step_mm", "mask_turn_deg",
+          "turn_deg", "x_um", "y_um", "x_mm", "y_mm"}  # fmt: skip
 # a measure of these has no meaning at 0
 ABOVE_ZERO = ("tolerance", "wavelength", "pitch_um", "aperture", "pixel_um", "samples", "window", "frames")
 
@@ -45,9 +46,14 @@ def test_below_zero_is_taken_only_where_it_means_something(trials):
 
 def test_nothing_of_another_kind_is_taken(trials):
     assert _taken(trials, "table", "deep", "NUL", "control", "lists", "mixed") == set()
-    assert _taken(trials, "empty") == {("process", "die.label")}  # no label
+    assert _taken(trials, "empty") == {  # no label, the only top cell
+        ("process", "die.label"),
+        ("arrangement", "die.label"),
+        ("arrangement", "cell[].cell"),
+        ("arrangement", "into.cell"),
+    }
     hints = _leaves(_taken(trials, "true"))
-    assert hints == {"hole", "add_focus", "conjugate", "budget", "own_cell"}
+    assert hints == {"hole", "add_focus", "conjugate", "budget", "own_cell", "furnished"}
 
 
 def test_what_is_good_is_taken():

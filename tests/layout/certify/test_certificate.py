@@ -34,7 +34,7 @@ def lens_map(n=61, pitch=0.4):
 @functools.cache
 def written(process, furnished=True):
     """The mask as files: the plan, what a reader finds, and its dose table."""
-    plan = build.prepare(lens_map(), process, furnished=furnished).plan
+    plan = build.prepare(lens_map(), process, furniture="die" if furnished else "none").plan
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
         doses.write(plan, process, Path(folder) / "doses.csv")

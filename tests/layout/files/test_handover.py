@@ -82,7 +82,7 @@ def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
     plan = build.prepare(lens_map(), process).plan
     marks = handover.marks_um(plan)
     crosses = [m for m in marks if m[2:] == (80.0, 80.0)]
-    assert len(marks) == 5  # four crosses and the F
+    assert len(marks) == 9  # four crosses, coarse and fine, and the F
     assert len(crosses) == 4
     assert {(np.sign(x), np.sign(y)) for x, y, *_ in crosses} == {(-1, -1), (1, -1), (-1, 1), (1, 1)}
     half = max(abs(p).max() for f in plan.figures if f.name == "OUTLINE" for p in f.polygons[10, 0]) * 1e-3

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import layout
 from layout.dose import exposure
-from layout.mask import build, cells, die, font
+from layout.mask import build, cells, die, font, marks
 from layout.process.process import Die, Exposure, Layers, Process, Rules
 from layout.shapes import polygon
 from metalens.ground.errors import LensError, ProcessError
@@ -199,7 +199,7 @@ def test_the_die_holds_everything_within_its_street_and_apart():
     process = Process(exposure=Exposure(correct=False))
     plan = layout.plan(disc_map(101), process, name="LENS_7")
     names = {figure.name for figure in plan.figures} | {lattice.name for lattice in plan.lattices}
-    assert names == {"APERTURE", "MARKS", "LABEL", "OUTLINE", "LENS", "DOSETEST", "WITNESS"}
+    assert names == {"APERTURE", "MARKS", "VERNIERS", "LABEL", "OUTLINE", "LENS", "DOSETEST", "WITNESS"}
     assert layout.check(plan, process.rules).ok
     outline = next(f for f in plan.figures if f.name == "OUTLINE").polygons[process.layers.outline][0]
     edge = outline.max() - 1000 * process.die.street_um
@@ -238,7 +238,7 @@ def test_a_die_without_room_is_refused_with_what_it_needs():
 
 
 def test_the_orientation_mark_is_like_none_of_its_images():
-    mark = die._letter_f(0, 0, 10)
+    mark = marks._letter_f(0, 0, 10)
     db = pytest.importorskip("klayout.db")
     shape = db.Region(db.Polygon([db.Point(*map(int, p)) for p in mark]))
     for turn in range(1, 8):

@@ -1,0 +1,144 @@
+"""Room between what is placed on a die: the rule for gaps, and how far the scattered electrons of a part reach."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.arrange.joined import PER_UM, Placing
+from layout.arrange.parts import APERTURE, Part
+from layout.dose import exposure
+from layout.files import Copies, Turn
+from layout.process import Process
+from layout.rules import Violation
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+MOST_PLACED = 4000  # parts on a die
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Standing:
+    """One copy of a part: where, and the boxes of its exposures there."""
+
+    part: Part
+    turn: Turn
+    x: int
+    y: int
+
+    @property
+    def text(self) -> str:
+        return f"{self.part.name} at ({self.x / PER_UM:g}, {self.y / PER_UM:g}) um"
+
+    def box(self) -> Array:
+        """(4,) around all that is exposed."""
+        some = [b for b in self.part.boxes.values() if len(b)]
+        if not some:
+            return np.zeros(4)
+        return _around(self.moved(np.concatenate(some)))
+
+    def moved(self, boxes: Array) -> Array:
+        """(n, 4) boxes around the turned boxes."""
+        corners = boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
+        x, y = self.turn.apply(corners[..., 0], corners[..., 1])
+        return np.column_stack([x.min(1) + self.x, y.min(1) + self.y, x.max(1) + self.x, y.max(1) + self.y])
+
+
+def reach_um(process: Process) -> float:
+    """Distance from a wide exposed area at which it adds less than the tolerance of the correction; 0 without one.
+
+    The half-plane gives sum w/2 erfc(d / a) of the exposure of its own middle, and dose-to-size is half of that.
+    """
+    if not process.exposure.corrected:
+        return 0.0
+    point = exposure.point_exposure(process.exposure)
+    most = exposure.CLEARS * process.exposure.tolerance
+
+    def added(away_um: float) -> float:
+        pairs = zip(point.weights.tolist(), point.widths_um.tolist(), strict=True)
+        return sum(w / 2 * math.erfc(away_um / a) for w, a in pairs)
+
+    low, high = 0.0, 8 * float(point.widths_um.max())
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        low, high = (middle, high) if added(middle) > most else (low, middle)
+    return high
+
+
+def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
+    """Pairs of parts that are nearer than the least gap, or than one's backscatter lets the other's doses hold.
+
+    Rectilinear shapes are taken as they are, a lattice of pillars and any other shape as the box around it.
+
+    Raises:
+        ProcessError: more than 4000 parts on the die.
+    """
+    standing = list(_all(placed))
+    if len(standing) > MOST_PLACED:
+        raise ProcessError(f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer")
+    gap, far = process.rules.minimum_gap_nm * PER_UM / 1e3, reach_um(process) * PER_UM
+    around = np.array([one.box() for one in standing])
+    found = []
+    for n, one in enumerate(standing):
+        for m in np.flatnonzero(_apart(around[n + 1 :], around[n]) < max(gap, far)).tolist():
+            two = standing[n + 1 + m]
+            scattered = far if one.part.corrected or two.part.corrected else 0.0
+            found += _between(one, two, gap, scattered, process)
+    return found
+
+
+def extent(placed: Sequence[Placing], *, exposed: bool = False) -> Array:
+    """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``: of what is exposed alone."""
+    made = []
+    for one in _all(placed):
+        made.append(one.box() if exposed else one.moved(one.part.extent[None])[0])
+    return _around(np.array(made))
+
+
+def _all(placed: Sequence[Placing]) -> Iterator[_Standing]:
+    for placing in placed:
+        for copies in placing.copies(placing.part.top):
+            yield from _each(placing.part, copies)
+
+
+def _each(part: Part, copies: Copies) -> Iterator[_Standing]:
+    if copies.count > MOST_PLACED:
+        raise ProcessError(f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked")
+    for x, y in zip(*(v.tolist() for v in copies.places()), strict=True):
+        yield _Standing(part, copies.turn, x, y)
+
+
+def _between(one: _Standing, two: _Standing, gap: float, scattered: float, process: Process) -> Iterator[Violation]:
+    """At most one finding for each exposure that both have shapes of."""
+    for kind in sorted(one.part.boxes.keys() & two.part.boxes.keys()):
+        first, second = one.moved(one.part.boxes[kind]), two.moved(two.part.boxes[kind])
+        need = gap if kind == APERTURE else max(gap, scattered)
+        first = first[_apart(first, _around(second)) < need] if len(first) and len(second) else first[:0]
+        second = second[_apart(second, _around(first)) < need] if len(first) else second[:0]
+        least, box = math.inf, np.zeros(4)
+        for each in second if len(first) else ():
+            apart = _apart(first, each)
+            n = int(apart.argmin())
+            if apart[n] < least:
+                least, box = float(apart[n]), _around(np.stack([first[n], each]))
+        if least >= need:
+            continue
+        left, bottom, right, top = (int(v) for v in box)
+        nm = least * 1e3 / PER_UM
+        if least < gap:
+            limit, text = process.rules.minimum_gap_nm, f"{one.text} to {two.text}, {kind}"
+        else:
+            limit = need * 1e3 / PER_UM
+            text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"
+        yield Violation("structures", (left, bottom, right, top), nm, limit, text)
+
+
+def _around(boxes: Array) -> Array:
+    return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
+
+
+def _apart(boxes: Array, box: Array) -> Array:
+    """(n,) distances of boxes (n, 4) from one; 0 where they meet."""
+    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
+    return np.asarray(np.hypot(*across.T))

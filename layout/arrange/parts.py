@@ -1,0 +1,206 @@
+"""What is placed: the content of a lens's mask or of a file made elsewhere, its doses, and boxes around its shapes."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from layout.files import CellContent, MaskContent, arrays, doses, flat
+from layout.mask import UNDRAWN, MaskPlan
+from layout.process import LayerNumber, Process
+from layout.shapes import rectilinear
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+UNIT_NM = 1.0
+PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
+_WHOLE = 1e-6
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Part:
+    """A cell with all below it, in nanometres.
+
+    name: of the part. top: its cell. cells: by name, as they will be written. doses: relative dose of each layer that
+    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; a
+    lattice of pillars is one box. extent: (4,) around everything, outline included. corrected: whether its doses make
+    up for the scattered electrons of its own shapes, and of no others. texts: that are left out, as they draw nothing.
+    """
+
+    name: str
+    top: str
+    cells: Mapping[str, CellContent]
+    doses: Mapping[LayerNumber, float]
+    layer_names: Mapping[LayerNumber, str]
+    boxes: Mapping[str, Array]
+    extent: Array
+    corrected: bool = False
+    texts: int = 0
+
+
+def of_plan(name: str, plan: MaskPlan, content: MaskContent, process: Process, *, corrected: bool) -> Part:
+    """The mask of a plan, as it was read back; its cells are named after the part."""
+    new = {cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells}
+    cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
+    boxes = {PILLARS: [_lattice_box(plan, n) for n in range(len(plan.lattices))], APERTURE: []}
+    every = list(boxes[PILLARS])
+    for figure in plan.figures:
+        for layer, shapes in figure.polygons.items():
+            some = [box for shape in shapes for box in _pieces(np.asarray(shape, np.int64))]
+            every += some
+            if figure.name not in UNDRAWN:
+                boxes[APERTURE if layer[0] == process.layers.aperture[0] else PILLARS] += some
+    extent = _around(np.array(every))
+    return Part(
+        name, name, cells, plan.doses, plan.layer_names, {k: _stacked(v) for k, v in boxes.items()}, extent, corrected
+    )
+
+
+def of_file(
+    name: str, path: Path, content: MaskContent, process: Process, *, cell: str, relative_dose: float, keep_top: bool
+) -> Part:
+    """A cell of a file, or all of the file with this cell as its ``top``.
+
+    Args:
+        cell: its name; empty: the only top cell. relative_dose: of its layers, where the file has no doses.csv.
+        keep_top: all cells of the file, not those below ``cell`` alone.
+
+    Raises:
+        MaskFileError: no such cell, several top cells and none named, coordinates that are no whole nanometres.
+    """
+    top = _chosen(path, content, cell)
+    whole = scaled(content, UNIT_NM, str(path))
+    wanted = set(content.cells) if keep_top else _below(content, top)
+    cells = {key: each for key, each in whole.cells.items() if key in wanted}
+    layers = process.layers
+    undrawn = {layers.outline, layers.fields}
+    table = path.with_name("doses.csv")
+    known = doses.read(table) if table.is_file() else {}
+    used = {layer for each in cells.values() for layer in (*each.polygons, *each.circles)}
+    dosed = {layer: known.get(layer, relative_dose) for layer in sorted(used - undrawn)}
+    found = _file_boxes(dataclasses.replace(whole, cells=cells), top, process)
+    every = np.concatenate([box for box in found.values() if len(box)] or [np.zeros((1, 4))])
+    exposed = {key: box for key, box in found.items() if key in (PILLARS, APERTURE)}
+    texts = sum(each.texts for each in cells.values())
+    names = {layer: text for layer, text in content.layer_names.items() if layer in used}
+    return Part(name, top, cells, dosed, names, exposed, _around(every), texts=texts)
+
+
+def _chosen(path: Path, content: MaskContent, cell: str) -> str:
+    if cell:
+        if cell not in content.cells:
+            raise MaskFileError(f"{path}: no cell {cell!r}; the file holds {', '.join(list(content.cells)[:8])}")
+        return cell
+    if len(content.tops) != 1:
+        raise MaskFileError(
+            f'{path}: {len(content.tops)} top cells ({", ".join(content.tops[:8])}); say which one, as cell = "NAME"'
+        )
+    return content.tops[0]
+
+
+def _below(content: MaskContent, top: str) -> set[str]:
+    """``top`` and all cells that it places, through others too."""
+    found, waiting = {top}, [top]
+    while waiting:
+        for child in content.cells[waiting.pop()].placed.children:
+            if child not in content.cells:
+                raise MaskFileError(f"cell {child!r} is placed, but the file does not hold it")
+            if child not in found:
+                found.add(child)
+                waiting.append(child)
+    return found
+
+
+def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
+    """The same mask in another database unit.
+
+    Raises:
+        MaskFileError: a coordinate that is no whole number of new units, or beyond 32 bits.
+    """
+    ratio = content.unit_nm / unit_nm
+    if abs(ratio - 1) < 1e-9:
+        return content
+
+    def made(values: Array, kind: "type[np.signedinteger]" = np.int64) -> Array:
+        new = np.asarray(values, float) * ratio
+        whole = np.rint(new)
+        if np.abs(new - whole).max(initial=0.0) > _WHOLE or np.abs(whole).max(initial=0.0) > 2**31 - 1:
+            raise MaskFileError(
+                f"{where}: its database unit is {content.unit_nm:g} nm, and its coordinates are no whole multiples of "
+                f"{unit_nm:g} nm within 32 bits; bring the file to a unit of {unit_nm:g} nm"
+            )
+        return whole.astype(kind)
+
+    def cell(old: CellContent) -> CellContent:
+        placed = old.kept()
+        moved = dataclasses.replace(placed, x=made(placed.x, np.int32), y=made(placed.y, np.int32))
+        polygons = {layer: [made(p) for p in shapes] for layer, shapes in old.polygons.items()}
+        circles = {
+            layer: [(int(x), int(y), int(r)) for x, y, r in made(np.array(some).reshape(-1, 3)).tolist()]
+            for layer, some in old.circles.items()
+        }
+        return dataclasses.replace(old, polygons=polygons, circles=circles, placed=moved)
+
+    return dataclasses.replace(content, unit_nm=unit_nm, cells={name: cell(c) for name, c in content.cells.items()})
+
+
+def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
+    placed = cell.kept()
+    children = tuple(new[child] for child in placed.children)
+    return dataclasses.replace(cell, name=new[cell.name], placed=dataclasses.replace(placed, children=children))
+
+
+def relayered(cell: CellContent, new: Mapping[LayerNumber, LayerNumber]) -> CellContent:
+    """A cell with other layer numbers; two that become one are put together."""
+    polygons: dict[LayerNumber, list[Array]] = {}
+    circles: dict[LayerNumber, list[tuple[int, int, int]]] = {}
+    for layer, shapes in cell.polygons.items():
+        polygons.setdefault(new.get(layer, layer), []).extend(shapes)
+    for layer, some in cell.circles.items():
+        circles.setdefault(new.get(layer, layer), []).extend(some)
+    return dataclasses.replace(cell, polygons=polygons, circles=circles)
+
+
+def compact(cell: CellContent) -> tuple[CellContent, tuple]:  # type: ignore[type-arg]
+    """The cell with what its arrays hold taken out, and the arrays."""
+    made, left = arrays(cell.kept())
+    return dataclasses.replace(cell, placed=left), made
+
+
+def _lattice_box(plan: MaskPlan, number: int) -> Array:
+    lattice = plan.lattices[number]
+    reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
+    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
+    return np.array([lattice.x0 - reach, lattice.y0 - bottom - reach, lattice.x0 + right + reach, lattice.y0 + reach])
+
+
+def _pieces(shape: Array) -> Array:
+    """(n, 4) rectangles of a rectilinear polygon; any other one as the box around it."""
+    step = np.roll(shape, -1, axis=0) - shape
+    if (step != 0).all(1).any():
+        return np.r_[shape.min(0), shape.max(0)][None]
+    return rectilinear.rectangles(shape)
+
+
+def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, Array]:
+    """Boxes of all shapes below ``top`` by exposure; layers that no exposure of ours knows by their number."""
+    layers = process.layers
+    ours = {layers.aperture[0]: APERTURE}
+    ours |= {n[0]: PILLARS for n in (layers.pillar, layers.marks, layers.labels, layers.dose, layers.witness)}
+    found: dict[str, list[Array]] = {}
+    for stack in flat.stacks(content, top):
+        pieces = np.concatenate([_pieces(outline) for outline in stack.outlines])
+        places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
+        every = (pieces[None] + places[:, None]).reshape(-1, 4)
+        found.setdefault(ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []).append(every)
+    return {key: np.concatenate(some) for key, some in found.items()}
+
+
+def _stacked(boxes: Sequence[Array]) -> Array:
+    return np.array(boxes, np.int64).reshape(-1, 4)
+
+
+def _around(boxes: Array) -> Array:
+    return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])

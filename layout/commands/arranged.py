@@ -1,0 +1,181 @@
+"""``metalens layout ARRANGEMENT.toml``: every lens made and checked by itself, then all put together in one mask."""
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from layout.arrange import Arrangement, At, Wafer, apart, joined, readback, wafer
+from layout.commands import placed as standing
+from layout.commands.check import read
+from layout.commands.job import Options
+from layout.commands.placed import Work
+from layout.commands.stages import Stages
+from layout.files import Assembly, doses
+from layout.gdsii import assemble as gdsii_assemble
+from layout.oasis import assemble as oasis_assemble
+from layout.process import LayerNumber, noticed
+from layout.process import process as processes
+from metalens.ground import config, store
+
+_MOST_READ = 2**40
+_LISTED = 12  # gaps that are told one by one
+
+
+def run(options: Options) -> int:
+    """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does not read back as planned."""
+    record = config.load(options.lens, Arrangement)
+    named = [part.file for part in (*record.lens, *record.cell)] + ([] if record.into is None else [record.into.file])
+    process = processes.Process() if options.process is None else processes.load(options.process)
+    if not options.dose:
+        process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, correct=False))
+    inputs = [options.lens.parent / file for file in named]
+    with options.claim_folder(options.output, inputs=inputs) as draft, noticed(options.console.say):
+        work = Work(options, record, process, draft.path, Stages(options.console.say))
+        made = _whole(work)
+        _write(work, made)
+        with work.stages("report"):
+            _accompany(work, made)
+    options.console.result(_values(work, made), _text(work, made))
+    return 0 if not work.failures else 1
+
+
+def _whole(work: Work) -> Assembly:
+    """The die of the record, or its wafer."""
+    record = work.record
+    if record.wafer is not None:
+        wafer.refuse_marks_off(record.wafer)
+    placed = [joined.Placing(standing.lens_part(work, part), part.at) for part in record.lens]
+    placed += [joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell]
+    if record.die is not None:
+        placed.append(joined.Placing(standing.surroundings(work, record.die, placed), (At(),)))
+    into = None if record.into is None else standing.file_part(work, "INTO", record.into)
+    every = placed if into is None else [*placed, joined.Placing(into, (At(),))]
+    with work.stages("room between parts"):
+        found = apart.check(every, work.process)
+    told = [f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}" for v in found]
+    work.failures += told[:_LISTED] + ([f"{len(told) - _LISTED} more"] if len(told) > _LISTED else [])
+    layers = work.process.layers
+    name = record.name if record.wafer is None else f"{record.name}_DIE"
+    kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
+    one = joined.die(name, placed, kept=kept, into=into)
+    return one if record.wafer is None else _stepped(work, record.wafer, one, placed)
+
+
+def _stepped(work: Work, size: Wafer, one: Assembly, placed: list[joined.Placing]) -> Assembly:
+    """The wafer: as many whole dies as it holds, and its marks."""
+    box = apart.extent(placed) / joined.PER_UM
+    scattered = apart.reach_um(work.process)
+    inner = apart.extent(placed, exposed=True) / joined.PER_UM
+    need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
+    for axis, pitch in enumerate(size.pitch_um):
+        between = pitch - float(inner[2 + axis] - inner[axis])
+        if between < need:
+            work.failures.append(f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, need {need:.4g}")
+    left, bottom, right, top = box.tolist()
+    work.dies = wafer.dies(size, (left, bottom, right, top), around_marks_um=max(scattered, joined.MARGIN_UM))
+    steps = wafer.stepped(one.name, work.dies, units_per_um=joined.PER_UM)
+    marks = None
+    if size.marks:
+        at = tuple(At(1e3 * mark.x_mm, 1e3 * mark.y_mm) for mark in size.marks)
+        marks = joined.Placing(standing.wafer_mark(work, size), at)
+    return joined.wafer(work.record.name, one, steps, marks)
+
+
+def _write(work: Work, made: Assembly) -> None:
+    """The files that were asked for, each read back."""
+    options = work.options
+    neither = not (options.oasis or options.gds)
+    if options.oasis or neither:
+        _one(work, made, "mask.oas", oasis_assemble.write)
+    if options.gds or neither:
+        _one(work, made, "mask.gds", gdsii_assemble.write)
+
+
+def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path], None]) -> None:
+    path = work.folder / name
+    with work.stages(f"write {name}"):
+        write(made, path)
+    with work.stages(f"read back {name}"):
+        found = readback.differences(made, read(path, _MOST_READ))
+    work.failures += [f"{name} does not read back as planned: {text}" for text in found]
+    work.written[name] = path.stat().st_size
+
+
+def _accompany(work: Work, made: Assembly) -> None:
+    """Dose table, list of dies, job sheet, values."""
+    doses.write(made, work.process, work.folder / "doses.csv")
+    most, held = work.process.exposure.maximum_classes, len({round(dose, 6) for dose in made.doses.values()})
+    if held > most:
+        work.failures.append(f"{held} doses on the mask, exposure.maximum_classes = {most}")
+    if work.dies is not None:
+        text = io.StringIO()
+        out = csv.writer(text, lineterminator="\n")
+        out.writerow(("die", "column", "row", "x_um", "y_um"))
+        for n, (index, place) in enumerate(zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True), 1):
+            out.writerow([n, *index, *(f"{v:.4f}" for v in place)])
+        store.write_text(work.folder / "dies.csv", text.getvalue())
+    store.write_text(work.folder / "process.toml", config.dumps(work.process))
+    store.write_text(work.folder / "arrangement.toml", config.dumps(work.record))
+    store.write_text(work.folder / "job.txt", "\n".join(_sheet(work, made)) + "\n")
+    store.write_text(work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n")
+
+
+def _values(work: Work, made: Assembly) -> dict[str, Any]:
+    return {
+        "ok": not work.failures,
+        "failures": work.failures,
+        "notes": work.notes,
+        "dies": 1 if work.dies is None else len(work.dies.index),
+        "cells": len(made.cells),
+        "doses": len(made.doses),
+        "files": work.written,
+        "lenses": work.lenses,
+        "seconds": work.stages.seconds,
+    }
+
+
+def _sheet(work: Work, made: Assembly) -> list[str]:
+    """The job sheet: what stands where, and its doses; what is said of each lens lies in its folder."""
+    process = work.process
+    lines = [
+        f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
+        work.verdict,
+        *work.notes,
+        "",
+        "Files:",
+        *(f"  {name:<16} {size:>14,} bytes" for name, size in sorted(work.written.items())),
+        "",
+        "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; +y up):",
+    ]
+    for part in (*work.record.lens, *work.record.cell):
+        for at in part.at:
+            many = f", {at.columns} x {at.rows} copies" if at.columns * at.rows > 1 else ""
+            turned = f", turned by {at.turn_deg:g}" if at.turn_deg else ""
+            mirrored = ", mirrored" if at.mirrored else ""
+            lines.append(f"  {part.name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {part.file}")
+    if work.dies is not None and work.record.wafer is not None:
+        size = work.record.wafer
+        lines += [
+            "",
+            f"Wafer of {size.diameter_mm:g} mm: {len(work.dies.index)} whole dies, {size.edge_exclusion_mm:g} mm from "
+            "its edge; dies.csv",
+            *(f"  alignment mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm" for mark in size.marks),
+        ]
+    lines += ["", "Doses (layer/datatype, relative, uC/cm2, name); the same in doses.csv:"]
+    for layer, dose in sorted(made.doses.items()):
+        absolute = dose * process.exposure.base_uC_cm2
+        lines.append(f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f}  {made.layer_names.get(layer, '')}")
+    return lines
+
+
+def _text(work: Work, made: Assembly) -> str:
+    target = work.options.output
+    lines = [work.verdict, *work.notes]
+    lines += [f"  {target / name}: {size / 1e6:.3g} MB, read back" for name, size in work.written.items()]
+    dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
+    lines.append(f"  {dies}{len(made.cells):,} cells; {target / 'job.txt'}; {sum(work.stages.seconds.values()):.1f} s")
+    return "\n".join(lines)

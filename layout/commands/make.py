@@ -1,0 +1,194 @@
+"""One lens to its mask in a folder: quantised, dosed, checked, written, read back, certified, with its companions."""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from layout.certify import MadeRows, Survey, survey
+from layout.commands.job import Job, Options
+from layout.commands.stages import Stages
+from layout.files import MaskContent, doses, dxf, handover, verify
+from layout.gdsii import read as gdsii_read
+from layout.gdsii import write as gdsii_write
+from layout.mask import MaskPlan, build, fields, with_fields
+from layout.oasis import read as oasis_read
+from layout.oasis import write as oasis_write
+from layout.process import LayerNumber
+from layout.process import process as processes
+from layout.rules import check as drc
+from layout.rules import markers
+from metalens import lens as lenses
+from metalens.ground import config, store, transaction
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+from metalens.ground.units import nm
+from metalens.lens import Lens
+
+MOST_MADE = 1 << 24  # sites of a lens whose predicted diameters are handed on as made.h5
+_KEPT = 1 << 16  # placements of a cell that are kept when a file is read back; of more only sums are
+_MOST_READ = 2**40
+
+
+def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") -> Job:
+    """Write the mask of ``options.lens`` and all that goes with it into a folder.
+
+    furniture: what stands on the die beside the lens.
+    """
+    job = _prepare(options, furniture)
+    doses.write(job.plan, job.process, folder / "doses.csv")
+    _write_masks(job, folder)
+    with job.stages("report"):
+        _accompany(job, folder)
+    store.write_text(folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n")
+    return job
+
+
+def _prepare(options: Options, furniture: build.Furniture) -> Job:
+    stages = Stages(options.console.say)
+    with stages("read"):
+        source = (lenses.load if options.study else lenses.streamed)(options.lens)
+        rules = processes.Process() if options.process is None else processes.load(options.process)
+        _refuse_beyond_plain(options, source)
+        transaction.check_room(options.output, math.prod(source.diameters.diameter_um.shape))  # a byte each, or more
+    with stages("classes and dose"):
+        made = build.prepare(source, rules, name=options.name, furniture=furniture, with_doses=options.dose)
+    with stages("write fields"):
+        split = fields.split(source.diameters, rules, drawn=made.cells)
+        plan = stages.rows.watched(with_fields(made.plan, split, rules))
+    with stages("check"):
+        found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
+    return Job(options, source, rules, made, split, plan, found, stages)
+
+
+def _refuse_beyond_plain(options: Options, source: Lens) -> None:
+    """What knows round pillars on a square lattice alone.
+
+    Raises:
+        ProcessError: naming the option.
+    """
+    disc = source.cell.shape.kind == "circle" and not source.cell.shape.hole
+    for name in ("study", "step", "stl"):
+        if getattr(options, name) and not (source.diameters.plain and disc):
+            raise ProcessError(f"--{name} takes round pillars on a square lattice, not {source.cell.described}")
+
+
+def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
+    """(classes,) diameters at the foot of what the etch makes of each class; isolated pillars count where wider."""
+    drawn = np.array([made.diameter_nm for made in plan.classes])
+    made = rules.made_diameter_nm(drawn) + max(0.0, rules.bias.isolated_nm)
+    top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
+    return np.maximum(top, foot)
+
+
+def _write_masks(job: Job, target: Path) -> None:
+    options, plan = job.options, job.plan
+    neither = not (options.oasis or options.gds)
+    if options.oasis or neither:
+        path = target / "mask.oas"
+        with job.stages("write OASIS"):
+            oasis_write.write(plan, path, form=options.form, circles=options.circles)
+        _read_back(job, path, oasis_read.read)
+    if options.gds or neither:
+        path = target / "mask.gds"
+        with job.stages("write GDSII"):
+            gdsii_write.write(plan, path)
+        _read_back(job, path, gdsii_read.read)
+    if options.dxf:
+        path = target / "mask.dxf"
+        with job.stages("write DXF"):
+            count = dxf.write(plan, path, window=options.window)
+        with job.stages("read back dxf"):
+            job.compared[path.name] = verify.Comparison(count, dxf.differences(plan, path, window=options.window))
+        job.written[path.name] = path.stat().st_size
+    if options.stl or options.step:
+        _write_solids(job, target)
+
+
+def _write_solids(job: Job, target: Path) -> None:
+    from layout.solid import files as solid_files
+
+    options, made = job.options, []
+    if options.stl:
+        with job.stages("write STL"):
+            made += solid_files.write_stl(job.source, job.process, target, options.window)
+    if options.step:
+        with job.stages("write STEP"):
+            made += solid_files.write_step(job.source, job.process, target, options.window)
+    job.written |= {path.name: path.stat().st_size for path in made}
+
+
+def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
+    with job.stages(f"read back {path.suffix[1:]}"):
+        content = read(path, limit=_MOST_READ, keep=_KEPT)
+        job.compared[path.name] = verify.compare(job.plan, content)
+        table = doses.read(path.with_name("doses.csv"))
+        job.undosed[path.name] = doses.missing(content, table, job.process)
+    if _certifiable(job) and job.compared[path.name].ok:
+        with job.stages(f"certify {path.suffix[1:]}"):
+            job.certified[path.name] = _certified(job, content, table)
+    job.written[path.name] = path.stat().st_size
+
+
+def _certifiable(job: Job) -> bool:
+    """Whether the simulator knows the point exposure (Gaussians), the tone, and the pillars (round, square lattice)."""
+    exposure = job.process.exposure
+    plain = job.source.diameters.plain and job.plan.classes[0].round
+    return exposure.known and exposure.csv is None and job.process.tone == "positive" and plain
+
+
+def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float]) -> Survey:
+    """What a file makes that holds the plan's places; two files of the same polygons make the same."""
+    if job.certified and not job.options.circles:
+        return next(iter(job.certified.values()))
+    lattice = job.plan.lattices[0]
+    small = not job.certified and lattice.rows * lattice.columns <= MOST_MADE
+    job.made_rows = MadeRows(job.plan) if small else job.made_rows
+    keep = job.made_rows.take if small and job.made_rows else None
+    return survey(content, job.plan, table, job.process, height_um=job.source.cell.height_um, keep=keep)
+
+
+def _accompany(job: Job, target: Path) -> None:
+    """Layer properties, markers, report and pictures."""
+    from layout.commands import page
+
+    markers.write_lyp(job.plan, target / "mask.lyp")
+    markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
+    store.write_text(target / "process.toml", config.dumps(job.process))
+    handover.write_fields(job.fields, target / "fields.csv")
+    store.write_text(target / "job.txt", job.sheet)
+    if job.made_rows is not None:
+        lenses.save(target / "made.h5", job.made_rows.lens(job.source))
+    page.write(job, target)
+
+
+def values_of(job: Job) -> dict[str, Any]:
+    """What layout.json says."""
+    found = job.drc
+    return {
+        "ok": job.ok,
+        "failures": job.failures,
+        "pillars": found.pillars,
+        "classes": len(job.plan.classes),
+        "diameters": len(job.made.cells.diameters_nm),
+        "minimum_gap_nm": found.minimum_gap_nm,
+        "minimum_foot_gap_nm": found.minimum_foot_gap_nm,
+        "minimum_feature_nm": found.minimum_feature_nm,
+        "maximum_density": found.maximum_density,
+        "violations": found.counts,
+        "files": job.written,
+        "exposure": {
+            name: {
+                "worst_relative": c.worst_exposure,
+                "worst_diameter_nm": c.worst_nm,
+                "pillars": c.pillars,
+                "edges": len(c.edges.x_um),
+            }
+            for name, c in job.certified.items()
+        },
+        "differences": {name: list(outcome.differences) for name, outcome in job.compared.items()},
+        "seconds": job.seconds,
+    }

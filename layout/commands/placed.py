@@ -1,0 +1,150 @@
+"""The parts of an arrangement: every lens as a mask of its own, cells of other files, what stands around them."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from layout.arrange import Arrangement, CellPart, Furniture, Into, LensPart, Wafer, apart, joined, parts, wafer
+from layout.certify import survey
+from layout.commands import make
+from layout.commands.check import read
+from layout.commands.job import Options
+from layout.commands.stages import Stages
+from layout.files import MaskContent, flat, verify
+from layout.mask import build
+from layout.oasis import write as oasis_write
+from layout.process import process as processes
+from layout.rules import DrcReport, check, foreign
+from metalens import lens as lenses
+from metalens.ground.errors import MaskFileError
+from metalens.lens import Lens
+
+_MOST_READ = 2**40
+
+
+@dataclass(eq=False, slots=True)
+class Work:
+    """What is known so far of an arrangement.
+
+    failures: what keeps the mask from the writer. notes: what a person should know.
+    """
+
+    options: Options
+    record: Arrangement
+    process: processes.Process
+    folder: Path
+    stages: Stages
+    failures: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
+    written: dict[str, int] = field(default_factory=dict)
+    dies: wafer.Dies | None = None
+
+    @property
+    def verdict(self) -> str:
+        """First line of everything that tells about the mask."""
+        return "FAILS: " + "; ".join(self.failures) if self.failures else "The mask passes its own checks."
+
+    def broken(self, name: str, found: DrcReport) -> None:
+        """Enter the rules that a part breaks."""
+        text = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
+        if text:
+            self.failures.append(f"{name}: design rules broken: {text}")
+
+    def beside(self, file: Path) -> Path:
+        """A file that the arrangement names."""
+        return self.options.lens.parent / file
+
+
+def lens_part(work: Work, part: LensPart) -> parts.Part:
+    """A lens, with mask, report and job sheet in a folder of its own."""
+    folder = work.folder / part.name
+    folder.mkdir()
+    options = dataclasses.replace(work.options, lens=work.beside(part.file), name=part.name)
+    work.options.console.say(f"{part.name}: {part.file}")
+    job = make.make(options, folder, furniture="die" if work.record.furnished(part) else "aperture")
+    work.failures += [f"{part.name}: {text}" for text in job.failures]
+    work.lenses[part.name] = make.values_of(job)
+    for stage, seconds in job.seconds.items():
+        work.stages.seconds[f"{part.name}: {stage}"] = seconds
+    path = next(path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file())
+    content = read(path, _MOST_READ)
+    return parts.of_plan(part.name, job.plan, content, work.process, corrected=job.made.dose is not None)
+
+
+def cell_part(work: Work, part: CellPart) -> parts.Part:
+    """A cell of a file made elsewhere, held to the rules where it is to be."""
+    made = file_part(work, part.name, part)
+    if part.checked:
+        layers = work.process.layers
+        with work.stages(f"{part.name}: check"):
+            content = MaskContent("cell", parts.UNIT_NM, dict(made.cells))
+            skip = (layers.outline[0], layers.fields[0])
+            found = foreign.check(content, work.process.rules, skip=skip, most=foreign.most_of(work.beside(part.file)))
+        work.broken(part.name, found)
+    return made
+
+
+def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
+    """A cell of a file, or all of a file that takes the others."""
+    path, keep = work.beside(record.file), isinstance(record, Into)
+    if not path.is_file():
+        raise MaskFileError(f"{path}: no such file; need a GDSII or OASIS mask")
+    most = foreign.most_of(path)
+    content = read(path, most)
+    flat.refuse_beyond(content, most)
+    made = parts.of_file(
+        name, path, content, work.process, cell=record.cell, relative_dose=record.relative_dose, keep_top=keep
+    )
+    if made.texts:
+        work.notes.append(f"{made.texts} texts of {path.name} are left out: they draw nothing")
+    return made
+
+
+def surroundings(work: Work, die: Furniture, placed: list[joined.Placing]) -> parts.Part:
+    """Marks, label and test structures around all that is placed."""
+    box = apart.extent(placed, exposed=True) / joined.PER_UM
+    made = build.surroundings(
+        _source(work),
+        work.process,
+        name="DIE",
+        size_um=die.size_um,
+        clear_um=max(-float(box[0]), float(box[2])) + apart.reach_um(work.process),
+        label=die.label or work.record.name,
+    )
+    return _written(work, made)
+
+
+def wafer_mark(work: Work, size: Wafer) -> parts.Part:
+    """The alignment mark of a wafer."""
+    made = build.wafer_mark(
+        _source(work), work.process, name="WMARK", mark_um=size.mark_um, width_um=size.mark_width_um
+    )
+    return _written(work, made)
+
+
+def _source(work: Work) -> Lens:
+    """Whose pillars the test structures repeat."""
+    return lenses.streamed(work.beside(work.record.lens[0].file))
+
+
+def _written(work: Work, made: build.MadePlan) -> parts.Part:
+    """What stands beside the lenses: checked, written, read back and certified as they are."""
+    plan, process = made.plan, work.process
+    name = plan.name
+    with work.stages(f"{name}: check"):
+        work.broken(name, check.check(plan, process.rules))
+    path = work.folder / f"{name}.oas"
+    oasis_write.write(plan, path)
+    content = read(path, _MOST_READ)
+    path.unlink()
+    work.failures += [f"{name}: {text}" for text in verify.compare(plan, content).differences]
+    if made.dose is not None and process.exposure.csv is None:
+        with work.stages(f"{name}: certify"):
+            seen = survey(content, plan, plan.doses, process)
+        if not seen.ok:
+            work.failures.append(
+                f"{name}: exposure off by {100 * seen.worst_exposure:.2g} % and {seen.worst_nm:.2g} nm"
+            )
+    return parts.of_plan(name, plan, content, process, corrected=made.dose is not None)

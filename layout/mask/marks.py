@@ -1,0 +1,196 @@
+"""Marks of a die: crosses, coarse and fine, an F for its orientation, verniers and boxes in boxes for its two steps.
+
+A vernier is two scales side by side: bars of pitch p1 drawn with the pillars, and of pitch p2 > p1 opened in the film
+of the aperture. Where the film lies d to the right of the pillars, bar n of both meets where n p1 = n p2 + d, so the
+reading is d = n (p1 - p2), with n counted from the middle bar, which is longer, to the right (upwards for the upright
+scale). A box in a box shows the same shift as a difference of the two margins, twice.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.mask.plan import MaskPlan
+from layout.process import Process
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+CLEAR_UM = 10.0  # between the structures on the die, and of the openings around them
+BARS = 10  # of a vernier on each side of the middle one
+_SHARE = 0.375  # of the pitch, width of a bar
+_BAR_UM, _LONG_UM = 12.0, 16.0  # length of a bar, of the middle one
+_INNER_UM, _OUTER_UM = 10.0, 20.0  # sides of the boxes
+_GAP_UM = 2.0  # from the film's edge to the bars of a vernier
+_FINE = 5  # a fine cross has a fifth of the arms and of the width of a coarse one
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A rectangle in database units."""
+
+    left: int
+    bottom: int
+    right: int
+    top: int
+
+    @property
+    def polygon(self) -> Array:
+        """Its corners."""
+        return np.array(
+            [[self.left, self.bottom], [self.right, self.bottom], [self.right, self.top], [self.left, self.top]]
+        )
+
+    def grown(self, by: int) -> "Box":
+        """A rectangle that is larger by ``by`` on each side."""
+        return Box(self.left - by, self.bottom - by, self.right + by, self.top + by)
+
+
+class Units:
+    """From micrometres to database units on the grid."""
+
+    def __init__(self, plan: MaskPlan) -> None:
+        self.per_um, self.grid, self.pitch = 1e3 / plan.unit_nm, plan.grid, plan.lattices[0].constant
+
+    def __call__(self, length_um: float) -> int:
+        return round(length_um * self.per_um / self.grid) * self.grid
+
+    def snapped(self, box: Box) -> Box:
+        """The box on the grid, no smaller."""
+        g = self.grid
+        return Box(box.left // g * g, box.bottom // g * g, -(-box.right // g) * g, -(-box.top // g) * g)
+
+
+@dataclass(frozen=True, slots=True)
+class Scales:
+    """Verniers and boxes: drawn with the pillars, opened with the aperture."""
+
+    drawn: tuple[Array, ...]
+    openings: tuple[Array, ...]
+
+
+def crosses(process: Process, unit: Units, die: Box) -> tuple[tuple[Array, ...], list[Box]]:
+    """A cross in each corner, a fine one beside it, and beside the upper left an F, unlike all its turns and mirrors.
+
+    Shapes, and the windows that the aperture opens around them.
+    """
+    arm, width = unit(process.die.mark_um / 2), unit(process.die.mark_width_um / 2)
+    inset = unit(process.die.street_um + CLEAR_UM) + arm
+    fine, thin = max(unit.grid, arm // _FINE // unit.grid * unit.grid), _thin(width, unit)
+    shapes: list[Array] = []
+    boxes = []
+    for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        x, y = sx * (die.right - inset), sy * (die.top - inset)
+        away = y - sy * (arm + unit(CLEAR_UM) + fine)
+        for at, reach, half in (((x, y), arm, width), ((x, away), fine, thin)):
+            shapes.append(cross(*at, reach, half))
+            boxes.append(Box(at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach).grown(unit(CLEAR_UM / 2)))
+    square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
+    left, bottom = die.left + inset + arm + unit(CLEAR_UM), die.top - inset - arm
+    shapes.append(_letter_f(left, bottom, square))
+    boxes.append(Box(left, bottom, left + 5 * square, bottom + 7 * square).grown(unit(CLEAR_UM / 2)))
+    return tuple(shapes), boxes
+
+
+def cross(x: int, y: int, arm: int, half: int) -> Array:
+    """(12, 2) corners of a cross at (x, y): arms of length ``arm`` from its middle, twice ``half`` wide."""
+    w, a = half, arm
+    corners = [
+        (w, w),
+        (w, a),
+        (-w, a),
+        (-w, w),
+        (-a, w),
+        (-a, -w),
+        (-w, -w),
+        (-w, -a),
+        (w, -a),
+        (w, -w),
+        (a, -w),
+        (a, w),
+    ]
+    return np.add(corners, (x, y))
+
+
+def wafer_cross(unit: Units, mark_um: float, width_um: float) -> tuple[Array, ...]:
+    """Four bars for the coarse alignment about (0, 0), and a fine cross in the middle that they leave free."""
+    arm, half = unit(mark_um / 2), unit(width_um / 2)
+    inner, thin = arm // _FINE // unit.grid * unit.grid * 2, _thin(half, unit)
+    upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
+    turn = np.array([[0, 1], [-1, 0]])
+    bars = [upright]
+    for _ in range(3):
+        bars.append(bars[-1] @ turn)
+    return (*bars, cross(0, 0, inner // 2, thin))
+
+
+def _thin(half: int, unit: Units) -> int:
+    return max(unit.grid, half // _FINE // unit.grid * unit.grid)
+
+
+def scales(process: Process, unit: Units, die: Box) -> Scales:
+    """Verniers along x and y and a box in a box, from the upper right cross to the left; none where none are wanted.
+
+    Raises:
+        ProcessError: the die is too narrow for them, or the step of the vernier is below the grid.
+    """
+    if not process.die.verniers:
+        return Scales((), ())
+    pitch, step = unit(process.die.vernier_pitch_um), unit(process.die.vernier_step_nm * 1e-3)
+    if step < unit.grid:
+        raise ProcessError(
+            f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
+        )
+    long, clear = BARS * (pitch + step) + pitch // 2, unit(CLEAR_UM)
+    arm = unit(process.die.mark_um / 2)
+    inset = unit(process.die.street_um + CLEAR_UM)
+    high = unit(_LONG_UM + 2 * _GAP_UM)
+    top = die.top - inset - high
+    right = die.right - inset - 2 * arm - 2 * clear
+    upright = right - high, die.top - inset - long
+    outer = unit(_OUTER_UM / 2)
+    middle = upright[0] - high - clear - outer, die.top - inset - outer
+    level = middle[0] - outer - clear - long, top
+    square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
+    if level[0] - long < die.left + inset + 2 * arm + 2 * clear + 5 * square:
+        need = (die.right - level[0] + long + inset + 2 * arm + 2 * clear + 5 * square) / unit.per_um
+        raise ProcessError(
+            f"the die is too narrow for VERNIERS: {need:.0f} um are needed; raise die.margin_um or die.size_um, or set "
+            "die.verniers = false"
+        )
+    drawn, openings = [], []
+    for at, turned in ((level, False), (upright, True)):
+        one, two = _vernier(unit, pitch, step)
+        drawn += [_placed(bar, at, turned) for bar in one]
+        openings += [_placed(bar, at, turned) for bar in two]
+    x, y = middle
+    half = unit(_INNER_UM / 2)
+    drawn.append(Box(x - half, y - half, x + half, y + half).polygon)
+    openings.append(Box(x - outer, y - outer, x + outer, y + outer).polygon)
+    return Scales(tuple(drawn), tuple(openings))
+
+
+def _vernier(unit: Units, pitch: int, step: int) -> tuple[list[Array], list[Array]]:
+    """Bars about (0, 0): drawn ones above, within a window of the film; openings of the film below."""
+    half, gap = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid), unit(_GAP_UM)
+    drawn = [Box(x - half, gap, x + half, gap + long).polygon for x, long in _bars(unit, pitch)]
+    opened = [Box(x - half, -gap - long, x + half, -gap).polygon for x, long in _bars(unit, pitch + step)]
+    reach = BARS * pitch + pitch // 2
+    return drawn, [*opened, unit.snapped(Box(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon]
+
+
+def _bars(unit: Units, pitch: int) -> Iterator[tuple[int, int]]:
+    """(middle, length) of the bars, from the left."""
+    for n in range(-BARS, BARS + 1):
+        yield n * pitch, unit(_BAR_UM if n else _LONG_UM)
+
+
+def _placed(shape: Array, at: tuple[int, int], upright: bool) -> Array:
+    """A shape of a scale where the scale stands; the upright one runs upwards, drawn bars on its left."""
+    turned = shape @ np.array([[0, 1], [-1, 0]]) if upright else shape
+    return np.asarray(turned + at, np.int64)
+
+
+def _letter_f(x: int, y: int, s: int) -> Array:
+    corners = [(0, 0), (1, 0), (1, 3), (4, 3), (4, 4), (1, 4), (1, 6), (5, 6), (5, 7), (0, 7)]
+    return np.add(np.multiply(corners, s), (x, y))

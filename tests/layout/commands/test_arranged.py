@@ -1,0 +1,187 @@
+"""``metalens layout ARRANGEMENT.toml``: every pillar of every die of the wafer at its place, by another reader."""
+
+import json
+
+import numpy as np
+import pytest
+
+import layout
+from layout.files import QUARTERS, Assembly, CellContent, Copies, doses
+from layout.gdsii import assemble as gdsii_assemble
+from metalens import cli, lens
+from metalens.cell.record import Cell
+from metalens.lens.record import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
+
+SIDES = {"a": 15, "b": 10}
+
+
+def lens_map(name):
+    n = SIDES[name]
+    d = np.random.default_rng(n).choice([0.0, 0.12, 0.16, 0.2], (n, n))
+    d[0, 0] = d[-1, -1] = 0.12
+    return DiameterMap(d, 0.4)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two small lenses, a file of pads made elsewhere (its unit 5 nm), and a process without correction."""
+    target = tmp_path_factory.mktemp("arranged")
+    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    for name in SIDES:
+        made = Lens(lens_map(name), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
+        lens.save(target / f"{name}.h5", made)
+    pad = CellContent("PAD", {(1, 0): [np.array([[0, 0], [400, 0], [400, 200], [0, 200]])]})
+    chip = CellContent("CHIP", {(20, 3): [np.array([[0, 0], [9, 0], [9, 11]])]})
+    pads = Copies("PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900))
+    made = Assembly("PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0)
+    gdsii_assemble.write(made, target / "pads.gds")
+    (target / "process.toml").write_text("[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n")
+    return target
+
+
+def run(folder, text, target, *words):
+    (folder / "arrangement.toml").write_text(text)
+    options = ["--process", str(folder / "process.toml"), "-o", str(target), "--force", *words]
+    return cli.main(["layout", str(folder / "arrangement.toml"), *options])
+
+
+WAFER = """
+name = "WAFER"
+[[lens]]
+file = "a.h5"
+name = "A"
+furnished = false
+[[lens.at]]
+x_um = -37.2
+y_um = 11.3
+turn_deg = 270
+[[lens.at]]
+x_um = 30
+mirrored = true
+columns = 2
+rows = 3
+step_um = [25, 21.5]
+[[lens]]
+file = "b.h5"
+name = "B"
+furnished = false
+[[lens.at]]
+x_um = -90
+[[cell]]
+file = "pads.gds"
+name = "PADS"
+relative_dose = 1.5
+checked = false
+[wafer]
+diameter_mm = 4
+edge_exclusion_mm = 0.1
+pitch_um = [340, 290]
+flat_mm = 1.5
+mark_um = 120
+mark_width_um = 8
+[[wafer.marks]]
+x_mm = 1.1
+y_mm = 0.3
+"""
+
+
+def planned(name):
+    """{(x, y) nm: drawn diameter} of a lens's pillars: the first row of the map is the lowest of the mask."""
+    d = lens_map(name).diameter_um
+    n = len(d)
+    at = (np.arange(n) - (n - 1) / 2) * 400
+    return {(at[j], at[i]): d[i, j] for i in range(n) for j in range(n) if d[i, j]}
+
+
+def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_path, capsys):
+    db = pytest.importorskip("klayout.db")
+    assert run(folder, WAFER, tmp_path / "m", "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    table = np.loadtxt(tmp_path / "m" / "dies.csv", delimiter=",", skiprows=1)
+    dies = [(round(1000 * x), round(1000 * y)) for x, y in table[:, 3:]]
+    assert len(dies) == values["dies"] > 60
+    wanted = set()
+    for name, x, y, turn in (
+        ("a", -37200, 11300, 3),
+        *(("a", 30000 + 25000 * i, 21500 * j, 4) for i in range(2) for j in range(3)),
+        ("b", -90000, 0, 0),
+    ):
+        for u, v in planned(name):
+            p, q = QUARTERS[turn].apply(np.array(u), np.array(v))
+            wanted |= {(round(x + float(p) + a), round(y + float(q) + b)) for a, b in dies}
+    for file in ("mask.gds", "mask.oas"):
+        there = db.Layout()
+        there.read(str(tmp_path / "m" / file))
+        pillars = db.Region(there.top_cell().begin_shapes_rec(there.layer(1, 0)))
+        pillars.merged_semantics = False
+        found = [p.bbox().center() for p in pillars.each() if p.bbox().width() < 500]
+        assert len(found) == len(wanted)
+        # pillars are symmetric: the middle of their box is their place, but for one step of the grid
+        assert {(p.x, p.y) for p in found} == wanted
+        pads = db.Region(there.top_cell().begin_shapes_rec(there.layer(1, 1)))
+        assert pads.count() == 60 * len(dies)  # 1.5 of the dose: a datatype of their own
+        assert pads.area() == 60 * len(dies) * 2000 * 1000
+    sizes = [(tmp_path / "m" / file).stat().st_size for file in ("mask.gds", "mask.oas")]
+    lone = [(tmp_path / "m" / "A" / file).stat().st_size for file in ("mask.gds", "mask.oas")]
+    assert sizes[0] < 5 * lone[0]
+    assert sizes[1] < 5 * lone[1]
+    held = doses.read(tmp_path / "m" / "doses.csv")
+    assert held[1, 0] == 1.0
+    assert held[1, 1] == held[20, 3] == 1.5
+
+
+def test_a_lens_goes_into_a_file_whose_cells_stay(folder, tmp_path, capsys):
+    text = '[[lens]]\nfile = "b.h5"\nname = "B"\n[[lens.at]]\nx_um = -60.4\n[into]\nfile = "pads.gds"\ncell = "CHIP"\n'
+    assert run(folder, text, tmp_path / "m", "--oasis", "--gds") == 0
+    assert "The mask passes its own checks." in capsys.readouterr().out
+    old = layout.read_gdsii(folder / "pads.gds")
+    for read, file in ((layout.read_gdsii, "mask.gds"), (layout.read_oasis, "mask.oas")):
+        content = read(tmp_path / "m" / file)
+        assert content.tops == ["CHIP"]
+        assert content.counts("CHIP")["PAD"] == old.counts("CHIP")["PAD"] == 60
+        pillars = {name: n for name, n in content.counts("CHIP").items() if name.startswith("B_D")}
+        assert sum(pillars.values()) == len(planned("b"))
+        assert (5 * old.cells["CHIP"].polygons[20, 3][0]).tolist() == content.cells["CHIP"].polygons[20, 3][0].tolist()
+
+
+def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder, tmp_path, capsys):
+    two = '[[lens]]\nfile = "a.h5"\nname = "A"\nfurnished = false\nat = [{x_um = 0}, {x_um = 5.5}]\n'
+    assert run(folder, two, tmp_path / "m", "--oasis") == 1
+    assert "A at (0, 0) um to A at (5.5, 0) um, pillars: 0.000 um apart" in capsys.readouterr().out
+    pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
+    assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
+    assert "PADS: design rules broken: 1 feature" in capsys.readouterr().out.splitlines()[0]
+    assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0
+
+
+@pytest.mark.slow  # two corrections and certificates: 20 s
+def test_doses_of_lenses_and_their_surroundings_are_corrected_each(folder, tmp_path, capsys):
+    (folder / "process.toml").write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 12.0\neta = 0.7\n")
+    text = 'name = "DUO"\n[die]\nsize_um = [1500, 800]\n[[lens]]\nfile = "a.h5"\nname = "A"\n'
+    text += "at = [{x_um = -40, y_um = 21}, {x_um = 60, turn_deg = 90}]\n"
+    assert run(folder, text, tmp_path / "m", "--json") == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["failures"] == []
+    held = doses.read(tmp_path / "m" / "doses.csv")
+    assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(n == 1 for n, _ in held)
+    content = layout.read_oasis(tmp_path / "m" / "mask.oas")
+    drawn = {layer for cell in content.cells.values() for layer in cell.polygons}
+    assert not drawn - set(held) - {(10, 0), (7, 0)}
+    near = text.replace("x_um = 60", "x_um = -20")
+    assert run(folder, near, tmp_path / "m") == 1
+    assert "backscatter of one that the doses of the other do not know of" in capsys.readouterr().out
+
+
+def test_bad_arrangements_are_refused_by_file_and_key(folder, tmp_path, capsys):
+    for text, said in (
+        ('name = "X"\n', "need a [[lens]] or a [[cell]]"),
+        ('[[cell]]\nfile = "none.gds"\nname = "N"\n', "none.gds"),
+        ('[[cell]]\nfile = "pads.gds"\nname = "P"\ncell = "PIT"\n', "no cell 'PIT'; the file holds PAD, CHIP"),
+        ('[[lens]]\nfile = "a.h5"\nname = "A"\nat = [{columns = 2}]\n', "step_um"),
+        ('[[lens]]\nfile = "a.h5"\nname = "A"\n[wafer]\npitch_um = [100, 900]\n', "wafer.pitch_um is 100 along x"),
+        ('[[lens]]\nfile = "a.h5"\nname = "A B"\n', "cell name 'A B'"),
+    ):
+        assert run(folder, text, tmp_path / "n", "--oasis", "--quiet") == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "n").exists()
