@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from layout.files import Assembly, CellContent, Copies, MaskContent, Turn, flat
-from layout.files.digest import Digest
+from layout.files import Assembly, CellContent, Copies, Digest, MaskContent, Turn, flat
 from metalens.ground.arrays import Array
 
 

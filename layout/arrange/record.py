@@ -186,7 +186,7 @@ class Arrangement:
             raise ProcessError("[into] and [wafer] together: place into the file first, then step it as a [[cell]]")
         if self.die is not None and not self.lens:
             raise ProcessError("[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars")
-        taken = [self.name, *(part.name for part in (*self.lens, *self.cell))]
+        taken = [self.name, *(part.name for part in self.lens), *(part.name for part in self.cell)]
         if self.die is not None:
             taken.append("DIE")
         names.distinct(taken)

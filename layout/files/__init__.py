@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from layout.files.content import Turn as Turn
     from layout.files.content import forget as forget
     from layout.files.content import mapped as mapped
+    from layout.files.digest import Digest as Digest
     from layout.files.digest import Sums as Sums
     from layout.files.dxf import Window as Window
     from layout.files.dxf import sites_in as sites_in
@@ -37,6 +38,7 @@ __getattr__, __dir__, __all__ = attach(
         "Assembly": "assembly",
         "CellContent": "content",
         "Copies": "assembly",
+        "Digest": "digest",
         "FARTHEST": "read_loops",
         "Gathered": "content",
         "MaskContent": "content",

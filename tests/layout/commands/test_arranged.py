@@ -168,7 +168,7 @@ def test_doses_of_lenses_and_their_surroundings_are_corrected_each(folder, tmp_p
     content = layout.read_oasis(tmp_path / "m" / "mask.oas")
     drawn = {layer for cell in content.cells.values() for layer in cell.polygons}
     assert not drawn - set(held) - {(10, 0), (7, 0)}
-    near = text.replace("x_um = 60", "x_um = -20")
+    near = text.replace("x_um = 60", "x_um = -30")
     assert run(folder, near, tmp_path / "m") == 1
     assert "backscatter of one that the doses of the other do not know of" in capsys.readouterr().out
 
