@@ -57,7 +57,7 @@ def reach_um(process: Process) -> float:
 
     def added(away_um: float) -> float:
         pairs = zip(point.weights.tolist(), point.widths_um.tolist(), strict=True)
-        return sum(w / 2 * math.erfc(away_um / a) for w, a in pairs)
+        return float(sum(w / 2 * math.erfc(away_um / a) for w, a in pairs))
 
     low, high = 0.0, 8 * float(point.widths_um.max())
     while high - low > 1e-3:
@@ -79,7 +79,7 @@ def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
         raise ProcessError(f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer")
     gap, far = process.rules.minimum_gap_nm * PER_UM / 1e3, reach_um(process) * PER_UM
     around = np.array([one.box() for one in standing])
-    found = []
+    found: list[Violation] = []
     for n, one in enumerate(standing):
         for m in np.flatnonzero(_apart(around[n + 1 :], around[n]) < max(gap, far)).tolist():
             two = standing[n + 1 + m]

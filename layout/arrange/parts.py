@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import CellContent, MaskContent, arrays, doses, flat
+from layout.files import CellContent, Copies, MaskContent, arrays, doses, flat
 from layout.mask import UNDRAWN, MaskPlan
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
@@ -123,7 +123,7 @@ def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
     if abs(ratio - 1) < 1e-9:
         return content
 
-    def made(values: Array, kind: "type[np.signedinteger]" = np.int64) -> Array:
+    def made(values: Array, kind: type[np.int64 | np.int32] = np.int64) -> Array:
         new = np.asarray(values, float) * ratio
         whole = np.rint(new)
         if np.abs(new - whole).max(initial=0.0) > _WHOLE or np.abs(whole).max(initial=0.0) > 2**31 - 1:
@@ -163,7 +163,7 @@ def relayered(cell: CellContent, new: Mapping[LayerNumber, LayerNumber]) -> Cell
     return dataclasses.replace(cell, polygons=polygons, circles=circles)
 
 
-def compact(cell: CellContent) -> tuple[CellContent, tuple]:  # type: ignore[type-arg]
+def compact(cell: CellContent) -> tuple[CellContent, tuple[Copies, ...]]:
     """The cell with what its arrays hold taken out, and the arrays."""
     made, left = arrays(cell.kept())
     return dataclasses.replace(cell, placed=left), made
@@ -180,7 +180,7 @@ def _pieces(shape: Array) -> Array:
     """(n, 4) rectangles of a rectilinear polygon; any other one as the box around it."""
     step = np.roll(shape, -1, axis=0) - shape
     if (step != 0).all(1).any():
-        return np.r_[shape.min(0), shape.max(0)][None]
+        return np.array([[*shape.min(0), *shape.max(0)]], np.int64)
     return rectilinear.rectangles(shape)
 
 

@@ -28,7 +28,8 @@ _LISTED = 12  # gaps that are told one by one
 def run(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does not read back as planned."""
     record = config.load(options.lens, Arrangement)
-    named = [part.file for part in (*record.lens, *record.cell)] + ([] if record.into is None else [record.into.file])
+    named = [part.file for part in record.lens] + [part.file for part in record.cell]
+    named += [] if record.into is None else [record.into.file]
     process = processes.Process() if options.process is None else processes.load(options.process)
     if not options.dose:
         process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, correct=False))
@@ -151,12 +152,14 @@ def _sheet(work: Work, made: Assembly) -> list[str]:
         "",
         "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; +y up):",
     ]
-    for part in (*work.record.lens, *work.record.cell):
-        for at in part.at:
+    every = [(part.name, part.file, part.at) for part in work.record.lens]
+    every += [(part.name, part.file, part.at) for part in work.record.cell]
+    for name, file, places in every:
+        for at in places:
             many = f", {at.columns} x {at.rows} copies" if at.columns * at.rows > 1 else ""
             turned = f", turned by {at.turn_deg:g}" if at.turn_deg else ""
             mirrored = ", mirrored" if at.mirrored else ""
-            lines.append(f"  {part.name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {part.file}")
+            lines.append(f"  {name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {file}")
     if work.dies is not None and work.record.wafer is not None:
         size = work.record.wafer
         lines += [

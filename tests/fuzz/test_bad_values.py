@@ -53,7 +53,17 @@ def test_nothing_of_another_kind_is_taken(trials):
         ("arrangement", "into.cell"),
     }
     hints = _leaves(_taken(trials, "true"))
-    assert hints == {"hole", "add_focus", "conjugate", "budget", "own_cell", "furnished"}
+    assert hints == {
+        "hole",
+        "add_focus",
+        "conjugate",
+        "budget",
+        "own_cell",
+        "furnished",
+        "checked",
+        "verniers",
+        "mirrored",
+    }
 
 
 def test_what_is_good_is_taken():
