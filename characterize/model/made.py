@@ -99,8 +99,8 @@ def psf_stack(
     """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs: :func:`metalens.psf.psf_stack`.
 
     Pillars, process, aberrations and distance enter; what belongs to one bench (stage, decentre, source size,
-    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the chief ray. Accuracy:
-    ``error`` of the record, relative L2.
+    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the chief ray, beside that of the
+    view. Accuracy: ``error`` of the record, relative L2.
     """
     from metalens import psf
 
@@ -114,12 +114,9 @@ def psf_stack(
                 pitch_um=lens.diameters.pitch_um,
                 wavelength_um=lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
                 sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
-                depths_um=np.array(view.depths_um),
                 angle_rad=[list(angle)],
-                window_um=view.window_um,
-                samples=view.samples,
                 tolerance=tolerance,
-                offset_um=offset_um,
+                **view.seen | {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())},
                 layers=lens.layers,
             )
         )

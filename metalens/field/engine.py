@@ -41,7 +41,7 @@ def imager(
     Args:
         lens: a lens file's content, or a wave (:class:`SmoothWave`, :class:`PillarWave`).
         spectrum: a diode, wavelengths with weights, or None for the design wavelength alone.
-        layers: films around the lens; by default none: the cell's cover fills the gap.
+        layers: films around the lens; by default those of the lens file with the cover of its cell (none for a wave).
         field: (x, y) angle in rad of the middle of the grid.
         tolerance: of the image of a 1/f texture, relative L2.
         distance_um: lens to sensor, by default the design's.
@@ -54,7 +54,7 @@ def imager(
     wave = wave_of(lens)
     focus = wave.focus  # type: ignore[attr-defined]
     if layers is None:
-        layers = Layers(cover=lens.cell.cover) if isinstance(lens, Lens) else Layers()
+        layers = lens.layers if isinstance(lens, Lens) else Layers()
     optics = Optics(wave, layers, focus.sensor_distance_um if distance_um is None else distance_um)
     source = spectrum or Nodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um

@@ -1,7 +1,8 @@
 """Light of other diffraction orders of the zones: each a blurred disc on the sensor, weak and wide.
 
 A ray that leaves the lens at r is turned by order m as a lens of m times the power would: on the sensor it lands at
-r (1 + d/z - m (1 + d/s)) from its chief ray (source depth z, focus s, sensor distance d). Order 1 is the image.
+r (1 + d/z - m (1 + d/s)) from its chief ray (source depth z, focus s, sensor distance d, each reduced: Σ t/n of the
+media on the way). Order 1 is the image.
 """
 
 import math
@@ -38,7 +39,9 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
     wave = optics.wave
     if not isinstance(wave, PillarWave):
         return None
-    focus, d = wave.focus, optics.distance_um
+    focus = wave.focus
+    d = optics.layers.after(optics.distance_um, focus.wavelength_um).reduced_um
+    depth, source = (_reduced(optics, z) for z in (depth_um, focus.source_distance_um))
     shares = wave.orders(focus.wavelength_um, ORDERS)
     frame = grid.frame
     shape = (scipy.fft.next_fast_len(2 * frame[0], real=True), scipy.fft.next_fast_len(2 * frame[1], real=True))
@@ -46,13 +49,20 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
     away = np.hypot(y[:, None], x)
     disc = np.zeros(shape)
     for m, share in shares.items():
-        radius = wave.radius_um * abs(1 + d / depth_um - m * (1 + d / focus.source_distance_um))
+        radius = wave.radius_um * abs(1 + d / depth - m * (1 + d / source))
         radius = max(radius, grid.step_um)
         inside = np.clip((radius - away) / grid.step_um + 0.5, 0, 1)
         disc += share * inside * grid.step_um**2 / (math.pi * radius**2)
     rows, columns = ((np.arange(n) - (n - 1) / 2) * grid.step_um for n in frame)
     cosine2 = 1 / (1 + ((rows[:, None] + middle_um[1]) ** 2 + (columns + middle_um[0]) ** 2) / d**2)
     return Stray(shares, torch.fft.rfft2(torch.from_numpy(disc).float()), shape, torch.from_numpy(cosine2**2).float())
+
+
+def _reduced(optics: Optics, depth_um: float) -> float:
+    """Σ t/n from a source at this depth to the lens; inf for a collimated beam."""
+    if math.isinf(depth_um):
+        return depth_um
+    return optics.layers.before(depth_um, optics.wave.focus.wavelength_um).reduced_um  # type: ignore[attr-defined]
 
 
 def add_stray(image: Tensor, frames: Frames, stray: Stray, grid: Grid) -> Tensor:

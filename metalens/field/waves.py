@@ -15,7 +15,7 @@ from torch import Tensor
 
 from metalens.design import Focus
 from metalens.ground.errors import SceneError
-from metalens.lens import Lens
+from metalens.lens import Lens, Media, media
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 
@@ -135,13 +135,25 @@ class PillarWave:
 
 
 def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
-    """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d (paper Eq. 1, exp(-iωt))."""
+    """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d (paper Eq. 1, exp(-iωt)).
+
+    Through the films of the focus the paths are those of :meth:`metalens.design.Focus.path_um`.
+    """
     r2 = x_um * x_um + y_um * y_um
-    d, s = focus.sensor_distance_um, focus.source_distance_um
-    total = r2 / (torch.sqrt(r2 + d * d) + d)
+    d, s, films = focus.sensor_distance_um, focus.source_distance_um, focus.layers
+    total = _longer(films.after(d, focus.wavelength_um), r2)
     if math.isfinite(s):
-        total = total + r2 / (torch.sqrt(r2 + s * s) + s)
+        total = total + _longer(films.before(s, focus.wavelength_um), r2)
     return -2 * math.pi / focus.wavelength_um * total
+
+
+def _longer(between: Media, r2: Tensor) -> Tensor:
+    """Optical path of the ray of squared reach r² less that along the normal, um."""
+    if len(between.layers) > 1:
+        extra: Tensor = media.longer(between.layers, 0.0, 0.0, r2)[1]
+        return extra
+    n, d = between.layers[0]
+    return n * r2 / (torch.sqrt(r2 + d * d) + d)
 
 
 def wave_of(lens: Lens | Wave) -> Wave:

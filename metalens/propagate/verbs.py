@@ -30,8 +30,8 @@ def case(
     sensor_distance_um: float,
     depths_um: Any,
     angle_rad: Any = 0.0,
-    window_um: float,
-    samples: int,
+    window_um: float | Sequence[float],
+    samples: int | Sequence[int],
     offset_um: tuple[float, float] = (0.0, 0.0),
     layers: Layers | None = None,
     row_um: float = 0.0,
@@ -42,8 +42,9 @@ def case(
     Args:
         shape: (y, x) pillars.
         depths_um: source depths, any sequence or a number; inf for a collimated beam.
-        angle_rad: field angle along x, or the pair (x, y); light of a positive angle moves to +x (+y).
-        window_um, samples: full width of the square window, and cells along it.
+        angle_rad: field angle along x, or the pair (x, y), arctangents of the light's slopes dx/dz and dy/dz (those in
+            air): light of a positive angle moves to +x (+y).
+        window_um, samples: full width of the window, and cells along it; pairs (x, y) where it is not square.
         offset_um: (x, y) of the window centre from the chief ray.
         layers: films around the lens; ``wavelength_um`` is then that in vacuum, and ``angle_rad`` that in air.
         row_um: distance of the rows, 0 for that of the columns; site_um2: area of the cell of one pillar, 0 for that
@@ -53,6 +54,7 @@ def case(
     Raises:
         PropagationError: a length that is not positive, an angle of 90° or more, no depth.
     """
+    step_um, cells = window_of(window_um, samples)
     ax, ay = angles(angle_rad)
     tangents = float(np.tan(ax)), float(np.tan(ay))
     depths = np.atleast_1d(np.asarray(depths_um, float))
@@ -71,12 +73,31 @@ def case(
         tangents=tangents,
         inverse_depths_per_um=tuple((1 / depths).tolist()),
         centre_um=(meets[0], meets[1]),
-        step_um=float(window_um) / max(int(samples), 1),
-        samples=(int(samples), int(samples)),
+        step_um=step_um,
+        samples=cells,
         row_um=float(row_um),
         site_um2=float(site_um2),
         **films,
     )
+
+
+def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
+    """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs (x, y).
+
+    Raises:
+        PropagationError: no number and no pair, or cells that are not square to 1e-6.
+    """
+    wide, many = np.ravel(np.asarray(window_um, float)), np.ravel(np.asarray(samples, int))
+    if wide.size not in (1, 2) or many.size not in (1, 2):
+        raise PropagationError(f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each")
+    (width, height), (across, down) = np.resize(wide, 2).tolist(), np.resize(many, 2).tolist()
+    step = width / max(across, 1)
+    if abs(height / max(down, 1) - step) > 1e-6 * abs(step):
+        raise PropagationError(
+            f"window of {width:g} x {height:g} um with {across} x {down} samples: cells of {step:g} x "
+            f"{height / max(down, 1):g} um; need square ones"
+        )
+    return step, (down, across)
 
 
 def around(layers: Layers, sensor_distance_um: float, wavelength_um: float) -> dict[str, Any]:

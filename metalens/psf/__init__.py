@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from metalens.psf.budget import Budget as Budget
     from metalens.psf.budget import LeftOut as LeftOut
     from metalens.psf.budget import scalar_error as scalar_error
+    from metalens.psf.extended import Extent as Extent
+    from metalens.psf.extended import SourceShape as SourceShape
     from metalens.psf.of_lens import Polarisation as Polarisation
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import aperture as aperture
@@ -31,11 +33,13 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Budget": "budget",
+        "Extent": "extended",
         "LeftOut": "budget",
         "Nodes": "spectrum",
         "Polarisation": "of_lens",
         "PsfStack": "record",
         "Source": "spectrum",
+        "SourceShape": "extended",
         "View": "of_lens",
         "aperture": "of_lens",
         "export": "",

@@ -47,7 +47,7 @@ class Budget:
     """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is not known.
 
     numerical: of the propagation, measured on the result. sampling: of the integration over the cells of the window.
-    spectrum: of the quadrature over wavelengths.
+    spectrum: of the quadrature over wavelengths. source: of a source of finite size, whose points are taken as alike.
     polarisation: of one scalar in place of both polarisations. neighbours: of pillars taken as if each stood among its
         like. angle: of pillars that answer as at normal incidence. glass: of light that goes twice between two faces.
     outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
@@ -57,6 +57,7 @@ class Budget:
     numerical: float
     sampling: float = 0.0
     spectrum: float = 0.0
+    source: float = 0.0
     polarisation: float = math.nan
     neighbours: float = math.nan
     angle: float = math.nan
@@ -65,8 +66,8 @@ class Budget:
 
     @property
     def computed(self) -> float:
-        """What the tolerance is about: numerical, sampling and spectrum together."""
-        return math.hypot(self.numerical, self.sampling, self.spectrum)
+        """What the tolerance is about: numerical, sampling, spectrum and source together."""
+        return math.hypot(self.numerical, self.sampling, self.spectrum, self.source)
 
     @property
     def model(self) -> float:

@@ -40,7 +40,8 @@ class Result:
     """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped.
 
     power: sum of squares of the transmission over the pillars, wavelengths weighted. brightness: mean of the window at
-        the darkest depth, against pillars of random phases. sampling: error of an integration over cells.
+        the darkest depth, against pillars of random phases. sampling: error of an integration over cells. source: of a
+        source of finite size taken as alike.
     """
 
     intensity: torch.Tensor
@@ -49,6 +50,7 @@ class Result:
     power: float
     brightness: float = math.inf
     sampling: float = 0.0
+    source: float = 0.0
 
 
 def intensity(

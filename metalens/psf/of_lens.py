@@ -13,6 +13,7 @@ from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
 from metalens.psf.budget import Budget, LeftOut, scalar_error, with_model, worst
+from metalens.psf.extended import Extent
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
@@ -25,13 +26,23 @@ AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 class View:
     """Where a lens is looked at.
 
-    depths_um: source depths; angles_rad: (x, y) pairs; window_um, samples: of the window that follows the chief ray.
+    depths_um: source depths, inf for a plane wave; angles_rad: (x, y) pairs, as in :func:`metalens.psf.psf_stack`.
+    window_um, samples: of the window that follows the chief ray; pairs (x, y) where it is not square.
+    offset_um: (x, y) from the chief ray to the window's centre. source: size and shape where it is no point.
     """
 
     depths_um: tuple[float, ...]
     angles_rad: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
-    window_um: float = 72.0
-    samples: int = 96
+    window_um: float | tuple[float, float] = 72.0
+    samples: int | tuple[int, int] = 96
+    offset_um: tuple[float, float] = (0.0, 0.0)
+    source: Extent | None = None
+
+    @property
+    def seen(self) -> dict[str, Any]:
+        """Depths, window and source as arguments of :func:`metalens.psf.psf_stack`."""
+        names = ("window_um", "samples", "offset_um", "source")
+        return {"depths_um": np.array(self.depths_um)} | {name: getattr(self, name) for name in names}
 
 
 def from_lens(
@@ -76,10 +87,8 @@ def from_lens(
                 wavelength_um=nodes.wavelengths_um.tolist(),
                 weights=nodes.weights.tolist(),
                 sensor_distance_um=lens.sensor_distance_um,
-                depths_um=np.array(view.depths_um),
                 angle_rad=[list(angle)],
-                window_um=view.window_um,
-                samples=view.samples,
+                **view.seen,
                 tolerance=share,
                 layers=lens.layers,
                 vector=_vectorial(lens, angle, polarisation, tolerance),

@@ -11,13 +11,13 @@ import torch
 from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.lens import Layers, media
+from metalens.lens import Layers
 from metalens.propagate import Case, Moving
 from metalens.psf.budget import Budget
-from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
-from metalens.psf.compute import Result, intensity
+from metalens.psf.compute import Result
+from metalens.psf.direction import Wanted, direction
+from metalens.psf.extended import Extent
 from metalens.psf.record import PsfStack
-from metalens.psf.vector import expanded
 
 
 def psf_stack(
@@ -29,30 +29,37 @@ def psf_stack(
     sensor_distance_um: Any,
     depths_um: Any,
     angle_rad: Any = 0.0,
-    window_um: float,
-    samples: int,
+    window_um: float | tuple[float, float],
+    samples: int | tuple[int, int],
     tolerance: float = 1e-4,
     weights: Sequence[float] | None = None,
     offset_um: Any = (0.0, 0.0),
     layers: Layers | None = None,
     vector: bool = False,
     integrate: bool = True,
+    source: Extent | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,
 ) -> PsfStack:
     """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
 
+    Light travels along +z with exp(-iωt): phases of a lens that focuses fall towards its rim. +x is right, +y down.
+
     Args:
         phase_rad, transmission: (…, y, x) maps, numpy or torch, float32 or float64; leading axes are a batch of
             lenses. With several wavelengths the axis before y is the wavelength. Torch maps are differentiable.
         wavelength_um: one, or several with ``weights`` (equal if None), whose intensities add (incoherent light).
-        depths_um: source depths from the lens, inf for collimated light.
-        angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles.
-        window_um, samples: full width of the square window, and cells along it; samples lie at cell centres.
+        depths_um: source depths from the lens along its axis, inf for a plane wave.
+        angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles: the light's direction has slopes
+            dx/dz = tan x, dy/dz = tan y, so that a positive angle moves the image to +x (+y); the source is at -x.
+        window_um, samples: full width of the window, and cells along it; samples lie at cell centres. Pairs (x, y) for
+            a window that is not square; its cells are.
         tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
         offset_um: (x, y) of the window from the chief ray.
         layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
             that in air, and what the sensor distance gains is cover.
+        source: its size and shape where it is no point; the PSF is then that of a point blurred by the image of the
+            source (:mod:`metalens.psf.extended`), its error ``budget.source``.
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
         vector: Ex, Ey and Ez of both polarisations in place of one scalar (:mod:`metalens.psf.vector`); six times the
             work.
@@ -66,14 +73,13 @@ def psf_stack(
 
     Raises:
         PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window, a
-            tolerance that is not above 0.
+            tolerance that is not above 0, a window that no method reaches, a source of finite size in um at infinity.
 
     A step too coarse for samples of |U|² (:func:`metalens.psf.cells.nyquist_um`) gives the mean over each cell.
 
     Accuracy: ``error`` of the record, 1 to 3 times the true error; ``budget`` has its parts.
     """
-    if not tolerance > 0:
-        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
+    wanted = Wanted(tolerance, vector, integrate, source)
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers}
@@ -85,7 +91,7 @@ def psf_stack(
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
         alike = [dataclasses.replace(one, centre_um=cases[-1].centre_um) for one in seen]
-        found.append(_direction((maps, alike, share.tolist()), tolerance, moving, vector=vector, integrate=integrate))
+        found.append(direction(maps, alike, share.tolist(), wanted, moving))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
@@ -97,52 +103,9 @@ def psf_stack(
 def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor) -> PsfStack:
     """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
     share = (stack.energy_um2.detach().cpu().double() / whole).min()
-    budget = Budget(worst.error, sampling=worst.sampling, outside=max(0.0, 1 - float(share)))
+    outside = max(0.0, 1 - float(share))
+    budget = Budget(worst.error, sampling=worst.sampling, source=worst.source, outside=outside)
     return dataclasses.replace(stack, budget=budget)
-
-
-def _passed(case: Case) -> float:
-    """Power that the faces behind the lens let through along the chief ray."""
-    if case.behind is None:
-        return 1.0
-    steep = 1 + case.tangents[0] ** 2 + case.tangents[1] ** 2
-    return float(media.passed_at(case.behind.order, 1 - 1 / steep))
-
-
-def _direction(
-    given: tuple[tuple[torch.Tensor, torch.Tensor], list[Case], list[float]],
-    tolerance: float,
-    moving: Moving | None,
-    *,
-    vector: bool,
-    integrate: bool,
-) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
-    """(…, depth, y, x) intensity of every lens in one direction, the results it is made of, and (…) the sum of squares
-    of what its pillars let through the faces behind them.
-
-    given: maps, cases and weights of the wavelengths.
-    """
-    maps, cases, weights = given
-    if vector:
-        maps, cases, weights = expanded(maps, cases, weights)
-    shape = maps[0].shape
-    lenses = [m.reshape(-1, *shape[-3:]) for m in maps]
-    shortest = min(cases, key=lambda case: case.wavelength_um)
-    for finer in FINER:
-        fine = cells(shortest, finer) if integrate else Cells(1, shortest)
-        seen = [dataclasses.replace(c, step_um=fine.case.step_um, samples=fine.case.samples) for c in cases]
-        each = zip(*lenses, strict=True)
-        found = [intensity(p, t, seen, weights, tolerance=tolerance, moving=moving) for p, t in each]
-        light, sampling = torch.stack([result.intensity for result in found]), 0.0
-        if fine.points > 1:
-            light, sampling = integrated(light, fine)
-        if sampling <= tolerance / 2 or max(fine.case.samples) > MOST / 2:
-            break
-    if fine.points > 1:
-        why = f"; light integrated over cells of {fine.points} x {fine.points} points"
-        found = [dataclasses.replace(r, sampling=sampling, reason=r.reason + why) for r in found]
-    power = torch.tensor([result.power for result in found], dtype=torch.float64).view(shape[:-3]) * _passed(cases[0])
-    return light.view(*shape[:-3], *light.shape[1:]), found, power
 
 
 def _record(
@@ -161,7 +124,7 @@ def _record(
         centres_um=np.array([c.centre_um for c in cases]),
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
-        error=math.hypot(worst.error, worst.sampling),
+        error=math.hypot(worst.error, worst.sampling, worst.source),
         reason=worst.reason,
     )
 

@@ -118,3 +118,62 @@ def test_a_proxy_outside_its_wavelengths_exits_2(folder):
 
 def test_a_tolerance_out_of_reach_exits_1(folder):
     assert command(folder, "--quiet", "--tolerance", "1e-13") == 1
+
+
+def test_plane_waves_windows_and_lines_from_the_command_line(folder, capsys):
+    """Options stand in place of the file; the same case by the library has the same numbers."""
+    more = "--sources-mm inf 1.4 --angles-deg -12 --angles-y-deg 7 --window-um 12 --samples 20 --height-um 7.2"
+    more += " --offset-um 1.5 -0.8 --wavelengths-nm 850"
+    assert command(folder, "--json", *more.split()) == 0
+    said = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert said["depths_um"] == [None, 1400.0]
+    stack = psf.load(folder / "psf.h5")
+    assert stack.intensity.shape == (1, 2, 12, 20)
+    assert np.isinf(stack.depths_um[0])
+    distance = 120.0
+    assert stack.centres_um[0] == pytest.approx(
+        [distance * np.tan(np.deg2rad(-12)) + 1.5, distance * np.tan(np.deg2rad(7)) - 0.8]
+    )
+    made = small_lens()
+    power = np.abs(
+        propagate.exact(
+            made.phase_rad(), made.transmission(), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=distance,
+            depths_um=stack.depths_um, angle_rad=np.deg2rad([-12.0, 7.0]), window_um=(12.0, 7.2), samples=(20, 12),
+            offset_um=(1.5, -0.8),
+        )
+    )  # fmt: skip
+    want = power**2 / (power**2).sum((1, 2), keepdims=True)
+    assert np.linalg.norm(stack.intensity[0] - want) < 1e-4 * np.linalg.norm(want)
+    assert main(["info", str(folder / "psf.h5")]) == 0
+    assert main(["view", str(folder / "psf.h5"), "-o", str(folder / "page.html"), "--quiet"]) == 0
+
+
+def test_a_finite_source_from_the_command_line(folder):
+    """Half a degree about a direction; the error of taking the PSF as alike is in the file."""
+    more = ("--angles-deg", "4", "--source-deg", "2", "--source-shape", "square", "--tolerance", "0.05", "--quiet")
+    assert command(folder, *more) == 0
+    stack = psf.load(folder / "psf.h5")
+    assert 0 < stack.budget.source < 0.05
+    size = 2 * np.tan(np.deg2rad(1))
+    view = psf.View(tuple(stack.depths_um), ((np.deg2rad(4.0), 0.0),), 16.0, 24, source=psf.Extent("square", 0.0, size))
+    assert psf.from_lens(small_lens(), view, tolerance=0.05).intensity == pytest.approx(stack.intensity, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--source-um", "10", "--sources-mm", "inf"),
+        ("--source-um", "10", "--source-deg", "1"),
+        ("--height-um", "7"),
+        ("--wavelengths-nm", "850", "--led-fwhm-nm", "10"),
+        ("--wavelengths-nm", "850", "--weights", "1", "2"),
+        ("--sources-mm", "0"),
+        ("--wavelengths-nm", "700"),
+    ],
+)
+def test_options_that_contradict_exit_2_and_write_nothing(folder, more, capsys):
+    assert command(folder, *more) == 2
+    said = capsys.readouterr().err
+    assert "metalens: error" in said
+    assert any(name.strip("-").replace("-", "_") in said for name in more) or "wavelength" in said
+    assert not (folder / "psf.h5").exists()

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from metalens.field import stray
+from metalens.cell import Film, Index
+from metalens.field import Layers, stray
 from metalens.image.scene import Frames
 
 GRID = SimpleNamespace(frame=(90, 120), step_um=7.0, margin=4, spare=3, samples=(76, 106))
@@ -23,10 +24,15 @@ class Wave:
         return SHARES
 
 
-def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch):
-    """Rays of order m land at r (1 + d/z) - m d r (1/d + 1/s): one pixel of light, off the middle of the field."""
+@pytest.mark.parametrize("glass_um", [0.0, 600.0])
+def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch, glass_um):
+    """Rays of order m land at r (1 + d/z) - m d r (1/d + 1/s): one pixel of light, off the middle of the field.
+
+    Glass of index 1.5 on the sensor counts by its thickness over its index, and d stays 2 mm.
+    """
     monkeypatch.setattr(stray, "PillarWave", Wave)
-    optics = SimpleNamespace(wave=Wave(), distance_um=D)
+    layers = Layers(behind=(Film(Index(1.5), glass_um),))
+    optics = SimpleNamespace(wave=Wave(), distance_um=D + glass_um / 3, layers=layers)
     middle = (310.0, -240.0)
     made = stray.stray_of(optics, GRID, DEPTH, middle)
     assert made.shares is SHARES

@@ -1,0 +1,182 @@
+"""Settings of ``metalens psf``: depths, angles, window, source and spectrum, from a file or from the command line."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens import lens, propagate, psf
+from metalens.ground import config
+from metalens.ground.errors import ConfigError
+from metalens.lens import Layers
+from metalens.psf import spectrum as spectra
+
+MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is computed; kept in the file.
+
+    depths_mm: nearest and farthest source, and the largest step between depths.
+    sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
+    angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the image of a positive angle lies
+        at +x. angles_y_deg: along y (down), one for each or none for 0.
+    window_um, samples: full width along x of the window that follows the chief ray, and samples along it.
+    height_um: its height, of samples as far apart; 0 for a square window.
+    offset_um: [x, y] from the chief ray to the window's middle.
+    source_um: full size of an incoherent source: diameter of a disc, side of a square, full width at half maximum of a
+        gaussian; 0 for a point. source_deg: the same as an angle, for sources at infinity too.
+    source_shape: disc, square or gaussian.
+    led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
+    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose product is the spectrum (LED,
+        filter, sensor).
+    wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add. weights: of each; none for equal.
+    tolerance: relative L2 error of the PSFs.
+    polarisation: ``scalar``, ``vector`` (Ex, Ey, Ez of both polarisations), or ``auto``: the scalar where its error is
+        below the tolerance.
+    layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
+    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell, for the error budget (seconds to a
+        minute); without it those terms are rough, of the default cell.
+    """
+
+    depths_mm: tuple[float, float, float] = (16.0, 26.0, 0.5)
+    sources_mm: tuple[float, ...] = field(default=(), metadata={"may_be_inf": True})
+    angles_deg: tuple[float, ...] = (0.0, 10.0, 20.0)
+    angles_y_deg: tuple[float, ...] = ()
+    window_um: float = 144.0
+    samples: int = 192
+    height_um: float = 0.0
+    offset_um: tuple[float, float] = (0.0, 0.0)
+    source_um: float = 0.0
+    source_deg: float = field(default=0.0, metadata={"signed": False})
+    source_shape: psf.SourceShape = "disc"
+    led_fwhm_nm: float = 0.0
+    spectrum: tuple[Path, ...] = ()
+    wavelengths_nm: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
+    tolerance: float = 1e-4
+    polarisation: psf.Polarisation = "scalar"
+    layers: Layers | None = None
+    own_cell: bool = False
+
+    def __post_init__(self) -> None:
+        self._check_sources()
+        self._check_window()
+        self._check_light()
+
+    def _check_sources(self) -> None:
+        """Depths, angles and the size of a source."""
+        near, far, step = self.depths_mm
+        if not (0 < near <= far < np.inf and step > 0):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
+            )
+        if not all(depth > 0 for depth in self.sources_mm):
+            raise ConfigError(f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave")
+        if (far - near) / step > MOST_DEPTHS or max(map(abs, (*self.angles_deg, *self.angles_y_deg, 0.0))) >= 90:
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
+                "angles within 90 degrees"
+            )
+        if not self.angles_deg or (self.angles_y_deg and len(self.angles_y_deg) != len(self.angles_deg)):
+            raise ConfigError(
+                f"{len(self.angles_deg)} angles along x, {len(self.angles_y_deg)} along y: need one for each"
+            )
+        if (self.source_um and self.source_deg) or not (self.source_um >= 0 and 0 <= self.source_deg < 90):
+            raise ConfigError(
+                f"source_um = {self.source_um}, source_deg = {self.source_deg}: need one of both, or 0 for a point"
+            )
+        if self.source_um and math.inf in self.sources_mm:
+            raise ConfigError(
+                f"source_um = {self.source_um}, sources_mm = {self.sources_mm}: a source at infinity has no size in "
+                "um; give source_deg"
+            )
+
+    def _check_window(self) -> None:
+        if not (2 <= self.samples <= MOST_SAMPLES and 0 < self.window_um < np.inf):
+            raise ConfigError(
+                f"samples = {self.samples}, window_um = {self.window_um}: need 2 to {MOST_SAMPLES} samples, window > 0"
+            )
+        down = self.samples_y
+        if not (self.height_um >= 0 and 1 <= down <= MOST_SAMPLES):
+            raise ConfigError(f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples")
+        step = self.window_um / self.samples
+        if self.height_um and abs(self.height_um / step - down) > 1e-6 * down:
+            raise ConfigError(
+                f"height_um = {self.height_um}: need a whole number of samples of window_um / samples = {step:g} "
+                f"um, as {down * step:g}"
+            )
+
+    def _check_light(self) -> None:
+        """Tolerance and spectrum."""
+        if not (0 < self.tolerance < 1 and self.led_fwhm_nm >= 0):
+            raise ConfigError(
+                f"tolerance = {self.tolerance}, led_fwhm_nm = {self.led_fwhm_nm}: need 0 < tolerance < 1, width >= 0"
+            )
+        if bool(self.spectrum) + bool(self.led_fwhm_nm) + bool(self.wavelengths_nm) > 1:
+            raise ConfigError(
+                "two of spectrum, led_fwhm_nm and wavelengths_nm are given: each is the whole spectrum; give one"
+            )
+        if not all(0 < nm < np.inf for nm in self.wavelengths_nm):
+            raise ConfigError(f"wavelengths_nm = {self.wavelengths_nm}: need wavelengths above 0")
+        good = len(self.weights) == len(self.wavelengths_nm) and sum(self.weights) > 0
+        if self.weights and not (good and min(self.weights) >= 0):
+            raise ConfigError(
+                f"weights = {self.weights} for wavelengths_nm = {self.wavelengths_nm}: need one of 0 or more for each"
+            )
+
+    @property
+    def samples_y(self) -> int:
+        """Samples along y."""
+        return round(self.height_um / self.window_um * self.samples) if self.height_um else self.samples
+
+    @property
+    def view(self) -> psf.View:
+        """Depths, angles, window and source in um and rad."""
+        near, far, step = self.depths_mm
+        depths = np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
+        depths = (np.array(self.sources_mm) if self.sources_mm else depths) * 1e3
+        along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
+        pairs = [tuple(np.deg2rad([x, y]).tolist()) for x, y in zip(self.angles_deg, along_y, strict=True)]
+        angles = tuple(propagate.angles(pair) for pair in pairs)
+        window = self.window_um, self.window_um / self.samples * self.samples_y
+        return psf.View(
+            tuple(depths.tolist()), angles, window, (self.samples, self.samples_y), self.offset_um, self.source
+        )
+
+    @property
+    def source(self) -> psf.Extent | None:
+        """Size and shape of the source, None for a point."""
+        if not (self.source_um or self.source_deg):
+            return None
+        return psf.Extent(self.source_shape, self.source_um, 2 * math.tan(math.radians(self.source_deg) / 2))
+
+    def nodes(self, made: lens.Lens) -> spectra.Nodes | None:
+        """Wavelengths and weights, no more than the tolerance needs; None for the design wavelength alone."""
+        if self.wavelengths_nm:
+            share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
+            return spectra.Nodes(np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0)
+        if self.led_fwhm_nm == 0 and not self.spectrum:
+            return None
+        path = spectra.path_span(made.diameters.radius_um, made.sensor_distance_um, min(self.view.depths_um))
+        source: spectra.Source | spectra.Measured
+        if self.spectrum:
+            source = spectra.measured(self.spectrum, within_um=made.proxy.wavelengths_um)
+        else:
+            source = spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm)
+        return spectra.nodes(source, path_um=path, tolerance=self.tolerance / 2)
+
+
+def read(path: Path | None, over: dict[str, Any]) -> Settings:
+    """Settings of a file (None: those of the record) with what was given on the command line in their place.
+
+    Raises:
+        ConfigError: as :func:`metalens.ground.config.load`.
+    """
+    table = {} if path is None else config.read(path, Settings, empty=False)
+    given = {name: value for name, value in over.items() if value is not None}
+    where = " and ".join([*([str(path)] if path is not None else []), *(["the command line"] if given else [])])
+    return config.from_table(table | given, Settings, where=where or "metalens psf")

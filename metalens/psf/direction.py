@@ -1,0 +1,157 @@
+"""PSFs of one direction: windows chosen, sources blurred, cells integrated, depths taken so many at a time as fit."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+
+from metalens.ground.errors import PropagationError
+from metalens.lens import media
+from metalens.propagate import Case, Moving
+from metalens.psf import extended
+from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
+from metalens.psf.compute import Result, intensity
+from metalens.psf.extended import Extent
+from metalens.psf.vector import expanded
+
+HELD_BYTES = 512e6  # of the fields of all depths that are computed at once
+SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
+STRICTER = 4  # settings for sources of finite size, whose estimate takes differences of PSFs
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is asked of a direction, as in :func:`metalens.psf.psf_stack`.
+
+    Raises:
+        PropagationError: a tolerance that is not above 0.
+    """
+
+    tolerance: float
+    vector: bool
+    integrate: bool
+    source: Extent | None
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise PropagationError(f"tolerance is {self.tolerance}, need a relative error above 0")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Light:
+    """Maps (wavelength, y, x) of one lens, and the cases and weights of the wavelengths."""
+
+    maps: tuple[torch.Tensor, torch.Tensor]
+    cases: list[Case]
+    weights: list[float]
+
+    def at(self, like: Case) -> list[Case]:
+        """The cases with the direction, depths and window of another."""
+        alike = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
+        return [replace(c, **{name: getattr(like, name) for name in alike}) for c in self.cases]
+
+
+def direction(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    cases: list[Case],
+    weights: list[float],
+    wanted: Wanted,
+    moving: Moving | None,
+) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
+    """(…, depth, y, x) intensity of every lens, the results it is made of, and (…) the sum of squares of what its
+    pillars let through the faces behind them.
+
+    maps: (…, wavelength, y, x); cases, weights: of the wavelengths.
+    """
+    if wanted.source is not None and moving is not None:
+        raise PropagationError("a source of finite size has no derivatives in the geometry: give numbers, or a point")
+    if wanted.vector:
+        maps, cases, weights = expanded(maps, cases, weights)
+    shape = maps[0].shape
+    lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
+    found = [_lens(Light(pair, cases, weights), wanted, moving) for pair in lenses]
+    light, results = torch.stack([one for one, _ in found]), [result for _, result in found]
+    power = torch.tensor([result.power for result in results], dtype=torch.float64).view(shape[:-3])
+    return light.view(*shape[:-3], *light.shape[1:]), results, power * _passed(cases[0])
+
+
+def _lens(given: Light, wanted: Wanted, moving: Moving | None) -> tuple[torch.Tensor, Result]:
+    """(depth, y, x) intensity of one lens, cells as fine as they must be, and its result with all errors."""
+    shortest = min(given.cases, key=lambda case: case.wavelength_um)
+    for finer in FINER:
+        fine = cells(shortest, finer) if wanted.integrate else Cells(1, shortest)
+        wide = fine.case if wanted.source is None else extended.widened(fine.case, wanted.source)[0]
+        if max(wide.samples) > MOST and fine.points > 1:
+            raise PropagationError(f"cells of {fine.points} points in {wide.samples} samples: give a smaller window")
+        lit, results = [], []
+        for some in _few(wide, given, moving):
+            light, result = _depths(given, fine, some, wanted, moving)
+            lit.append(light)
+            results.append(result)
+        result = _together(results)
+        if result.sampling <= wanted.tolerance / 2 or max(fine.case.samples) > MOST / 2:
+            break
+    if fine.points > 1:
+        why = f"; light integrated over cells of {fine.points} x {fine.points} points"
+        result = replace(result, reason=result.reason + why)
+    return torch.cat(lit), result
+
+
+def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:
+    """The case with as many of its depths as fit in ``HELD_BYTES``; all of them where gradients hold them anyway."""
+    inverse, phase = wide.inverse_depths_per_um, given.maps[0]
+    each = wide.samples[0] * wide.samples[1] * SAMPLE_BYTES * phase.element_size()
+    step = max(1, int(HELD_BYTES / each))
+    if moving is not None or phase.requires_grad or given.maps[1].requires_grad:
+        step = len(inverse)
+    count = -(-len(inverse) // step)
+    for i in range(count):  # even shares
+        yield replace(wide, inverse_depths_per_um=inverse[len(inverse) * i // count : len(inverse) * (i + 1) // count])
+
+
+def _depths(
+    given: Light, fine: Cells, some: Case, wanted: Wanted, moving: Moving | None
+) -> tuple[torch.Tensor, Result]:
+    """(depth, y, x) intensity on the window at some depths."""
+    if wanted.source is None:
+        result = intensity(*given.maps, given.at(some), given.weights, tolerance=wanted.tolerance, moving=moving)
+        light = result.intensity
+    else:
+        light, result = _blurred(given, fine, some, wanted.source, wanted.tolerance)
+    if fine.points > 1:
+        light, sampling = integrated(light, fine)
+        result = replace(result, sampling=sampling)
+    return light, replace(result, intensity=light)
+
+
+def _blurred(given: Light, fine: Cells, some: Case, source: Extent, tolerance: float) -> tuple[torch.Tensor, Result]:
+    """As :func:`_depths` for a source of finite size, on the samples of the cells."""
+
+    def point(case: Case) -> Result:
+        return intensity(*given.maps, given.at(case), given.weights, tolerance=tolerance / STRICTER)
+
+    result = point(some)
+    more = (some.samples[0] - fine.case.samples[0]) // 2, (some.samples[1] - fine.case.samples[1]) // 2
+    light, edge = extended.blurred(result.intensity, some, source, more)
+    with torch.no_grad():
+        unlike = extended.unlike(result.intensity, some, source, lambda case: point(case).intensity)
+    reason = f"{result.reason}; blurred by a {source.shape} source"
+    return light, replace(result, source=math.hypot(edge, unlike), reason=reason)
+
+
+def _together(results: list[Result]) -> Result:
+    """Of all depths: the largest of every error."""
+    first = max(results, key=lambda result: result.error)
+    if len(results) == 1:
+        return first
+    worst = {name: max(getattr(result, name) for result in results) for name in ("sampling", "source")}
+    return replace(first, **worst, reason=f"{first.reason}; depths in {len(results)} shares")
+
+
+def _passed(case: Case) -> float:
+    """Power that the faces behind the lens let through along the chief ray."""
+    if case.behind is None:
+        return 1.0
+    steep = 1 + case.tangents[0] ** 2 + case.tangents[1] ** 2
+    return float(media.passed_at(case.behind.order, 1 - 1 / steep))
