@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ def write(path: str | Path, stack: PsfStack) -> None:
     """Write a stack in the format that the name's ending says; same stack, same bytes.
 
     ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32 page for every PSF, the last axis
-    before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON in the image description.
+    before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON in the image description
+    (a depth at infinity is null there).
     ``.mat``: MATLAB 5 variables of the same names and shapes as in the HDF5 file.
     ``.fits``: the primary image (…, y, x) in float32 with linear x and y axes in um, row 0 first (+y down, which most
     viewers draw from below), and an image extension of float64 for every axis and for the energies.
@@ -53,6 +55,7 @@ def tiff(stack: PsfStack) -> bytes:
 
     plain = stack.numpy()
     about = {name: getattr(plain, name) for name in _NUMBERS} | {n: v.tolist() for n, v in _arrays(plain).items()}
+    about["depths_um"] = [None if math.isinf(depth) else depth for depth in about["depths_um"]]
     about |= {"shape": list(plain.intensity.shape), "axes": _axes(plain), "length_unit": "um", "angle_unit": "rad"}
     pages = np.asarray(plain.intensity, np.float32).reshape(-1, *plain.intensity.shape[-2:])
     file = io.BytesIO()
