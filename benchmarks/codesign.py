@@ -30,7 +30,7 @@ from metalens.image.sensor import Sensor
 
 NONE, BATCH = float("nan"), 32
 SCENES = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
-OPTICS = OpticsConfig(focus_mm=33.0, depth_count=20)
+OPTICS = OpticsConfig(focus_mm=33.0, depth_count=20, image="uniform")
 SENSOR = Sensor(9.0, 9.0, 2000.0, 0.0, 4000.0, 5.0, 10)
 SPACE = Space(widths=(0.25, 0.5, 0.75), depths=(2, 3), expansions=(3, 4), kernels=(3, 5), resolution=(0.5, 1.0))
 SIZES = ((0.25, 2), (0.5, 2), (0.5, 3), (0.75, 3))  # width, depth

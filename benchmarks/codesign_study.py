@@ -88,7 +88,7 @@ def optics_of(lens: str, *, angle_deg: float = 0.0) -> tuple[OpticsConfig, Sched
     phase. swiftobliqueF: trained from obliqueF. jointhelixN: trained from helixN.
     """
     kind, number = lens.rstrip("0123456789"), float(lens.lstrip("abcdefghijklmnopqrstuvwxyz"))
-    fixed = OpticsConfig(polynomials=0, depth_count=20, angle_deg=angle_deg)
+    fixed = OpticsConfig(polynomials=0, depth_count=20, angle_deg=angle_deg, image="uniform")
     if kind == "hyper":
         return replace(fixed, focus_mm=number), Schedule(0.0)
     if kind == "oblique":

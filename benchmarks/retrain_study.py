@@ -83,8 +83,9 @@ def expected(design_lens: lens.Lens) -> AsBuilt:
     and crosstalk are unknown too, and marginalised.
     """
     settings = trained.OpticsConfig(
-        focus_mm=28.0, polynomials=0, sample_um=3.0, window_samples=49, depths_mm=(12.0, 60.0), depth_count=7
-    )
+        focus_mm=28.0, polynomials=0, sample_um=3.0, window_samples=49, depths_mm=(12.0, 60.0), depth_count=7,
+        image="uniform",
+    )  # fmt: skip
     ready = MadeLens(design_lens, settings)
     light = ready.stack().intensity.double().numpy()
     depths = settings.depths_um.numpy()

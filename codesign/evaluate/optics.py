@@ -4,14 +4,16 @@ of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals ov
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.eye import Camera, Rendered, Rig, States, Triplets, triplets
+from codesign.optics import formed
 from metalens.ground.errors import ConfigError, SceneError
-from metalens.image import Normalisation, axial_information, integrate, scene
+from metalens.image import Grid, Imager, Normalisation, axial_information, imager, integrate, scene
 from metalens.lens import Lens
 from metalens.psf import View, from_lens
 
@@ -57,15 +59,20 @@ class Scenes:
 
     count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the paper's kind of step).
     pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the light within it.
+    image: "true", every part of the image through the PSFs of its own field angle; or "uniform", the PSF on axis for
+        the whole image, an approximation whose error is printed. image_tolerance: of the true image, relative L2 of a
+        texture.
     """
 
     count: int = 24
     seed: int = 11
     gaze_step_deg: float = 1.0
     slip_step_mm: float = field(default=0.5, metadata={"signed": True})
-    pitch_um: float = 6.0
-    pixels: int = 240
+    pitch_um: float = 12.0
+    pixels: int = 120
     window_um: float = 288.0
+    image: Literal["true", "uniform"] = "true"
+    image_tolerance: float = field(default=0.1, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= 100_000:
@@ -144,7 +151,10 @@ class SceneEnergy:
     """Table 1 of one lens: (scenes,) squared differences of energy-matched images, summed over pixels.
 
     gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
-    light: least share of the light through the lens that the PSFs' window holds, over the depths of the scenes.
+    light: least share of the light through the lens that the PSFs' window holds, over the depths of the scenes; of the
+    true image, of its mean over the field.
+    image_error: of the images, relative L2 of a texture: the true image's own estimate, or how far the uniform image is
+    from it; nan where it is not known.
     maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared difference of gaze and slip (Fig. 5).
     """
 
@@ -152,6 +162,7 @@ class SceneEnergy:
     slip: Tensor
     separability: Tensor
     light: float
+    image_error: float
     maps: Tensor
 
     @property
@@ -189,9 +200,28 @@ def scene_energies(
     out = []
     for lens in lenses:
         rendered = (views.anchor, views.gaze, views.slip)
+        true = lens_imager(lens, rendered, settings)
+        if settings.image == "true":
+            light = 1 - true.parts["outside"]
+            out.append(energies_of(true, views, light=light, image_error=true.error))
+            continue
         basis, light = lens_basis(lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um)
-        out.append(energies_of(scene.uniform_imager(basis, (settings.pixels, settings.pixels)), views, light=light))
+        one = scene.uniform_imager(basis, (settings.pixels, settings.pixels))
+        out.append(energies_of(one, views, light=light, image_error=formed.difference(one, true)))
     return out
+
+
+def lens_imager(lens: Lens, views: Sequence[Rendered], settings: Scenes) -> Imager:
+    """The true image of a lens at one wavelength, on the pixels of the scenes and over the depths that they hold."""
+    window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
+    grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
+    return imager(lens, grid, layers=lens.layers, tolerance=settings.image_tolerance)
+
+
+def depths_of(views: Sequence[Rendered]) -> tuple[float, float]:
+    """Nearest and farthest surface that is seen, um."""
+    seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
+    return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
 def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0) -> Triplets:
@@ -205,13 +235,16 @@ def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float =
     )
 
 
-def energies_of(optics: scene.UniformImager, views: Triplets, *, light: float = 1.0) -> SceneEnergy:
+def energies_of(
+    optics: scene.UniformImager | Imager, views: Triplets, *, light: float = 1.0, image_error: float = math.nan
+) -> SceneEnergy:
     """Table 1 of any PSFs, see :func:`scene_energies`."""
-    images = [scene.image(v.frames, optics) for v in (views.anchor, views.gaze, views.slip)]
+    seen = [v.frames for v in (views.anchor, views.gaze, views.slip)]
+    images = [optics(f) if isinstance(optics, Imager) else scene.image(f, optics) for f in seen]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
     maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
     sums = [m.sum((1, 2)) for m in maps]
-    return SceneEnergy(sums[0], sums[1], sums[2], light, torch.stack([anchor[0], maps[0][0], maps[2][0]]))
+    return SceneEnergy(sums[0], sums[1], sums[2], light, image_error, torch.stack([anchor[0], maps[0][0], maps[2][0]]))
 
 
 def lens_basis(
@@ -222,8 +255,7 @@ def lens_basis(
     Also the least share of the light through the lens that the window holds: what lies outside is left out of the
     images, where a real sensor would show it as haze.
     """
-    seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
-    low, high = max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
+    low, high = depths_of(views)
     count = max(2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1)  # 0.5 mm at the pupil, more beyond
     depths = 1 / torch.linspace(1 / high, 1 / low, count, dtype=torch.float64).flip(0)
     fine, window = max(1, math.ceil(pitch_um / 0.85)), 2 * math.ceil(window_um / (2 * pitch_um))

@@ -1,5 +1,6 @@
 """Tables 1 and 3 of the paper for any lenses, as text and as numbers, with intervals over scenes."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -56,6 +57,7 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
             "scene_ratios": {kind: list(interval) for kind, interval in compared[name].items()},
             "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
             "light_in_window": energy.light,
+            "image_error": None if math.isnan(energy.image_error) else energy.image_error,
         }
     return out
 
@@ -89,11 +91,11 @@ def _scene_lines(scenes: Mapping[str, SceneEnergy], width: int) -> list[str]:
     first = next(iter(scenes))
     count = len(scenes[first].gaze)
     lines = [f"Energy-matched images of {count} scenes: ratio to {first}, 95 % interval over the scenes"]
-    lines.append(f"{'lens':<{width}}" + "".join(f"{kind:<21}" for kind in KINDS) + "span angle   light in window")
+    lines.append(f"{'lens':<{width}}" + "".join(f"{kind:<21}" for kind in KINDS) + "span angle   light in window   image error")
     for name, found in ratios(scenes).items():
         parts = "".join(f"{f'{value:.2f} [{low:.2f}, {high:.2f}]':<21}" for value, low, high in found.values())
         angle = float(torch.rad2deg(scenes[name].angle_rad).mean())
-        lines.append(f"{name:<{width}}{parts}{f'{angle:.1f}°':<13}{scenes[name].light:.2f}")
+        lines.append(f"{name:<{width}}{parts}{f'{angle:.1f}°':<13}{scenes[name].light:<18.2f}{scenes[name].image_error:.3f}")
     paper = "".join(f"{PAPER_SCENES[kind]:<21.2f}" for kind in KINDS)
     lines.append(f"{'paper: proposed':<{width}}{paper}")
     return lines

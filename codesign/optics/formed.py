@@ -175,14 +175,22 @@ def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margi
     one = imager(replace(settings, image="uniform"), coefficients_rad, frame, margin=margin)
     if not isinstance(true, Imager) or not isinstance(one, UniformImager):
         raise TrainingError("no pair of images to compare")
-    seen = trial(true.grid)
-    edge = true.grid.margin + true.grid.spare
-    inside = slice(edge, edge + true.grid.samples[0])
+    return difference(one, true)
+
+
+@torch.no_grad()
+def difference(one: UniformImager, true: Imager) -> float:
+    """Relative L2 difference of the image of a texture in depth through one PSF a depth from its true image.
+
+    Of the texture's contrast; both images of frames of one size, with the same margin.
+    """
+    seen, grid = trial(true.grid), true.grid
+    edge = grid.margin + grid.spare
+    inside = slice(edge, edge + grid.samples[0])
     want = blurred(seen, true)[..., inside, inside]
-    start = true.grid.spare
-    part = slice(start, start + frame)
+    part = slice(grid.spare, grid.spare + grid.samples[0] + 2 * grid.margin)
     few = Frames(*(getattr(seen, name)[..., part, part].contiguous() for name in Frames.__slots__))
-    got = scene.image(few, one, margin=margin)
+    got = scene.image(few, one, margin=grid.margin)
     return float((got - want).norm() / (want - want.mean()).norm())
 
 

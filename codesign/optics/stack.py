@@ -73,10 +73,10 @@ class OpticsConfig:
     tolerance: float = field(default=3e-3, metadata={"above": 0})
     spread: LensErrors = field(default_factory=LensErrors)
     angle_deg: float = 0.0
-    image: Literal["true", "uniform"] = "uniform"
+    image: Literal["true", "uniform"] = "true"
     fwhm_nm: float = 0.0
     filter_nm: float = 0.0
-    image_tolerance: float = 0.03
+    image_tolerance: float = 0.1
     family: Family = "free"
     parts: int = 1
     apart_um: float = 0.0

@@ -186,7 +186,7 @@ class Trainer:
             "pitch": (inner.pitch, [made.log_pitch]),
         }
         self.optimisers = {
-            name: torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0)
+            name: torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True)
             for name, (_, parameters) in self.groups.items()
             if parameters
         }

@@ -5,7 +5,8 @@
 E: relative illumination: cos⁴ of the field angle (projected aperture and solid angle of a sample) times the light of
 the PSF's window. 1 is what an ideal lens of the same aperture sends to a sample on the axis from radiance 1; the
 irradiance in watts is that times π NA'² L with sin of the rim's angle NA' (small angles: area / distance²).
-The near sheet hides the far one as in :mod:`metalens.image.scene`; where one sheet is seen, the sum is as above.
+The near sheet hides the far one as in :mod:`metalens.image.scene`; where one sheet is seen, the sum is as above, and
+frames whose far sheet covers all take that sum alone, at less than half the cost.
 """
 
 import math
@@ -89,16 +90,21 @@ def _continued(field: Tensor, spare: int) -> Tensor:
 
 def blur(frames: Frames, optics: Imager) -> Tensor:
     """(frames, light and coverage, sheets, y, x) of frames as large as the grid's, through every patch."""
+    return _through(frames.radiance, frames.coverage, frames.depth_um, optics, kinds=2)
+
+
+def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, kinds: int) -> Tensor:
+    """(frames, kinds, sheets, y, x) of sheets (frames, sheets, y, x): their light, and with two kinds their coverage."""
     grid, size = optics.grid, optics.stack.shape[-1]
     reach = size // 2
-    count = len(frames.radiance)
-    out = frames.radiance.new_zeros(count, 2, 2, grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach)
-    position = vergence(frames.depth_um, optics.plan.depths_um)
+    whole = grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach
+    out = light.new_zeros(len(light), kinds, light.shape[1], *whole)
+    position = vergence(depth_um, optics.plan.depths_um)
     for patch, transfer in zip(optics.patches, optics.transfer, strict=True):
         high, wide = patch.rows[1] - patch.rows[0] + 2 * reach, patch.columns[1] - patch.columns[0] + 2 * reach
         shape = _size(patch, size)
-        sources = _sources(patch, frames, position, len(optics.plan.depths_um), shape)
-        for kind, source in enumerate(sources):
+        given = light, cover, position
+        for kind, source in enumerate(_sources(patch, given, len(optics.plan.depths_um), shape, kinds)):
             mixed = _mixed(torch.fft.rfft2(source, s=shape), transfer)
             seen = torch.fft.irfft2(mixed, s=shape)[..., :high, :wide]
             place = out[:, kind, :, patch.rows[0] : patch.rows[0] + high, patch.columns[0] : patch.columns[0] + wide]
@@ -107,18 +113,23 @@ def blur(frames: Frames, optics: Imager) -> Tensor:
 
 
 def _sources(
-    patch: Patch, frames: Frames, position: Tensor, depths: int, shape: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """(rank, frames, sheets, …) light and coverage of a patch, weighted for its kernels."""
+    patch: Patch, given: tuple[Tensor, Tensor, Tensor], depths: int, shape: tuple[int, int], kinds: int
+) -> list[Tensor]:
+    """(rank, frames, sheets, …) light, and with two kinds coverage, of a patch, weighted for its kernels.
+
+    Args:
+        given: light, coverage and :func:`vergence` of the whole frame.
+    """
     rows, columns = slice(*patch.rows), slice(*patch.columns)
-    light, cover, place = (a[..., rows, columns] for a in (frames.radiance, frames.coverage, position))
+    light, cover, place = (a[..., rows, columns] for a in given)
     tables = patch.weights, patch.energy
+    few = patch.coverage if kinds > 1 else 0
     if all(_plain(a) for a in (light, cover, place, *tables)):
-        given = light.numpy(), cover.numpy(), place.numpy()
-        made = compiled.weighted(given, (tables[0].numpy(), tables[1].numpy()), shape, patch.coverage)
-        return torch.from_numpy(made[0]), torch.from_numpy(made[1])
+        seen = light.numpy(), cover.numpy(), place.numpy()
+        made = compiled.weighted(seen, (tables[0].numpy(), tables[1].numpy()), shape, few)
+        return [torch.from_numpy(part) for part in made[:kinds]]
     weights, level = at_depth(patch, place, depths)
-    return weights * (light * level), weights[: patch.coverage] * cover
+    return [weights * (light * level), weights[:few] * cover][:kinds]
 
 
 def _mixed(spectrum: Tensor, transfer: Tensor) -> Tensor:
@@ -182,8 +193,19 @@ def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
 
 def blurred(frames: Frames, optics: Imager) -> Tensor:
     """(frames, y, x) image on the whole frame, without stray light."""
+    if _far_alone(frames):
+        light, cover, depth_um = (getattr(frames, name)[:, 1:] for name in Frames.__slots__)
+        return _through(light, cover, depth_um, optics, kinds=1)[:, 0, 0]
     both = blur(frames, optics)
     return _over(both[:, 0], both[:, 1])
+
+
+def _far_alone(frames: Frames) -> bool:
+    """Whether the far sheet covers everything, so that nothing is hidden; never where coverage has derivatives."""
+    cover, light = frames.coverage, frames.radiance
+    if not (_plain(cover) and _plain(light)):
+        return False
+    return not bool(cover[:, 0].any()) and not bool(light[:, 0].any()) and bool((cover[:, 1] == 1).all())
 
 
 def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:

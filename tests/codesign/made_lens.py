@@ -56,7 +56,7 @@ depths = [2]
 budgets_mmacs = [2.0]
 pitch_um = 3.0
 """
-OPTICS = OpticsConfig(0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11)
+OPTICS = OpticsConfig(0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11, image="uniform")
 
 
 @functools.lru_cache

@@ -26,7 +26,9 @@ from metalens.image.sensor import Sensor
 torch.set_num_threads(1)
 parallel.join()
 scenes = EyeScenes(SceneConfig(pixels=48, margin=8), 24.0, 2000.0, 3)
-optics = OpticsConfig(aperture_mm=0.4, depth_count=4, sample_um=24.0, window_samples=9, polynomials=6)
+optics = OpticsConfig(
+    aperture_mm=0.4, depth_count=4, sample_um=24.0, window_samples=9, polynomials=6, image="uniform"
+)
 space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
 config = InnerConfig(steps=3, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
 member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)

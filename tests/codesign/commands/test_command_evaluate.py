@@ -24,6 +24,7 @@ count = 3
 pixels = 64
 pitch_um = 9.0
 window_um = 72.0
+image_tolerance = 0.3
 [reader]
 frames = 64
 pool = 32
@@ -50,6 +51,8 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "Read by the reference reader: 64 frames of 32 pixels of 12 um" in shown
     assert "paper: proposed" in shown
+    assert "image error" in shown
+    assert 0 < json.loads((tmp_path / "out" / "optics.json").read_text())["lenses"]["b"]["image_error"] < 0.3
     assert "95 % interval over the scenes" in shown
     values = json.loads((tmp_path / "out" / "optics.json").read_text())
     assert values["lenses"]["a"]["scene_ratios"]["gaze"] == [1.0, 1.0, 1.0]
@@ -71,6 +74,15 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml")]
     assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 2
     assert "sensor distance" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(tmp_path, capsys):
+    made(tmp_path / "a.h5", 2000.0)
+    (tmp_path / "o.toml").write_text(TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0"))
+    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "--reader", "-o", str(tmp_path / "out")]
+    assert cli.main(["evaluate", "optics", *words]) == 2
+    assert "the proxy holds from 0.85 to 0.85 um" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -79,7 +79,7 @@ def test_deformable_attention_looks_where_its_offsets_say():
 def test_baselines_train_in_the_same_loop(name):
     torch.manual_seed(0)
     scenes = EyeScenes(SceneConfig(pixels=64, margin=8, slip_mm=(2.0, 1.5, 3.0)), 18.0, 2000.0, 3)
-    optics = OpticsConfig(depth_count=4, sample_um=18.0, window_samples=17, polynomials=3)
+    optics = OpticsConfig(depth_count=4, sample_um=18.0, window_samples=17, polynomials=3, image="uniform")
     config = InnerConfig(steps=3, batch=4, patience=1, optics=inner.Schedule(0.02, 0.0, 1.0))
     plain = inner.model(optics, pitch_um=18.0, seed=0)
     net = make(name)

@@ -16,8 +16,9 @@ from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
 OPTICS = OpticsConfig(
-    aperture_mm=0.3, sensor_distance_mm=1.0, polynomials=6, depth_count=4, window_samples=9, depths_mm=(14.0, 30.0)
-)
+    aperture_mm=0.3, sensor_distance_mm=1.0, polynomials=6, depth_count=4, window_samples=9, depths_mm=(14.0, 30.0),
+    image="uniform",
+)  # fmt: skip
 SENSOR = Sensor(pitch_um=9.0)
 SIZE = 48
 

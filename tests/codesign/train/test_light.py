@@ -101,6 +101,10 @@ def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp
     assert float(run.coefficients(whole).abs().max()) > 1e-3
     with pytest.raises(TrainingError, match=r'optics\.image: "true" -> "uniform"'):
         run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, image="uniform")))
+    one = replace(settings, optics=replace(settings.optics, image="uniform"))
+    run.save(tmp_path / "one", run.start(one))
+    with pytest.raises(TrainingError, match=r'optics\.image: "uniform" -> "true"'):
+        run.resume(tmp_path / "one", settings)
     with pytest.raises(TrainingError, match=r"optics\.fwhm_nm: 0\.0 -> 30\.0"):
         run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, fwhm_nm=30.0)))
     pixel = replace(settings.run, pitch_um=settings.run.pitch_um * 1.5)
@@ -109,7 +113,8 @@ def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp
 
 
 def test_a_made_lens_known_on_axis_alone_is_no_true_image():
-    settings = OpticsConfig(polynomials=0, image="true")
+    settings = OpticsConfig(polynomials=0)
+    assert settings.image == "true"  # what training sees where nothing is said
     made = stack.stack(replace(settings, image="uniform"), torch.zeros(0))
     light = Light(settings, (made,), refresh=2, draws=2, seed=0, draw=_never)
     with pytest.raises(TrainingError, match="cannot stand for the field"):

@@ -184,6 +184,15 @@ def test_compiled_and_differentiable_paths_give_one_image(optics):
     assert float((quick - slow.detach()).norm() / quick.norm()) < 1e-5  # single precision
 
 
+def test_frames_of_one_sheet_are_imaged_as_a_near_sheet_too_faint_to_hide_makes_them(optics):
+    """The short path for opaque frames against the two-sheet one, which a near sheet of 1e-6 somewhere calls for."""
+    alone = _frames(_texture().astype(np.float32), _depths().astype(np.float32))
+    touched = alone.coverage.clone()
+    touched[0, 0, 3, 2], touched[0, 1, 3, 2] = 1e-6, 1 - 1e-6
+    both = optics(Frames(alone.radiance, touched, alone.depth_um))
+    assert float((optics(alone) - both).norm() / both.norm()) < 2e-5  # single precision, and the 1e-6
+
+
 def test_the_gradient_to_the_phase_is_that_of_differences():
     """Coma-like added phase: d image power / d strength through nodes, kernels and patches; asymmetric on purpose."""
 
