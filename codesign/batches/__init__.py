@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from codesign.batches.scenes import SceneConfig as SceneConfig
     from codesign.batches.scenes import as_batch as as_batch
     from codesign.batches.scenes import decoupled as decoupled
+    from codesign.batches.scenes import varied as varied
+    from codesign.batches.scenes import worn as worn
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -39,5 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "irradiance": "flat",
         "parallel": "",
         "samples": "flat",
+        "varied": "scenes",
+        "worn": "scenes",
     },
 )

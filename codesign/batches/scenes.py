@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from codesign.batches.batch import Batch
-from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, Trait, render
+from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, Trait, drawn, dressed, render
 from codesign.eye import population as eye
+from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames
 
@@ -32,8 +33,9 @@ class SceneConfig:
     slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
     depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image tells it from slippage.
     variety: factor on how far looks spread about the population's mean: albedos and texture of iris, sclera and skin,
-        lashes, brow, pupil, glints, ambient light, exposure, opening of the lids. 1 is the population as published;
-        2 and more train a network for faces, lamps and cameras that nobody modelled.
+        lashes, brow, pupil, glints, ambient light, exposure, opening of the lids. 1 is the population as published,
+        bare; from there to 2 and more come spectacles with reflections, make-up, uneven light, shadows, movement and
+        other views (:mod:`codesign.eye.worn`): for faces, lamps and cameras that nobody modelled.
     pool: frames that training draws from again and again, at another scale each time; 0 renders every frame anew.
     """
 
@@ -62,10 +64,10 @@ class SceneConfig:
     def motion(self) -> Motion:
         """The ranges that states are drawn from, at unit scale."""
         depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)
+        wide = varied(self.variety)
         return replace(
-            Motion(),
-            population={**POPULATION, **looks(self.variety), "depth_um": depth},
-            aperture=(max(1 - (1 - Motion().aperture[0]) * self.variety, 0.1), Motion().aperture[1]),
+            wide,
+            population={**wide.population, "depth_um": depth},
             gaze_x_rad=math.radians(self.gaze_deg[0]),
             gaze_y_rad=math.radians(self.gaze_deg[1]),
             slip_um=(self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3),
@@ -114,12 +116,54 @@ class EyeScenes:
         return replace(plain, scale=decoupled(depth, self.depths_um, self.settings.scale, generator))
 
     def rendered(self, step: int, size: int) -> Rendered:
-        """Frames of a step with all labels."""
-        return render(self.states(step, size), rig=self.rig, camera=self.camera)
+        """Frames of a step with all labels, and with what the scenes' variety lets them wear."""
+        seed = (self.seed, self.stream, step, 3)
+        return worn(self.states(step, size), self.rig, self.camera, self.settings.variety, seed)
 
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step, as training takes them."""
         return as_batch(self.rendered(step, size), self.margin)
+
+
+def worn(states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[int, ...]) -> Rendered:
+    """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1."""
+    if variety <= 1:
+        return render(states, rig=rig, camera=camera)
+    found = drawn(len(states), variety, np.random.default_rng(seed))
+    return dressed(tilted(states, found.size["tilt"], rig, camera), found)
+
+
+def tilted(states: States, tilt_deg: Array, rig: Rig, camera: Camera) -> Rendered:
+    """Frames that are each seen from another elevation: the rig's and ``tilt_deg`` (n,), rounded to 10 degrees."""
+    steps = np.round(np.asarray(tilt_deg) / 10).astype(int)
+    parts, order = [], []
+    for step in np.unique(steps):
+        rows = np.flatnonzero(steps == step)
+        turned = replace(rig, elevation_rad=rig.elevation_rad - math.radians(10.0 * int(step)))
+        parts.append(render(states[torch.from_numpy(rows)], rig=turned, camera=camera))
+        order.append(rows)
+    return joined(parts, torch.from_numpy(np.argsort(np.concatenate(order))))
+
+
+def joined(parts: list[Rendered], rows: Tensor) -> Rendered:
+    """Rendered frames of several calls as one, in the order ``rows`` of all of them one after the other."""
+    frames, labels = (
+        type(getattr(parts[0], part))(
+            *(
+                torch.cat([getattr(getattr(p, part), name) for p in parts])[rows]
+                for name in type(getattr(parts[0], part)).__slots__
+            )
+        )
+        for part in ("frames", "labels")
+    )
+    return Rendered(frames, torch.cat([p.pupil for p in parts])[rows], labels)
+
+
+def varied(variety: float) -> Motion:
+    """The usual ranges with looks and opening of the lids spread by a factor about the mean."""
+    usual = Motion()
+    widest = max(1 - (1 - usual.aperture[0]) * variety, 0.1), usual.aperture[1]
+    return replace(usual, population={**POPULATION, **looks(variety)}, aperture=widest)
 
 
 def looks(variety: float) -> dict[str, Trait]:

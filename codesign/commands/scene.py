@@ -8,7 +8,8 @@ import numpy as np
 import torch
 import tyro
 
-from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks, render
+from codesign.batches import varied, worn
+from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks
 from codesign.referee import pathtraced
 from metalens.commands import Common, Output
 from metalens.ground import config, store, transaction
@@ -26,6 +27,8 @@ class Scene:
     elevation_deg, distance_mm: of the camera below the eye's forward direction, and its distance from the pupil.
     gaze_deg: largest gaze to the side, and up or down. slip_mm: largest slippage along the camera's x, y, z.
     scale: spread of the scale ambiguity (depth and labels times 1 +- scale at an unchanged image).
+    variety: of the looks, as of training's frames: 1 the population as published, bare; 2 with spectacles, make-up,
+        uneven light, shadows, movement and other views as well.
     layer_mm: thickness of the depth layers that are written; at most 0.5.
     """
 
@@ -38,6 +41,7 @@ class Scene:
     gaze_deg: tuple[float, float] = (18.0, 13.0)
     slip_mm: tuple[float, float, float] = (2.0, 1.5, 3.5)
     scale: float = 0.0
+    variety: float = 1.0
     layer_mm: float = 0.5
 
     def __post_init__(self) -> None:
@@ -57,6 +61,8 @@ class Scene:
             )
         if not 0 <= self.scale < 0.5:
             raise ConfigError(f"scale = {self.scale}: need 0 to 0.5")
+        if not 0 <= self.variety <= 4:
+            raise ConfigError(f"variety = {self.variety}: need 0 to 4")
 
     @property
     def rig(self) -> Rig:
@@ -68,7 +74,7 @@ class Scene:
         """Ranges in um and rad."""
         x, y = (math.radians(angle) for angle in self.gaze_deg)
         slip = (self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3)
-        return replace(Motion(), gaze_x_rad=x, gaze_y_rad=y, slip_um=slip, scale=self.scale)
+        return replace(varied(self.variety), gaze_x_rad=x, gaze_y_rad=y, slip_um=slip, scale=self.scale)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
     """Render and write; the number of layers of the first frame."""
     camera = Camera(settings.pixels, settings.pitch_um)
     states = dataset.states_at(torch.arange(settings.frames), settings.seed, motion=settings.motion)
-    made = render(states, rig=settings.rig, camera=camera)
+    made = worn(states, settings.rig, camera, settings.variety, (settings.seed, 3))
     about = Provenance(config=config.dumps(settings), seed=settings.seed)
     dataset.write_shard(folder / "scene.h5", made, seed=settings.seed, provenance=about)
     count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)

@@ -91,11 +91,15 @@ def _scene_lines(scenes: Mapping[str, SceneEnergy], width: int) -> list[str]:
     first = next(iter(scenes))
     count = len(scenes[first].gaze)
     lines = [f"Energy-matched images of {count} scenes: ratio to {first}, 95 % interval over the scenes"]
-    lines.append(f"{'lens':<{width}}" + "".join(f"{kind:<21}" for kind in KINDS) + "span angle   light in window   image error")
+    lines.append(
+        f"{'lens':<{width}}" + "".join(f"{kind:<21}" for kind in KINDS) + "span angle   light in window   image error"
+    )
     for name, found in ratios(scenes).items():
         parts = "".join(f"{f'{value:.2f} [{low:.2f}, {high:.2f}]':<21}" for value, low, high in found.values())
         angle = float(torch.rad2deg(scenes[name].angle_rad).mean())
-        lines.append(f"{name:<{width}}{parts}{f'{angle:.1f}°':<13}{scenes[name].light:<18.2f}{scenes[name].image_error:.3f}")
+        lines.append(
+            f"{name:<{width}}{parts}{f'{angle:.1f}°':<13}{scenes[name].light:<18.2f}{scenes[name].image_error:.3f}"
+        )
     paper = "".join(f"{PAPER_SCENES[kind]:<21.2f}" for kind in KINDS)
     lines.append(f"{'paper: proposed':<{width}}{paper}")
     return lines

@@ -27,10 +27,14 @@ if TYPE_CHECKING:
     from codesign.eye.renderer import Labels as Labels
     from codesign.eye.renderer import Rendered as Rendered
     from codesign.eye.renderer import render as render
+    from codesign.eye.worn import CAUSES as CAUSES
+    from codesign.eye.worn import drawn as drawn
+    from codesign.eye.worn import dressed as dressed
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "CAUSES": "worn",
         "Camera": "renderer",
         "Labels": "renderer",
         "Motion": "population",
@@ -44,6 +48,8 @@ __getattr__, __dir__, __all__ = attach(
         "dataset": "",
         "landmarks": "",
         "model": "",
+        "dressed": "worn",
+        "drawn": "worn",
         "face_axes": "population",
         "mean_eye_um": "population",
         "parameters": "population",

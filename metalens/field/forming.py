@@ -94,7 +94,7 @@ def blur(frames: Frames, optics: Imager) -> Tensor:
 
 
 def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, kinds: int) -> Tensor:
-    """(frames, kinds, sheets, y, x) of sheets (frames, sheets, y, x): their light, and with two kinds their coverage."""
+    """(frames, kinds, sheets, y, x) of sheets (frames, sheets, y, x): their light; of two kinds, coverage too."""
     grid, size = optics.grid, optics.stack.shape[-1]
     reach = size // 2
     whole = grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach

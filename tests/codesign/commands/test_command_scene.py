@@ -25,9 +25,21 @@ def test_scene_writes_sheet_layers_and_labels(tmp_path):
     assert store.load(tmp_path / "out" / "scene.h5", "scene").provenance.seed == 4
 
 
+def test_variety_changes_the_frames_and_is_reproducible(tmp_path):
+    sheets = []
+    for name, variety in (("bare", 1.0), ("worn", 2.5), ("again", 2.5)):
+        (tmp_path / "scene.toml").write_text(TOML + f"variety = {variety}\n")
+        assert cli.main(["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / name), "--quiet"]) == 0
+        sheets.append((tmp_path / name / "sheet.png").read_bytes())
+    assert sheets[0] != sheets[1] == sheets[2]
+
+
 def test_bad_scene_is_refused_with_the_key(tmp_path, capsys):
     source = tmp_path / "scene.toml"
     source.write_text("layer_mm = 2.0\n")
     assert cli.main(["scene", str(source), "-o", str(tmp_path / "out")]) == 2
     assert "layer_mm" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+    source.write_text("variety = 5.0\n")
+    assert cli.main(["scene", str(source), "-o", str(tmp_path / "out")]) == 2
+    assert "variety = 5.0: need 0 to 4" in capsys.readouterr().err

@@ -18,9 +18,7 @@ from metalens.ground.errors import TrainingError
 from metalens.image.sensor import Sensor
 
 SCENES = EyeScenes(SceneConfig(pixels=64, margin=8), 18.0, 2000.0, 0, TEST)
-OPTICS = OpticsConfig(
-    depth_count=12, sample_um=18.0, window_samples=17, polynomials=0, focus_mm=33.0, image="uniform"
-)
+OPTICS = OpticsConfig(depth_count=12, sample_um=18.0, window_samples=17, polynomials=0, focus_mm=33.0, image="uniform")
 
 
 @pytest.fixture(scope="module")

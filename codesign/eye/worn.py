@@ -1,0 +1,212 @@
+"""What real frames have and the model of the eye has not: spectacles, make-up, uneven light, movement, another view.
+
+Every cause is a record of :data:`CAUSES` and changes rendered frames, their depth and their pupil masks, in the image.
+It is on in a share of the frames that grows with the ``variety`` of the scenes: none at 1, the record's share at 2.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from codesign.eye.renderer import Labels, Rendered
+from metalens.ground.arrays import Array
+from metalens.image import Frames
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Something that a frame may have: in this share of them at variety 2, its size drawn evenly from a range.
+
+    low, high: range of its size in ``unit``.
+    """
+
+    share: float
+    low: float
+    high: float
+    unit: str
+    what: str
+
+
+CAUSES: Mapping[str, Cause] = {
+    "tilt": Cause(0.6, -30.0, 30.0, "deg", "the camera sees the face from above or below its usual place"),
+    "liner": Cause(0.25, 0.3, 0.9, "opacity", "dark line along the lids' margins: liner, mascara, dense lashes"),
+    "lid_shadow": Cause(0.25, 0.15, 0.6, "opacity", "darkened upper lid: eye shadow, a deep socket"),
+    "rim": Cause(0.2, 0.03, 0.10, "frame widths", "band of a spectacle frame before the face"),
+    "reflection": Cause(0.25, 0.15, 0.8, "radiance", "windows and lamps mirrored in spectacle glass"),
+    "glints": Cause(0.4, 0.4, 1.2, "radiance", "mirror images of lamps on the cornea and the tears"),
+    "gradient": Cause(0.6, 0.1, 0.7, "of the mean light", "light that falls off from one side to the other"),
+    "shade": Cause(0.25, 0.2, 0.7, "of the light", "shadow with a soft edge, of brow, nose or frame"),
+    "movement": Cause(0.3, 0.008, 0.04, "frame widths", "the eye or the camera moves during the exposure"),
+}
+RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
+TAPS = 15  # of the kernel of a movement, at most its length
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Worn:
+    """What each of n frames has: ``size`` by cause, 0 where it is off; ``draws`` (n, 12) in [0, 1) place it."""
+
+    size: Mapping[str, Array]
+    draws: Array
+
+
+def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
+    """Causes of ``count`` frames; off everywhere up to variety 1. The same generator draws the same at any variety."""
+    size = {}
+    for name, cause in CAUSES.items():
+        on = generator.random(count) < min(cause.share * max(variety - 1.0, 0.0), 1.0)
+        size[name] = np.where(on, generator.uniform(cause.low, cause.high, count), 0.0)
+    return Worn(size, generator.random((count, 12)))
+
+
+def dressed(made: Rendered, worn: Worn) -> Rendered:
+    """Rendered frames with what is worn but the tilt, which belongs to the view that they are rendered from.
+
+    Light, coverage and depth of both sheets change, and the pupil's mask where something hides or moves it; of the
+    labels the centroid and the visible share of the pupil follow.
+    """
+    if not any(worn.size[name].any() for name in CAUSES if name != "tilt"):
+        return made
+    light, cover, depth = (getattr(made.frames, name).clone() for name in Frames.__slots__)
+    pupil, grid = made.pupil.clone(), _grid(int(light.shape[-1]))
+    for steps in ((_made_up, _glints), (_lit,), (_spectacles,), (_moved,)):
+        for step in steps:
+            step(light, cover, depth, pupil, grid, worn, made.labels)
+    return Rendered(Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil))
+
+
+def _grid(pixels: int) -> tuple[Tensor, Tensor]:
+    """(1, x) and (y, 1) places in frame widths from the middle."""
+    line = (torch.arange(pixels) + 0.5) / pixels - 0.5
+    return line[None], line[:, None]
+
+
+def _on(worn: Worn, name: str) -> list[tuple[int, float, Array]]:
+    """(frame, size, draws) of every frame that has a cause."""
+    size = worn.size[name]
+    return [(int(i), float(size[i]), worn.draws[i]) for i in np.flatnonzero(size)]
+
+
+def _made_up(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
+    """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin above, up to 12 % of the frame."""
+    pixels = int(light.shape[-1])
+    for i, opacity, draws in _on(worn, "liner"):
+        wide = max(1, round((0.015 + 0.025 * draws[0]) * pixels))
+        near = _spread(cover[i, 1], up=wide, down=wide if draws[1] < 0.5 else 1)
+        light[i, 0] *= 1 - opacity * near
+    for i, opacity, draws in _on(worn, "lid_shadow"):
+        high = max(2, round((0.06 + 0.06 * draws[2]) * pixels))
+        light[i, 0] *= 1 - opacity * _soft(_spread(cover[i, 1], up=high, down=0), high / 2)
+
+
+def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
+    """(y, x) largest coverage within ``up`` rows below each pixel and ``down`` rows above it."""
+    padded = F.pad(cover[None, None], (0, 0, down, up))
+    return F.max_pool2d(padded, (up + down + 1, 1), stride=1)[0, 0]
+
+
+def _soft(picture: Tensor, width: float) -> Tensor:
+    """(y, x) mean over a square of about this width."""
+    reach = max(1, round(width / 2))
+    padded = F.pad(picture[None, None], (reach,) * 4, mode="replicate")
+    return F.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
+
+
+def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
+            of: Labels) -> None:  # fmt: skip
+    """One to four spots about the pupil, 0.5 to 2 % of the frame across, on what is seen of the eye."""
+    pixels, (x, y) = int(light.shape[-1]), grid
+    for i, radiance, draws in _on(worn, "glints"):
+        px, py = ((of.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
+        turn, apart = 6.283 * draws[3], 0.02 + 0.07 * draws[4]
+        for k in range(1 + int(4 * draws[5])):
+            at = turn + 1.7 * k
+            size = 0.005 + 0.015 * ((draws[6] + 0.37 * k) % 1)
+            dx, dy = x - px - apart * np.cos(at), y - py - apart * np.sin(at)
+            light[i, 1] += radiance * cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
+
+
+def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
+         of: Labels) -> None:  # fmt: skip
+    """Uneven light and shadows: a factor on both sheets."""
+    x, y = grid
+    for i, change, draws in _on(worn, "gradient"):
+        at = 6.283 * draws[7]
+        light[i] *= (1 + change * 2 * (x * np.cos(at) + y * np.sin(at))).clamp_min(0.1)
+    for i, taken, draws in _on(worn, "shade"):
+        at, edge = 6.283 * draws[8], 0.02 + 0.1 * draws[9]
+        away = x * np.cos(at) + y * np.sin(at) - (draws[10] - 0.5) * 0.6
+        light[i] *= 1 - taken * torch.sigmoid(away / edge)
+
+
+def _spectacles(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
+                of: Labels) -> None:  # fmt: skip
+    """Mirrored windows on the glass, then the rim before all: an arc that hides what is behind it."""
+    x, y = grid
+    for i, radiance, draws in _on(worn, "reflection"):
+        for k in range(1 + int(3 * draws[0])):
+            at_x, at_y = ((draws[1] + 0.61 * k) % 1 - 0.5, (draws[2] + 0.43 * k) % 1 - 0.5)
+            half_x, half_y = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1), 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
+            lean = 0.6 * (draws[5] - 0.5)
+            u, v = (x - at_x) + lean * (y - at_y), (y - at_y) - lean * (x - at_x)
+            light[i] += radiance * cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+    for i, width, draws in _on(worn, "rim"):
+        radius, at, gap = 0.45 + 0.5 * draws[6], 6.283 * draws[7], 0.30 + 0.17 * draws[8]
+        middle_x, middle_y = (radius - gap) * np.cos(at), (radius - gap) * np.sin(at)
+        away = torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
+        band = torch.sigmoid((width / 2 - (away - width / 2).abs()) * light.shape[-1] * 2)
+        shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(away / width * 6.0))
+        far = depth[i, 1].median() * RIM_DEPTH
+        _hidden(light, cover, depth, pupil, i, band, band * shine, far)
+
+
+def _hidden(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, i: int, band: Tensor, shine: Tensor,
+            depth_um: Tensor) -> None:  # fmt: skip
+    """Put something of coverage ``band`` before frame ``i``, on its near sheet."""
+    light[i] *= 1 - band
+    cover[i] *= 1 - band
+    pupil[i] *= 1 - band
+    light[i, 0] += shine
+    cover[i, 0] += band
+    depth[i, 0] = torch.where(band > 0.5, depth_um, depth[i, 0])
+
+
+def _moved(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
+    """Both sheets and the mask averaged along a line: what the pixels collect while the picture moves."""
+    pixels = int(light.shape[-1])
+    for i, length, draws in _on(worn, "movement"):
+        kernel = line_kernel(length * pixels, 3.1416 * draws[11])
+        kept = cover[i].clamp_min(1e-6)
+        stack = torch.cat([light[i], cover[i], kept * depth[i], kept, pupil[i][None]])
+        reach = len(kernel) // 2
+        padded = F.pad(stack[:, None], (reach,) * 4, mode="replicate")
+        seen = F.conv2d(padded, kernel[None, None])[:, 0]
+        light[i], cover[i], depth[i], pupil[i] = seen[:2], seen[2:4], seen[4:6] / seen[6:8], seen[8]
+
+
+def line_kernel(length_px: float, angle_rad: float) -> Tensor:
+    """(k, k) weights, of sum 1, of a picture that moves evenly along a line of this length through the middle."""
+    reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for along in ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach):
+        x, y = along * np.cos(angle_rad) + reach, along * np.sin(angle_rad) + reach
+        column, row = (min(int(v), 2 * reach - 1) if reach else 0 for v in (x, y))
+        s, t = (x - column, y - row) if reach else (0.0, 0.0)
+        for dy, dx, weight in ((0, 0, (1 - s) * (1 - t)), (0, 1, s * (1 - t)), (1, 0, (1 - s) * t), (1, 1, s * t)):
+            if weight > 0:
+                kernel[row + dy, column + dx] += weight
+    return torch.from_numpy(kernel / kernel.sum()).float()
+
+
+def _labels(labels: Labels, before: Tensor, after: Tensor) -> Labels:
+    """Centroid and visible share of the pupil as its mask is now."""
+    was, now = before.sum((1, 2)).double(), after.sum((1, 2)).double()
+    share = torch.where(was > 1e-6, now / was.clamp_min(1e-9), torch.ones_like(was))
+    place = torch.arange(after.shape[-1], dtype=torch.float64)
+    sums = torch.stack([(after.sum(k).double() * place).sum(1) for k in (1, 2)], 1)
+    centroid = torch.where(now[:, None] > 1e-6, sums / now.clamp_min(1e-9)[:, None], labels.pupil_px)
+    return replace(labels, visible=(labels.visible * share).clamp(max=1.0), centroid_px=centroid)
