@@ -22,7 +22,7 @@ from benchmarks import Row
 from characterize.inference.estimate import Options, fit
 from characterize.model import slopes
 from metalens.ground import store
-from metalens.ground.errors import FitError
+from metalens.ground.errors import CaptureError, FitError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "referees"))
 FOLDER = Path(__file__).parent / "results" / "characterize_referee"
@@ -92,7 +92,7 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
     start, clock = time.process_time(), time.perf_counter()
     try:
         found = fit(seen.capture, lens, Options(insist=True), response=response)
-    except FitError as refusal:
+    except (CaptureError, FitError) as refusal:
         return {"seed": seed, "refused": str(refusal), "seconds": time.process_time() - start}
     seconds, wall = time.process_time() - start, time.perf_counter() - clock
     inside, error = {}, {}

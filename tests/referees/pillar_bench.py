@@ -98,7 +98,7 @@ def shoot(lens, session):
     fixed = 97 + 2.0 * rng.standard_normal(electrons.shape[1:])
     frames = _read(electrons * response, session, rng, fixed)
     dark = _read(np.zeros((8, *response.shape)), session, rng, fixed)
-    half = 0.45 * (2**session.bits) * session.gain_e
+    half = 0.45 * min((2**session.bits) * session.gain_e, session.faults.full_well_e)
     flat = _read(np.full((24, *response.shape), half) * response, session, rng, fixed)
     n = len(frames)
     names = tuple(f"frame_{i}.tif" for i in range(n))
