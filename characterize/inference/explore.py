@@ -2,21 +2,23 @@
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.inference import posterior, residual
+from characterize.inference import posterior, residual, walk
 from characterize.inference.leastsquares import Solution
 from characterize.inference.posterior import Profile, Valley
 from characterize.inference.search import Task, distinct, refine
+from characterize.inference.walk import Walk
 from characterize.model import ForwardModel
 from metalens.ground.arrays import Array
 
 REACH = posterior.REACH
 _RESTARTS = 2
 _OF_THE_BENCH = ("log_gain", "background")
+_POINTS = 61  # of the curve of a walk
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
 
 
@@ -46,11 +48,13 @@ class Posterior:
 
 
 def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
-    """Profiles from every valley; one that falls below its mode is followed to a better one first.
+    """Walks over the prior of what may have several valleys; profiles; what falls below its mode is followed first.
 
     Intervals, curves, draws and covariance hold the errors of dark and flat too, which all frames have in common.
     """
     modes = list(ends)
+    for name in walk.WALKED:
+        modes = walk.valleys(task, modes, name) if name in task.names else modes
     for _ in range(_RESTARTS):
         valleys = [_valley(task, mode) for mode in modes]
         profiles, better = _profiles(task, valleys[0], modes[0])
@@ -63,7 +67,8 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     else:
         valleys = [_valley(task, mode) for mode in modes]
         profiles, _ = _profiles(task, valleys[0], modes[0])
-    return _joined(task, modes, valleys, profiles)
+    bent = [name for name in walk.WALKED if name in profiles and (len(modes) > 1 or not profiles[name].parabolic)]
+    return _joined(task, modes, valleys, profiles, {name: walk.walk(task, modes, name) for name in bent})
 
 
 def _valley(task: Task, mode: Solution) -> Valley:
@@ -81,22 +86,20 @@ def _profiles(task: Task, valley: Valley, mode: Solution) -> tuple[dict[str, Pro
     return found, None
 
 
-def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: dict[str, Profile]) -> Posterior:
+def _joined(
+    task: Task,
+    modes: list[Solution],
+    valleys: list[Valley],
+    profiles: dict[str, Profile],
+    walks: Mapping[str, Walk],
+) -> Posterior:
     best, names = modes[0], task.names
     spread = max(1.0, best.chi2_per_dof)
     calibration = valleys[0].calibration()
     sigma = valleys[0].sigma * np.sqrt(spread)
-    low, high = best.value - posterior.REACH * sigma, best.value + posterior.REACH * sigma
-    parabolic = np.ones(len(names), bool)
-    for i, name in enumerate(names):
-        if name in profiles:
-            low[i], high[i], parabolic[i] = profiles[name].low, profiles[name].high, profiles[name].parabolic
-    for mode, valley in zip(modes[1:], valleys[1:], strict=True):
-        room = np.sqrt(max(1 - (mode.merit - best.merit) / (posterior.REACH**2 * spread), 0.0))
-        if room > 0:
-            reach = room * posterior.REACH * valley.sigma * np.sqrt(spread)
-            low, high = np.minimum(low, mode.value - reach), np.maximum(high, mode.value + reach)
+    low, high, parabolic = _intervals(task, modes, valleys, profiles, walks)
     wider = np.sqrt(1 + np.maximum(np.diag(calibration), 0.0) / sigma**2)
+    profiles = profiles | {names[one.index]: _whole(one, best, low, high) for one in walks.values()}
     low = np.maximum(best.value + wider * (low - best.value), task.prior.low)
     high = np.minimum(best.value + wider * (high - best.value), task.prior.high)
     profiles = {name: _widened(one, best.value, wider, names.index(name)) for name, one in profiles.items()}
@@ -107,9 +110,67 @@ def _joined(task: Task, modes: list[Solution], valleys: list[Valley], profiles: 
         size, vectors = np.linalg.eigh(calibration)
         normal = np.random.default_rng(1).standard_normal((posterior.DRAWS, len(names)))
         shift = normal * np.sqrt(np.maximum(size, 0)) @ vectors.T
-        draws = np.clip(posterior.draws(valleys) + shift, task.prior.low, task.prior.high)
+        drawn = _drawn(modes, valleys, list(walks.values()), spread)
+        draws = np.clip(drawn + shift, task.prior.low, task.prior.high)
         covariance = _covariance(draws, valleys[0], (high - low) / (2 * posterior.REACH))
     return Posterior(tuple(modes), share, low, high, parabolic, draws, profiles, covariance)
+
+
+def _intervals(
+    task: Task,
+    modes: list[Solution],
+    valleys: list[Valley],
+    profiles: dict[str, Profile],
+    walks: Mapping[str, Walk],
+) -> tuple[Array, Array, Array]:
+    """(p,) ends over all profiles, modes and walks, and whether the parabola of the best has the same."""
+    best, names = modes[0], task.names
+    spread = max(1.0, best.chi2_per_dof)
+    level = posterior.REACH**2 * spread
+    sigma = valleys[0].sigma * np.sqrt(spread)
+    low, high = best.value - posterior.REACH * sigma, best.value + posterior.REACH * sigma
+    parabolic = np.ones(len(names), bool)
+    for i, name in enumerate(names):
+        if name in profiles:
+            low[i], high[i], parabolic[i] = profiles[name].low, profiles[name].high, profiles[name].parabolic
+    for mode, valley in zip(modes[1:], valleys[1:], strict=True):
+        room = np.sqrt(max(level - (mode.merit - best.merit), 0.0))
+        if room > 0:
+            low = np.minimum(low, mode.value - room * valley.sigma)
+            high = np.maximum(high, mode.value + room * valley.sigma)
+    for one in walks.values():
+        ends = one.interval(best.merit, level)
+        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
+        apart = np.maximum(high - best.value, best.value - low) / (posterior.REACH * sigma)
+        parabolic &= apart < posterior.PARABOLIC[1]
+    return low, high, parabolic
+
+
+def _whole(one: Walk, best: Solution, low: Array, high: Array) -> Profile:
+    """The profile that a walk is."""
+    value, rise = one.profile(best.merit)
+    some = np.unique(np.linspace(0, len(value) - 1, _POINTS).round().astype(int))
+    return Profile(float(low[one.index]), float(high[one.index]), value[some], rise[some], parabolic=False)
+
+
+def _drawn(modes: list[Solution], valleys: list[Valley], walks: list[Walk], spread: float) -> Array:
+    """Draws about the modes; of the walks where there are any, and about those modes alone that lie on none."""
+    if not walks:
+        return posterior.draws(valleys)
+    rng, least = np.random.default_rng(0), modes[0].merit
+    beside = [k for k, mode in enumerate(modes) if not any(one.passes(mode.value) for one in walks)]
+    one = max(walks, key=lambda w: w.log_mass(least))
+    log = [one.log_mass(least), *(_log_mass(modes[k], valleys[k], least) for k in beside)]
+    share = np.exp(np.array(log) - max(log))
+    count = rng.multinomial(posterior.DRAWS, share / share.sum())
+    parts = [one.draws(int(count[0]), least=least, widened=spread, rng=rng)]
+    parts += [posterior.draws([valleys[k]], int(n)) for k, n in zip(beside, count[1:], strict=True) if n]
+    return np.asarray(rng.permutation(np.concatenate(parts)))
+
+
+def _log_mass(mode: Solution, valley: Valley, least: float) -> float:
+    """As :meth:`Walk.log_mass`, of a parabola."""
+    return float(posterior.half_volume(valley) - (mode.merit - least) / 2 + np.log(2 * np.pi) / 2)
 
 
 def _widened(one: Profile, best: Array, wider: Array, i: int) -> Profile:

@@ -216,9 +216,14 @@ def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Ar
 
 def shares(valleys: Sequence[Valley]) -> Array:
     """(k,) probability of every mode by Laplace's rule: exp(-misfit / 2) times the volume of its parabola."""
-    half = [-v.least / 2 + np.linalg.slogdet(_unit(v))[1] / 2 + np.log(v.sigma).sum() for v in valleys]
+    half = [-v.least / 2 + half_volume(v) for v in valleys]
     weight = np.exp(np.array(half) - max(half))
     return np.asarray(weight / weight.sum())
+
+
+def half_volume(valley: Valley) -> float:
+    """Half the log determinant of a parabola's covariance."""
+    return float(np.linalg.slogdet(_unit(valley))[1] / 2 + np.log(valley.sigma).sum())
 
 
 def _unit(valley: Valley) -> Array:

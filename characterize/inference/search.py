@@ -61,17 +61,17 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
     the best to the end. Then from what it found with even aberrations reversed and moved along its weakest valley:
     whatever of all these promises as much is fitted to the end too.
     """
-    few = _few(task.model.setting)
+    few = few_frames(task.model.setting)
     plain = starts(task)
     first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
     best = _long(task, first[0].value)
     tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
     floor = min(tries[0].merit, first[0].merit)
     promising = [t for t in tries if t.merit < floor + _PROMISING]
-    return _mirrored(task, distinct([best, *_followed(task, best, [t.value for t in promising][: 2 * _MOST])]))
+    return _mirrored(task, distinct([best, *followed(task, best, [t.value for t in promising][: 2 * _MOST])]))
 
 
-def _followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
+def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
     """Where some starts lead: a few steps on all frames, and to the end what promises as much as the best.
 
     At most ``_MOST`` ends, none that leads to the best itself or to another.
@@ -97,7 +97,7 @@ def _mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
     for _ in range(_AGAIN):
         best = ends[0]
         begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
-        ends = distinct([*ends, *_followed(task, best, begins)])
+        ends = distinct([*ends, *followed(task, best, begins)])
         if ends[0].merit > best.merit - 1:
             break
     return ends
@@ -191,7 +191,7 @@ def prior_of(names: Sequence[str], known: dict[str, Known], distance_um: float) 
     return Prior(np.array(mean), np.array(sigma), np.array(low), np.array(high))
 
 
-def _few(setting: Setting) -> Array:
+def few_frames(setting: Setting) -> Array:
     """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
     chosen: list[int] = []
     for angle in np.unique(setting.angle_rad, axis=0):

@@ -1,0 +1,225 @@
+"""One parameter over its whole prior, all others fitted at every place: valleys that no start led to, bent ones whole.
+
+The least misfit along such a walk is a profile however its valley bends. Times the volume of the others' parabola at
+each place it is the marginal posterior of what is walked (Laplace; Tierney and Kadane 1986), and with the others
+Gaussian about their own place it is drawn from, two valleys or more as they come.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import interpolate
+
+from characterize.inference import leastsquares
+from characterize.inference.leastsquares import Data, Model, Settings, Solution
+from characterize.inference.search import Task, distinct, few_frames, followed
+from metalens.ground.arrays import Array
+
+WALKED = ("bias_nm",)
+REACH = 2.5  # prior sigma to either side of what is thought
+SHOWN = 30.0  # rise of -2 ln L up to which a walk is a profile; beyond it, it looks for valleys
+_WIDEST = 0.35  # of the prior sigma: a step at most
+_VALLEYS, _AGAIN = 3, 3
+_NEAR = Settings(iterations=5, step_tolerance=0.3, secant=True, near=1.0, finish=False)
+_FAR = Settings(iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False)
+_FINE, _ON_IT = 1201, 3.0
+Part = tuple[Model, Data]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Walk:
+    """Where the others go as one parameter is walked.
+
+    index: of the parameter. value: (k, p) all parameters, those of the walked one rising. merit: (k,) -2 ln L of each.
+    spread: (k, p, p) covariance of the others with this one held; 0 in its row and column.
+    """
+
+    index: int
+    value: Array
+    merit: Array
+    spread: Array
+
+    @classmethod
+    def of(cls, task: Task, stops: Sequence[Solution], index: int) -> "Walk":
+        """By its stops, in any order; of two at one place the lower."""
+        order: list[Solution] = []
+        for one in sorted(stops, key=lambda s: (s.value[index], s.merit)):
+            if not order or one.value[index] > order[-1].value[index]:
+                order.append(one)
+        value, merit = np.array([one.value for one in order]), np.array([one.merit for one in order])
+        return cls(index, value, merit, np.array([_held(task, one, index) for one in order]))
+
+    def minima(self) -> list[int]:
+        """Places lower than their neighbours, the lowest first."""
+        wall = np.concatenate([[math.inf], self.merit, [math.inf]])
+        low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
+        return [int(k) for k in low[np.argsort(self.merit[low])]]
+
+    def profile(self, least: float) -> tuple[Array, Array]:
+        """(m,) values of the walked parameter and (m,) rise above ``least``, where it is below ``SHOWN``."""
+        at, rise, *_ = self._between(least)
+        keep = rise < SHOWN
+        return at[keep], rise[keep]
+
+    def interval(self, least: float, level: float) -> tuple[Array, Array]:
+        """(p,) lowest and highest values at which -2 ln L has risen by ``level`` or less above ``least``."""
+        _, rise, value, spread = self._between(least)
+        room = np.sqrt(np.maximum(level - rise, 0))[:, None] * np.sqrt(np.einsum("mii->mi", spread))
+        inside = rise <= level
+        if not inside.any():
+            nearest = value[np.argmin(rise)]
+            return nearest, nearest
+        return (value - room)[inside].min(0), (value + room)[inside].max(0)
+
+    def draws(self, count: int, *, least: float, widened: float, rng: np.random.Generator) -> Array:
+        """(count, p) of the posterior along the walk; ``widened``: factor of all variances."""
+        at, rise, value, spread = self._between(least)
+        density = np.exp(-rise / (2 * widened) + _half_volume(spread, self.index))
+        mass = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(at))])
+        place = np.interp((rng.permutation(count) + rng.random(count)) / count * mass[-1], mass, np.arange(len(at)))
+        k = place.astype(int).clip(0, len(at) - 2)
+        value = value[k] + (place - k)[:, None] * (value[k + 1] - value[k])
+        size, vectors = np.linalg.eigh(spread[np.rint(place).astype(int)])
+        normal = rng.standard_normal(size.shape) * np.sqrt(np.maximum(size, 0) * widened)
+        return np.asarray(value + np.einsum("mij,mj->mi", vectors, normal))
+
+    def log_mass(self, least: float) -> float:
+        """Of the posterior along the walk: log of the integral of exp(-rise / 2) times the others' volume."""
+        at, rise, _, spread = self._between(least)
+        log = -rise / 2 + _half_volume(spread, self.index)
+        return float(log.max() + np.log(np.trapezoid(np.exp(log - log.max()), at)))
+
+    def passes(self, value: Array) -> bool:
+        """Whether (p,) values lie within three sigma of the walk."""
+        at = self.value[:, self.index]
+        there = float(np.clip(value[self.index], at[0], at[-1]))
+        middle, spread = (interpolate.interp1d(at, part, axis=0)(there) for part in (self.value, self.spread))
+        others = np.flatnonzero(np.arange(len(value)) != self.index)
+        away = (value - middle)[others]
+        return bool(away @ leastsquares.invert(spread[np.ix_(others, others)]) @ away < _ON_IT**2)
+
+    def _between(self, least: float) -> tuple[Array, Array, Array, Array]:
+        """Finely: values walked (m,), rise (m,), all parameters (m, p), covariance of the others (m, p, p).
+
+        The rise by a cubic that keeps between its points, the others linearly.
+        """
+        at = self.value[:, self.index]
+        some = slice(None)
+        close = np.flatnonzero(self.merit - least < SHOWN)
+        if len(close):
+            some = slice(max(int(close[0]) - 1, 0), int(close[-1]) + 2)
+        at, merit = at[some], self.merit[some]
+        fine = np.union1d(np.linspace(at[0], at[-1], _FINE), at)
+        rise = np.maximum(interpolate.PchipInterpolator(at, merit - least)(fine), 0.0)
+        value, spread = (interpolate.interp1d(at, part[some], axis=0)(fine) for part in (self.value, self.spread))
+        value[:, self.index] = fine
+        return fine, rise, value, spread
+
+
+def _half_volume(spread: Array, index: int) -> Array:
+    """(m,) half the log determinant of the others' covariance."""
+    others = np.flatnonzero(np.arange(spread.shape[1]) != index)
+    return np.asarray(np.linalg.slogdet(spread[:, others[:, None], others])[1] / 2)
+
+
+def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
+    """The modes with those that a walk over the prior of one parameter leads to, best first.
+
+    On a few frames, which show where the misfit falls again; from there with all free, on all frames. Again from a
+    new best.
+    """
+    i, kept = task.names.index(name), list(modes)
+    for _ in range(_AGAIN):
+        best, few = kept[0], few_frames(task.model.setting)
+        part, step = (task.problem(few), task.data.planes(few)), _WIDEST * _wide(task, best, i)
+        sides = [_side(task, part, best, i, end, step=step, settings=_FAR) for end in _ends(task, best, i)]
+        seen = Walk.of(
+            task, [*sides[0], *sides[1], dataclasses.replace(best, merit=_misfit(task, part, best.value))], i
+        )
+        begins = [seen.value[k] for k in seen.minima() if seen.value[k, i] != best.value[i]]
+        kept = distinct([*kept, *followed(task, best, begins[:_VALLEYS])])
+        if kept[0].merit > best.merit - 1:
+            break
+    return kept
+
+
+def walk(task: Task, modes: Sequence[Solution], name: str) -> Walk:
+    """Through the valleys of the modes, on all frames, as far as they are no higher than ``SHOWN`` above the best."""
+    i, part = task.names.index(name), (task.problem(), task.data)
+    stops: list[Solution] = []
+    for mode in modes:
+        step = min(float(np.sqrt(mode.covariance[i, i])), _WIDEST * _wide(task, mode, i))
+        for end in _ends(task, mode, i):
+            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=modes[0].merit + SHOWN)
+    return Walk.of(task, [*modes, *stops], i)
+
+
+def _wide(task: Task, mode: Solution, i: int) -> float:
+    """Sigma of the prior, or what stands for it where there is none."""
+    known = float(task.prior.sigma[i])
+    return known if np.isfinite(known) else 8 / REACH * float(np.sqrt(mode.covariance[i, i]))
+
+
+def _ends(task: Task, mode: Solution, i: int) -> tuple[float, float]:
+    """What the prior leaves possible, and the mode."""
+    prior, here = task.prior, float(mode.value[i])
+    middle = float(prior.mean[i]) if np.isfinite(prior.sigma[i]) else here
+    reach = REACH * _wide(task, mode, i)
+    return min(max(middle - reach, prior.low[i]), here), max(min(middle + reach, prior.high[i]), here)
+
+
+def _side(
+    task: Task,
+    part: Part,
+    mode: Solution,
+    i: int,
+    end: float,
+    *,
+    step: float,
+    settings: Settings,
+    most: float = math.inf,
+) -> list[Solution]:
+    """Stops from the mode to one end, or to the first that is higher than ``most``."""
+    count = int(np.ceil(abs(end - mode.value[i]) / step - 1e-3))
+    here, out = mode, []
+    for goal in np.linspace(mode.value[i], end, count + 1)[1:]:
+        here = _stop(task, part, here, i, float(goal), settings)
+        out.append(here)
+        if here.merit > most:
+            break
+    return out
+
+
+def _stop(task: Task, part: Part, here: Solution, i: int, goal: float, settings: Settings) -> Solution:
+    """The others fitted with one parameter at ``goal``, from where they are or where the parabola sends them."""
+    low, high = task.prior.low.copy(), task.prior.high.copy()
+    low[i] = high[i] = goal
+    stay = np.clip(here.value, low, high)
+    along = here.covariance[:, i] / here.covariance[i, i]
+    led = np.clip(here.value + along * (goal - here.value[i]), low, high)
+    begin = min((stay, led), key=lambda x: _misfit(task, part, x))
+    known = dataclasses.replace(task.prior, low=low, high=high)
+    return leastsquares.fit(*part, begin, prior=known, settings=settings)
+
+
+def _held(task: Task, stop: Solution, i: int) -> Array:
+    """(p, p) covariance of the others with one parameter held."""
+    p = len(stop.value)
+    others = np.flatnonzero(np.arange(p) != i)
+    out, known = np.zeros((p, p)), stop.information + np.diag(task.prior.sigma**-2.0)
+    out[np.ix_(others, others)] = leastsquares.invert(known[np.ix_(others, others)])
+    return out
+
+
+def _misfit(task: Task, part: Part, x: Array) -> float:
+    """-2 ln L and the prior's part, outliers capped."""
+    images, data = part
+    image = images(x, False)[0]
+    keep = data.usable & ~data.saturated
+    variance = data.variance(image)
+    loss = np.minimum((data.electrons - image) ** 2 / variance, 36.0) + np.log(variance)
+    pull = np.where(np.isfinite(task.prior.sigma), (x - task.prior.mean) / task.prior.sigma, 0.0)
+    return float(loss[keep].sum() + (pull**2).sum())

@@ -1,0 +1,184 @@
+"""Two valleys of one parameter, where misfit, intervals and shares are a formula; the bent bias of a lens by scipy."""
+
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.bench import bench
+from characterize.inference import explore, leastsquares, residual, search, walk
+from characterize.inference.arrange import Arrangement
+from characterize.inference.leastsquares import Data, Prior
+from characterize.model import NAMES, PLACE, ForwardModel, Known, vector
+from characterize.model.setting import Setting
+
+NAMED = ("bias_nm", "height_nm", "background_e")
+DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
+RNG = np.random.default_rng(5)
+BRIGHT, PICTURES = RNG.uniform(3, 9, (5, 4, 3)), RNG.standard_normal((3, 5, 4, 3))
+ROOTS, PER_NM, NOISE, HEIGHT = (-9.0, 14.0), 0.011, 0.4, 1.7
+START = np.zeros(len(NAMES))
+
+
+class Double:
+    """The bias b acts as q (b - b1)(b - b2) on one picture; the height on a second, and by a share of q on the first.
+
+    The height acts on the first as well, so that its valley moves along.
+    """
+
+    def __init__(self, index=None):
+        self.index = index = np.arange(5) if index is None else index
+        self.setting = Setting(DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3)
+        self.groups = [SimpleNamespace(index=np.arange(len(index)))]
+
+    def only(self, index):
+        return Double(self.index[index])
+
+    def rough(self, tolerance):
+        return self
+
+    def images(self, x, names=None):
+        bias, height, level = (x[PLACE[name]] for name in NAMED)
+        one, two, three = PICTURES[:, self.index]
+        act = PER_NM * (bias - ROOTS[0]) * (bias - ROOTS[1])
+        image = BRIGHT[self.index] + act * one + height * (two + 0.3 * one) + level * three
+        slope = PER_NM * (2 * bias - sum(ROOTS))
+        return image, None if names is None else np.stack([slope * one, two + 0.3 * one, three])
+
+
+def prior(mean, sigma):
+    wide = np.array([26.0, 99.0, 99.0])
+    return Prior(np.array([mean, 0.0, 0.0]), np.array([sigma, np.inf, np.inf]), -wide, wide)
+
+
+def task(known):
+    model = Double()
+    frames = BRIGHT + HEIGHT * (PICTURES[1] + 0.3 * PICTURES[0])
+    everywhere = np.ones(frames.shape, bool)
+    data = Data(frames, everywhere, ~everywhere, np.full(frames.shape, NOISE**2), np.full(frames.shape, 1e15))
+
+    def problem(index=None):
+        return residual.problem(model if index is None else model.only(index), NAMED, START)
+
+    return SimpleNamespace(model=model, data=data, names=NAMED, prior=known, start=START, problem=problem)
+
+
+def at(about, bias):
+    """A fit to the end from the valley of a bias."""
+    return leastsquares.fit(about.problem(), about.data, np.array([bias, HEIGHT, 0.0]), prior=about.prior)
+
+
+def rise(bias, known):
+    """-2 ln posterior, the rest fitted: least squares leave of the first picture what the other two do not hold."""
+    columns = np.stack([PICTURES[1] + 0.3 * PICTURES[0], PICTURES[2]]).reshape(2, -1).T
+    first = PICTURES[0].ravel()
+    alone = first - columns @ np.linalg.lstsq(columns, first, rcond=None)[0]
+    act = PER_NM * (bias - ROOTS[0]) * (bias - ROOTS[1])
+    return act**2 * (alone @ alone) / NOISE**2 + ((bias - known.mean[0]) / known.sigma[0]) ** 2
+
+
+def test_both_valleys_are_found_and_the_interval_is_their_hull():
+    """Both lie below 3.84 of the closed form's least: its interval runs from the left one's end to the right one's."""
+    known = prior(0.0, 15.0)
+    about = task(known)
+    found = explore.explore(about, [at(about, ROOTS[1])])
+    fine = np.linspace(-25, 25, 200001)
+    curve = rise(fine, known) - rise(fine, known).min()
+    inside = fine[curve < 3.8415]
+    assert curve[np.abs(fine).argmin()] > 12  # a wall between
+    assert [m.value[0] for m in found.modes] == pytest.approx(ROOTS, abs=0.2)  # drawn to 0 by the prior
+    assert found.modes[1].merit - found.modes[0].merit == pytest.approx(
+        curve[fine > 0].min() - curve[fine < 0].min(), abs=0.02
+    )
+    # stops are a sigma apart, a cubic between them: an end is off by a twentieth of the sigma, 0.5 nm
+    assert (found.low[0], found.high[0]) == pytest.approx((inside.min(), inside.max()), abs=0.05)
+    assert not found.parabolic[0]
+    assert found.low[1] < HEIGHT < found.high[1]
+
+
+def test_draws_lie_in_both_valleys_as_often_as_the_density_says():
+    known = prior(4.0, 15.0)
+    about = task(known)
+    found = explore.explore(about, [at(about, ROOTS[1])])
+    fine = np.linspace(-25, 25, 200001)
+    density = np.exp(-rise(fine, known) / 2)
+    share = density[fine < 2.5].sum() / density.sum()
+    left = float((found.draws[:, 0] < 2.5).mean())
+    assert left == pytest.approx(share, abs=0.05)  # drawn evenly in the integral: 1/96; the cubic between stops: 0.03
+    spread = found.draws[found.draws[:, 0] < 2.5, 0].std()
+    middle = np.average(fine[fine < 2.5], weights=density[fine < 2.5])
+    want = np.sqrt(np.average((fine[fine < 2.5] - middle) ** 2, weights=density[fine < 2.5]))
+    assert spread == pytest.approx(want, rel=0.2)
+
+
+def test_a_far_better_valley_replaces_the_fit():
+    """A prior of -9 +- 3 puts the right valley (23 / 3)² = 59 above the left one."""
+    about = task(prior(ROOTS[0], 3.0))
+    other = at(about, ROOTS[1])
+    assert other.value[0] > 10
+    found = explore.explore(about, [other])
+    assert len(found.modes) == 1
+    assert found.best.value[0] == pytest.approx(ROOTS[0], abs=0.01)
+    assert found.high[0] < ROOTS[0] + 3
+
+
+def test_a_walk_between_two_stops_keeps_to_the_lower_of_each_place():
+    def stop(bias, merit):
+        return SimpleNamespace(value=np.array([bias, 1.0, 2.0]), merit=merit, information=np.diag([4.0, 9.0, 25.0]))
+
+    seen = walk.Walk.of(task(prior(0.0, 15.0)), [stop(3.0, 8.0), stop(-1.0, 5.0), stop(3.0, 6.0), stop(1.0, 7.0)], 0)
+    assert seen.value[:, 0].tolist() == [-1, 1, 3]
+    assert seen.merit.tolist() == [5, 7, 6]
+    assert seen.minima() == [0, 2]
+    assert seen.spread[1] == pytest.approx(np.diag([0, 1 / 9, 1 / 25]))
+    assert seen.passes(np.array([0.0, 1.6, 2.4]))  # 1.8 and 2 sigma
+    assert not seen.passes(np.array([0.0, 1.8, 2.4]))  # 2.4 and 2
+
+
+def test_the_ends_of_a_lens_s_bent_bias_are_where_another_solver_finds_the_rise():
+    """Three depths near focus leave the bias to a third of its prior, bent: scipy fits the rest at both ends."""
+    depths = (560.0, 600.0, 640.0)
+    values = {"bias_nm": 15.0, "stage_zero_um": 4.0}
+    known = tuple(Known(name, value) for name, value in values.items())
+    hidden = b.Truth(depths, peak_e=6000.0, parameter=known, camera=b.Camera(pixel_um=1.5, pixels=16))
+    bright = bench.irradiance(b.lens(), hidden, b.RESPONSE)
+    electrons = bright * (6000.0 / bright.max())
+    electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
+    everywhere = np.ones(electrons.shape, bool)
+    data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
+    model = ForwardModel(b.lens(), Setting(np.array(depths), np.zeros((3, 2)), np.ones(3), 1.5, 16, 16), b.RESPONSE)
+    free = {"bias_nm", "stage_zero_um", "log_gain", "background_e", "crosstalk_px"}
+    start = vector({"crosstalk_px": 0.2})
+    held = {name: Known(name, float(start[PLACE[name]])) for name in NAMES if name not in free}
+    about = search.Task(model, data, start, held, Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ()))
+    place = [about.names.index(name) for name in ("bias_nm", "log_gain")]
+    light = model.images(start)[0]
+    begin = np.array([start[PLACE[name]] for name in about.names])
+    begin[place[1]] = np.log((light * electrons).sum() / (light**2).sum())
+    mode = search.refine(about, begin)
+    low, high = walk.walk(about, [mode], "bias_nm").interval(mode.merit, 3.8415)
+    sigma, others = np.sqrt(np.diag(mode.covariance)), np.delete(np.arange(len(begin)), place[0])
+
+    def rise(bias):
+        def misfit(step):
+            x = mode.value.copy()
+            x[others] += step * sigma[others]
+            x[place[0]] = bias
+            image = about.problem()(x, False)[0]
+            pull = (x - about.prior.mean) / about.prior.sigma
+            return ((electrons - image) ** 2 / (mode.image + 9)).sum() + (pull**2).sum()
+
+        return optimize.minimize(misfit, np.zeros(len(others)), method="BFGS", options={"gtol": 0.05}).fun
+
+    sides = mode.value[place[0]] - low[place[0]], high[place[0]] - mode.value[place[0]]
+    assert abs(math.log(sides[0] / sides[1])) > 0.1
+    least = rise(mode.value[place[0]])
+    # noise that follows the light at every stop 0.1; a cubic between stops a sigma apart 0.1; stops end early: 0.1
+    assert [rise(low[place[0]]) - least, rise(high[place[0]]) - least] == pytest.approx([3.84, 3.84], abs=0.3)
