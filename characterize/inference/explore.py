@@ -139,7 +139,7 @@ def _intervals(
             low = np.minimum(low, mode.value - room * valley.sigma)
             high = np.maximum(high, mode.value + room * valley.sigma)
     for one in walks.values():
-        ends = one.interval(best.merit, level)
+        ends = one.interval(level)
         low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
         apart = np.maximum(high - best.value, best.value - low) / (posterior.REACH * sigma)
         parabolic &= apart < posterior.PARABOLIC[1]
@@ -148,7 +148,7 @@ def _intervals(
 
 def _whole(one: Walk, best: Solution, low: Array, high: Array) -> Profile:
     """The profile that a walk is."""
-    value, rise = one.profile(best.merit)
+    value, rise = one.profile()
     some = np.unique(np.linspace(0, len(value) - 1, _POINTS).round().astype(int))
     return Profile(float(low[one.index]), float(high[one.index]), value[some], rise[some], parabolic=False)
 
@@ -159,11 +159,11 @@ def _drawn(modes: list[Solution], valleys: list[Valley], walks: list[Walk], spre
         return posterior.draws(valleys)
     rng, least = np.random.default_rng(0), modes[0].merit
     beside = [k for k, mode in enumerate(modes) if not any(one.passes(mode.value) for one in walks)]
-    one = max(walks, key=lambda w: w.log_mass(least))
-    log = [one.log_mass(least), *(_log_mass(modes[k], valleys[k], least) for k in beside)]
+    one = max(walks, key=Walk.log_mass)
+    log = [one.log_mass(), *(_log_mass(modes[k], valleys[k], least) for k in beside)]
     share = np.exp(np.array(log) - max(log))
     count = rng.multinomial(posterior.DRAWS, share / share.sum())
-    parts = [one.draws(int(count[0]), least=least, widened=spread, rng=rng)]
+    parts = [one.draws(int(count[0]), widened=spread, rng=rng)]
     parts += [posterior.draws([valleys[k]], int(n)) for k, n in zip(beside, count[1:], strict=True) if n]
     return np.asarray(rng.permutation(np.concatenate(parts)))
 

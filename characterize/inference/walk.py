@@ -26,6 +26,7 @@ _VALLEYS, _AGAIN = 3, 3
 _NEAR = Settings(iterations=5, step_tolerance=0.3, secant=True, near=1.0, finish=False)
 _FAR = Settings(iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False)
 _FINE, _ON_IT = 1201, 3.0
+_HUBER = Settings().huber
 Part = tuple[Model, Data]
 
 
@@ -33,40 +34,41 @@ Part = tuple[Model, Data]
 class Walk:
     """Where the others go as one parameter is walked.
 
-    index: of the parameter. value: (k, p) all parameters, those of the walked one rising. merit: (k,) -2 ln L of each.
+    index: of the parameter. value: (k, p) all parameters, the walked one's rising.
+    rise: (k,) of -2 ln L above the best.
     spread: (k, p, p) covariance of the others with this one held; 0 in its row and column.
     """
 
     index: int
     value: Array
-    merit: Array
+    rise: Array
     spread: Array
 
     @classmethod
-    def of(cls, task: Task, stops: Sequence[Solution], index: int) -> "Walk":
-        """By its stops, in any order; of two at one place the lower."""
+    def of(cls, task: Task, stops: Sequence[Solution], index: int, *, least: float = 0.0) -> "Walk":
+        """By its stops, in any order; of two at one place the lower. Their merits are those of :func:`_measured`."""
         order: list[Solution] = []
         for one in sorted(stops, key=lambda s: (s.value[index], s.merit)):
             if not order or one.value[index] > order[-1].value[index]:
                 order.append(one)
-        value, merit = np.array([one.value for one in order]), np.array([one.merit for one in order])
-        return cls(index, value, merit, np.array([_held(task, one, index) for one in order]))
+        value, rise = np.array([one.value for one in order]), np.array([one.merit for one in order]) - least
+        return cls(index, value, rise, np.array([_held(task, one, index) for one in order]))
 
     def minima(self) -> list[int]:
         """Places lower than their neighbours, the lowest first."""
-        wall = np.concatenate([[math.inf], self.merit, [math.inf]])
+        wall = np.concatenate([[math.inf], self.rise, [math.inf]])
         low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
-        return [int(k) for k in low[np.argsort(self.merit[low])]]
+        return [int(k) for k in low[np.argsort(self.rise[low])]]
 
-    def profile(self, least: float) -> tuple[Array, Array]:
-        """(m,) values of the walked parameter and (m,) rise above ``least``, where it is below ``SHOWN``."""
-        at, rise, *_ = self._between(least)
+    def profile(self) -> tuple[Array, Array]:
+        """(m,) values of the walked parameter and (m,) rise, where it is below ``SHOWN``."""
+        at, rise, *_ = self._between()
         keep = rise < SHOWN
         return at[keep], rise[keep]
 
-    def interval(self, least: float, level: float) -> tuple[Array, Array]:
-        """(p,) lowest and highest values at which -2 ln L has risen by ``level`` or less above ``least``."""
-        _, rise, value, spread = self._between(least)
+    def interval(self, level: float) -> tuple[Array, Array]:
+        """(p,) lowest and highest values at which -2 ln L has risen by ``level`` or less."""
+        _, rise, value, spread = self._between()
         room = np.sqrt(np.maximum(level - rise, 0))[:, None] * np.sqrt(np.einsum("mii->mi", spread))
         inside = rise <= level
         if not inside.any():
@@ -74,9 +76,9 @@ class Walk:
             return nearest, nearest
         return (value - room)[inside].min(0), (value + room)[inside].max(0)
 
-    def draws(self, count: int, *, least: float, widened: float, rng: np.random.Generator) -> Array:
+    def draws(self, count: int, *, widened: float, rng: np.random.Generator) -> Array:
         """(count, p) of the posterior along the walk; ``widened``: factor of all variances."""
-        at, rise, value, spread = self._between(least)
+        at, rise, value, spread = self._between()
         density = np.exp(-rise / (2 * widened) + _half_volume(spread, self.index))
         mass = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(at))])
         place = np.interp((rng.permutation(count) + rng.random(count)) / count * mass[-1], mass, np.arange(len(at)))
@@ -86,9 +88,9 @@ class Walk:
         normal = rng.standard_normal(size.shape) * np.sqrt(np.maximum(size, 0) * widened)
         return np.asarray(value + np.einsum("mij,mj->mi", vectors, normal))
 
-    def log_mass(self, least: float) -> float:
+    def log_mass(self) -> float:
         """Of the posterior along the walk: log of the integral of exp(-rise / 2) times the others' volume."""
-        at, rise, _, spread = self._between(least)
+        at, rise, _, spread = self._between()
         log = -rise / 2 + _half_volume(spread, self.index)
         return float(log.max() + np.log(np.trapezoid(np.exp(log - log.max()), at)))
 
@@ -101,19 +103,19 @@ class Walk:
         away = (value - middle)[others]
         return bool(away @ leastsquares.invert(spread[np.ix_(others, others)]) @ away < _ON_IT**2)
 
-    def _between(self, least: float) -> tuple[Array, Array, Array, Array]:
+    def _between(self) -> tuple[Array, Array, Array, Array]:
         """Finely: values walked (m,), rise (m,), all parameters (m, p), covariance of the others (m, p, p).
 
         The rise by a cubic that keeps between its points, the others linearly.
         """
         at = self.value[:, self.index]
         some = slice(None)
-        close = np.flatnonzero(self.merit - least < SHOWN)
+        close = np.flatnonzero(self.rise < SHOWN)
         if len(close):
             some = slice(max(int(close[0]) - 1, 0), int(close[-1]) + 2)
-        at, merit = at[some], self.merit[some]
+        at, known = at[some], self.rise[some]
         fine = np.union1d(np.linspace(at[0], at[-1], _FINE), at)
-        rise = np.maximum(interpolate.PchipInterpolator(at, merit - least)(fine), 0.0)
+        rise = np.maximum(interpolate.PchipInterpolator(at, known)(fine), 0.0)
         value, spread = (interpolate.interp1d(at, part[some], axis=0)(fine) for part in (self.value, self.spread))
         value[:, self.index] = fine
         return fine, rise, value, spread
@@ -149,12 +151,13 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
 def walk(task: Task, modes: Sequence[Solution], name: str) -> Walk:
     """Through the valleys of the modes, on all frames, as far as they are no higher than ``SHOWN`` above the best."""
     i, part = task.names.index(name), (task.problem(), task.data)
-    stops: list[Solution] = []
-    for mode in modes:
+    lows = [dataclasses.replace(one, merit=_measured(task, task.data, one.value, one.image)) for one in modes]
+    stops, most = list(lows), lows[0].merit + SHOWN
+    for mode in lows:
         step = min(float(np.sqrt(mode.covariance[i, i])), _WIDEST * _wide(task, mode, i))
         for end in _ends(task, mode, i):
-            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=modes[0].merit + SHOWN)
-    return Walk.of(task, [*modes, *stops], i)
+            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=most)
+    return Walk.of(task, stops, i, least=lows[0].merit)
 
 
 def _wide(task: Task, mode: Solution, i: int) -> float:
@@ -202,7 +205,8 @@ def _stop(task: Task, part: Part, here: Solution, i: int, goal: float, settings:
     led = np.clip(here.value + along * (goal - here.value[i]), low, high)
     begin = min((stay, led), key=lambda x: _misfit(task, part, x))
     known = dataclasses.replace(task.prior, low=low, high=high)
-    return leastsquares.fit(*part, begin, prior=known, settings=settings)
+    found = leastsquares.fit(*part, begin, prior=known, settings=settings)
+    return dataclasses.replace(found, merit=_measured(task, part[1], found.value, found.image))
 
 
 def _held(task: Task, stop: Solution, i: int) -> Array:
@@ -215,11 +219,25 @@ def _held(task: Task, stop: Solution, i: int) -> Array:
 
 
 def _misfit(task: Task, part: Part, x: Array) -> float:
-    """-2 ln L and the prior's part, outliers capped."""
-    images, data = part
-    image = images(x, False)[0]
-    keep = data.usable & ~data.saturated
-    variance = data.variance(image)
-    loss = np.minimum((data.electrons - image) ** 2 / variance, 36.0) + np.log(variance)
+    """The misfit at (p,) parameters."""
+    return _measured(task, part[1], x, part[0](x, False)[0])
+
+
+def _measured(task: Task, data: Data, x: Array, image: Array) -> float:
+    """Quasi-deviance of the pixels, outliers linear, and the prior's part: its slope is the score that a fit sets to 0.
+
+    2 times the integral from image I to count d of (d - t) / v(t), with v = floor + t / scale above no light and the
+    floor below (McCullagh and Nelder 1989, 9.2): of one height in valleys far apart, as weights held at one are not.
+    """
+    seen, floor, scale = data.electrons, data.variance_e2, data.scale
+    up, lit = np.maximum(seen, 0), np.maximum(image, 0)
+    light = floor * scale + lit
+    z = (up - lit) / light
+    bend = np.where(np.abs(z) < 1e-3, z**2 / 2 * (1 - z / 3), (1 + z) * np.log1p(z) - z)
+    above = 2 * scale * (light * bend + (seen - up) * np.log1p(z))
+    below = ((seen - np.minimum(image, 0)) ** 2 - np.where(seen < 0, 0.0, seen**2)) / floor
+    size = np.sqrt(np.maximum(above + below, 0.0))
+    loss = np.where(size <= _HUBER, size**2, _HUBER * (2 * size - _HUBER))
+    counted = data.usable & ~(data.saturated & (image >= seen))
     pull = np.where(np.isfinite(task.prior.sigma), (x - task.prior.mean) / task.prior.sigma, 0.0)
-    return float(loss[keep].sum() + (pull**2).sum())
+    return float(loss[counted].sum() + (pull**2).sum())
