@@ -1,0 +1,119 @@
+"""Widths told, causes scored, terms dropped and noise added up, on models made by hand."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from characterize.inference import arrange, estimate, missing, prepare, residual, verdict
+from characterize.inference.leastsquares import Data
+from characterize.inference.missing import Lean
+
+RNG = np.random.default_rng(31)
+
+
+def test_an_interval_is_told_as_a_share_of_its_prior():
+    """± 1.96 sigma is the whole interval: 0.6 and 0.05 wide of 3.92 sigma where 2 and 0.25 was the prior's."""
+    found = SimpleNamespace(low=np.array([-1.0, 3.0]), high=np.array([-1.0 + 3.919928 * 0.6, 3.0 + 3.919928 * 0.05]))
+    task = SimpleNamespace(prior=SimpleNamespace(sigma=np.array([2.0, 0.25])))
+    assert estimate._told(task, found) == pytest.approx([0.3, 0.2], rel=1e-6)
+
+
+def test_the_error_of_the_gain_goes_where_electrons_are_counted():
+    """Of 3.1 +- 0.4 electrons a count: 0.4 / 3.1 of the background, as much of log gain, together; never above 1."""
+    names = ("bias_nm", "background_e", "log_gain")
+    covariance = np.diag([0.3, 0.7, 0.002])
+    found = SimpleNamespace(best=SimpleNamespace(value=np.array([5.0, 23.0, 1.9])), covariance=covariance)
+    share = 0.4 / 3.1
+    by = np.array([0.0, 23.0 * share, share])
+    got = estimate._with_gain(names, found, SimpleNamespace(gain_e=3.1, gain_sigma_e=0.4))
+    assert got == pytest.approx(covariance + np.outer(by, by), rel=1e-12)
+    by = np.array([0.0, 23.0, 1.0])
+    got = estimate._with_gain(names, found, SimpleNamespace(gain_e=3.1, gain_sigma_e=9.4))
+    assert got == pytest.approx(covariance + np.outer(by, by), rel=1e-12)
+
+
+@pytest.mark.parametrize(("clipped", "told", "want"), [(3, [], 0), (3, ["bad"], 2), (1, ["bad"], 1)])
+def test_saturation_is_blamed_for_what_is_wrong_and_for_nothing_else(monkeypatch, clipped, told, want):
+    """3 of 20 pixels are more than a tenth, 1 of 20 is not; without a problem there is nothing to blame."""
+    monkeypatch.setattr(verdict, "problems", lambda *_: list(told))
+    saturated = np.zeros((1, 4, 5), bool)
+    saturated[0, 0, :clipped] = True
+    task = SimpleNamespace(
+        names=(), data=SimpleNamespace(saturated=saturated), model=SimpleNamespace(modes=np.zeros(3))
+    )
+    found = estimate._problems(task, None, None)
+    assert len(found) == want
+    assert ("15% of the pixels are saturated" in "".join(found)) is (want == 2)
+    task.model.modes = np.array([0.8, 0.0, 0.6]) * residual.MOST_RAD
+    assert len(estimate._problems(task, None, None)) == want
+    task.model.modes = task.model.modes * 1.01
+    assert f"a phase of {1.01 * residual.MOST_RAD:.2f} rad rms is left" in estimate._problems(task, None, None)[-1]
+
+
+@pytest.mark.parametrize(("chi2", "spread"), [(4.0, 4.0), (0.6, 1.0), (1.7, 1.7)])
+def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spread):
+    """(c r)² / (c c) / chi-square a pixel, never scored up; far residuals count as 6, dark pixels not at all."""
+    shape = (2, 3, 4)
+    image, sigma = np.full(shape, 30.0), RNG.uniform(0.5, 1.5, shape)
+    data = Data(image, np.ones(shape, bool), np.zeros(shape, bool), sigma**2, np.full(shape, 1e15))
+    data.usable[0, 0, 0], data.saturated[1, 2, 3] = False, True
+    slope, change = RNG.normal(size=shape), RNG.normal(size=shape)
+    off = RNG.uniform(-2, 2, shape)
+    off[1, 0, 2] = 9.0
+    counted = (data.usable & ~data.saturated).ravel()
+    root = (1 / sigma).ravel()[counted]
+    fitted, other = slope.ravel()[counted] * root, change.ravel()[counted] * root
+    rest = np.clip(off, -6, 6).ravel()[counted]
+    prior = 0.4
+    model = SimpleNamespace(images=lambda x, names: (image, slope[None]))
+    task = SimpleNamespace(
+        model=model, all_of=lambda x: x, data=data, names=("bias_nm",), prior=SimpleNamespace(sigma=np.array([prior]))
+    )
+    mode = SimpleNamespace(value=np.zeros(1), residual_sigma=off, chi2_per_dof=chi2)
+    monkeypatch.setattr(missing, "_changes", lambda *_: [("made", 1.0, "", change[None])])
+    monkeypatch.setattr(missing, "_ghost", lambda *_: Lean("ghost", 0.0, 0, 1.0))
+    (lean,) = missing.leans(task, mode)
+    own = other - fitted * (fitted @ other) / (fitted @ fitted + prior**-2)
+    want = (own @ rest) ** 2 / spread / (own @ other)
+    assert lean.chi2 == pytest.approx(want, rel=1e-9)
+    assert lean.chance == pytest.approx(stats.chi2.sf(want, 1), rel=1e-9)
+
+
+@pytest.mark.parametrize(("scale", "kept"), [(1.0, 2e-2), (2.0, 8e-3), (6.0, 3e-3), (40.0, None)])
+def test_terms_are_dropped_while_chi_square_rises_by_less_than_a_fiftieth(scale, kept):
+    """Images off by the cut times a picture: chi-square is its square over the noise; unusable pixels do not count."""
+    shape = (2, 3, 5)
+    exact, picture = RNG.uniform(20, 60, shape), RNG.normal(size=shape)
+    data = Data(exact, np.ones(shape, bool), np.zeros(shape, bool), RNG.uniform(1, 3, shape), np.full(shape, 2.7))
+    data.usable[1, 1, 1] = False
+    picture[1, 1, 1] = 1e6
+    variance = data.variance_e2 + exact / 2.7
+    power = float((picture**2 / variance)[data.usable].sum())
+    unit = math.sqrt(0.02 / power) / 2.1e-2  # at a cut of 2e-2 chi-square is 0.0181
+
+    def made(cut):
+        return SimpleNamespace(
+            cut=cut, images=lambda x: (exact + (cut or 0.0) * scale * unit * picture, None), rough=made
+        )
+
+    assert prepare.quick_enough(made(None), data, np.zeros(2)).cut == kept
+
+
+def test_the_noise_of_a_frame_is_that_of_its_usable_pixels():
+    """Floor and shot noise summed over the pixels that count, each frame by itself."""
+    shape = (2, 6, 7)
+    light = RNG.uniform(10, 90, shape)
+    data = Data(light, np.ones(shape, bool), np.zeros(shape, bool), RNG.uniform(2, 5, shape), np.full(shape, 1.6))
+    data.usable[0, 2:4, 1:3] = False
+    data.saturated[1, 0, :3] = True
+    groups = [SimpleNamespace(index=np.array([0, 1]))]
+    model = SimpleNamespace(
+        rough=lambda cut: None, groups=groups, setting=SimpleNamespace(depth_um=np.array([1.0, 2.0]))
+    )
+    found = arrange._Frames.of(model, data)
+    variance = (data.variance_e2 + light / 1.6) * data.usable
+    assert found.noise == pytest.approx([math.sqrt(v.sum()) for v in variance], rel=1e-12)
+    assert found.clipped == pytest.approx([0, 3 / 42])

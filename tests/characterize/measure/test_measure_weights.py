@@ -1,0 +1,85 @@
+"""Weights and windows of measurements: what lies beside the spot, the edge, the pillar does not move the answer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from characterize.measure import frames, metrics, overlay, sem
+
+RNG = np.random.default_rng(17)
+
+
+def test_widths_are_those_of_the_spot_without_a_speck_far_off():
+    """A hundredth of the light 30 samples away lies outside the window of three widths (ISO 11146-1)."""
+    y, x = np.mgrid[:80, :90]
+    light = np.exp(-((x - 41.3) ** 2 / (2 * 2.1**2) + (y - 38.6) ** 2 / (2 * 1.7**2)))
+    light[66:70, 60:64] += light.sum() * 0.01 / 16
+    spot = metrics.spot(light, step_um=0.6)
+    assert spot.d4sigma_um == pytest.approx((4 * 2.1 * 0.6, 4 * 1.7 * 0.6), rel=2e-3)
+    assert spot.centroid_um == pytest.approx(((41.3 - 44.5) * 0.6, (38.6 - 39.5) * 0.6), abs=1e-3)
+
+
+def test_the_line_of_an_edge_is_not_drawn_to_a_second_edge():
+    """Of six tenths of the contrast, 20 samples behind: a fifth of a percent of the weight is left at the end, 0.08 samples."""
+    rows = np.arange(60)
+    place = 31.7 + 0.11 * rows
+    columns = np.arange(90)[None]
+    image = 1 / (1 + np.exp(-(columns - place[:, None]) / 0.7))
+    image += 0.6 / (1 + np.exp(-(columns - place[:, None] - 20) / 0.7))
+    slope, offset = metrics._edge_line(image, rows)
+    assert slope == pytest.approx(0.11, abs=1e-3)
+    assert slope * 30 + offset == pytest.approx(31.7 + 3.3, abs=0.1)
+
+
+@pytest.mark.parametrize(("peak", "seen"), [(11.2, True), (11.0, False)])
+def test_one_bright_pixel_of_the_rim_is_not_noise(peak, seen):
+    """The rim is 18.5, 20, 21.5 in turn: 5 x 1.4826 x 1.5 = 11.12 electrons above its median is a spot."""
+    light = np.full((9, 10), 20.0)
+    for edge in (light[0], light[-1], light[1:-1, 0], light[1:-1, -1]):
+        edge += 1.5 * (np.arange(len(edge)) % 3 - 1)
+    light[0, 4] = light[8, 7] = 300.0
+    usable = np.ones(light.shape, bool)
+    usable[0, 4] = usable[8, 7] = False
+    light[4, 5] = 20.0 + peak
+    if seen:
+        rim = np.concatenate([light[0], light[-1], light[1:-1, 0], light[1:-1, -1]])
+        assert frames._above(light, usable)[4, 5] == pytest.approx(light[4, 5] - np.median(rim))
+    else:
+        with pytest.raises(frames.CaptureError, match="no spot above five times"):
+            frames._above(light, usable)
+
+
+def test_a_pillar_is_as_wide_from_wherever_its_site_is_guessed():
+    """A circle about a place 0.9 pixels off is 0.9² / (4 x 12.4) = 0.016 pixels too narrow, until that is put right."""
+    y, x = np.mgrid[:61, :61]
+    disc = np.clip(12.4 - np.hypot(y - 30.2, x - 29.7) + 0.5, 0, 1)
+    true = sem._pillar(disc, 30.2, 29.7, 40.0, there=True)
+    off = sem._pillar(disc, 30.2 + 0.75, 29.7 - 0.5, 40.0, there=True)
+    assert true[2] == pytest.approx(12.4, abs=0.05)  # rays are smoothed over a pixel
+    assert off[2] == pytest.approx(true[2], abs=3e-3)
+    assert off[:2] == pytest.approx((30.2, 29.7), abs=0.01)
+
+
+def test_the_error_of_a_radius_is_the_scatter_of_its_rays_over_the_root_of_their_number():
+    """Rays are smoothed along the rim, so that four are one: scatter / sqrt(rays / 4)."""
+    y, x = np.mgrid[:61, :61]
+    rough = 12.4 + 0.4 * np.cos(2 * np.arctan2(y - 30.2, x - 29.7))
+    disc = np.clip(rough - np.hypot(y - 30.2, x - 29.7) + 0.5, 0, 1)
+    _, _, radius, sigma, scatter = sem._edges(disc, 30.2, 29.7, 40.0)
+    assert radius == pytest.approx(12.4, abs=0.05)
+    assert scatter == pytest.approx(0.4 / math.sqrt(2), rel=0.05)  # smoothing over rays takes 1 %
+    assert sigma == pytest.approx(scatter / math.sqrt(sem.RAYS / 4), rel=1e-12)
+
+
+def test_pillars_nearly_of_one_size_are_laid_by_what_little_they_differ():
+    """Drawn sizes vary by 0.6 nm; made ones are 7 nm less: no scatter about the line where they belong."""
+    drawn = 180.0 + 0.6 * RNG.standard_normal((9, 8))
+    made = drawn[2:7, 3:7] - 7.0
+    scatter = overlay._scatter(made, np.ones(made.shape), drawn)
+    assert np.unravel_index(scatter.argmin(), scatter.shape) == (2, 3)
+    assert scatter[2, 3] == pytest.approx(0, abs=1e-6)
+    x = drawn[1:6, 1:5]
+    slope = np.clip(np.cov(x.ravel(), made.ravel(), bias=True)[0, 1] / x.var(), 2 / 3, 4 / 3)
+    rest = made - made.mean() - slope * (x - x.mean())
+    assert scatter[1, 1] == pytest.approx((rest**2).mean(), rel=1e-4)  # differences of squares of 180
