@@ -21,7 +21,7 @@ def test_widths_are_those_of_the_spot_without_a_speck_far_off():
 
 
 def test_the_line_of_an_edge_is_not_drawn_to_a_second_edge():
-    """Of six tenths of the contrast, 20 samples behind: a fifth of a percent of the weight is left at the end, 0.08 samples."""
+    """Of six tenths of the contrast, 20 samples behind: a fifth of a percent of the weight is left, 0.08 samples."""
     rows = np.arange(60)
     place = 31.7 + 0.11 * rows
     columns = np.arange(90)[None]

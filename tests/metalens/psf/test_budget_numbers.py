@@ -56,7 +56,7 @@ def test_the_models_own_terms_are_integrals_over_the_aperture():
         return math.sqrt(1 - p * p)
 
     def factor(p):
-        return 1 - 0.28j * p - 0.55 * p * p
+        return 1 + (0.057 - 0.289j) * p + (-0.523 + 0.054j) * p * p
 
     plain = np.array([radial(aperture, r, 0, lambda p: 1 / (1 - p * p)) for r in radius])
     crowd = np.array(
