@@ -15,8 +15,8 @@ from scipy.special import jv
 
 from metalens.ground.arrays import Array
 
-# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell: amplitude 0.986, -0.066 rad at sine 0.236,
-# and 0.959, -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
+# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell: amplitude 0.986, -0.066 rad at sine
+# 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 ANGLE = 2.5  # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst pillar off resonance
 
