@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a locale of ASCII alone
     if not words or words[0] in ("-h", "--help"):
-        sys.stdout.write(_help(VERBS))
+        sys.stdout.write(_help(VERBS) + _INTERRUPTED)
         return SUCCESS if words else BAD_INPUT
     if words[0] == "--version":
         from metalens import __version__
@@ -215,6 +215,12 @@ def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
         f"usage: {name} COMMAND ... ({name} COMMAND --help for its options; --debug shows where an error came from)\n\n"
         f"{rows}\n"
     )
+
+
+_INTERRUPTED = """
+An interrupted command leaves what stood at its output. library, budget, plan and evaluate paper go on with the same
+command, codesign, retrain and demo with --resume; all others begin anew.
+"""
 
 
 def _refuse(message: str, status: int = BAD_INPUT) -> int:

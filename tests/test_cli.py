@@ -1,5 +1,7 @@
 """The command line: exit codes, refusals in one line, nothing half-written, and the main job end to end."""
 
+import importlib
+import inspect
 import json
 import os
 import subprocess
@@ -23,6 +25,26 @@ def test_help_lists_every_verb():
     assert done.returncode == cli.SUCCESS
     for verb in cli.VERBS:
         assert f"  {verb}" in done.stdout
+
+
+def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
+    """Those with --resume, those that keep a journal beside their output; psf, fit and study say that they do not."""
+    said = " ".join(run("--help").stdout.split())
+    modules = {verb: importlib.import_module(where) for verb, (where, _) in cli.VERBS.items()}
+    parts = modules["evaluate"].PARTS
+    assert [
+        name for name, (where, _) in parts.items() if "grow=True" in inspect.getsource(importlib.import_module(where))
+    ] == ["paper"]
+    with_option = {
+        v for v, m in modules.items() if "resume" in getattr(getattr(m, "Options", None), "__annotations__", ())
+    }
+    assert with_option == {"codesign", "retrain", "demo"}
+    journals = {verb for verb, module in modules.items() if '".resume"' in inspect.getsource(module)}
+    assert journals == {"library", "budget", "plan"}
+    assert "library, budget, plan and evaluate paper go on with the same command" in said
+    assert "codesign, retrain and demo with --resume; all others begin anew" in said
+    for verb in ("fit", "psf", "study"):
+        assert "An interruption leaves what stood at the output" in modules[verb].__doc__
 
 
 def test_no_command_and_unknown_command_are_bad_input():

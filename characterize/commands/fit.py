@@ -1,4 +1,8 @@
-"""Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report."""
+"""Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report.
+
+An interruption leaves what stood at the output; the same command begins the fit (minutes) anew, but for its pillars,
+which are kept in the cache folder of the user.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field

@@ -1,4 +1,7 @@
-"""lens.h5 or asbuilt.h5 to psf.h5: PSFs over depth, field angle and wavelength to a stated error, with plots."""
+"""lens.h5 or asbuilt.h5 to psf.h5: PSFs over depth, field angle and wavelength to a stated error, with plots.
+
+An interruption leaves what stood at the output; the same command begins anew.
+"""
 
 import importlib
 import math

@@ -1,4 +1,7 @@
-"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure."""
+"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure.
+
+An interruption leaves what stood at the output; the same command begins anew.
+"""
 
 import importlib
 import itertools
