@@ -1,19 +1,20 @@
 """Rules on a mask made anywhere: pillars at any place and turn, shapes of any outline, checked layer by layer.
 
 Shapes that touch are one shape, as a writer exposes them. Convex ones that stand alone are measured polygon to
-polygon, those that can be near each other found through a tree of their places; all others edge against edge.
+polygon, those that can be near each other found by sorting their places; all others edge against edge.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from layout.files import MaskContent, flat
-from layout.process import Rules
+from layout.process import Rules, compiled
 from layout.rules import edges as facing
+from layout.rules import near
 from layout.rules.report import DrcReport, Violation
 from layout.shapes import convex, region
 from metalens.ground.arrays import Array
@@ -21,34 +22,30 @@ from metalens.ground.errors import MaskFileError
 
 MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
 _EACH_BYTE = 4  # more of them for each byte: our densest masks, pillars of few sizes as OASIS arrays, hold 3.8
-_MOST_PAIRS = 1 << 22
-_STRIP = 1 << 16  # shapes whose neighbours are looked for at once
-_AT_ONCE = 1 << 20  # corners
+_AT_ONCE = 1 << 18  # shapes that are held to the grid at once
+_ROUNDED = 1e-6  # of a step of a grid that is no whole number of units
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Layer:
-    """Shapes of one layer number: different outlines, and (n,) which each is, with its place."""
+    """Shapes of one layer number: different outlines, and (n,) int32 which each is, with its place x, y."""
 
     outlines: list[Array]
     cells: list[str]
     kind: Array
-    xy: Array
+    x: Array
+    y: Array
 
     @property
-    def centre(self) -> Array:
-        """(n, 2) middles of the boxes around the shapes."""
+    def discs(self) -> near.Discs:
+        """Circles around the shapes, about the middles of their boxes."""
         middle = np.array([(o.min(0) + o.max(0)) / 2 for o in self.outlines])
-        return np.asarray(self.xy + middle[self.kind])
-
-    @property
-    def reach(self) -> Array:
-        """(outlines,) distance from the middle of the box to the farthest corner."""
-        return np.array([np.hypot(*(o - (o.min(0) + o.max(0)) / 2).T).max() for o in self.outlines])
+        reach = np.array([np.hypot(*(o - m).T).max() for o, m in zip(self.outlines, middle, strict=True)])
+        return near.Discs(self.x, self.y, self.kind, middle, reach)
 
     def points(self, n: int) -> Array:
         """(m, 2) corners of shape ``n``."""
-        return np.asarray(self.outlines[self.kind[n]] + self.xy[n])
+        return np.asarray(self.outlines[self.kind[n]] + np.array([self.x[n], self.y[n]], np.int64))
 
     def box(self, *members: int) -> tuple[int, int, int, int]:
         """Left, bottom, right, top of some shapes."""
@@ -77,31 +74,51 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
         raise MaskFileError("the mask has no top cell: its cells place each other in a circle")
     flat.refuse_beyond(content, most)
     report = DrcReport.empty(content, rules)
-    for number, layer in sorted(_layers(content, skip).items()):
+    for number, layer in _layers(content, skip):
         report.pillars += len(layer.kind)
         _off_grid(layer, rules, content.unit_nm, report)
         _check_layer(layer, rules, report, f"layer {number}")
     return report
 
 
-def _layers(content: MaskContent, skip: Sequence[int]) -> Mapping[int, _Layer]:
-    found: dict[int, tuple[dict[bytes, int], list[Array], list[str], list[Array], list[Array]]] = {}
+@dataclass(eq=False, slots=True)
+class _Gathered:
+    """Shapes of one layer number while they come. number: {outline: index}; parts: kind, x, y of some."""
+
+    number: dict[bytes, int] = field(default_factory=dict)
+    outlines: list[Array] = field(default_factory=list)
+    cells: list[str] = field(default_factory=list)
+    parts: list[tuple[int, Array, Array]] = field(default_factory=list)
+
+    def take(self, shape: flat.Shapes) -> None:
+        key = np.ascontiguousarray(shape.outline, np.int64).tobytes()
+        if key not in self.number:
+            self.number[key] = len(self.outlines)
+            self.outlines.append(_plain(np.asarray(shape.outline, np.int64)))
+            self.cells.append(shape.cell)
+        self.parts.append((self.number[key], shape.x, shape.y))
+
+    def layer(self) -> _Layer:
+        """All of them; their parts are let go."""
+        total, at = sum(len(x) for _, x, _ in self.parts), 0
+        kind, x, y = (np.empty(total, np.int32) for _ in range(3))
+        while self.parts:
+            number, some_x, some_y = self.parts.pop()
+            kind[at : at + len(some_x)], x[at : at + len(some_x)] = number, some_x
+            y[at : at + len(some_x)] = some_y
+            at += len(some_x)
+        return _Layer(self.outlines, self.cells, kind, x, y)
+
+
+def _layers(content: MaskContent, skip: Sequence[int]) -> Iterator[tuple[int, _Layer]]:
+    """(layer number, its shapes), rising."""
+    found: dict[int, _Gathered] = {}
     for top in content.tops:
         for shape in flat.shapes(content, top):
-            if shape.layer[0] in skip:
-                continue
-            known, outlines, cells, kinds, places = found.setdefault(shape.layer[0], ({}, [], [], [], []))
-            key = np.ascontiguousarray(shape.outline, np.int64).tobytes()
-            if key not in known:
-                known[key] = len(outlines)
-                outlines.append(_plain(np.asarray(shape.outline, np.int64)))
-                cells.append(shape.cell)
-            kinds.append(np.full(len(shape.x), known[key], np.int32))
-            places.append(np.column_stack([shape.x, shape.y]))
-    return {
-        number: _Layer(outlines, cells, np.concatenate(kinds), np.concatenate(places))
-        for number, (_, outlines, cells, kinds, places) in found.items()
-    }
+            if shape.layer[0] not in skip:
+                found.setdefault(shape.layer[0], _Gathered()).take(shape)
+    for number in sorted(found):
+        yield number, found.pop(number).layer()
 
 
 def _plain(points: Array) -> Array:
@@ -120,100 +137,51 @@ def _is_convex(points: Array) -> bool:
 
 
 def _check_layer(layer: _Layer, rules: Rules, report: DrcReport, name: str) -> None:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     gap = rules.minimum_gap_nm / report.unit_nm
-    one, two, apart = _near(layer, gap)
-    count, touch = len(layer.kind), apart <= 0
-    graph = coo_matrix((np.ones(int(touch.sum())), (one[touch], two[touch])), (count, count))
-    _, joined = connected_components(graph, directed=False)
-    straight = np.array([_is_convex(o) for o in layer.outlines])[layer.kind]
-    alone = straight & (np.bincount(joined)[joined] == 1)
-    _features(layer, np.flatnonzero(alone), rules, report)
-    both = alone[one] & alone[two] & (apart < gap - 1e-9) & ~touch
+    one, two = near.pairs(layer.discs, gap)
+    apart = _distances(layer, one, two)
+    touch = apart <= 0
+    alone = np.array([_is_convex(o) for o in layer.outlines])[layer.kind]
+    alone[one[touch]] = alone[two[touch]] = False
+    _features(layer, alone, rules, report)
+    both = alone[one] & alone[two] & (apart < gap - 1e-9)
     for a, b, value in zip(one[both].tolist(), two[both].tolist(), apart[both].tolist(), strict=True):
         text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
         value *= report.unit_nm
         report.add("gap", 1, Violation("gap", layer.box(a, b), value, rules.minimum_gap_nm, text))
     least = apart[alone[one] & alone[two]].min(initial=math.inf) * report.unit_nm
     report.minimum_gap_nm = min(report.minimum_gap_nm, float(least))
-    near = np.zeros(count, bool)
-    near[one[~alone[two]]] = near[two[~alone[one]]] = True
-    _by_edges(layer, joined, ~alone, near & alone, rules, report, name)
+    beside = np.unique(np.concatenate([one[alone[one] & ~alone[two]], two[alone[two] & ~alone[one]]]))
+    other = np.flatnonzero(~alone)
+    if len(other):
+        _by_edges(layer, _joined(other, one[touch], two[touch]), beside, rules, report, name)
 
 
-def _near(layer: _Layer, gap: float) -> tuple[Array, Array, Array]:
-    """Pairs of shapes that can be closer than the rule, and their distance: 0 and below where they touch or meet.
+def _joined(members: Array, one: Array, two: Array) -> list[list[int]]:
+    """Members in groups that touch: pairs ``one`` and ``two`` do."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
 
-    Shapes of unlike size are searched from the larger one, so that one long line does not pair everything.
-    """
-    from scipy.spatial import cKDTree
+    ends = np.searchsorted(members, one), np.searchsorted(members, two)
+    graph = coo_matrix((np.ones(len(one), np.int8), ends), (len(members), len(members)))
+    label = connected_components(graph, directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
+    return [some.tolist() for some in np.split(members[order], starts[1:])]
 
-    centre, reach = layer.centre, layer.reach[layer.kind]
-    size = np.ceil(np.log2(np.maximum(reach, 1))).astype(int)
-    ones: list[Array] = [np.empty(0, np.int64)]
-    twos: list[Array] = [np.empty(0, np.int64)]
-    groups = {s: np.flatnonzero(size == s) for s in np.unique(size).tolist()}
-    widest = {s: float(reach[members].max()) for s, members in groups.items()}
-    trees = {s: cKDTree(centre[members]) for s, members in groups.items() if len(groups) > 1}
-    for s, members in groups.items():
-        for pairs in _alike(centre[members], 2 * widest[s] + gap):
-            kept = _close(centre, reach, *members[pairs.T]) < gap
-            ones.append(members[pairs[kept, 0]])
-            twos.append(members[pairs[kept, 1]])
-            _refuse_many(sum(map(len, ones)))
-        for t in (t for t in groups if t < s):
-            far = widest[s] + widest[t] + gap
-            _refuse_many(int(trees[t].count_neighbors(trees[s], far)))
-            found = trees[t].query_ball_point(centre[members], far)
-            twos.append(groups[t][np.concatenate([np.asarray(f, np.int64) for f in found])])
-            ones.append(np.repeat(members, [len(f) for f in found]))
-    one, two = np.concatenate(ones), np.concatenate(twos)
-    kept = _close(centre, reach, one, two) < gap
-    one, two = one[kept], two[kept]
+
+def _distances(layer: _Layer, one: Array, two: Array) -> Array:
+    """(n,) between shapes, of hulls where they are not convex: 0 and below where they touch or meet."""
     hulls = [o if _is_convex(o) else _hull(o) for o in layer.outlines]
-    moves = layer.xy[two] - layer.xy[one]
+    moves = (layer.x[two].astype(np.int64) - layer.x[one], layer.y[two].astype(np.int64) - layer.y[one])
+    keys = zip(layer.kind[one].tolist(), layer.kind[two].tolist(), *(m.tolist() for m in moves), strict=True)
     known: dict[tuple[int, int, int, int], float] = {}
     apart = np.empty(len(one))
-    for n, key in enumerate(zip(layer.kind[one].tolist(), layer.kind[two].tolist(), *moves.T.tolist(), strict=True)):
+    for n, key in enumerate(keys):
         if key not in known:
             known[key] = convex.gap(hulls[key[0]], hulls[key[1]], key[2], key[3])
         apart[n] = known[key]
-    return one, two, apart
-
-
-def _close(centre: Array, reach: Array, one: Array, two: Array) -> Array:
-    """(n,) distance of the circles around two shapes."""
-    return np.asarray(np.hypot(*(centre[one] - centre[two]).T) - reach[one] - reach[two])
-
-
-def _alike(centre: Array, far: float) -> Iterator[Array]:
-    """(n, 2) pairs of places not farther than ``far`` apart, each once, strip by strip in bounded memory.
-
-    Raises:
-        MaskFileError: so many in one strip that shapes must lie on each other.
-    """
-    from scipy.spatial import cKDTree
-
-    order = np.argsort(centre[:, 1], kind="stable")
-    y = centre[order, 1]
-    for first in range(0, len(order), _STRIP):
-        last = min(first + _STRIP, len(order))
-        end = int(np.searchsorted(y, y[last - 1] + far, side="right"))
-        own, all_of = order[first:last], order[first:end]
-        tree = cKDTree(centre[all_of])
-        _refuse_many(int(cKDTree(centre[own]).count_neighbors(tree, far)) // 2)
-        pairs = np.sort(tree.query_pairs(far, output_type="ndarray"), axis=1)
-        yield all_of[pairs[pairs[:, 0] < last - first]]
-
-
-def _refuse_many(count: int) -> None:
-    if count > _MOST_PAIRS:
-        raise MaskFileError(
-            f"{count:,} pairs of shapes can be closer than the rule, at most {_MOST_PAIRS:,} are measured; shapes lie "
-            "on each other, or the rule's gap is far wider than they are"
-        )
+    return apart
 
 
 def _hull(points: Array) -> Array:
@@ -222,29 +190,32 @@ def _hull(points: Array) -> Array:
     return np.asarray(points[ConvexHull(points).vertices])
 
 
-def _features(layer: _Layer, members: Array, rules: Rules, report: DrcReport) -> None:
+def _features(layer: _Layer, alone: Array, rules: Rules, report: DrcReport) -> None:
     """Widths of convex shapes that stand alone."""
-    for kind in np.unique(layer.kind[members]).tolist():
+    for kind in np.flatnonzero(counted(layer.kind, alone, np.zeros(len(layer.outlines), np.int64))).tolist():
         width = convex.width(layer.outlines[kind]) * report.unit_nm
         report.minimum_feature_nm = min(report.minimum_feature_nm, width)
         if width < rules.minimum_feature_nm - 1e-9:
-            for n in members[layer.kind[members] == kind].tolist():
+            for n in np.flatnonzero((layer.kind == kind) & alone).tolist():
                 text = layer.cells[kind]
                 report.add("feature", 1, Violation("feature", layer.box(n), width, rules.minimum_feature_nm, text))
 
 
+@compiled
+def counted(kind: Array, alone: Array, out: Array) -> Array:
+    """Shapes of each kind that stand alone, added to ``out``."""
+    for n in range(kind.shape[0]):
+        if alone[n]:
+            out[kind[n]] += 1
+    return out
+
+
 def _by_edges(
-    layer: _Layer, joined: Array, other: Array, near: Array, rules: Rules, report: DrcReport, name: str
+    layer: _Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str
 ) -> None:
-    """Everything that is not convex or not alone, as merged contours, with the convex shapes beside it."""
-    if not other.any():
-        return
+    """Groups of shapes that are not convex or touch, as merged contours, with the convex shapes beside them."""
     lines, owner = [], []
-    groups = np.flatnonzero(other)[np.argsort(joined[other], kind="stable")]
-    starts = np.flatnonzero(np.diff(joined[groups], prepend=-1))
-    pieces: list[list[int]] = [p.tolist() for p in np.split(groups, starts[1:])]
-    pieces += [[n] for n in np.flatnonzero(near).tolist()]
-    for number, members in enumerate(pieces):
+    for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
         contours = region.union(shapes) if len(shapes) > 1 or not _is_convex(shapes[0]) else shapes
         for contour in map(_plain, contours):
@@ -267,11 +238,22 @@ def _by_edges(
 def _off_grid(layer: _Layer, rules: Rules, unit_nm: float, report: DrcReport) -> None:
     """Corners that do not lie on the grid of the process."""
     step = rules.grid_nm / unit_nm
-    places = np.mod(layer.xy, step)
-    for kind, outline in enumerate(layer.outlines):
-        at = np.flatnonzero(layer.kind == kind)
-        for some in np.array_split(at, -(-len(at) * len(outline) // _AT_ONCE)):
-            off = np.mod(outline[None] + places[some][:, None], step)
-            for n in some[(np.minimum(off, step - off) > 1e-6).any((1, 2))].tolist():
-                violation = Violation("off-grid", layer.box(n), 0.0, float(rules.grid_nm), layer.cells[kind])
-                report.add("off-grid", 1, violation)
+    if step == 1:
+        return
+    whole = step == round(step)
+    bad = [_residue(outline, step) for outline in layer.outlines]
+    for first in range(0, len(layer.kind), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        kind, place = layer.kind[some], np.column_stack([layer.x[some], layer.y[some]])
+        off = np.mod(place + np.array([r if r is not None else (0.0, 0.0) for r in bad])[kind], step)
+        apart = (np.minimum(off, step - off) > (0 if whole else _ROUNDED)).any(1)
+        apart |= np.array([r is None for r in bad])[kind]
+        for n in (np.flatnonzero(apart) + first).tolist():
+            violation = Violation("off-grid", layer.box(n), 0.0, float(rules.grid_nm), layer.cells[layer.kind[n]])
+            report.add("off-grid", 1, violation)
+
+
+def _residue(outline: Array, step: float) -> tuple[float, float] | None:
+    """Where all corners lie on a grid of ``step``, from its points; None where they lie on different ones."""
+    off = np.mod(outline - outline[0] + step / 2, step) - step / 2
+    return None if np.abs(off).max() > _ROUNDED else tuple(np.mod(outline[0], step).tolist())

@@ -14,7 +14,7 @@ from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis
 from layout.oasis import read as oasis_read
 from layout.process import Rules
-from layout.rules import foreign
+from layout.rules import foreign, near
 from metalens import cli
 from metalens.ground.errors import MaskFileError
 
@@ -143,7 +143,7 @@ def test_neighbours_are_found_across_strips(monkeypatch, tmp_path):
     path = tmp_path / "a.gds"
     path.write_bytes(gdsii(structure("TOP", array("A", 17, 13, (530, 640)))))
     whole = foreign.check(check.read(path, 1000), Rules(minimum_gap_nm=70))
-    monkeypatch.setattr(foreign, "_STRIP", 20)
+    monkeypatch.setattr(near, "_AT_ONCE", 40)
     strips = foreign.check(check.read(path, 1000), Rules(minimum_gap_nm=70))
     assert whole.counts == strips.counts
     assert whole.counts["gap"] >= 16 * 13 + 17 * 12  # each to the right and each above stands too close
