@@ -119,6 +119,9 @@ def _write_solids(job: Job, target: Path) -> None:
         with job.stages("write STEP"):
             made += solid_files.write_step(job.source, job.process, target, options.window)
     job.written |= {path.name: path.stat().st_size for path in made}
+    with job.stages("read back solids"):
+        found = solid_files.differences(job.source, job.process, target, options.window)
+    job.compared |= {name: verify.Comparison(count, wrong) for name, (count, wrong) in found.items()}
 
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:

@@ -4,8 +4,24 @@ from pathlib import Path
 
 from layout.files import Window
 from layout.process import Process
+from layout.solid import readback
 from layout.solid import verbs as solid
+from layout.solid.module import COLOURS
 from metalens.lens import Lens
+
+
+def differences(lens: Lens, process: Process, target: Path, window: Window) -> dict[str, tuple[int, tuple[str, ...]]]:
+    """{file: solids in it, what it lacks of what was asked for} of those in ``target``, read back."""
+    pillars, found = _tile(lens, process, window), {}
+    count = len(pillars.kind)
+    if (path := target / "pillars.stl").is_file():
+        found[path.name] = count, readback.stl_differences(path, pillars)
+    if (path := target / "pillars.step").is_file():
+        found[path.name] = count, readback.step_differences(path, pillars)
+    if (path := target / "module.step").is_file():
+        whole = solid.around(lens, process)
+        found[path.name] = len(COLOURS), readback.module_differences(path, whole)
+    return found
 
 
 def write_stl(lens: Lens, process: Process, target: Path, window: Window) -> list[Path]:

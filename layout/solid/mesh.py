@@ -15,7 +15,7 @@ from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
 _METRE = 1e-6  # of a um
 _CHUNK = 4096  # pillars that are written at a time
 
@@ -102,7 +102,7 @@ def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
 def _facets(mesh: Mesh) -> Array:
     corners = mesh.vertices_um[mesh.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facets = np.zeros(len(corners), _STL)
+    facets = np.zeros(len(corners), STL)
     facets["normal"] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     facets["corners"] = corners
     return facets

@@ -39,7 +39,7 @@ def lens(ny=14, nx=11):
 
 def stl(path):
     data = path.read_bytes()
-    return np.frombuffer(data[84:], solid_mesh._STL), struct.unpack("<I", data[80:84])[0]
+    return np.frombuffer(data[84:], solid_mesh.STL), struct.unpack("<I", data[80:84])[0]
 
 
 def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
