@@ -4,7 +4,8 @@ The profile of a parameter is the least misfit over all others as it is moved; w
 its 95 % interval (Wilks 1938), however the valley bends. Draws solve the fit anew for perturbed data and prior means
 (randomised maximum likelihood: Kitanidis 1995, Oliver et al. 1996): exact where the model is linear, and along a bent
 valley as the frames allow. Noise and outlier weights are those at the mode; steps reuse its Jacobian, brought up to
-date by what each of them gave (Broyden 1965), so that one costs an image and no derivatives.
+date by what each of them gave (Broyden 1965), so that one costs an image and no derivatives. Where a profile ends they
+are computed anew: a descent with those of a mode far away stops too high.
 """
 
 import math
@@ -20,7 +21,7 @@ REACH = 1.959964  # of a 95 % interval, in sigma
 BENT = 0.25  # sigma by which images may miss their linear prediction at 2 sigma: moves the ends of an interval by 6 %
 PARABOLIC = (0.85, 1.18)  # end of an interval over that of the parabola
 DRAWS = 96
-_CLOSE, _ROUNDS, _SOLVES = 0.08, 5, 5
+_CLOSE, _ROUNDS, _CHECKS, _SOLVES = 0.08, 5, 4, 5
 _HUBER = 6.0
 
 
@@ -46,10 +47,8 @@ class Valley:
         first = np.abs(self._pixels(image))
         self._root *= np.sqrt(np.minimum(1, _HUBER / np.maximum(first, _HUBER)))
         self._image = image
-        silent = (data.saturated & (image >= data.electrons)).ravel()
         self._pull = np.where(np.isfinite(prior.sigma), 1 / prior.sigma, 0.0)
-        columns = (np.asarray(jacobian).reshape(len(mode), -1) * (self._root * ~silent)).T
-        self.slopes = np.concatenate([columns, np.diag(self._pull)])
+        self.slopes = self._columns(image, np.asarray(jacobian))
         self.bottom = self.residual(self.mode, image)
         self.least = float(self.bottom @ self.bottom)
         curvature = self.slopes.T @ self.slopes
@@ -104,10 +103,14 @@ class Valley:
         shift: Array | float = 0.0,
         rounds: int = _SOLVES,
         least: float = 0.02,
+        exact: bool = False,
     ) -> tuple[Array, float]:
-        """The least misfit from ``x`` on, one parameter ``held``: (place, misfit). ``shift``: added to the residual."""
+        """The least misfit from ``x`` on, one parameter ``held``: (place, misfit). ``shift``: added to the residual.
+
+        exact: slopes are those at ``x``, not those of the mode.
+        """
         free = np.array([j for j in range(len(x)) if j != held])
-        slopes, rest = self.slopes, self.residual(x) + shift
+        slopes, rest = self.slopes_at(x) if exact else self.slopes, self.residual(x) + shift
         value, damping = float(rest @ rest), 1e-6
         for _ in range(rounds):
             part = slopes[:, free]
@@ -131,6 +134,16 @@ class Valley:
             else:
                 damping = max(damping * 30, 1e-2)
         return x, value
+
+    def slopes_at(self, x: Array) -> Array:
+        """(pixels + p, p) derivatives of :meth:`residual`."""
+        image, jacobian = self._model(x, True)
+        return self._columns(image, np.asarray(jacobian))
+
+    def _columns(self, image: Array, jacobian: Array) -> Array:
+        silent = (self._data.saturated & (image >= self._data.electrons)).ravel()
+        columns = (jacobian.reshape(len(jacobian), -1) * (self._root * ~silent)).T
+        return np.concatenate([columns, np.diag(self._pull)])
 
     def _pixels(self, image: Array) -> Array:
         rest = image - self._data.electrons
@@ -181,19 +194,23 @@ def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tu
     """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
     mode, sigma, along = valley.mode, float(valley.sigma[i]), sign * valley.along(i)
     bound = valley.prior.low[i] if sign < 0 else valley.prior.high[i]
-    reach, direction, seen = goal, along, []
-    for _ in range(_ROUNDS):
-        x = valley.inside(mode + reach * direction)
-        x, misfit = valley.descend(x, held=i)
+    reach, direction, exact = goal, along, False
+    seen: list[tuple[float, float]] = []
+    for turn in range(_ROUNDS + _CHECKS):
+        x, misfit = valley.descend(valley.inside(mode + reach * direction), held=i, exact=exact)
         rise = misfit - valley.least
         seen.append((float(x[i]), max(rise, 0.0)))
         if rise < -0.5:
             return float(x[i]), seen, x
         root = math.sqrt(max(rise, 1e-6))
-        if abs(root - goal) < _CLOSE or (x[i] == bound and root < goal):
-            break
+        done = abs(root - goal) < _CLOSE or (x[i] == bound and root < goal)
         direction = (x - mode) / reach
-        reach *= float(np.clip(goal / root, 0.35, 2.0))
+        if exact and done:
+            break
+        if not exact and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
+            exact, seen = True, []
+        else:
+            reach *= float(np.clip(goal / root, 0.35, 2.0))
     place, roots = np.array([p for p, _ in seen]), np.sqrt([r for _, r in seen])
     nearest = int(np.argmin(np.abs(roots - goal)))
     gained = goal / max(float(roots[nearest]), 1e-3)

@@ -96,8 +96,9 @@ class Walk:
 
     def passes(self, value: Array) -> bool:
         """Whether (p,) values lie within three sigma of the walk."""
-        at = self.value[:, self.index]
-        there = float(np.clip(value[self.index], at[0], at[-1]))
+        at, there = self.value[:, self.index], float(value[self.index])
+        if not at[0] <= there <= at[-1]:
+            return False
         middle, spread = (interpolate.interp1d(at, part, axis=0)(there) for part in (self.value, self.spread))
         others = np.flatnonzero(np.arange(len(value)) != self.index)
         away = (value - middle)[others]
@@ -152,10 +153,15 @@ def walk(task: Task, modes: Sequence[Solution], name: str) -> Walk:
     """Through the valleys of the modes, on all frames, as far as they are no higher than ``SHOWN`` above the best."""
     i, part = task.names.index(name), (task.problem(), task.data)
     lows = [dataclasses.replace(one, merit=_measured(task, task.data, one.value, one.image)) for one in modes]
-    stops, most = list(lows), lows[0].merit + SHOWN
+    sigma = max(float(np.sqrt(one.covariance[i, i])) for one in modes)
+    step, most = min(sigma, _WIDEST * _wide(task, lows[0], i)), lows[0].merit + SHOWN
+    stops: list[Solution] = []
     for mode in lows:
-        step = min(float(np.sqrt(mode.covariance[i, i])), _WIDEST * _wide(task, mode, i))
-        for end in _ends(task, mode, i):
+        low, high = _ends(task, mode, i)
+        if stops and Walk.of(task, stops, i).passes(mode.value):  # as finely about this one as about the first
+            low, high = max(low, mode.value[i] - 2 * step), min(high, mode.value[i] + 2 * step)
+        stops.append(mode)
+        for end in (low, high):
             stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=most)
     return Walk.of(task, stops, i, least=lows[0].merit)
 

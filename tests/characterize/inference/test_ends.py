@@ -81,7 +81,7 @@ def test_of_two_lenses_the_covariance_has_the_intervals_and_the_correlation_of_t
     about = SimpleNamespace(names=("bias_nm", "background_e"), prior=prior)
     drawn = RNG.normal(0, 1, (posterior.DRAWS, 2)) @ np.array([[1.0, 0.5], [0, 3.0]])
     monkeypatch.setattr(posterior, "draws", lambda given: drawn if given == valleys else None)
-    found = explore._joined(about, [best, other], valleys, {})
+    found = explore._joined(about, [best, other], valleys, {}, {})
     clipped = np.clip(drawn, prior.low, prior.high)
     assert found.draws == pytest.approx(clipped)
     sigma = (found.high - found.low) / (2 * 1.959964)
@@ -91,7 +91,7 @@ def test_of_two_lenses_the_covariance_has_the_intervals_and_the_correlation_of_t
     assert found.share == pytest.approx(posterior.shares(valleys))
     shared = [fake((0.7, 2.1), 0.6, 50.0, common=0.5), valleys[1]]
     monkeypatch.setattr(posterior, "draws", lambda given: np.zeros((posterior.DRAWS, 2)))
-    spread = explore._joined(about, [best, other], shared, {}).draws  # of the calibration alone
+    spread = explore._joined(about, [best, other], shared, {}, {}).draws  # of the calibration alone
     assert np.cov(spread.T)[0, 0] == pytest.approx(0.5 * 0.49, rel=6 * math.sqrt(2 / posterior.DRAWS))
     assert np.corrcoef(spread.T)[0, 1] == pytest.approx(0.6, abs=4 / math.sqrt(posterior.DRAWS))
 

@@ -140,6 +140,7 @@ def test_a_walk_between_two_stops_keeps_to_the_lower_of_each_place():
     assert seen.spread[1] == pytest.approx(np.diag([0, 1 / 9, 1 / 25]))
     assert seen.passes(np.array([0.0, 1.6, 2.4]))  # 1.8 and 2 sigma
     assert not seen.passes(np.array([0.0, 1.8, 2.4]))  # 2.4 and 2
+    assert not seen.passes(np.array([3.1, 1.0, 2.0]))  # beyond its end
 
 
 @pytest.mark.parametrize(
