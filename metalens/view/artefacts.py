@@ -11,6 +11,7 @@ from metalens import library as libraries
 from metalens import psf
 from metalens.ground import store
 from metalens.ground.arrays import Array
+from metalens.view import standing
 from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, classes_of
 
 MOST_SAMPLES = 40_000_000  # float32 values of one figure: 160 MB before they are deflated
@@ -59,7 +60,7 @@ def lens_panels(path: Path) -> list[Panel]:
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
-        return [*_turns(lens), _section(diameter, lens)]
+        return [standing.drawn(lens), standing.phase(lens), _section(diameter, lens)]
     index, sizes = classes_of(diameter)
     return [
         Classes(
@@ -79,19 +80,8 @@ def lens_panels(path: Path) -> list[Panel]:
     ]
 
 
-def _turns(lens: lenses.Lens) -> list[Panel]:
-    """The turn of every pillar, to a degree, on a square lattice."""
-    d = lens.diameters
-    if d.angle_rad is None or d.lattice.kind != "square":
-        return []
-    degrees = np.mod(np.rint(np.degrees(d.angle_rad)), 180).astype(np.uint16) + 1
-    index = np.where(d.diameter_um > 0, degrees, 0).astype(np.uint16)
-    words = f"Turn of every pillar from +x to +y, to a degree; each is {lens.cell.shape.name}."
-    return [Classes("Pillars", index, np.arange(180.0), d.pitch_um, "deg", words)]
-
-
 def _section(diameter: Array, lens: lenses.Lens) -> Curves:
-    """Phase and diameter along the middle row."""
+    """Phase along the middle row."""
     middle = diameter[len(diameter) // 2]
     held = middle > 0
     phase = lens.phase_rad()[len(diameter) // 2]
