@@ -12,10 +12,11 @@ import tyro
 
 from metalens import library
 from metalens.cell import Blend, Cell
+from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, store
 from metalens.ground.errors import DomainError
-from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, converted
+from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, axes, converted
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars.circular import Turned
 
@@ -50,6 +51,10 @@ class Options(Distributed):
 def run(options: Options) -> int:
     """Sweep, fit, write; exit 1 where an error bar misses the tolerance or no full turn is covered."""
     wanted = config.load(options.config, CellFile, empty=False)
+    if wanted.sweep.lengths_um is not None:
+        axes.check(wanted.cell, wanted.sweep)
+        about = store.Provenance(config.dumps(wanted), _inputs(options.config, wanted.cell))
+        return axes_library.run(options, options.output, wanted.cell, wanted.sweep, about)
     library.check(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
     with options.claim(target, beside=(".png",)) as draft, options.workers():

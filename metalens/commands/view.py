@@ -19,7 +19,7 @@ FOLDERS = {
     "run": ("log.jsonl", "checkpoint.safetensors"),
     "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
 }
-OWN = {"library": "library_panels", "lens": "lens_panels", "psf": "psf_panels"}
+OWN = {"library": "library_panels", "axes-library": "axes_panels", "lens": "lens_panels", "psf": "psf_panels"}
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.pillars import axes as axes
     from metalens.pillars import converted as converted
     from metalens.pillars import curve as curve
     from metalens.pillars import engines as engines
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "Study": "study",
         "Sweep": "record",
         "Wanted": "fit",
+        "axes": "",
         "converted": "",
         "curve": "",
         "engines": "",

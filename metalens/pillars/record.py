@@ -23,6 +23,7 @@ from metalens.pillars.proxy import Proxy
 # film of Pierce and Spicer ("a-Si") absorbs so much that its pillars stay below |t| = 0.8 before half a turn.
 PLAIN = Index(3.6)
 DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
+MOST_ALONG = 1000  # samples along a size, where there are two
 EDGE_GAP_UM = 0.05  # a sweep ends this far below the pitch: 10 nm of bias beyond a printable gap of 60 nm
 
 
@@ -36,6 +37,8 @@ class Sweep:
     samples: evenly spaced diameters; more are added around resonances.
     tolerance: error bar that is asked of every entry's t.
     engine: auto, rcwa or modal.
+    lengths_um: (least, largest) size along y of a rectangle or an ellipse; diameters_um is then that along x, and the
+        library one over both sizes (``samples`` entries along the longer range) with Jones matrices.
     light: linear, or circular: x and y at normal incidence, for pillars that are turned one by one; the proxy is then
         that of the light converted to the other hand.
     """
@@ -47,6 +50,7 @@ class Sweep:
     tolerance: float = 1e-3
     engine: str = "auto"
     light: Literal["linear", "circular"] = "linear"
+    lengths_um: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name, values in (("wavelengths_um", self.wavelengths_um), ("angles_deg", self.angles_deg)):
@@ -64,6 +68,19 @@ class Sweep:
             raise ConfigError(f"engine = {self.engine!r}: need auto, rcwa or modal")
         if self.light == "circular" and self.angles_deg != (0.0,):
             raise ConfigError(f"angles_deg = {list(self.angles_deg)} of circular light: need normal incidence, [0.0]")
+        if self.lengths_um is not None:
+            self._check_lengths(self.lengths_um)
+
+    def _check_lengths(self, lengths: tuple[float, float]) -> None:
+        for name, span in (("diameters_um", self.diameters_um or (0, 0)), ("lengths_um", lengths)):
+            if not (0 < span[0] < span[1] and math.isfinite(span[1])):
+                raise ConfigError(f"{name} = {list(span)}: with lengths_um both need 0 < least < largest")
+        plain = self.angles_deg == (0.0,) and self.light == "linear" and self.engine != "modal"
+        if not plain or self.samples > MOST_ALONG:
+            raise ConfigError(
+                f"lengths_um = {list(lengths)}: a library over two sizes is for normal incidence (angles_deg = [0.0]), "
+                f'light = "linear", engine auto or rcwa, and at most {MOST_ALONG} samples'
+            )
 
     @property
     def polarizations(self) -> tuple[Polarization, ...]:
@@ -145,8 +162,19 @@ def check(cell: Cell, sweep: Sweep) -> None:
         the range of a material.
     """
     span = sweep.span_um(cell)
+    if sweep.lengths_um is not None:
+        raise ConfigError("lengths_um: a library over two sizes is made by metalens.pillars.axes.sweep")
     if sweep.light == "circular":
         check_turned(cell, span[1])
+    check_light(cell, sweep)
+
+
+def check_light(cell: Cell, sweep: Sweep) -> None:
+    """Refuse wavelengths that a material does not hold, half-spaces that absorb, and orders that propagate.
+
+    Raises:
+        CellError, MaterialError: as :func:`check`.
+    """
     films = [film.material for film in (*cell.under, *cell.over)]
     for wavelength in sweep.wavelengths_um:
         for material in (cell.pillar, cell.between, *films):

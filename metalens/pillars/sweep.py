@@ -62,7 +62,7 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
     """
     console = console or Console(quiet=True)
     engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
-    journal = _Journal(checkpoint, cell, sweep)
+    journal = Journal(checkpoint, cell, sweep)
     span = sweep.span_um(cell)
     normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
 
@@ -192,7 +192,7 @@ def _entry(line: str) -> tuple[str, Result] | None:
     return (str(task), result) if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,) else None
 
 
-class _Journal:
+class Journal:
     """Finished tasks as JSON lines beside the output, so that an interrupted sweep goes on where it stopped.
 
     The first line names the sweep; a file of another sweep is started afresh, a line cut short is dropped.

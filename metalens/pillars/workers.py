@@ -23,10 +23,18 @@ def points_task(cell: Cell, light: Light, diameters_um: list[float], *, toleranc
     return _task("points", cell, light, tolerance, engine) | {"diameters_um": diameters_um}
 
 
+def jones_task(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float, reach: int) -> Task:
+    """Both polarisations of one pillar at normal incidence, at a fixed truncation; the result has a row an element."""
+    light = Light(wavelength_um)
+    return _task("jones", cell, light, tolerance, "rcwa") | {"size_um": size_um, "harmonics": reach}
+
+
 def work(task: Task) -> Result:
     """Do one task; the result holds only JSON types."""
     cell = config.loads(task["cell"], Cell, where="task")
     light = Light(*task["light"])
+    if task["kind"] == "jones":
+        return _both_polarizations(cell, task["size_um"], light, task["harmonics"])
     about: dict[str, Any] = {"tolerance": task["tolerance"], "engine": task["engine"]}
     if task["kind"] == "points":
         solve = precise(cell, light, **about)
@@ -43,6 +51,16 @@ def work(task: Task) -> Result:
     nodes = reduced.explore(remembered, low, high, tolerance=FIT_SHARE * task["tolerance"])
     order = nodes.diameter_um.tolist()
     return _listed(order, [made[d] for d in order]) | {"converged": nodes.converged, "reason": nodes.reason}
+
+
+def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) -> Result:
+    """Rows xx, xy, yx, yy: the polarisation that leaves, then that comes."""
+    from metalens.rcwa import jones
+
+    found = jones(cell, size_um, light.wavelength_um, harmonics=reach)
+    rows = zip(found.t.ravel().tolist(), found.r.ravel().tolist(), [0, 1, 0, 1], strict=True)
+    made = [Response(t, r, found.t_error, found.orders, float(found.energy[k]), "rcwa", True, "") for t, r, k in rows]
+    return _listed([size_um] * 4, made)
 
 
 def run(tasks: list[Task], *, processes: int | None = None) -> Iterator[tuple[int, Result]]:

@@ -11,6 +11,7 @@ from metalens import library as libraries
 from metalens import psf
 from metalens.ground import store
 from metalens.ground.arrays import Array
+from metalens.pillars import axes
 from metalens.view import standing
 from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, classes_of
 
@@ -52,6 +53,28 @@ def library_panels(path: Path) -> list[Panel]:
             bands,
         ),
         Curves("Error bar of t", x, "diameter / nm", {"error bar": error}, "|t - exact| at most", axes, scale="log"),
+    ]
+
+
+def axes_panels(path: Path) -> list[Panel]:
+    """Phase, level and error bar over both sizes; what is left out has phase and level 0."""
+    made = axes.load(path)
+    names = [Axis("polarisation", ["x", "y"]), Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm")]
+    own = np.stack([made.t[..., k, k] for k in (0, 1)]).swapaxes(-1, -2)  # the size along x runs to the right
+    step = float(made.x_um[1] - made.x_um[0])
+    kept = made.usable.swapaxes(-1, -2)
+    middle = [1e3 * float(v[0] + v[-1]) / 2 for v in (made.x_um, made.y_um)]
+    words = (
+        f"Along x the size along x, along y that along y, from their middles ({middle[0]:.4g} and {middle[1]:.4g} nm); "
+        f"{1 - made.usable.mean():.1%} is left out (error bars above {made.sweep.tolerance:g})."
+    )
+    turns = np.where(kept, np.angle(own) / (2 * math.pi) % 1, 0.0)
+    held = [tuple(row) for row in (made.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]
+    return [
+        Images("Phase", turns, names, step, "turns", words),
+        Images("Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words),
+        Images("Error bar", made.t_error.swapaxes(-1, -2), names[1:], step, "|t - exact| at most", words),
+        Numbers("Pairs held out", ("wavelength", "x / nm", "y / nm", "error", "bar of the interpolation"), held),
     ]
 
 

@@ -77,7 +77,8 @@ def _place(d: DiameterMap, axis: int, at_um: Array, start: int, step: int) -> Ar
     """Index along an axis of the nearest of every ``step``-th line from ``start`` on."""
     count, width = d.diameter_um.shape[axis], d.steps_um[1 - axis]
     exact = (at_um / width + (count - 1) / 2 - start) / step
-    return np.clip(np.rint(exact), 0, max(0, (count - 1 - start) // step)).astype(int) * step + start
+    place = np.clip(np.rint(exact), 0, max(0, (count - 1 - start) // step)).astype(int)
+    return np.asarray(place * step + start)
 
 
 def _standing(lens: Lens) -> tuple[_Standing, bool]:

@@ -33,7 +33,7 @@ class Ellipse:
     is of second order in grow / axis).
     """
 
-    ratio: float
+    ratio: float = 1.0
     angle_rad: float = 0.0
     hole: bool = False
     kind: Literal["ellipse"] = "ellipse"

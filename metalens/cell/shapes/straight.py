@@ -41,7 +41,7 @@ class Square:
 class Rectangle:
     """Its size is the edge along x before the turn; ratio: of the other edge to it. hole: an opening in a film."""
 
-    ratio: float
+    ratio: float = 1.0
     angle_rad: float = 0.0
     hole: bool = False
     kind: Literal["rectangle"] = "rectangle"
