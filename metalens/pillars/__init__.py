@@ -10,9 +10,11 @@ if TYPE_CHECKING:
     from metalens.pillars import curve as curve
     from metalens.pillars import engines as engines
     from metalens.pillars import fit as fit
+    from metalens.pillars import rational as rational
     from metalens.pillars import record as record
     from metalens.pillars import study as study
     from metalens.pillars import study_plots as study_plots
+    from metalens.pillars import workers as workers
     from metalens.pillars.engines import Light as Light
     from metalens.pillars.fit import ProxyFit as ProxyFit
     from metalens.pillars.fit import Wanted as Wanted
@@ -22,12 +24,14 @@ if TYPE_CHECKING:
     from metalens.pillars.record import Sweep as Sweep
     from metalens.pillars.study import Study as Study
     from metalens.pillars.study_plots import library_figure as library_figure
+    from metalens.pillars.sweep import Journal as Journal
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "study_plots": "",
         "DEFAULT_CELL": "record",
+        "Journal": "sweep",
         "Light": "engines",
         "PillarLibrary": "record",
         "Proxy": "proxy",
@@ -41,7 +45,9 @@ __getattr__, __dir__, __all__ = attach(
         "engines": "",
         "fit": "",
         "library_figure": "study_plots",
+        "rational": "",
         "record": "",
         "study": "",
+        "workers": "",
     },
 )

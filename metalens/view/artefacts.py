@@ -74,7 +74,7 @@ def axes_panels(path: Path) -> list[Panel]:
         Images("Phase", turns, names, step, "turns", words),
         Images("Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words),
         Images("Error bar", made.t_error.swapaxes(-1, -2), names[1:], step, "|t - exact| at most", words),
-        Numbers("Pairs held out", ("wavelength", "x / nm", "y / nm", "error", "bar of the interpolation"), held),
+        Numbers("Pairs held out", ("wavelength", "x / nm", "y / nm", "error of the interpolation", "error bar"), held),
     ]
 
 

@@ -42,4 +42,4 @@ def _held_out(panel: Any, library: AxesLibrary) -> None:
     panel.loglog(bar, np.maximum(error, 1e-6), ".")
     ends = np.array([bar.min() / 2, 2 * bar.max()])
     panel.loglog(ends, ends, lw=0.8)
-    panel.set(title="pairs held out", xlabel="bar of the interpolation", ylabel="error")
+    panel.set(title="pairs held out", xlabel="error bar of the entry", ylabel="error of the interpolation")

@@ -34,7 +34,7 @@ class AxesLibrary:
     t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not below the true error: solver and
         interpolation.
     held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the wavelength, x, y, largest
-        |interpolated - solved|, error bar of the interpolation there.
+        |interpolated - solved| on one truncation, error bar of the entry.
     solves: behind the entries. harmonics: orders of the truncation, the same for all entries.
     """
 

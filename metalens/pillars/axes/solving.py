@@ -24,7 +24,7 @@ LOOK = 61  # places along an axis where the interpolations are compared in betwe
 LEFT_OUT = 0.03  # of the pairs that may stay above the tolerance (resonances) when the search ends
 SOLVER_SHARE = 0.6  # of the tolerance, for the solver
 HELD_OUT = 24  # pairs; the bars are scaled by what half of them show, the other half judges
-SPREAD, LEAST_WIDE = 1.5, 0.3  # of the scale: over the largest error to bar of twelve pairs; the least that it may be
+SPREAD, LEAST_WIDE = 2.0, 0.5  # of the scale: over the largest error to bar of twelve pairs; the least that it may be
 _GOLDEN = (0.7548776662466927, 0.5698402909980532)  # of the plane: 1/g, 1/g², g³ = g + 1
 
 
@@ -104,9 +104,11 @@ def sweep(
         made = surface((x, y), values, places, tolerance=settings.tolerance)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
         wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
-        judged[:, 3] *= wide
+        bar = wide * made.doubt + _carried((x, y), bars, places, made.value)
+        row, column = _spread(places)
+        judged[:, 3] = bar[row, column]
         t.append(made.value.reshape(*made.doubt.shape, 2, 2))
-        error.append(wide * made.doubt + _carried((x, y), bars, places, made.value))
+        error.append(bar)
         held.append(np.insert(judged, 0, index, axis=1))
         solves += nodes.solves
     axes = np.array(settings.wavelengths_um), *places
@@ -183,13 +185,19 @@ def _more(lines: Array, look: Array, profile: Array) -> Array:
 
 
 def _held_out(nodes: _Nodes, places: tuple[Array, Array], value: Array, doubt: Array, console: Console) -> Array:
-    """(k, 4) x, y, error and bar of the interpolation at entries that spread over the plane (Roberts's sequence)."""
-    shares = np.mod(np.outer(np.arange(1, HELD_OUT + 1), _GOLDEN) + 0.5, 1)
-    row, column = (np.minimum((shares[:, k] * len(places[k])).astype(int), len(places[k]) - 1) for k in (0, 1))
+    """(k, 4) x, y, error and doubt of the interpolation at the entries that are held out."""
+    row, column = _spread(places)
     pairs = [(float(places[0][i]), float(places[1][j])) for i, j in zip(row, column, strict=True)]
     exact = np.array([one.t.ravel() for one in nodes.solve(pairs, console, "held out")])
     missed = np.abs(value[row, column] - exact).max(axis=1)
     return np.column_stack([np.array(pairs), missed, doubt[row, column]])
+
+
+def _spread(places: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Entries that spread over the plane (Roberts's sequence)."""
+    shares = np.mod(np.outer(np.arange(1, HELD_OUT + 1), _GOLDEN) + 0.5, 1)
+    row, column = (np.minimum((shares[:, k] * len(places[k])).astype(int), len(places[k]) - 1) for k in (0, 1))
+    return row, column
 
 
 def _carried(nodes: tuple[Array, Array], bars: Array, places: tuple[Array, Array], value: Array) -> Array:
