@@ -20,9 +20,11 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError, ProcessError
 from metalens.ground.units import nm
 from metalens.lens import DiameterMap, Lens
+from metalens.pillars.axes import sized
 
 _BLOCK_SITES = 1 << 20
 _FLAT = 1e-9
+_LENGTHS = 1 << 20  # above any drawn size in nm
 
 
 def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, tuple[PillarClass, ...]]:
@@ -43,7 +45,9 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
     if not len(used):
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     if len(used) > MOST_CLASSES:
-        raise ProcessError(f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg")
+        raise ProcessError(
+            f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
+        )
     kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
     numbered = (
         (first, np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind))
@@ -82,14 +86,16 @@ def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
 
 
 def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, Array]]:
-    """(first row, drawn size in nm times the turns, plus the turn) of blocks of rows; 0 for no pillar."""
-    step = process.rules.diameter_step_nm
+    """(first row, key) of blocks of rows; 0 for no pillar.
+
+    key: drawn size in nm, plus the drawn length (0: by the shape) times ``_LENGTHS``; times the turns, plus the turn.
+    """
     size = max(1, _BLOCK_SITES // max(1, d.diameter_um.shape[1]))
     for first in range(0, d.diameter_um.shape[0], size):
         design = np.asarray(d.diameter_um[first : first + size], float) / nm
-        drawn = np.rint(process.bias.drawn_nm(design) / step).astype(np.int64) * step
-        if ((drawn < step) & (design > 0)).any():
-            raise ProcessError(f"a pillar would be drawn below one step of {step} nm; check the bias")
+        drawn = _steps(design, design, process)
+        if d.length_um is not None:
+            drawn += _LENGTHS * _steps(np.asarray(d.length_um[first : first + size], float) / nm, design, process)
         turn = np.zeros(design.shape, np.int64)
         if d.angle_rad is not None:
             degrees = np.degrees(np.asarray(d.angle_rad[first : first + size], float))
@@ -97,14 +103,34 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
         yield first, np.where(design > 0, drawn * turns + turn, 0)
 
 
+def _steps(size_nm: Array, design_nm: Array, process: Process) -> Array:
+    """Sizes as they are drawn, in whole steps."""
+    step = process.rules.diameter_step_nm
+    drawn = np.rint(process.bias.drawn_nm(size_nm) / step).astype(np.int64) * step
+    if ((drawn < step) & (design_nm > 0)).any():
+        raise ProcessError(f"a pillar would be drawn below one step of {step} nm; check the bias")
+    return np.asarray(np.where(design_nm > 0, drawn, 0))
+
+
 def _class(cell: Cell, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
     """What is drawn for a key."""
-    grid, (drawn, turn) = process.rules.grid_nm, divmod(key, turns)
-    made = float(process.bias.made_nm(np.array(float(drawn)))) * nm
-    outline = cell.outline(made, grow_um=drawn * nm - made).parts[0].vertices(process.rules.vertices)
+    grid, (both, turn) = process.rules.grid_nm, divmod(key, turns)
+    length, drawn = divmod(both, _LENGTHS)
+    if length:  # each axis has the bias of its own size
+        cell = sized(cell, float(drawn), float(length))
+        outline = cell.outline(drawn * nm).parts[0].vertices(process.rules.vertices)
+    else:
+        outline = _biased(cell, drawn, process)
     corners = turned(outline, math.radians(turn * process.rules.angle_step_deg)) / nm / unit_nm
     points = np.asarray(np.rint(corners / grid) * grid, np.int64)
     points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
+    name = f"D{drawn:05}L{length:05}" if length else name
     layer = process.layers.pillar
     return PillarClass(name, float(drawn), round(drawn / unit_nm), layer, points, round=False)
+
+
+def _biased(cell: Cell, drawn: int, process: Process) -> Array:
+    """(n, 2) the outline of a drawn size: all edges moved alike by the bias of the process."""
+    made = float(process.bias.made_nm(np.array(float(drawn)))) * nm
+    return np.asarray(cell.outline(made, grow_um=drawn * nm - made).parts[0].vertices(process.rules.vertices))

@@ -10,7 +10,10 @@ import tyro
 
 from metalens import design, lens, library
 from metalens.cell import Cell
+from metalens.commands import design_words as words
+from metalens.commands import paired
 from metalens.commands.common import Common, Output
+from metalens.commands.paired import Target
 from metalens.design import (
     Conversion,
     Cubic,
@@ -31,7 +34,7 @@ from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
 from metalens.lens import Layers, check_gaps
 from metalens.lens import picture as lens_plot
-from metalens.pillars import PillarLibrary
+from metalens.pillars import PillarLibrary, axes
 
 MOST_SUMMED = 60_000_000  # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
@@ -52,6 +55,8 @@ class Design:
     layers: [[layers.front]] and [[layers.behind]] with material and thickness_um, in the order that the light meets
         them: films that the phase is corrected for; the gap behind the pillars is filled by the cell's cover.
     double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` chooses its own source distance.
+    along_y: [along_y] with profile, distances and their tables: what light polarised along y is to see, where the
+        library is one over two sizes; without it the same as light along x.
     hand: of the circular light that comes, where the library is for circular light: right (x + iy) or left. The phase
         is then made by the turn of pillars of one size.
     """
@@ -70,6 +75,7 @@ class Design:
     map: PhaseMap | None = None
     layers: Layers = field(default_factory=Layers)
     hand: Literal["right", "left"] = "right"
+    along_y: Target | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.aperture_mm <= 10:
@@ -110,22 +116,69 @@ def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where the light does not focus where it should."""
     wanted = config.load(options.config, Design, empty=False)
     target, read = options.output, _read(wanted, options.config)
+    if wanted.library is not None and paired.holds(options.config.parent / wanted.library):
+        return _paired(wanted, options, read)
+    if wanted.along_y is not None:
+        raise ConfigError("along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it")
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
-    values, text = _values(made.quality, made.check), _text(target, wanted, made.quality, made.check)
+    values = words.values(made.quality, made.check)
+    text = words.text(_head(wanted, target, made.quality), wanted.layers, made.quality, made.check)
     if made.conversion is not None:
         values["circular"] = {"hand": wanted.hand, **asdict(made.conversion)}
-        text = f"{text}\n{_converted(made.conversion, made.quality, wanted.hand)}"
+        text = f"{text}\n{words.converted(made.conversion, made.quality, wanted.hand)}"
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     options.console.result(values, text)
     return 0 if made.check is None or made.check.passed else 1
 
 
+def _head(wanted: Design, target: Path, quality: Quality) -> str:
+    return (
+        f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
+        f"{wanted.wavelength_nm:g} nm"
+    )
+
+
+def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
+    """A lens of pillars of two sizes, for light along x and along y."""
+    with options.claim(options.output, beside=(".png",), inputs=read) as draft:
+        path = options.config.parent / (wanted.library or "")
+        made_of, inputs = axes.load(path), {file.name: store.sha256(file) for file in (path, options.config)}
+        made_of.at(wanted.focus.wavelength_um)
+        if options.process is not None:
+            wanted = replace(wanted, limits=_printable(options.process, made_of.cell, wanted.limits))
+            inputs[options.process.name] = store.sha256(options.process)
+        wanted = replace(wanted, layers=_filled(wanted.layers, made_of.cell))
+        radius_um = wanted.aperture_mm * 500
+        phase, focus, _ = _phase(wanted, options, radius_um)
+        if wanted.along_y is None:
+            other: tuple[PhaseOf | None, Focus] = None, focus
+        else:
+            other = paired.phase(wanted.along_y, focus, options.config, radius_um=radius_um)
+        about = store.Provenance(config=config.dumps(wanted), inputs=inputs)
+        made, split = design.make_paired(
+            (phase, other[0]),
+            (focus, other[1]),
+            aperture_um=2 * radius_um,
+            library=made_of,
+            limits=wanted.limits,
+            profile=wanted.profile,
+            provenance=about,
+        )
+        profiles = wanted.profile, (wanted.along_y or wanted).profile
+        checks = paired.checks(made, profiles, skip=options.skip_focus_check)
+        lens.save(draft.path, made)
+        write_bytes(draft.path.with_suffix(".png"), lens_plot.picture(made))
+    head = _head(wanted, options.output, split.x)
+    options.console.result(paired.values(split, checks), paired.text(head, wanted.layers, split, checks))
+    return 0 if all(check.passed for check in checks if check is not None) else 1
+
+
 def _read(wanted: Design, where: Path) -> list[Path]:
     """The files that the config names."""
-    own = _located(wanted, where)
-    return ([where.parent / wanted.library] if wanted.library else []) + ([own.file] if own else [])
+    maps = [one for one in (wanted.map, wanted.along_y.map if wanted.along_y else None) if one is not None]
+    return ([where.parent / wanted.library] if wanted.library else []) + [where.parent / one.file for one in maps]
 
 
 def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
@@ -264,86 +317,3 @@ def _located(wanted: Design, where: Path) -> PhaseMap | None:
     if wanted.map is None:
         return None
     return replace(wanted.map, file=where.parent / wanted.map.file)
-
-
-def _values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
-    values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
-    if quality.focuses:
-        values |= {
-            "numerical_aperture": quality.numerical_aperture,
-            "field_of_view_deg": math.degrees(quality.field_of_view_rad),
-            "efficiency": quality.efficiency,
-        }
-    else:
-        values["wave_efficiency"] = quality.efficiency
-    values |= {
-        "sampled_aperture": quality.sampled_aperture,
-        "steepest": quality.steepest,
-        "transmission": quality.transmission,
-        "strehl": quality.strehl,
-        "max_phase_error_rad": quality.max_phase_error_rad,
-        "rms_phase_error_rad": quality.rms_phase_error_rad,
-        "turns": quality.turns,
-    }
-    if check is not None:
-        along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
-        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": along}
-        values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
-    return values
-
-
-def _cone(quality: Quality) -> list[str]:
-    """Aperture and field of a lens that has a focus."""
-    if not quality.focuses:
-        return ["  the phase brings no light together on the sensor: it has no focusing efficiency, NA or field"]
-    return [
-        f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
-        f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)"
-    ]
-
-
-def _converted(found: Conversion, quality: Quality, hand: str) -> str:
-    """What becomes of circular light, in words."""
-    whole = quality.strehl * found.converted
-    return (
-        f"  {hand} circular light, pillars of {1e3 * found.size_um:.1f} nm: {found.converted:.3f} +- "
-        f"{found.converted_error:.2g} leaves with the other hand and the wanted phase ({whole:.3f} in the focus), "
-        f"{found.unconverted:.2g} +- {found.unconverted_error:.1g} with the same hand and no phase;\n"
-        f"  pillars are taken as turned alone, which is {found.isolated_error:.2g} of t off the solved lattice"
-    )
-
-
-def _films(layers: Layers) -> list[str]:
-    """What the light passes beside the pillars."""
-    found = []
-    for where, films in (("front", layers.front), ("behind", layers.behind)):
-        if films:
-            named = ", ".join(f"{film.thickness_um:g} um {film.material}" for film in films)
-            found.append(f"  phase corrected for layers {where}: {named}")
-    return found
-
-
-def _text(target: Path, wanted: Design, quality: Quality, check: FocusCheck | None) -> str:
-    lines = [
-        f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
-        f"{wanted.wavelength_nm:g} nm",
-        *_cone(quality),
-        f"  {'focusing' if quality.focuses else 'wave-front'} efficiency {quality.efficiency:.3f}, "
-        f"mean |T|² {quality.transmission:.3f}, "
-        f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
-        *_films(wanted.layers),
-    ]
-    if quality.steepest > quality.sampled_aperture:
-        lines.append(
-            f"  at the rim the phase is steeper than the lattice samples (sine {quality.steepest:.3f}, "
-            f"{quality.sampled_aperture:.3f} without aliases): there light leaves in other directions too; take a "
-            "smaller pitch"
-        )
-    if quality.turns < 1:
-        lines.append(
-            f"  the pillars cover {quality.turns:.3f} of a turn: the nearest stands in for the phases that none has, "
-            f"{quality.rms_phase_error_rad:.2g} rad rms off, which costs {1 - quality.strehl:.1%} of the peak"
-        )
-    if check is not None:
-        lines.append(f"  exact diffraction sum: {check.text}")
-    return "\n".join(lines)

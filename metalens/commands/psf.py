@@ -141,15 +141,33 @@ def _stack(path: Path, settings: Settings) -> psf.PsfStack:
         found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
         return replace(found, provenance=provenance)
     made = lens.load(path)
+    if settings.light != "both" and made.pairs is None:
+        raise ConfigError(f"{path}: light = {settings.light!r} is for pillars of two sizes; these treat x and y alike")
     if settings.layers is not None:
         made = replace(made, layers=settings.layers)
     inputs = dict(provenance.inputs) | {file.name: store.sha256(file) for file in settings.spectrum if file.is_file()}
+    return _seen(made, settings, replace(provenance, inputs=inputs))
+
+
+def _seen(made: lens.Lens, settings: Settings, provenance: Provenance) -> psf.PsfStack:
+    """PSFs for the polarisation that is asked for."""
+    if made.pairs is None:
+        return _from_lens(made, settings, provenance)
+    if settings.light != "both":
+        return _from_lens(made.seen(settings.light), settings, provenance)
+    x, y = made.seen("x"), made.seen("y")
+    if (x.sensor_distance_um, x.source_distance_um) != (y.sensor_distance_um, y.source_distance_um):
+        raise ConfigError("light along x and y is focused at other distances by this lens: give light = 'x' or 'y'")
+    return psf.unpolarised(*(_from_lens(one, settings, provenance) for one in (x, y)))
+
+
+def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> psf.PsfStack:
     return psf.from_lens(
         made,
         settings.view,
         tolerance=settings.tolerance,
         spectrum=settings.nodes(made),
-        provenance=replace(provenance, inputs=inputs),
+        provenance=provenance,
         polarisation=settings.polarisation,
         left_out=_own_cell(made, settings) if settings.own_cell else None,
     )

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Settings:
     polarisation: ``scalar``, ``vector`` (Ex, Ey, Ez of both polarisations), or ``auto``: the scalar where its error is
         below the tolerance.
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
+    light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean of the two, where they are
+        focused from and to the same distances (any light, for other lenses).
     own_cell: solve rows of unlike pillars and tilted light for the lens's own cell, for the error budget (seconds to a
         minute); without it those terms are rough, of the default cell.
     """
@@ -61,6 +63,7 @@ class Settings:
     polarisation: psf.Polarisation = "scalar"
     layers: Layers | None = None
     own_cell: bool = False
+    light: Literal["both", "x", "y"] = "both"
 
     def __post_init__(self) -> None:
         self._check_sources()

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from metalens.design.of_phase import phase_of as phase_of
     from metalens.design.of_phase import printable as printable
     from metalens.design.own_cell import left_out as left_out
+    from metalens.design.paired import Split as Split
+    from metalens.design.paired import make_paired as make_paired
     from metalens.design.profiles import Cubic as Cubic
     from metalens.design.profiles import DoubleHelix as DoubleHelix
     from metalens.design.profiles import Focus as Focus
@@ -38,12 +40,14 @@ __getattr__, __dir__, __all__ = attach(
         "PhaseMap": "profiles",
         "PhaseOf": "sites",
         "Quality": "of_phase",
+        "Split": "paired",
         "check_focus": "focus_check",
         "field_angle": "of_phase",
         "focuses": "focusing",
         "hyperbolic": "profiles",
         "left_out": "own_cell",
         "make": "of_phase",
+        "make_paired": "paired",
         "make_turned": "turned",
         "neighbours": "",
         "phase_of": "of_phase",

@@ -12,6 +12,7 @@ import numpy as np
 from metalens import rcwa
 from metalens.design.neighbours import neighbours, printed
 from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
 from metalens.lens import Lens
 from metalens.psf import LeftOut
 
@@ -32,6 +33,8 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
 
     Accuracy: the factor c(s) = 1 + a s + b s² goes through the rows; a few 1e-2 of it are truncation.
     """
+    if lens.pairs is not None:
+        raise CellError("own_cell: rows of pillars of two sizes are not solved here; leave own_cell out")
     rim = lens.wavelength_um / (lens.cell.pitch_um * aperture)
     long = int(np.clip(round(rim), FEWEST + 1, MOST))
     found = neighbours(lens, counts=(long, max(FEWEST, round(long / 1.5))))

@@ -42,10 +42,10 @@ class Sites:
                 inside &= odd == 0
             yield rows, inside, phase(x, y[rows])[inside]
 
-    def map(self, diameter_um: Array, angle_rad: Array | None = None) -> DiameterMap:
+    def map(self, diameter_um: Array, angle_rad: Array | None = None, length_um: Array | None = None) -> DiameterMap:
         """The pillars on these sites."""
         row_um = 0.0 if self.lattice.kind == "square" else self.steps_um[1]
-        return DiameterMap(diameter_um, self.pitch_um, self.lattice, row_um, angle_rad)
+        return DiameterMap(diameter_um, self.pitch_um, self.lattice, row_um, angle_rad, length_um)
 
 
 def sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> Sites:

@@ -9,11 +9,12 @@ if TYPE_CHECKING:
     from metalens.lens import media as media
     from metalens.lens import picture as picture
     from metalens.lens import reach as reach
+    from metalens.lens.diameters import DiameterMap as DiameterMap
     from metalens.lens.layers import Layers as Layers
     from metalens.lens.layers import check_gaps as check_gaps
     from metalens.lens.media import Media as Media
+    from metalens.lens.pairs import Pairs as Pairs
     from metalens.lens.record import HANDS as HANDS
-    from metalens.lens.record import DiameterMap as DiameterMap
     from metalens.lens.record import Hand as Hand
     from metalens.lens.record import Lens as Lens
     from metalens.lens.record import from_parts as from_parts
@@ -26,12 +27,13 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "DiameterMap": "record",
+        "DiameterMap": "diameters",
         "HANDS": "record",
         "Hand": "record",
         "Layers": "layers",
         "Lens": "record",
         "Media": "media",
+        "Pairs": "pairs",
         "check_gaps": "layers",
         "export": "",
         "from_parts": "record",

@@ -33,7 +33,7 @@ def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     """Write a lens in the format that the name's ending says.
 
     ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission, pitch_um, wavelength_um; where
-    pillars are turned angle_rad.
+    pillars are turned angle_rad; where they have two sizes length_um, phase and transmission for light along x.
     ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
 
     Returns:
@@ -74,7 +74,7 @@ def arrays(lens: Lens) -> dict[str, Array]:
         "transmission": lens.transmission(),
         "pitch_um": np.array(d.pitch_um),
         "wavelength_um": np.array(lens.wavelength_um),
-    } | ({} if d.angle_rad is None else {"angle_rad": np.asarray(d.angle_rad)})
+    } | {name: np.asarray(v) for name, v in (("angle_rad", d.angle_rad), ("length_um", d.length_um)) if v is not None}
 
 
 @dataclass(frozen=True, eq=False, slots=True)

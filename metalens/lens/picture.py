@@ -8,6 +8,7 @@ from metalens.cell.shapes import turned
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.lens.record import Lens
+from metalens.pillars.axes import sized
 
 _PIXELS = 420  # along the longer side of the phase picture
 _ZOOM = 28  # pillars along the side of the zoom
@@ -52,13 +53,11 @@ def mean_field(lens: Lens, sites: int) -> Array:
     height, width = (-(-n // sites) for n in d.shape)
     mean = np.empty((height, width), complex)
     for i in range(height):
-        band, angle = np.zeros((2, sites, width * sites))
-        at = slice(i * sites, (i + 1) * sites)
+        at = slice(i * sites, min((i + 1) * sites, d.shape[0]))
         rows = np.asarray(d[at])
-        band[: len(rows), : rows.shape[1]] = rows
-        angle[: len(rows), : rows.shape[1]] = lens.geometric_rad(at)
-        phase = lens.proxy.phase_rad(np.where(band > 0, band, lens.proxy.domain_um[0]), lens.wavelength_um)
-        field = np.where(band > 0, np.exp(1j * (phase + angle)), 0) * (2 if centred else 1)
+        field = np.zeros((sites, width * sites), complex)
+        there = np.where(rows > 0, np.exp(1j * lens.rows_phase_rad(at)), 0)
+        field[: len(rows), : rows.shape[1]] = there * (2 if centred else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean
 
@@ -75,19 +74,22 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     there = part > 0
     size = part[there]
     turn = np.zeros(len(size)) if d.angle_rad is None else d.angle_rad[rows, columns][there]
-    drawn = [_outline(lens, *one) for one in zip(size, turn, x[there], y[there], strict=True)]
+    length = np.zeros(len(size)) if d.length_um is None else d.length_um[rows, columns][there]
+    drawn = [_outline(lens, *one) for one in zip(size, length, turn, x[there], y[there], strict=True)]
     shown = PolyCollection(drawn, cmap="viridis")
     shown.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
     axes.add_collection(shown)
     half = d.pitch_um / 2
     axes.set(xlim=(x.min() - half, x.max() + half), ylim=(y.max() + half, y.min() - half), aspect="equal")
     axes.set(title="single pillars", xlabel="x / µm", ylabel="y / µm")
-    figure.colorbar(shown, ax=axes, label="size / nm" if d.angle_rad is None else "turn / deg", shrink=0.85)
+    size_name = "size / nm" if d.length_um is None else "size along x / nm"
+    figure.colorbar(shown, ax=axes, label=size_name if d.angle_rad is None else "turn / deg", shrink=0.85)
     axes.grid(visible=False)
 
 
-def _outline(lens: Lens, size_um: float, turn_rad: float, x_um: float, y_um: float) -> Array:
+def _outline(lens: Lens, size_um: float, length_um: float, turn_rad: float, x_um: float, y_um: float) -> Array:
     """(n, 2) corners of one pillar where it stands."""
-    corners = lens.cell.outline(float(size_um)).parts[0].vertices(32)
+    cell = sized(lens.cell, float(size_um), float(length_um)) if length_um else lens.cell
+    corners = cell.outline(float(size_um)).parts[0].vertices(32)
     placed: Array = turned(corners, float(turn_rad)) + np.array([x_um, y_um])
     return placed

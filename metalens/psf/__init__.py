@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import aperture as aperture
     from metalens.psf.of_lens import from_lens as from_lens
+    from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
     from metalens.psf.record import PsfStack as PsfStack
     from metalens.psf.record import load as load
@@ -44,6 +45,7 @@ __getattr__, __dir__, __all__ = attach(
         "aperture": "of_lens",
         "export": "",
         "from_lens": "of_lens",
+        "unpolarised": "of_lens",
         "load": "record",
         "on_pixels": "pixels",
         "plots": "",

@@ -101,6 +101,15 @@ def from_lens(
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
 
 
+def unpolarised(x: PsfStack, y: PsfStack) -> PsfStack:
+    """PSFs of light without polarisation: the mean irradiance of those of light along x and along y, as one stack."""
+    energy = (x.energy_um2 + y.energy_um2) / 2
+    shares = [(one.energy_um2 / (2 * np.where(energy > 0, energy, 1.0)))[..., None, None] for one in (x, y)]
+    intensity = (x.intensity * shares[0] + y.intensity * shares[1]).astype(x.intensity.dtype)
+    worse = x if x.error >= y.error else y
+    return dataclasses.replace(worse, intensity=intensity, energy_um2=energy.astype(x.energy_um2.dtype))
+
+
 def _budget(
     lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, vector: bool, left_out: LeftOut
 ) -> Budget:
@@ -118,10 +127,11 @@ def _budget(
 
 
 def _vectorial(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> bool:
-    if lens.hand:
+    if lens.hand or lens.pairs is not None:
         if polarisation == "vector":
+            own = "is for circular light" if lens.hand else "has pillars of two sizes"
             raise PropagationError(
-                "polarisation = 'vector' is for light along x and y; this lens is for circular light: take 'scalar'"
+                f"polarisation = 'vector' is for pillars that treat x and y alike; this lens {own}: take 'scalar'"
             )
         return False
     if polarisation == "auto":

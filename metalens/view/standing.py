@@ -7,6 +7,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.lens import DiameterMap, Lens
+from metalens.pillars import axes
 from metalens.view.panels import Axis, Drawing, Images, Outline
 
 MOST_DRAWN = 3_000_000  # pillars of a page; of a larger lens its middle is drawn
@@ -18,7 +19,8 @@ _NM = 1e3
 
 @dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class _Standing:
-    """Pillars one by one: (n,) positions in um (+y up, as on the mask), size in whole nm, turn in whole degrees."""
+    """Pillars one by one: (n,) positions in um (+y up, as on the mask), size, length (0: the shape says it)
+    in whole nm, turn in whole degrees."""
 
     x_um: Array
     y_um: Array
@@ -26,7 +28,7 @@ class _Standing:
 
     @property
     def kinds(self) -> tuple[Array, Array]:
-        """(k, 2) distinct (size, turn), and which of them each pillar is."""
+        """(k, 3) distinct (size, length, turn), and which of them each pillar is."""
         found, place = np.unique(self.kind, axis=0, return_inverse=True)
         return found, place.reshape(-1)
 
@@ -35,17 +37,18 @@ def drawn(lens: Lens) -> Drawing:
     """Every pillar's outline where it stands, coloured by its size, or by its turn where pillars are turned."""
     this, whole = _standing(lens)
     kinds, place = this.kinds
-    what, unit = (1, "deg") if lens.diameters.angle_rad is not None else (0, "nm")
+    what, unit = (2, "deg") if lens.diameters.angle_rad is not None else (0, "nm")
     named = _bands(kinds[:, what], unit)
     at = np.rint(_NM * np.stack([this.x_um, this.y_um], axis=1)).astype(np.int32)
     order = np.argsort(place, kind="stable")
     parts = np.split(at[order], np.cumsum(np.bincount(place, minlength=len(kinds)))[:-1])
     outlines = []
-    for (size, turn), places, name in zip(kinds.tolist(), parts, named, strict=True):
-        notes = {"size / nm": size} | ({"turn / deg": turn} if what else {})
-        outlines.append(Outline(name, _NM * _corners(lens, size / _NM, math.radians(turn)), places, notes))
+    for (size, length, turn), places, name in zip(kinds.tolist(), parts, named, strict=True):
+        notes = {"size / nm": size} | ({"length / nm": length} if length else {})
+        corners = _NM * _corners(lens, size / _NM, length / _NM, math.radians(turn))
+        outlines.append(Outline(name, corners, places, notes | ({"turn / deg": turn} if what else {})))
     text = (
-        f"{len(at):,} pillars, each a {lens.cell.shape.name} where it stands, +y up as on the mask"
+        f"{len(at):,} pillars, each a {lens.cell.shape.name} where it stands, +y of the lens up, as on the mask"
         f"{'' if whole else ' (the middle of a larger lens)'}. Drag to move, wheel or + and - to zoom."
     )
     return Drawing("Pillars", outlines, 1 / _NM, text)
@@ -58,9 +61,11 @@ def phase(lens: Lens) -> Images:
     step = max(edge / _PIXELS, min(d.steps_um))
     y, x = (np.arange(-math.ceil(end / step), math.ceil(end / step) + 1) * step for end in (d.y_um[-1], d.x_um[-1]))
     row, column = nearest(d, y[:, None], x[None])
-    values = np.mod(lens.phase_rad()[row, column] / (2 * np.pi), 1)
+    seen = [lens] if lens.pairs is None else [lens.seen("x"), lens.seen("y")]
+    values = np.stack([np.mod(one.phase_rad()[row, column] / (2 * np.pi), 1) for one in seen])
     values = np.where(d.diameter_um[row, column] > 0, values, 0.0)
-    return Images("Phase", values[None], [Axis("light", [lens.hand or "any"])], step, "turns, modulo one")
+    names = [lens.hand or "any"] if lens.pairs is None else ["along x", "along y"]
+    return Images("Phase", values, [Axis("light", names)], step, "turns, modulo one")
 
 
 def nearest(d: DiameterMap, y_um: Array, x_um: Array) -> tuple[Array, Array]:
@@ -91,18 +96,21 @@ def _standing(lens: Lens) -> tuple[_Standing, bool]:
         kept = (np.abs(d.y_um[rows]) <= reach) & (np.abs(d.x_um[columns]) <= reach)
         rows, columns = rows[kept], columns[kept]
     size = np.rint(_NM * np.asarray(d.diameter_um)[rows, columns].astype(float)).astype(int)
-    turn = np.zeros(len(size), int)
+    turn, length = np.zeros((2, len(size)), int)
+    if d.length_um is not None:
+        length = np.rint(_NM * d.length_um[rows, columns].astype(float)).astype(int)
     if d.angle_rad is not None:
         turn = np.rint(np.degrees(d.angle_rad[rows, columns].astype(float))).astype(int)
-    return _Standing(d.x_um[columns], -d.y_um[rows], np.stack([size, turn], axis=1)), whole
+    return _Standing(d.x_um[columns], d.y_um[rows], np.stack([size, length, turn], axis=1)), whole
 
 
-def _corners(lens: Lens, size_um: float, turn_rad: float) -> Array:
-    """(n, 2) of one pillar about its site, +y up."""
+def _corners(lens: Lens, size_um: float, length_um: float, turn_rad: float) -> Array:
+    """(n, 2) of one pillar about its site."""
     from metalens.cell.shapes import turned
 
-    corners = lens.cell.outline(size_um).parts[0].vertices(_CORNERS)
-    return np.asarray(turned(corners, turn_rad) * (1, -1))
+    cell = axes.sized(lens.cell, size_um, length_um) if length_um else lens.cell
+    corners = cell.outline(size_um).parts[0].vertices(_CORNERS)
+    return np.asarray(turned(corners, turn_rad))
 
 
 def _bands(values: Array, unit: str) -> list[str]:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from metalens.pillars.axes.between import Surface as Surface
     from metalens.pillars.axes.between import surface as surface
     from metalens.pillars.axes.plots import figure as figure
+    from metalens.pillars.axes.record import KIND as KIND
     from metalens.pillars.axes.record import AxesLibrary as AxesLibrary
     from metalens.pillars.axes.record import check as check
     from metalens.pillars.axes.record import load as load
@@ -19,6 +20,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "AxesLibrary": "record",
+        "KIND": "record",
         "Surface": "between",
         "check": "record",
         "figure": "plots",

@@ -120,11 +120,11 @@ def sweep(
 
 
 def entries(sweep: Sweep) -> tuple[Array, Array]:
-    """Evenly spaced sizes along x and y, with one step."""
+    """Evenly spaced sizes along x and y, with one step; the shorter range may end before its largest size."""
     spans = _spans(sweep)
     step = max(high - low for low, high in spans) / (sweep.samples - 1)
-    x, y = (low + step * np.arange(round((high - low) / step) + 1) for low, high in spans)
-    return np.minimum(x, spans[0][1]), np.minimum(y, spans[1][1])
+    x, y = (low + step * np.arange(int((high - low) / step + 1e-9) + 1) for low, high in spans)
+    return np.minimum(x, spans[0][1]), np.minimum(y, spans[1][1])  # the last one, to rounding
 
 
 def _spans(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -17,7 +17,7 @@ from layout.rules import check as drc
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Cross, Ellipse, Rectangle, Ring, Square
 from metalens.ground.errors import ProcessError
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import DiameterMap, Lens, Pairs
 from metalens.pillars import Proxy
 
 PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01)
@@ -112,6 +112,28 @@ def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(
     assert axis_of(found[0][2])[1] == pytest.approx(area, rel=0.012)
     if isinstance(shape, Rectangle):
         assert axis_of(found[0][2])[0] == pytest.approx(0.4, abs=0.006)
+
+
+@pytest.mark.parametrize("shape", [Rectangle(), Ellipse()], ids=lambda s: s.kind)
+def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, shape):
+    rng, there = np.random.default_rng(8), np.random.default_rng(4).random((9, 12)) < 0.8
+    size, length = (
+        np.where(there, rng.integers(low, high, (9, 12)) * 2e-3, 0.0) for low, high in ((45, 140), (60, 150))
+    )
+    axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
+    table = Pairs(np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf))
+    sizes = DiameterMap(size, 0.4, length_um=length)
+    made = Lens(sizes, Cell(0.4, shape=shape), table.proxy, 0.94, 77.0, math.inf, "map", pairs=table)
+    plan, found = written(made, tmp_path, "gds")
+    placed = {(x, y): np.ptp(corners, axis=0) for x, y, corners in found}
+    assert len(found) == there.sum()
+    d, grid = made.diameters, 1.0 if shape.kind == "rectangle" else 2.0  # corners of ellipses keep the area
+    for row, column in np.argwhere(there):
+        at = round(1e3 * d.x_um[column] + plan.axis[0]), round(1e3 * d.y_um[row] + plan.axis[1])
+        want = 1e3 * np.array([size[row, column], length[row, column]])
+        assert np.abs(placed[at] - want).max() <= grid
+    wide = np.array([c.outline for c in plan.classes if c.name.startswith("D")], dtype=object)
+    assert len(wide) == len(np.unique(np.stack([size[there], length[there]]), axis=1).T)
 
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])

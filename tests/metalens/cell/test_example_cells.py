@@ -12,6 +12,7 @@ from metalens.cell.orders import check_subwavelength
 from metalens.cli import main
 from metalens.commands.library import CellFile
 from metalens.ground import config
+from metalens.pillars import axes
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -21,7 +22,7 @@ COARSE = {"samples": 40, "tolerance": 5e-2}  # the hexagonal cell needs its 200 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
 def test_example_cells_read_and_are_subwavelength(path):
     wanted = config.load(path, CellFile)
-    library.check(wanted.cell, wanted.sweep)
+    (axes if wanted.sweep.lengths_um else library).check(wanted.cell, wanted.sweep)
     low, high = wanted.sweep.span_um(wanted.cell)
     assert wanted.cell.gap_um(high) > 0.04
     got = rcwa.jones(wanted.cell, (low + high) / 2, wanted.sweep.wavelengths_um[0], harmonics=5)
@@ -108,3 +109,22 @@ def test_a_hexagonal_lens_from_toml_to_mask(tmp_path, capsys):
     assert found["focus_passed"]
     assert found["steepest"] < found["sampled_aperture"]
     assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+
+
+@pytest.mark.slow
+def test_two_phases_by_width_and_length_from_toml_to_mask(tmp_path, capsys):
+    found = chained(tmp_path, "a_si_two_sizes_940", "two_sizes.h5", capsys)
+    for light, distance in (("along_x", 80), ("along_y", 110)):
+        own = found[light]
+        assert own["numerical_aperture"] == pytest.approx(math.sin(math.atan(20 / distance)), rel=0.01)
+        assert own["focus_passed"]
+        assert 0.6 < own["efficiency"] <= own["transmission"] <= 1
+        assert own["leaked"] < 1e-20  # mirrors
+    assert found["multiplexed"]
+    view = "depths_mm = [1e3, 1e3, 1.0]\nangles_deg = [0.0]\nsamples = 40\nwindow_um = 16.0\ntolerance = 1e-3\n"
+    words = ["psf", str(tmp_path / "lens.h5"), "--config", str(tmp_path / "psf.toml"), "--quiet"]
+    (tmp_path / "psf.toml").write_text(view)
+    assert main([*words, "-o", str(tmp_path / "both.h5")]) == 2
+    assert "give light" in capsys.readouterr().err
+    (tmp_path / "psf.toml").write_text(view + 'light = "y"\n')
+    assert main([*words, "-o", str(tmp_path / "y.h5")]) == 0

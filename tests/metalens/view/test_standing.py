@@ -30,7 +30,7 @@ def test_every_pillar_of_a_hexagonal_lens_is_drawn_on_its_site():
     panel = standing.drawn(lens)
     places = np.concatenate([o.places for o in panel.outlines])
     there = d.diameter_um > 0
-    want = np.stack(np.meshgrid(d.x_um, -d.y_um), axis=-1)[there]
+    want = np.stack(np.meshgrid(d.x_um, d.y_um), axis=-1)[there]
     assert sorted(map(tuple, places.tolist())) == sorted(map(tuple, np.rint(1e3 * want).astype(int).tolist()))
     for outline in panel.outlines:  # each has the area of its disc, to the rounding of its size to 1 nm
         x, y = outline.corners.T
@@ -65,8 +65,8 @@ def test_turned_rectangles_are_drawn_turned_and_coloured_by_their_turn(tmp_path)
     for outline in panel.outlines:
         side = outline.corners[1] - outline.corners[0]
         longest = side if np.hypot(*side) > 200 else outline.corners[2] - outline.corners[1]
-        assert np.degrees(np.arctan2(-longest[1], longest[0])) % 180 == pytest.approx(outline.notes["turn / deg"])
+        assert np.degrees(np.arctan2(longest[1], longest[0])) % 180 == pytest.approx(outline.notes["turn / deg"])
         x, y = outline.places[0]
-        column, row = int(x > 0), int(y < 0)
+        column, row = int(x > 0), int(y > 0)
         assert np.degrees(angle[row, column]) == pytest.approx(outline.notes["turn / deg"], abs=1e-4)
     assert len({o.layer for o in panel.outlines}) == 4

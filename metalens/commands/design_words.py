@@ -1,0 +1,90 @@
+"""What ``metalens design`` says of a lens: numbers for programs, lines for people."""
+
+import math
+
+from metalens.design import Conversion, FocusCheck, Quality
+from metalens.lens import Layers
+
+
+def values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
+    """Numbers of a lens and of the check of its focus; None for what JSON does not know."""
+    values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
+    if quality.focuses:
+        values |= {
+            "numerical_aperture": quality.numerical_aperture,
+            "field_of_view_deg": math.degrees(quality.field_of_view_rad),
+            "efficiency": quality.efficiency,
+        }
+    else:
+        values["wave_efficiency"] = quality.efficiency
+    values |= {
+        "sampled_aperture": quality.sampled_aperture,
+        "steepest": quality.steepest,
+        "transmission": quality.transmission,
+        "strehl": quality.strehl,
+        "max_phase_error_rad": quality.max_phase_error_rad,
+        "rms_phase_error_rad": quality.rms_phase_error_rad,
+        "turns": quality.turns,
+    }
+    if check is not None:
+        along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
+        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": along}
+        values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
+    return values
+
+
+def _cone(quality: Quality) -> list[str]:
+    """Aperture and field of a lens that has a focus."""
+    if not quality.focuses:
+        return ["  the phase brings no light together on the sensor: it has no focusing efficiency, NA or field"]
+    return [
+        f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
+        f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)"
+    ]
+
+
+def converted(found: Conversion, quality: Quality, hand: str) -> str:
+    """What becomes of circular light, in words."""
+    whole = quality.strehl * found.converted
+    return (
+        f"  {hand} circular light, pillars of {1e3 * found.size_um:.1f} nm: {found.converted:.3f} +- "
+        f"{found.converted_error:.2g} leaves with the other hand and the wanted phase ({whole:.3f} in the focus), "
+        f"{found.unconverted:.2g} +- {found.unconverted_error:.1g} with the same hand and no phase;\n"
+        f"  pillars are taken as turned alone, which is {found.isolated_error:.2g} of t off the solved lattice"
+    )
+
+
+def _films(layers: Layers) -> list[str]:
+    """What the light passes beside the pillars."""
+    found = []
+    for where, films in (("front", layers.front), ("behind", layers.behind)):
+        if films:
+            named = ", ".join(f"{film.thickness_um:g} um {film.material}" for film in films)
+            found.append(f"  phase corrected for layers {where}: {named}")
+    return found
+
+
+def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None) -> str:
+    """Lines about a lens below a head; layers: films that its phase is corrected for."""
+    lines = [
+        head,
+        *_cone(quality),
+        f"  {'focusing' if quality.focuses else 'wave-front'} efficiency {quality.efficiency:.3f}, "
+        f"mean |T|² {quality.transmission:.3f}, "
+        f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
+        *_films(layers),
+    ]
+    if quality.steepest > quality.sampled_aperture:
+        lines.append(
+            f"  at the rim the phase is steeper than the lattice samples (sine {quality.steepest:.3f}, "
+            f"{quality.sampled_aperture:.3f} without aliases): there light leaves in other directions too; take a "
+            "smaller pitch"
+        )
+    if quality.turns < 1:
+        lines.append(
+            f"  the pillars cover {quality.turns:.3f} of a turn: the nearest stands in for the phases that none has, "
+            f"{quality.rms_phase_error_rad:.2g} rad rms off, which costs {1 - quality.strehl:.1%} of the peak"
+        )
+    if check is not None:
+        lines.append(f"  exact diffraction sum: {check.text}")
+    return "\n".join(lines)
