@@ -170,3 +170,19 @@ def test_absorbing_substrate_and_total_reflection_are_refused():
         rcwa.derivatives(replace(PLAIN, substrate=Index(1.45, 0.1)), 0.2, 0.85)
     with pytest.raises(CellError, match="totally reflected"):
         rcwa.derivatives(replace(PLAIN, cover=Index(0.3)), 0.2, 0.85, angle_rad=0.6, polarization="s")
+
+
+@pytest.mark.parametrize("tilt", [0.12, -0.07])
+def test_a_tilted_wall_counts_with_its_mean_area_where_nothing_is_reflected(tilt):
+    """Index-matched: t = exp(i k n h), and dt/dn = i k h s t, s the mean of pi D(z)²/4 over the cell's area."""
+    n, diameter, height = 1.7, 0.21, 0.6
+    matched = dict.fromkeys(("pillar", "between", "substrate", "cover"), Index(n))
+    cell = replace(PLAIN, **matched, height_um=height, sidewall_rad=tilt)
+    got = rcwa.derivatives(cell, diameter, 0.85, harmonics=3)
+    k, spread = 2 * math.pi / 0.85, 2 * height * math.tan(tilt)
+    share = math.pi / 4 * (diameter**2 + spread**2 / 12) / cell.pitch_um**2
+    assert abs(got.t - cmath.exp(1j * k * n * height)) < 1e-12
+    assert abs(got.n - 1j * k * height * share * got.t) < 1e-10
+    assert abs(got.height_um - 1j * k * n * got.t) < 1e-10
+    upright = rcwa.derivatives(replace(cell, sidewall_rad=0.0), diameter, 0.85, harmonics=3)
+    assert abs(got.n - upright.n) > 1e-2 * abs(got.n)  # the tilt does matter
