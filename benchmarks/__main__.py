@@ -17,7 +17,7 @@ from pathlib import Path
 import benchmarks
 from benchmarks import Row, figures
 
-LONG = ("closure", "engines", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee")
+LONG = ("closure", "engines", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee", "shaped_cells")
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 
