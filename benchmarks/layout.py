@@ -58,10 +58,11 @@ def sites(*, freeform: bool) -> Array:
 @functools.cache
 def plan(*, freeform: bool = True) -> MaskPlan:
     """The mask of the lens alone."""
-    return _plan(Lattice.of("LENS", sites(freeform=freeform), pitch=PITCH, x0=-1250 * PITCH, y0=1250 * PITCH))
+    return lens_of(Lattice.of("LENS", sites(freeform=freeform), pitch=PITCH, x0=-1250 * PITCH, y0=1250 * PITCH))
 
 
-def _plan(lattice: Lattice) -> MaskPlan:
+def lens_of(lattice: Lattice) -> MaskPlan:
+    """A mask of one lattice of the bench's sizes."""
     classes = pillar_classes(SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round")
     return MaskPlan("TOP", classes, (lattice,), layer_names={(1, 0): "pillar"})
 
@@ -81,7 +82,7 @@ def large(diameter_mm: float) -> MaskPlan:
         return out
 
     half = (count - 1) * PITCH // 2
-    return _plan(Lattice("LENS", count, count, PITCH, -half, half, rows))
+    return lens_of(Lattice("LENS", count, count, PITCH, -half, half, rows))
 
 
 @contextlib.contextmanager
@@ -115,7 +116,8 @@ def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder)
         files = [*_file_rows(target), *_check_rows(), *_polygon_rows(), *_streaming_rows(target)]
-        return [*files, *_certificate_rows(target), *_command_rows(target), *_large_command_rows(target)]
+        files += [*_certificate_rows(target), *_foreign_check_rows(target), *_command_rows(target)]
+        return [*files, *_large_command_rows(target)]
 
 
 def _file_rows(target: Path) -> list[Row]:
@@ -259,6 +261,29 @@ print(code, time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF
 """
 
 
+_CHECK = """
+import resource, sys, time
+from metalens import cli
+start = time.process_time()
+code = cli.main(["check", sys.argv[1], "--json", "--quiet"])
+print(code, time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def _foreign_check_rows(target: Path) -> list[Row]:
+    """``metalens check`` of 8.7 million pillars from OASIS, in a process of its own: CPU time, peak of all memory."""
+    from layout.mask import build
+    from layout.process.process import Process
+
+    made = build.prepare(_lens(1.0, 0.3).diameters, Process(), furniture="none", with_doses=False)
+    layout.write_oasis(made.plan, target / "check.oas")
+    words = [sys.executable, "-c", _CHECK, str(target / "check.oas")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    code, seconds, peak = map(float, done.stdout.split()[-3:])
+    text = f"exit status of {int(made.plan.counts()[1:].sum()):,} pillars; CPU s, all memory"
+    return [Row("1 mm lens", "metalens check, OASIS", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")]
+
+
 def _large_command_rows(target: Path) -> list[Row]:
     """The whole command in a process of its own, with the peak of all its memory."""
     from metalens import lens as lenses
@@ -275,114 +300,8 @@ def _large_command_rows(target: Path) -> list[Row]:
 
 
 def peer_rows() -> list[Row]:
-    """gdstk and KLayout at their best on the same pillars, and their agreement with our files."""
+    """gdstk and KLayout on the same pillars."""
+    from benchmarks import _layout_peers
+
     with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder)
-        return [*_gdstk_rows(target), *_klayout_rows(target)]
-
-
-def _gdstk_rows(target: Path) -> list[Row]:
-    try:
-        import gdstk
-    except ImportError:
-        return []
-    mask = plan()
-    grid = mask.lattices[0].whole()
-
-    def build(size: float) -> "gdstk.Library":
-        library = gdstk.Library("TOP", unit=1e-6, precision=1e-9)
-        top = library.new_cell("TOP")
-        for k, made in enumerate(mask.classes, 1):
-            cell = library.new_cell(made.name)
-            cell.add(gdstk.Polygon(made.outline * 1e-3, layer=1))
-            row, column = np.nonzero(grid == k)
-            place = np.column_stack([(column - 1250) * size, (1250 - row) * size])
-            reference = gdstk.Reference(cell, tuple(place[0]))
-            reference.repetition = gdstk.Repetition(offsets=(place - place[0])[1:])
-            top.add(reference)
-        return library
-
-    made = []
-    for name, write in (
-        ("GDSII", lambda: build(0.4).write_gds(target / "g.gds")),
-        ("OASIS level 6", lambda: build(0.4).write_oas(target / "g.oas", compression_level=6)),
-    ):
-        seconds = fastest(write, repeats=1)
-        size = (target / ("g.gds" if name == "GDSII" else "g.oas")).stat().st_size / 1e6
-        made.append(Row("free-form", f"gdstk build + write {name}", seconds, NAN, f"{size:.2f} MB, no comparison"))
-    layout.write_oasis(mask, target / "r.oas", form="reader")
-    start = time.perf_counter()
-    library = gdstk.read_oas(target / "r.oas")
-    seconds = time.perf_counter() - start
-    lens = next(cell for cell in library.cells if cell.name == "LENS")
-    count = sum(r.repetition.size or 1 for r in lens.references)
-    wrong = float(count - np.count_nonzero(grid))
-    valid, _ = gdstk.oas_validate(target / "r.oas")
-    text = f"pillars less the plan; checksum {'right' if valid else 'WRONG'}"
-    return [*made, Row("free-form", "gdstk opens OASIS reader", seconds, wrong, text, goal="<= 0.5 s")]
-
-
-def _klayout_rows(target: Path) -> list[Row]:
-    try:
-        import klayout.db as db
-    except ImportError:
-        return []
-    mask = plan()
-    grid = mask.lattices[0].whole()
-
-    def build() -> "db.Layout":
-        made = db.Layout()
-        made.dbu = 0.001
-        top, layer = made.create_cell("TOP"), made.layer(1, 0)
-        cells = []
-        for kind in mask.classes:
-            cell = made.create_cell(kind.name)
-            cell.shapes(layer).insert(db.Polygon([db.Point(*p) for p in kind.outline.tolist()]))
-            cells.append(cell.cell_index())
-        rows, columns = np.nonzero(grid)
-        x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
-        for k, px, py in zip(grid[rows, columns].tolist(), x, y, strict=True):
-            top.insert(db.CellInstArray(cells[k - 1], db.Vector(px, py)))
-        return made
-
-    start = time.perf_counter()
-    build().write(str(target / "k.gds"))
-    made = [Row("free-form", "KLayout build + write GDSII", time.perf_counter() - start, NAN, "no comparison")]
-    for name, write in (("m.gds", layout.write_gdsii), ("m.oas", layout.write_oasis)):
-        write(mask, target / name)
-        start = time.perf_counter()
-        read = db.Layout()
-        read.read(str(target / name))
-        seconds = time.perf_counter() - start
-        count = db.Region(read.cell("TOP").begin_shapes_rec(read.layer(1, 0))).count()
-        wrong = float(count - np.count_nonzero(grid))
-        made.append(Row("free-form", f"KLayout reads {name[2:]}", seconds, wrong, "pillars less the plan"))
-    return [*made, _klayout_check(db, mask)]
-
-
-def _klayout_check(db: object, mask: MaskPlan) -> Row:
-    """The space check of KLayout on a patch of 240 000 pillars."""
-    patch = mask.lattices[0].whole()[1005:1495, 1005:1495]
-    region = db.Region()  # type: ignore[attr-defined]
-    shapes = [db.Polygon([db.Point(*p) for p in kind.outline.tolist()]) for kind in mask.classes]  # type: ignore[attr-defined]
-    for row, column in np.argwhere(patch > 0).tolist():
-        region.insert(shapes[patch[row, column] - 1].moved(column * PITCH, -row * PITCH))
-    region.merged_semantics = False
-    start = time.perf_counter()
-    count = region.space_check(70, False, db.Region.Euclidian).count()  # type: ignore[attr-defined]
-    thin = region.width_check(80, False, db.Region.Projection).count()  # type: ignore[attr-defined]
-    overlap = region.merged(False, 2).count()
-    seconds = time.perf_counter() - start
-    plan_of_patch = _plan(Lattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0))
-    own = drc.check(plan_of_patch, RULES).counts
-    wrong = abs(count - own["gap"]) + abs(min(thin, 1) - min(own["feature"], 1)) + abs(overlap - own["overlap"])
-    whole = fastest(lambda: drc.check(mask, RULES))
-    ratio = seconds / patch.size / (whole / np.count_nonzero(mask.lattices[0].whole()))
-    return Row(
-        "240 100 pillars",
-        "KLayout gap, width and overlap checks",
-        seconds,
-        float(wrong),
-        "violations, ours less theirs",
-        goal=f"ours, all checks, is {ratio:.0f}x faster a pillar (500x)",
-    )
+        return _layout_peers.measured(Path(folder))

@@ -57,16 +57,6 @@ class Certificate:
         return self.survey.lean_nm
 
     @property
-    def foot_nm(self) -> Array:
-        """(n,) diameters at the foot."""
-        return np.asarray(self.made_nm + self.lean_nm)
-
-    @property
-    def top_nm(self) -> Array:
-        """(n,) diameters at the top."""
-        return np.asarray(self.made_nm - self.lean_nm)
-
-    @property
     def worst_exposure(self) -> float:
         """Largest |exposure - 1| of the judged pillars and of all edges."""
         return self.survey.worst_exposure

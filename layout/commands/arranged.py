@@ -20,6 +20,7 @@ from layout.oasis import assemble as oasis_assemble
 from layout.process import LayerNumber, noticed
 from layout.process import process as processes
 from metalens.ground import config, store
+from metalens.ground.errors import ProcessError
 
 _MOST_READ = 2**40
 _LISTED = 12  # gaps that are told one by one
@@ -44,9 +45,22 @@ def run(options: Options) -> int:
     return 0 if not work.failures else 1
 
 
+def _refuse_negative(work: Work) -> None:
+    """Raises: ProcessError: gaps are drawn, and something stands on the die that the frame of a lens does not know."""
+    record, size = work.record, work.record.wafer
+    alone = all(record.furnished(part) for part in record.lens) and not record.cell
+    alone &= record.die is None and record.into is None and not (size and size.marks)
+    if work.process.tone == "negative" and not alone:
+        raise ProcessError(
+            "tone = 'negative' draws the die around each lens: need lenses that are furnished, and no [die], [[cell]], "
+            "[into] or wafer.marks"
+        )
+
+
 def _whole(work: Work) -> Assembly:
     """The die of the record, or its wafer."""
     record = work.record
+    _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
     placed = [joined.Placing(standing.lens_part(work, part), part.at) for part in record.lens]

@@ -7,6 +7,7 @@ from typing import Any
 
 import tyro
 
+from layout.commands.validate import Finding, validate
 from layout.files import MaskContent, mapped
 from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis_bytes
@@ -28,6 +29,8 @@ class Options(Common):
         ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
         most_shapes: shapes that the mask may hold when its arrays are taken apart, some 150 bytes of memory for each;
             left out: 4 million, and four more for each byte of the file.
+        strict: also what readers let pass and a mask shop might not: names of cells, one top cell, doubled vertices,
+            strict tables and the checksum of OASIS.
     """
 
     mask: tyro.conf.Positional[Path]
@@ -35,6 +38,7 @@ class Options(Common):
     output: MaybeOutput = None
     ignore: tuple[int, ...] = ()
     most_shapes: int | None = None
+    strict: bool = False
 
 
 def run(options: Options) -> int:
@@ -50,8 +54,11 @@ def run(options: Options) -> int:
         found = foreign.check(content, process.rules, skip=skip, most=most)
         if draft is not None:
             markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
-    options.console.result(_values(found), _text(options.mask, found))
-    return 0 if found.ok else 1
+        form = validate(options.mask, content) if options.strict else []
+    told = "".join(f"\n  form: {finding.text}" for finding in form)
+    values = _values(found) | ({"form": [finding.text for finding in form]} if options.strict else {})
+    options.console.result(values, _text(options.mask, found, form) + told)
+    return 0 if found.ok and not form else 1
 
 
 def read(path: Path, most: int | None = None) -> MaskContent:
@@ -76,8 +83,9 @@ def _values(found: DrcReport) -> dict[str, Any]:
     }
 
 
-def _text(path: Path, found: DrcReport) -> str:
+def _text(path: Path, found: DrcReport, form: list[Finding]) -> str:
     broken = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
+    broken += f"{', ' if broken else ''}{len(form)} of form" if form else ""
     verdict = f"FAILS: design rules broken: {broken}" if broken else "keeps the design rules"
     lines = [
         f"{path}: {verdict}",

@@ -32,8 +32,10 @@ class Finding:
     text: str
 
 
-def validate(path: str | Path) -> list[Finding]:
+def validate(path: str | Path, content: MaskContent | None = None) -> list[Finding]:
     """All findings about a GDSII or OASIS file, told apart by its first bytes; an empty list is a clean file.
+
+    content: what was read of it, where it was read already.
 
     Raises:
         MaskFileError: an empty file.
@@ -42,7 +44,8 @@ def validate(path: str | Path) -> list[Finding]:
     data = mapped(path)
     oasis = data[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
     try:
-        content = oasis_read.read(path) if oasis else gdsii_read.read(path)
+        if content is None:
+            content = oasis_read.read(path) if oasis else gdsii_read.read(path)
     except MaskFileError as error:
         return [Finding(_offset(error), str(error))]
     own = _oasis(path, data) if oasis else _gdsii(content, data)

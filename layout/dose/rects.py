@@ -121,20 +121,6 @@ def _free(boxes: Array, starts: Array, near: Array, least: float, step: float, p
     return count
 
 
-def of_boxes(points_um: Array, boxes_um: Array, point: PointExposure) -> Array:
-    """(n,) exposure at points by boxes of unit dose: products of error functions, exact."""
-    from scipy.special import erf
-
-    total = np.zeros(len(points_um))
-    for width, weight in zip(point.widths_um, point.weights, strict=True):
-        part = np.ones((len(points_um), len(boxes_um)))
-        for axis in (0, 1):
-            at = points_um[:, None, axis]
-            part *= (erf((boxes_um[:, axis + 2] - at) / width) - erf((boxes_um[:, axis] - at) / width)) / 2
-        total += weight * part.sum(-1)
-    return total
-
-
 def samples(rects: Rects, step_um: float) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the rectangle of each (n,)."""
     box = rects.box_um

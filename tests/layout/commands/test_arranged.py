@@ -173,6 +173,28 @@ def test_doses_of_lenses_and_their_surroundings_are_corrected_each(folder, tmp_p
     assert "backscatter of one that the doses of the other do not know of" in capsys.readouterr().out
 
 
+def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(folder, tmp_path, capsys):
+    (folder / "negative.toml").write_text('tone = "negative"\n[die]\nmargin_um = 330\nverniers = false\n')
+    words = [
+        "layout",
+        str(folder / "arrangement.toml"),
+        "--process",
+        str(folder / "negative.toml"),
+        "--oasis",
+        "--quiet",
+    ]
+    one = '[[lens]]\nfile = "b.h5"\nname = "B"\n'
+    for text in (
+        one + "furnished = false\n",
+        one + '[[cell]]\nfile = "pads.gds"\nname = "P"\n',
+        one + "furnished = true\n[die]\nsize_um = [900, 800]\n",
+        one + '[into]\nfile = "pads.gds"\n',
+    ):
+        (folder / "arrangement.toml").write_text(text)
+        assert cli.main([*words, "-o", str(tmp_path / "n")]) == 2
+        assert "need lenses that are furnished" in capsys.readouterr().err
+
+
 def test_bad_arrangements_are_refused_by_file_and_key(folder, tmp_path, capsys):
     for text, said in (
         ('name = "X"\n', "need a [[lens]] or a [[cell]]"),

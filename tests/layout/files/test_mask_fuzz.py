@@ -1,5 +1,6 @@
 """Broken mask files: a typed error that names the byte, or a clean read; never a crash, a hang, or another error."""
 
+import json
 import signal
 
 import numpy as np
@@ -7,8 +8,11 @@ import pytest
 
 import layout
 from layout.commands.validate import validate
+from layout.files import Assembly, CellContent
+from layout.gdsii import assemble
 from layout.gdsii import read as gdsii_read
 from layout.oasis import read as oasis_read
+from metalens import cli
 from metalens.ground.errors import MaskFileError
 
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
@@ -147,3 +151,20 @@ def test_the_validator_says_what_is_wrong(plan, tmp_path):
     other.write(str(tmp_path / "k.gds"))
     texts = [finding.text for finding in validate(tmp_path / "k.gds")]
     assert any("top cells" in text for text in texts)
+
+
+def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
+    path = tmp_path / "m.oas"
+    layout.write_oasis(plan, path)
+    words = ["check", str(path), "--strict", "--json"]
+    first = cli.main(words)
+    values = json.loads(capsys.readouterr().out)
+    assert values["form"] == []
+    assert first == (0 if values["ok"] else 1)
+    square = np.array([[0, 0], [900, 0], [900, 900], [0, 900]])
+    both = {name: CellContent(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
+    assemble.write(Assembly("LIB", both, {}), tmp_path / "m.gds")
+    assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
+    told = capsys.readouterr().out
+    assert "1 of form" in told.splitlines()[0]
+    assert "form: 2 top cells (ONE, TWO), need one" in told
