@@ -128,7 +128,7 @@ def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:
     good = [run for run in runs if "inside" in run and not run["problems"]]
     if not good:
         return []
-    seconds = float(np.mean([run["seconds"] for run in good]))
+    seconds = float(np.mean([run.get("seconds", math.nan) for run in good]))
     head = f"{len(runs)} hidden lenses, {case}"
     names = list(good[0]["inside"])
     every = [run["inside"][name] for run in good for name in names]
@@ -148,13 +148,14 @@ def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:
 
 def _fault_row(name: str, run: dict[str, Any]) -> Row:
     """Share of the parameters outside their intervals, and what is said: found, or that it would not be seen."""
+    seconds = run.get("seconds", math.nan)
     if "inside" not in run or run["problems"]:
-        return Row(f"fault: {name}", "refused", run["seconds"], 0.0, "truth", goal="found, inside, or refused")
+        return Row(f"fault: {name}", "refused", seconds, 0.0, "truth", goal="found, inside, or refused")
     outside = 1 - float(np.mean(list(run["inside"].values())))
     cause = DECLARED.get(name.split(" ")[0], name)
     said = any(cause in words for words in run.get("declared", ()))
     told = "found" if run["words"] else "said to be taken for others" if said else "silent"
-    return Row(f"fault: {name}", told, run["seconds"], outside, "truth", goal="found, inside, or refused")
+    return Row(f"fault: {name}", told, seconds, outside, "truth", goal="found, inside, or refused")
 
 
 def _stored(case: str) -> dict[str, Any]:
@@ -168,18 +169,23 @@ def _keep(case: str, key: str, run: dict[str, Any]) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Fit what is missing until the time is up."""
+    """Fit what is missing until the time is up; ``--untimed`` on a busy machine: seconds are not kept."""
+    drop = ("seconds", "wall_seconds") if "--untimed" in words else ()
+
+    def keep(case: str, key: str, run: dict[str, Any]) -> None:
+        _keep(case, key, {name: value for name, value in run.items() if name not in drop})
+
     minutes = float(words[words.index("--minutes") + 1]) if "--minutes" in words else math.inf
     count = next((int(w) for w in words if w.isdigit()), 20)
     end = time.monotonic() + 60 * minutes
     if "faults" in words:
         for name, fault in FAULTS.items():
             if name not in _stored("faults") and time.monotonic() < end:
-                _keep("faults", name, study("small", 0, fault))
+                keep("faults", name, study("small", 0, fault))
     for case in CASES:
         for seed in range(count if case in words else 0):
             if str(seed) not in _stored(case) and time.monotonic() < end:
-                _keep(case, str(seed), study(case, seed))
+                keep(case, str(seed), study(case, seed))
 
 
 if __name__ == "__main__":

@@ -141,3 +141,29 @@ def test_the_density_of_a_parabola_is_the_normal_one_and_of_a_bent_profile_two_h
     assert left == pytest.approx(right, rel=1e-12)  # two sigma of its own side each
     assert left / middle == pytest.approx(math.exp(-2), rel=1e-12)
     assert middle == pytest.approx(2 / (1.4 * math.sqrt(2 * math.pi)), rel=0.014)
+
+
+def test_a_profile_ends_right_where_the_slopes_of_the_mode_have_turned_round():
+    """Two amplitudes turned by 0.45 x, and x itself on a third picture: whatever x, the two fit, so that its profile is
+    that of the third alone; at its ends the slopes of the others point 100 degrees from those at the mode."""
+    turn, shapes = 0.45, np.linalg.qr(np.random.default_rng(3).standard_normal((3 * 11 * 13, 3)))[0].T
+    shapes = shapes.reshape(3, 3, 11, 13)
+
+    def turned(x, jacobian):
+        c, s = math.cos(turn * x[0]), math.sin(turn * x[0])
+        first, second = c * x[1] - s * x[2], s * x[1] + c * x[2]
+        image = first * shapes[0] + second * shapes[1] + 0.35 * x[0] * shapes[2]
+        by_x = turn * (-second * shapes[0] + first * shapes[1]) + 0.35 * shapes[2]
+        slopes = by_x, c * shapes[0] + s * shapes[1], -s * shapes[0] + c * shapes[1]
+        return image, np.stack(slopes) if jacobian else None
+
+    mode = np.array([0.3, 7.0, -4.0])
+    seen = data(turned(mode, False)[0])
+    exact = dataclasses.replace(seen, electrons=turned(mode, False)[0])
+    found, better = profile(Valley(turned, exact, mode, Prior.none(mode)), 0)
+    reach = REACH * NOISE / 0.35
+    assert turn * reach > math.radians(90)
+    assert better is None
+    assert (found.low, found.high) == pytest.approx(
+        (mode[0] - reach, mode[0] + reach), abs=0.05 * reach
+    )  # 0.08 of 1.96
