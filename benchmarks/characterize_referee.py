@@ -154,7 +154,7 @@ def _fault_row(name: str, run: dict[str, Any]) -> Row:
     outside = 1 - float(np.mean(list(run["inside"].values())))
     cause = DECLARED.get(name.split(" ")[0], name)
     said = any(cause in words for words in run.get("declared", ()))
-    told = "found" if run["words"] else "said to be taken for others" if said else "silent"
+    told = "found" if run["words"] else "said to be taken for others" if said else "silent" if outside else "inside"
     return Row(f"fault: {name}", told, seconds, outside, "truth", goal="found, inside, or refused")
 
 
