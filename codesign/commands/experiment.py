@@ -83,7 +83,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
     per = [_per_subject(r) for r in results]
     rows = []
     for result, means in zip(results, per, strict=True):
-        row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs}
+        row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs, **_beyond(result)}
         for quantity, values in means.items():
             row[quantity] = float(values.mean())
             if len(values) > 1:
@@ -100,6 +100,28 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
     about = {"subjects": config.subjects, "frames": config.frames, "seed": config.seed, "share": config.share,
              "points": config.points, "fixation_deg": config.fixation_deg}  # fmt: skip
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
+
+
+def _beyond(result: Result) -> dict[str, Any]:
+    """Slippages that training never saw, how far it saw, and the axial error where it did."""
+    within = result.within
+    if within.all():
+        return {}
+    axial, slips = result.slip_error_mm[:, 2], np.unique(result.trial.slip_mm[~within], axis=0)
+    return {
+        "trained_to_mm": list(result.reach_mm), "beyond_training_mm": slips.tolist(),
+        "slip_axial_within_mm": float(axial[within].mean()), "slip_axial_beyond_mm": float(axial[~within].mean()),
+    }  # fmt: skip
+
+
+def _of_reach(row: dict[str, Any]) -> str:
+    """A sentence of :func:`_beyond`."""
+    far = ", ".join("(" + ", ".join(f"{v:g}" for v in slip) + ")" for slip in row["beyond_training_mm"])
+    seen = ", ".join(f"{v:g}" for v in row["trained_to_mm"])
+    return (
+        f"{row['name']}: trained on slippage up to ({seen}) mm; {far} mm lie outside of what it saw: axial error "
+        f"{row['slip_axial_beyond_mm']:.2f} mm there, {row['slip_axial_within_mm']:.2f} mm within (scenes.slip_mm)"
+    )
 
 
 def _per_subject(result: Result) -> dict[str, Any]:
@@ -134,6 +156,7 @@ def table(values: dict[str, Any]) -> str:
     for r in values["ratios"]:
         low, high = r["interval"]
         lines.append(f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]")
+    lines += [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
     for name, found in values.get("images", {}).items():
         lines.append(f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}")
     return "\n".join(lines)
@@ -184,7 +207,9 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
         report.KeyFigure(f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°")
         for r in values["runs"]
     ]
-    sections = [report.Section("Numbers", _told(values["settings"]), tables), report.Section("Figures", "", figures)]
+    reach = [f"{_of_reach(r)}." for r in values["runs"] if "beyond_training_mm" in r]
+    words = " ".join([_told(values["settings"]), *reach])
+    sections = [report.Section("Numbers", words, tables), report.Section("Figures", "", figures)]
     report.write(path, "Virtual experiment", sections, key_figures=keys)
 
 

@@ -111,7 +111,8 @@ class Result:
 
     slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
     calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where the
-    regressor is told the true slippage: what the reading of the pupil alone leaves.
+    regressor is told the true slippage: what the reading of the pupil alone leaves. reach_mm: largest slippage along x,
+    y, z that the run's training saw.
     """
 
     name: str
@@ -123,6 +124,12 @@ class Result:
     gaze_deg: Array
     predicted_deg: Array
     told_deg: Array
+    reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+
+    @property
+    def within(self) -> Array:
+        """(n,) frames whose slippage training saw."""
+        return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
 
     def gaze(self, kind: str) -> float:
         """Mean gaze error over the judged frames of a group, deg."""
@@ -264,7 +271,8 @@ def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config
     predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig)
     told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=rig)
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
-    return Result(name, float(source.row["mmacs"]), trial, slip, centre, iou, error, predicted, told_error)
+    mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
+    return Result(name, mmacs, trial, slip, centre, iou, error, predicted, told_error, reach)
 
 
 def calibrated(

@@ -116,6 +116,9 @@ class BlurBranch(nn.Module):
 
     depth: (batch, 2, GRID, GRID) vergence in units of :data:`VERGENCE_UNIT_PER_M` about :data:`VERGENCE_PER_M`, and
     the logarithm of its standard deviation. features: (batch, SLIP_FEATURES) for the slippage.
+
+    A PSF differs from window to window of the field, so every window weighs the spectra that the first layer has
+    learned by gains and offsets of its own; they cost next to nothing.
     """
 
     place: Tensor
@@ -125,6 +128,8 @@ class BlurBranch(nn.Module):
         super().__init__()
         self.norm = norm
         self.first = nn.Conv2d(FEATURES + PLACES, HIDDEN[0], 1)
+        self.gain = nn.Parameter(torch.ones(HIDDEN[0], GRID, GRID))
+        self.offset = nn.Parameter(torch.zeros(HIDDEN[0], GRID, GRID))
         self.second = nn.Conv2d(HIDDEN[0], HIDDEN[1], 1)
         self.depth = nn.Conv2d(HIDDEN[1], 2, 1)
         line = torch.linspace(-1, 1, GRID)
@@ -135,7 +140,8 @@ class BlurBranch(nn.Module):
         power, mean = spectra(frames)
         told = self.norm(torch.cat([torch.log(power + FLOOR), mean], 1))
         told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
-        depth = self.depth(F.hardswish(self.second(F.hardswish(self.first(told)))))
+        seen = F.hardswish(self.first(told) * self.gain + self.offset)
+        depth = self.depth(F.hardswish(self.second(seen)))
         spread = depth[:, 1].clamp(-3, 2)
         depth = torch.stack([depth[:, 0], spread], 1)
         trust = torch.exp(-2 * spread)

@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
 from codesign.adapt import train as retraining
+from codesign.commands import experiment as command
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentConfig, Trial
 from codesign.eye import population as eye
@@ -144,11 +145,32 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     told = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in told["runs"]] == ["run 1", "run 2"]
     assert all(r["ratio"] == 1.0 for r in told["ratios"])  # the same run twice, the same noise
+    first = told["runs"][0]
+    assert first["trained_to_mm"] == [2.0, 1.5, 3.5]
+    assert first["beyond_training_mm"] == [[-5, 0, 0], [-2.5, 0, 0], [0, 0, -5], [0, 0, 5]]
+    assert "(0, 0, 5) mm lie outside of what it saw" in (out / "report.html").read_text()
     assert {p.name for p in out.iterdir()} >= {"experiment.json", "samples.png", "ambiguity.png", "errors.png"}
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
     assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
     assert "is no run folder" in capsys.readouterr().err
+
+
+def test_slippage_beyond_training_is_told_apart():
+    """Errors of 0.2 mm where training saw the slip and of 0.7 mm beyond, to either side and along either axis."""
+    config = replace(SMALL, subjects=1, axial_mm=(-3.0, 1.5, 2.5), lateral_mm=(-4.0,))
+    trial = _trial(config, 1)
+    off = np.where((trial.slip_mm[:, 2] == -3.0) | (trial.slip_mm[:, 0] == -4.0), 0.7, -0.2)
+    read = trial.slip_mm + np.stack([0 * off, 0 * off, off], 1)
+    blank = np.zeros((len(off), 2))
+    made = experiment.Result("a", 1.0, trial, read, blank, off, off, blank, off, (3.9, 1.0, 2.5))
+    found = command._beyond(made)
+    assert found["beyond_training_mm"] == [[-4.0, 0.0, 0.0], [0.0, 0.0, -3.0]]
+    assert found["slip_axial_within_mm"] == pytest.approx(0.2)
+    assert found["slip_axial_beyond_mm"] == pytest.approx(0.7)
+    said = command._of_reach({"name": "a", **found})
+    assert said.startswith("a: trained on slippage up to (3.9, 1, 2.5) mm; (-4, 0, 0), (0, 0, -3) mm lie outside")
+    assert command._beyond(replace(made, reach_mm=(4.0, 0.0, 3.0))) == {}
 
 
 def test_places_that_cover_a_plane_are_each_the_farthest_from_all_before():
