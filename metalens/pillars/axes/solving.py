@@ -20,6 +20,7 @@ from metalens.pillars.sweep import Journal
 
 FIRST, MOST, ADDED = 7, 19, 2  # nodes along an axis: to begin with, at most, and more a round
 COARSEST = 5  # orders of the truncation
+MOST_ERROR = 2.0  # of an amplitude within 1
 LOOK = 61  # places along an axis where the interpolations are compared in between
 LEFT_OUT = 0.03  # of the pairs that may stay above the tolerance (resonances) when the search ends
 SOLVER_SHARE = 0.6  # of the tolerance, for the solver
@@ -104,7 +105,7 @@ def sweep(
         made = surface((x, y), values, places, tolerance=settings.tolerance)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
         wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
-        bar = wide * made.doubt + _carried((x, y), bars, places, made.value)
+        bar = np.minimum(wide * made.doubt + _carried((x, y), bars, places, made.value), MOST_ERROR)
         row, column = _spread(places)
         judged[:, 3] = bar[row, column]
         t.append(made.value.reshape(*made.doubt.shape, 2, 2))
