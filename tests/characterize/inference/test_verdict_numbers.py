@@ -1,0 +1,52 @@
+"""What a verdict counts: intervals over 3.92, products of neighbouring frames over their own scatter."""
+
+import numpy as np
+import pytest
+
+from characterize.inference import verdict
+from characterize.model import PARAMETERS, PLACE
+
+RNG = np.random.default_rng(41)
+
+
+def test_a_cause_is_known_to_its_interval_over_3_92():
+    """Known where that is within the scale of the parameter, wherever it lies; else from the prior, or only loosely."""
+    scale = {name: PARAMETERS[PLACE[name]].scale for name in ("bias_nm", "height_nm", "index")}
+    names = ("bias_nm", "log_gain", "height_nm", "index")
+    sigma = np.array([0.5 * scale["bias_nm"], 9.0, 1.1 * scale["height_nm"], 1.2 * scale["index"]])
+    middle = np.array([37.0 * scale["bias_nm"], 2.0, -61.0 * scale["height_nm"], 0.3])
+    said = verdict.process_verdict(
+        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.69, 0.71])
+    )
+    assert said.startswith(f"the process is known to bias_nm +- {sigma[0]:.2g};")
+    low, high = middle[2] - 1.96 * sigma[2], middle[2] + 1.96 * sigma[2]
+    assert f"loosely: height_nm {low:.3g} to {high:.3g}" in said
+    assert said.endswith("from prior knowledge only: index")
+    assert "log_gain" not in said
+    sigma[2] = 0.98 * scale["height_nm"]
+    said = verdict.process_verdict(names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.8, 0.7]))
+    assert f"height_nm +- {sigma[2]:.2g}" in said
+    assert "loosely: index" in said
+
+
+@pytest.mark.parametrize("frames", [2, 5])
+def test_products_of_neighbouring_frames_scatter_by_one_about_nothing(frames):
+    """Unit noise a pixel with shares of dark and flat that all frames have in common; 600 draws: 0.041 and 0.029."""
+    shape = (frames, 9, 11)
+    dark, flat = RNG.uniform(0.2, 0.5, shape), RNG.uniform(0.1, 0.4, shape)
+    masked = RNG.uniform(size=shape) < 0.1
+    found = []
+    for _ in range(600):
+        one, two = RNG.standard_normal((2, 1, 9, 11))
+        own = np.sqrt(1 - dark**2 - flat**2) * RNG.standard_normal(shape)
+        found.append(verdict._from_frame_to_frame(np.where(masked, 0.0, own + dark * one + flat * two),
+                                                  dark * ~masked, flat * ~masked))  # fmt: skip
+    assert np.mean(found) == pytest.approx(0, abs=0.2)
+    assert np.std(found) == pytest.approx(1, abs=0.13)
+
+
+def test_products_of_neighbouring_pixels_are_over_the_root_of_their_number():
+    one, other = RNG.standard_normal((2, 3, 8, 10))
+    one[0, :2], other[1, 3] = 0.0, 0.0
+    want = [(a * b).sum() / np.sqrt(n) for a, b, n in zip(one, other, (60, 70, 80), strict=True)]
+    assert verdict._together(one, other) == pytest.approx(want, rel=1e-12)
