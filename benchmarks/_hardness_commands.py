@@ -28,7 +28,7 @@ OPTICS = (
     "[axial]\ncount = 3\nangles_deg = [0.0]\nbinnings = [1]\nwindow_um = 48.0\n[scenes]\ncount = 1\npixels = 32\n"
     "window_um = 48.0\npitch_um = 12.0\n"
 )
-PLAN = "aperture_mm = 0.05\nstacks = {}\nframes = 5\n[task]\nscenes = 1\npixels = 16\nmargin = 4\n"
+PLAN = "aperture_mm = 0.0{}\nstacks = 4\nframes = 5\n[task]\nscenes = 1\npixels = 16\nmargin = 4\n"
 CHAIN = "cell = 'cell{0}.toml'\ndesign = 'design{0}.toml'\nprocess = 'process.toml'\nbudget = false\n"
 RUN = """preset = "smoke"
 checkpoint_every = 1
@@ -196,7 +196,7 @@ def inputs(folder: Path, verbs: tuple[str, ...]) -> Iterator[str]:
         texts[f"wide{i}.toml"] = DESIGN.format(0.06 + 0.01 * i)
         texts |= {f"scene{i}.toml": FRAME.format(pixels), f"study{i}.toml": STUDY.format(pitch)}
         texts |= {f"truth{i}.toml": f"depths_um = [16000.0, 20000.0, 30000.0]\nseed = {i}\n{CAMERA}"}
-        texts |= {f"plan{i}.toml": PLAN.format(4 + i), f"run{i}.toml": RUN.format(3 + i)}
+        texts |= {f"plan{i}.toml": PLAN.format(5 + i), f"run{i}.toml": RUN.format(3 + i)}
         texts |= {f"chain{i}.toml": CHAIN.format(i), f"rules{i}.toml": f"[rules]\nminimum_gap_nm = {200 + i}\n"}
     for name, text in texts.items():
         (folder / name).write_text(text)
