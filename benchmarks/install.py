@@ -29,7 +29,7 @@ EXTRAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "optics": (("cv2", "OCP"), ("design design.toml -o lens.h5", "psf lens.h5 -o psf.h5 --tolerance 1e-3")),
-    "bench": (("OCP",), ("design design.toml -o lens.h5", "capture lens.h5 -o shots", "measure shots -o measured")),
+    "bench": (("OCP",), ("design design.toml -o lens.h5", "capture lens.h5 --truth truth.toml -o shots", "measure shots -o measured")),
     "codesign": (("OCP",), ("scene -o scene",)),
     "cad": (("torch",), ("design design.toml -o lens.h5", "layout lens.h5 -o mask --step")),
 }
@@ -38,6 +38,7 @@ DESIGN = (
     'profile = "hyperbolic"\naperture_mm = 0.02\nwavelength_nm = 850.0\n'
     "sensor_distance_mm = 0.2\nsource_distance_mm = 20.0\n"
 )
+TRUTH = "depths_um = [400.0, 900.0, 3000.0]\nseed = 3\n"
 
 
 def rows() -> list[Row]:
@@ -75,6 +76,7 @@ def _run(home: Path, words: list[str]) -> bool:
     """Whether a command succeeds in the folder of an environment."""
     (home / "cell.toml").write_text(CELL, encoding="utf-8")
     (home / "design.toml").write_text(DESIGN, encoding="utf-8")
+    (home / "truth.toml").write_text(TRUTH, encoding="utf-8")
     return subprocess.run(words, cwd=home, env=_clean(), capture_output=True, check=False).returncode == 0
 
 
