@@ -29,7 +29,10 @@ EXTRAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "optics": (("cv2", "OCP"), ("design design.toml -o lens.h5", "psf lens.h5 -o psf.h5 --tolerance 1e-3")),
-    "bench": (("OCP",), ("design design.toml -o lens.h5", "capture lens.h5 --truth truth.toml -o shots", "measure shots -o measured")),
+    "bench": (
+        ("OCP",),
+        ("design design.toml -o lens.h5", "capture lens.h5 --truth truth.toml -o shots", "measure shots -o measured"),
+    ),
     "codesign": (("OCP",), ("scene -o scene",)),
     "cad": (("torch",), ("design design.toml -o lens.h5", "layout lens.h5 -o mask --step")),
 }

@@ -67,7 +67,7 @@ def _site():
     ("name", "row"),
     [
         ("DESIGN.toml", "| `aperture_mm` | number | `1.0` | diameter of the round aperture, up to 10 |"),
-        ("PSF.toml", "| `window_um` | number | `144.0` | of the square window that follows the chief ray |"),
+        ("PSF.toml", "| `tolerance` | number | `0.0001` | relative L2 error of the PSFs |"),
     ],
 )
 def test_a_settings_page_shows_a_key_with_kind_default_and_text(name, row):

@@ -3,7 +3,13 @@
 from pathlib import Path
 
 from characterize.inference import asbuilt
+from metalens.lens import Lens
 from metalens.psf import PsfStack, View
+
+
+def design(path: Path) -> Lens:
+    """The lens that was to be made."""
+    return asbuilt.load(path).design
 
 
 def stack(path: Path, view: View, tolerance: float) -> PsfStack:

@@ -22,7 +22,9 @@ from metalens.ground.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
 from metalens.psf import plots as psf_plots
 
-SOURCES: dict[str, str] = {}  # module with ``stack(path, view, tolerance)`` by kind of file, filled by the command line
+SOURCES: dict[
+    str, str
+] = {}  # module with ``design(path)``, ``stack(path, view, tolerance)`` by kind, filled by the command line
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
     "montage": "PSFs over depth (across) and field angle (down); square root of intensity.",
@@ -43,13 +45,14 @@ class Options(Common):
         lens: lens.h5, or asbuilt.h5 for the lens that was made (its process and wave front included).
         output: the PSF file to write, .h5 (which all other commands read), .tif, .mat or .fits; plots are written
             beside it as NAME_xz.png and so on.
-        config: PSF.toml with any of the settings below, own_cell, [[layers.front]] and [[layers.behind]]; without it 16
-            to 26 mm in steps of 0.5 mm at 0, 10 and 20 degrees. What follows stands in place of the file's.
-        depths_mm: nearest and farthest source, and the largest step between depths.
+        config: PSF.toml with any of the settings below, own_cell, [[layers.front]] and [[layers.behind]]. What follows
+            stands in place of the file's.
+        depths_mm: nearest and farthest source, and the largest step between depths; left out: 21 depths about the
+            focus of this lens, to 1.75 waves out of focus.
         sources_mm: the depth of every source, in place of depths_mm; inf for a plane wave.
         angles_deg: field angles along x; the image of a positive angle lies at +x.
         angles_y_deg: field angles along y (down), one for each of angles_deg.
-        window_um: full width along x of the window about the chief ray.
+        window_um: full width along x of the window about the chief ray; left out: what the blur of this lens needs.
         samples: samples along the window's width.
         height_um: height of the window, of samples as far apart; 0 for a square.
         offset_um: x and y from the chief ray to the window's middle.
@@ -103,11 +106,14 @@ def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
     settings = options.settings
     psf_export.check(options.output)
+    made, kind = _read(options.lens)
+    made = made if settings.layers is None else replace(made, layers=settings.layers)
+    settings = settings.about(made)
     target, view = options.output, settings.view
     pixels = len(view.depths_um) * len(view.angles_rad) * settings.samples * settings.samples_y
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
-        stack = _make(options, settings, draft.path)
+        stack = _make(options, settings, made if kind == "lens" else None, draft.path)
     shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
@@ -115,9 +121,18 @@ def run(options: Options) -> int:
     return 0 if stack.converged else 1
 
 
-def _make(options: Options, settings: Settings, path: Path) -> psf.PsfStack:
+def _read(path: Path) -> tuple[lens.Lens, str]:
+    """The lens of a file, and the file's kind; of another kind that the command line knows, its design."""
+    kind = store.load(path).kind
+    if kind in SOURCES:
+        found: lens.Lens = importlib.import_module(SOURCES[kind]).design(path)
+        return found, kind
+    return lens.load(path), kind
+
+
+def _make(options: Options, settings: Settings, made: lens.Lens | None, path: Path) -> psf.PsfStack:
     """Compute, write, draw."""
-    stack = _stack(options.lens, settings)
+    stack = _of_design(options.lens, settings, made) if made is not None else _of_made(options.lens, settings)
     psf_export.write(path, stack)
     pictures = psf_plots.pictures(stack)
     for name, image in pictures.items():
@@ -127,30 +142,25 @@ def _make(options: Options, settings: Settings, path: Path) -> psf.PsfStack:
     return stack
 
 
-def _stack(path: Path, settings: Settings) -> psf.PsfStack:
-    """PSFs of a lens file, or of another kind of file that the command line knows a source for."""
-    kind, provenance = store.load(path).kind, Provenance(config.dumps(settings), {path.name: store.sha256(path)})
-    if kind in SOURCES:
-        for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
-            if getattr(settings, name):
-                raise ConfigError(
-                    f"{path}: {name} is for a design; this {kind} file has the wavelength and layers that were fitted"
-                )
-        if settings.polarisation == "vector":
-            raise ConfigError(f"{path}: polarisation = 'vector' is for a design; a {kind} file is one scalar")
-        found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
-        return replace(found, provenance=provenance)
-    made = lens.load(path)
+def _of_made(path: Path, settings: Settings) -> psf.PsfStack:
+    """PSFs of a kind of file that the command line knows a source for."""
+    kind = store.load(path).kind
+    for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
+        if getattr(settings, name):
+            raise ConfigError(
+                f"{path}: {name} is for a design; this {kind} file has the wavelength and layers that were fitted"
+            )
+    if settings.polarisation == "vector":
+        raise ConfigError(f"{path}: polarisation = 'vector' is for a design; a {kind} file is one scalar")
+    found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
+    return replace(found, provenance=_provenance(path, settings))
+
+
+def _of_design(path: Path, settings: Settings, made: lens.Lens) -> psf.PsfStack:
+    """PSFs of a lens file, for the polarisation that is asked for."""
     if settings.light != "both" and made.pairs is None:
         raise ConfigError(f"{path}: light = {settings.light!r} is for pillars of two sizes; these treat x and y alike")
-    if settings.layers is not None:
-        made = replace(made, layers=settings.layers)
-    inputs = dict(provenance.inputs) | {file.name: store.sha256(file) for file in settings.spectrum if file.is_file()}
-    return _seen(made, settings, replace(provenance, inputs=inputs))
-
-
-def _seen(made: lens.Lens, settings: Settings, provenance: Provenance) -> psf.PsfStack:
-    """PSFs for the polarisation that is asked for."""
+    provenance = _provenance(path, settings)
     if made.pairs is None:
         return _from_lens(made, settings, provenance)
     if settings.light != "both":
@@ -171,6 +181,11 @@ def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> p
         polarisation=settings.polarisation,
         left_out=_own_cell(made, settings) if settings.own_cell else None,
     )
+
+
+def _provenance(path: Path, settings: Settings) -> Provenance:
+    files = [path, *(file for file in settings.spectrum if file.is_file())]
+    return Provenance(config.dumps(settings), {file.name: store.sha256(file) for file in files})
 
 
 def _own_cell(made: lens.Lens, settings: Settings) -> psf.LeftOut:

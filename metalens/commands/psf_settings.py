@@ -1,7 +1,7 @@
 """Settings of ``metalens psf``: depths, angles, window, source and spectrum, from a file or from the command line."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,21 +10,24 @@ import numpy as np
 from metalens import lens, propagate, psf
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
-from metalens.lens import Layers
+from metalens.lens import Layers, reach
 from metalens.psf import spectrum as spectra
 
 MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
+AIRY, BLURS = 28.0, 8.0  # width of a window in units of wavelength / NA, and of the blur's radius
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
     """What is computed; kept in the file.
 
-    depths_mm: nearest and farthest source, and the largest step between depths.
+    depths_mm: nearest and farthest source, and the largest step between depths; left out: 21 depths over which the rim
+        of this lens goes from 1.75 waves out of focus on one side to as many on the other.
     sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
     angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the image of a positive angle lies
         at +x. angles_y_deg: along y (down), one for each or none for 0.
-    window_um, samples: full width along x of the window that follows the chief ray, and samples along it.
+    window_um, samples: full width along x of the window that follows the chief ray, and samples along it; without a
+        width 28 wavelength / NA, or 8 blur radii at the worst depth where that is more.
     height_um: its height, of samples as far apart; 0 for a square window.
     offset_um: [x, y] from the chief ray to the window's middle.
     source_um: full size of an incoherent source: diameter of a disc, side of a square, full width at half maximum of a
@@ -44,11 +47,11 @@ class Settings:
         minute); without it those terms are rough, of the default cell.
     """
 
-    depths_mm: tuple[float, float, float] = (16.0, 26.0, 0.5)
+    depths_mm: tuple[float, float, float] | None = None
     sources_mm: tuple[float, ...] = field(default=(), metadata={"may_be_inf": True})
     angles_deg: tuple[float, ...] = (0.0, 10.0, 20.0)
     angles_y_deg: tuple[float, ...] = ()
-    window_um: float = 144.0
+    window_um: float | None = None
     samples: int = 192
     height_um: float = 0.0
     offset_um: tuple[float, float] = (0.0, 0.0)
@@ -72,7 +75,7 @@ class Settings:
 
     def _check_sources(self) -> None:
         """Depths, angles and the size of a source."""
-        near, far, step = self.depths_mm
+        near, far, step = self.depths_mm or (1.0, 1.0, 1.0)
         if not (0 < near <= far < np.inf and step > 0):
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
@@ -99,10 +102,15 @@ class Settings:
             )
 
     def _check_window(self) -> None:
-        if not (2 <= self.samples <= MOST_SAMPLES and 0 < self.window_um < np.inf):
+        width = 1.0 if self.window_um is None else self.window_um
+        if not (2 <= self.samples <= MOST_SAMPLES and 0 < width < np.inf):
             raise ConfigError(
                 f"samples = {self.samples}, window_um = {self.window_um}: need 2 to {MOST_SAMPLES} samples, window > 0"
             )
+        if self.window_um is None:
+            if self.height_um:
+                raise ConfigError(f"height_um = {self.height_um}: need window_um too")
+            return
         down = self.samples_y
         if not (self.height_um >= 0 and 1 <= down <= MOST_SAMPLES):
             raise ConfigError(f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples")
@@ -134,18 +142,46 @@ class Settings:
     @property
     def samples_y(self) -> int:
         """Samples along y."""
-        return round(self.height_um / self.window_um * self.samples) if self.height_um else self.samples
+        return round(self.height_um / self.width_um * self.samples) if self.height_um else self.samples
+
+    @property
+    def width_um(self) -> float:
+        """Of the window.
+
+        Raises:
+            ConfigError: it is that of a lens, and no lens was named (:meth:`about`).
+        """
+        if self.window_um is None:
+            raise ConfigError("window_um is left to the lens, and there is none")
+        return self.window_um
+
+    def about(self, made: lens.Lens) -> "Settings":
+        """These with the depths and the window of this lens where they were left out."""
+        near, far = (depth * 1e-3 for depth in reach.depth_range_um(made))
+        depths_mm = self.depths_mm or (near, far, (far - near) / 20)
+        if self.window_um is not None:
+            return replace(self, depths_mm=depths_mm)
+        ends = [z * 1e3 for z in self.sources_mm or depths_mm[:2]]
+        worst = max(reach.blur_um(made, z) for z in ends)
+        width = max(AIRY * reach.diffraction_um(made), BLURS * worst)
+        return replace(self, depths_mm=depths_mm, window_um=float(f"{width:.3g}"))
 
     @property
     def view(self) -> psf.View:
-        """Depths, angles, window and source in um and rad."""
-        near, far, step = self.depths_mm
+        """Depths, angles, window and source in um and rad.
+
+        Raises:
+            ConfigError: depths or window are those of a lens, and no lens was named (:meth:`about`).
+        """
+        if self.depths_mm is None and not self.sources_mm:
+            raise ConfigError("depths_mm are left to the lens, and there is none")
+        near, far, step = self.depths_mm or (0.0, 0.0, 1.0)
         depths = np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
         depths = (np.array(self.sources_mm) if self.sources_mm else depths) * 1e3
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
         pairs = [tuple(np.deg2rad([x, y]).tolist()) for x, y in zip(self.angles_deg, along_y, strict=True)]
         angles = tuple(propagate.angles(pair) for pair in pairs)
-        window = self.window_um, self.window_um / self.samples * self.samples_y
+        window = self.width_um, self.width_um / self.samples * self.samples_y
         return psf.View(
             tuple(depths.tolist()), angles, window, (self.samples, self.samples_y), self.offset_um, self.source
         )

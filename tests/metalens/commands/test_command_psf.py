@@ -9,6 +9,8 @@ import pytest
 from metalens import lens, propagate, psf
 from metalens.cell.record import Cell
 from metalens.cli import main
+from metalens.commands.psf import Settings
+from metalens.ground.errors import ConfigError
 from metalens.pillars.proxy import Proxy
 
 SETTINGS = """
@@ -177,3 +179,30 @@ def test_options_that_contradict_exit_2_and_write_nothing(folder, more, capsys):
     assert "metalens: error" in said
     assert any(name.strip("-").replace("-", "_") in said for name in more) or "wavelength" in said
     assert not (folder / "psf.h5").exists()
+
+
+def test_depths_and_window_that_are_left_out_follow_the_lens():
+    """Rim 12.6 um: 1.75 waves at |1/z - 1/1.3 mm| = 2 x 1.75 x 0.85 / 12.6²; 28 wavelength / NA of 120 um."""
+    made = small_lens()
+    settings = Settings(angles_deg=(0.0,)).about(made)
+    rim = made.diameters.radius_um
+    most = 2 * 1.75 * 0.85 / rim**2
+    near, far, step = settings.depths_mm
+    assert near == pytest.approx(1e-3 / (1 / 1300 + most), rel=0.05)  # two digits
+    assert far == pytest.approx(10 * near, rel=0.05)
+    assert len(settings.view.depths_um) == 21
+    assert step == pytest.approx((far - near) / 20)
+    blur = rim * 120 * (1 / (near * 1e3) - 1 / 1300)
+    assert settings.window_um == pytest.approx(max(28 * 0.85 * 120 / rim, 8 * blur), rel=5e-3)
+    near_only = Settings(sources_mm=(0.05, 2.0)).about(made)
+    assert near_only.window_um == pytest.approx(8 * rim * 120 * (1 / 50 - 1 / 1300), rel=5e-3)
+    assert Settings(window_um=9.0, depths_mm=(1.0, 2.0, 0.5)).about(made).view.window_um == (9.0, 9.0)
+
+
+def test_settings_that_wait_for_a_lens_say_so():
+    with pytest.raises(ConfigError, match="depths_mm"):
+        _ = Settings(window_um=10.0).view
+    with pytest.raises(ConfigError, match="window_um"):
+        _ = Settings(depths_mm=(1.0, 2.0, 1.0)).view
+    with pytest.raises(ConfigError, match="need window_um"):
+        Settings(height_um=10.0)
