@@ -117,6 +117,12 @@ class Bins:
 
 
 @compiled
+def _spline(off: float) -> tuple[float, float, float]:
+    """Weights of the quadratic B-spline on three pixels, the middle one's centre ``off`` pixels before the place."""
+    return 0.5 * (0.5 - off) ** 2, 0.75 - off * off, 0.5 * (0.5 + off) ** 2
+
+
+@compiled
 def _put(x: Array, y: Array, mass: Array, left: float, bottom: float, pixel: float, image: Array) -> None:
     rows, columns = image.shape
     for n in range(x.shape[0]):
@@ -125,8 +131,7 @@ def _put(x: Array, y: Array, mass: Array, left: float, bottom: float, pixel: flo
         if i < 1 or j < 1 or i > columns - 2 or j > rows - 2:
             continue
         a, b = u - i, v - j
-        wx = (0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2)
-        wy = (0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2)
+        wx, wy = _spline(a), _spline(b)
         for q in range(3):
             for p in range(3):
                 image[j - 1 + q, i - 1 + p] += mass[n] * wy[q] * wx[p]
@@ -139,8 +144,7 @@ def _take(x: Array, y: Array, left: float, bottom: float, pixel: float, image: A
         i = min(max(int(np.floor(u + 0.5)), 1), image.shape[1] - 2)
         j = min(max(int(np.floor(v + 0.5)), 1), image.shape[0] - 2)
         a, b = u - i, v - j
-        wx = (0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2)
-        wy = (0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2)
+        wx, wy = _spline(a), _spline(b)
         total = 0.0
         for q in range(3):
             for p in range(3):
