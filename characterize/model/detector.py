@@ -1,5 +1,6 @@
 """From the intensity in front of the sensor to expected electrons: source size, blur, pixel area, gain, background."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -43,17 +44,24 @@ class Grid:
         return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(columns, self.fine_um)[None]
 
     def sample(self, intensity: Array, transfer: Array) -> Array:
-        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
-        shifted = transfer if self.oversample % 2 else transfer * self._half_step()
-        blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
+        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres.
+
+        In the precision of the intensity.
+        """
+        shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
+        seen = fft.rfft2(intensity)
+        seen = seen * shifted.astype(seen.dtype)
+        blurred = fft.irfft2(seen, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
         return np.asarray(blurred[..., y, x])
 
-    def _half_step(self) -> Array:
-        """Transfer that moves the light by half a fine sample, where no fine sample sits at a pixel's centre."""
-        fy, fx = self.frequencies()
-        return np.asarray(np.exp(-1j * np.pi * (fy + fx) * self.fine_um))
+
+@functools.lru_cache(maxsize=4)
+def _half_step(grid: Grid) -> Array:
+    """Transfer that moves the light by half a fine sample, where no fine sample sits at a pixel's centre."""
+    fy, fx = grid.frequencies()
+    return np.asarray(np.exp(-1j * np.pi * (fy + fx) * grid.fine_um))
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:

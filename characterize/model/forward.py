@@ -11,10 +11,12 @@ import numpy as np
 
 from characterize.model import detector
 from characterize.model.glass import extra_path
+from characterize.model.kernel import turns
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
-from characterize.model.reduced import Bench, Operators, Reduced
+from characterize.model.reduced import Bench, Reduced
 from characterize.model.setting import Setting, spectrum, true_depth
+from characterize.model.window import Operators
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path, source_path
@@ -39,10 +41,8 @@ GEOMETRY = (
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
-_STEP: dict[str, Callable[[Bench], float]] = {
-    "distance_um": lambda bench: bench.distance_um,
-    "wavelength_nm": lambda bench: bench.wavelength_um * 1e3,
-}
+_WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
+_WAVE_STEP_NM = 0.01
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -208,21 +208,21 @@ class ForwardModel:
     ) -> tuple[Array, dict[str, Array]]:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
-        phasor = np.exp(1j * self._phase(x, group))
-        pupil, by_bias, by_answers = self._pupil(x, group, bool(names))
-        operators = self._operators(x, group)
-        field = operators.field(pupil * phasor, terms=operators.terms(self.cut))
+        kind = group.reduced.kind
+        phasor = turns(self._phase(x, group), kind)
+        pupil, by_bias, by_answers, by_wave = self._pupil(x, group, bool(names))
+        operators, lit = self._operators(x, group), pupil * phasor
+        field = operators.field(lit, terms=operators.terms(self.cut))
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
         out: dict[str, Array] = {}
         growth = self._growth(x, group)
         conjugate = field.conj()
-        lit = (pupil * phasor).astype(np.complex64)
-        short, power = phasor.astype(np.complex64), np.vdot(lit, lit)
+        power = np.vdot(lit, lit)
 
         def sampled(change: Array, more: Array | float = 0.0) -> Array:
-            """Derivative of the light; the part of a change that is the light itself needs no sum, nor loses digits."""
+            """Derivative of the light; the part of a change that is the light itself needs no sum."""
             same = np.vdot(lit, change) / power
             field = operators.field(change - same * lit, terms=operators.terms(_SLOPE_TOLERANCE)) + more
             return np.asarray(self.grid.sample(2 * (conjugate * field).real, transfer) + 2 * same.real * light)
@@ -230,15 +230,17 @@ class ForwardModel:
         for name in names:
             if name in WIDENING:
                 changed = by_bias * group.widening[WIDENING[name]]
-                out[name] = sampled(changed.astype(np.complex64) * short)
+                out[name] = sampled(changed.astype(kind) * phasor)
             elif name in ANSWERING:
-                out[name] = sampled(by_answers[ANSWERING[name]].astype(np.complex64) * short)
+                out[name] = sampled(by_answers[ANSWERING[name]] * phasor)
             elif (turning := group.turning(name)) is not None:
-                out[name] = sampled((1j * turning).astype(np.complex64) * lit)
+                out[name] = sampled((1j * turning).astype(kind) * lit)
             elif name in GEOMETRY:
-                turned = 1j * self._phase_slope(x, group, name)
-                more = self._by_operators(x, group, name) if name in _STEP else 0.0
-                out[name] = sampled(turned.astype(np.complex64) * lit, more)
+                changed = (1j * self._phase_slope(x, group, name)).astype(kind) * lit
+                if name == "wavelength_nm":
+                    changed += by_wave * phasor
+                more, level = self._by_window(x, name, operators, lit)
+                out[name] = sampled(changed, more) + level * light
                 if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
                     disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
                     out[name] = out[name] + self.grid.sample(intensity, disc)
@@ -246,37 +248,33 @@ class ForwardModel:
                 out[name] = self.grid.sample(intensity, blurs[name])
         return light, out
 
-    def _by_operators(self, x: Array, group: _Group, name: str) -> Array:
-        """Derivative of the field through the window operators, and of the pillars where the wavelength changes.
+    def _by_window(self, x: Array, name: str, operators: Operators, lit: Array) -> tuple[Array | float, float]:
+        """Derivatives of the field behind distance and wavelength's own move of the window, and of ln of the light."""
+        if name not in _WINDOW:
+            return 0.0, 0.0
+        rate, um = _WINDOW[name]
+        length = self.lens.sensor_distance_um if rate == "distance" else self.lens.wavelength_um
+        field = operators.rates(lit, rate, terms=operators.terms(_SLOPE_TOLERANCE))
+        return um * field, -2 * um / (length + um * float(x[PLACE[name]]))
 
-        By all terms: what some leave out is no smooth function of the operators.
-        """
-        step = group.reduced.small_change(self.grid.axes_um()) * _STEP[name](group.reduced.bench)
-        up = x.copy()
-        up[PLACE[name]] += step
-        phasor, pupil = np.exp(1j * self._phase(x, group)), self._pupil(x, group, False)[0]
-        moved = self._pupil(up, group, False)[0] if name == "wavelength_nm" else pupil
-        ends = self._operators(up, group).field(moved * phasor), self._operators(x, group).field(pupil * phasor)
-        return np.asarray((ends[0] - ends[1]) / step)
-
-    def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array]:
-        """(q, p) complex lens on the nodes, its derivative by the bias per um, and by units of the answering causes."""
+    def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
+        """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
+        the wavelength per nm."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
-        weight, rate = group.pillars.weights(np.clip(bias, -reach, reach))
-        gathered = group.reduced.gathered
-        r, b, shape = len(gathered), len(weight), gathered.shape[1:]
+        bias = np.clip(bias, -reach, reach).astype(np.empty(0, group.reduced.kind).real.dtype)
+        weight, rate = group.pillars.weights(bias)
         values = group.pillars.coefficients(change(x), self._lean_um)
-
-        def combine(w: Array, c: Array) -> Array:
-            return np.asarray(((c.T @ w.reshape(b, -1)).reshape(r, *shape) * gathered).sum(0))
-
-        pupil = combine(weight, values)
+        pupil = group.reduced.combined(weight, values)
         if not slopes:
-            return pupil, pupil, pupil
+            return pupil, pupil, pupil, pupil
         rows = (row for _, row in of_kind(Answers))
-        by = [combine(weight, c) * row.unit for c, row in zip(group.pillars.slopes(change(x)), rows, strict=True)]
-        return pupil, combine(rate, values), np.stack(by)
+        slopes_of = zip(group.pillars.slopes(change(x)), rows, strict=True)
+        by = [group.reduced.combined(weight, c * row.unit) for c, row in slopes_of]
+        up = x.copy()
+        up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
+        by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
+        return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
     def _phase(self, x: Array, group: _Group) -> Array:
         """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, plus aberrations."""
@@ -315,6 +313,7 @@ class ForwardModel:
             wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
             distance_um=nominal.distance_um + x[PLACE["distance_um"]],
             axes_um=self.grid.axes_um(),
+            edge_um=self.setting.margin * self.setting.pixel_um,
         )
 
     def _growth(self, x: Array, group: _Group) -> dict[str, Array]:

@@ -6,6 +6,7 @@ and q = b, or Y = 0 and p = a. The three factors are put on exactly; what the wi
 axis with the direction, is in them. The rest begins with X² q²: a window as wide as the lens is far needs few nodes.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -49,17 +50,37 @@ class Kernel:
         path = longer(r_w, X * X + Y * Y + 2 * (X * dx + Y * dy))
         return np.asarray(path), np.asarray(r_w + path)
 
-    def along_x(self, p: Array, X: Array) -> Array:
-        """exp(ik F(p, b, X, 0)); arguments broadcast."""
-        return np.asarray(np.exp(1j * self.k * self._by_x(p, X)))
-
-    def along_y(self, q: Array, Y: Array) -> Array:
-        """exp(ik F(a, q, 0, Y)); arguments broadcast."""
-        return np.asarray(np.exp(1j * self.k * self._by_y(q, Y)))
-
     def window(self, X: Array, Y: Array) -> Array:
         """exp(ik H(X, Y)); arguments broadcast."""
         return np.asarray(np.exp(1j * self.k * self._by_window(X, Y)))
+
+    def by_x(self, p: Array | float, X: Array, off_um: float = 0.0) -> Array:
+        """F(p, b, X, 0), um, with the sensor ``off_um`` farther away; arguments broadcast."""
+        return self._off(off_um).path(p, _middle(self.q), X, 0.0)[0]
+
+    def by_y(self, q: Array | float, Y: Array, off_um: float = 0.0) -> Array:
+        """F(a, q, 0, Y), um, with the sensor ``off_um`` farther away; arguments broadcast."""
+        return self._off(off_um).path(_middle(self.p), q, 0.0, Y)[0]
+
+    def _off(self, off_um: float) -> "Kernel":
+        return dataclasses.replace(self, distance_um=self.distance_um + off_um) if off_um else self
+
+    def bands(self, wy: float, wx: float) -> tuple[float, float]:
+        """(along y, along x) highest frequency, rad/um, on a window of half sides (wy, wx) of the field less the turns
+        of the middle direction (a, b): k times the most by which dF/dX and dF/dY differ from those of it."""
+        t = np.linspace(-1, 1, _COARSE)
+        Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
+        a, b = _middle(self.p), _middle(self.q)
+        by_x, by_y = self._steep(p, q, X, Y)
+        off_x, off_y = by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
+        return self.k * float(np.abs(off_y).max()), self.k * float(np.abs(off_x).max())
+
+    def _steep(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
+        """dF/dX and dF/dY: the direction cosines seen from (X, Y)."""
+        r_0 = self.nominal_um / np.sqrt(1 - np.square(p) - np.square(q))
+        off, (tx, ty) = self.distance_um - self.nominal_um, self.tangents
+        r = self.path(p, q, X, Y)[1]
+        return np.asarray((X + off * tx - r_0 * p) / r), np.asarray((Y + off * ty - r_0 * q) / r)
 
     def rest(self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64) -> Array:
         """What the three factors leave, with the amplitude, as ``kind`` complex numbers; arguments broadcast."""
@@ -88,17 +109,11 @@ class Kernel:
 
     def _left(self, p: Array, q: Array, X: Array, Y: Array) -> tuple[Array, Array]:
         path, r = self.path(p, q, X, Y)
-        return path - self._by_x(p, X) - self._by_y(q, Y) - self._by_window(X, Y), r
-
-    def _by_x(self, p: Array | float, X: Array) -> Array:
-        return self.path(p, _middle(self.q), X, 0.0)[0]
-
-    def _by_y(self, q: Array | float, Y: Array) -> Array:
-        return self.path(_middle(self.p), q, 0.0, Y)[0]
+        return path - self.by_x(p, X) - self.by_y(q, Y) - self._by_window(X, Y), r
 
     def _by_window(self, X: Array, Y: Array) -> Array:
         a, b = _middle(self.p), _middle(self.q)
-        return np.asarray(self.path(a, b, X, Y)[0] - self._by_x(a, X) - self._by_y(b, Y))
+        return np.asarray(self.path(a, b, X, Y)[0] - self.by_x(a, X) - self.by_y(b, Y))
 
 
 def turns(phase: Array, kind: Any = np.complex64) -> Array:

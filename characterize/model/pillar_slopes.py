@@ -15,7 +15,10 @@ from metalens.lens import Lens
 from metalens.made import Answers, Cause, Sensitivity, Solved, of_kind, sensitivity
 
 _NODES, _MOST = 25, 14
-_SOURCES = "metalens.cell", "metalens.modal", "metalens.rcwa", "metalens.made", "metalens.pillars", "characterize.model"
+_SOURCES = (
+    *("metalens.cell", "metalens.modal", "metalens.rcwa", "metalens.made", "metalens.pillars"),
+    *("characterize.model.solving", "characterize.model.pillar_slopes"),
+)
 
 
 def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) -> Sensitivity:

@@ -133,9 +133,9 @@ class Pillars:
         return np.where(diameter_um > 0, entry, _ENTRIES)
 
     def weights(self, bias_um: Array) -> tuple[Array, Array]:
-        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, and their derivatives."""
+        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, and their derivatives, in its precision."""
         x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
-        value = np.empty((len(self.nodes_um), *x.shape))
+        value = np.empty((len(self.nodes_um), *x.shape), x.dtype)
         slope = np.empty_like(value)
         value[0], value[1], slope[0], slope[1] = 1.0, x, 0.0, 1.0
         for n in range(2, len(value)):

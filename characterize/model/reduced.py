@@ -7,20 +7,23 @@ low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pill
 sum for every smooth f.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from characterize.model.kernel import Kernel, digits, factors, precision, turns
 from characterize.model.pillars import Pillars
+from characterize.model.window import MIXED, Operators, Ways, ways
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path, source_path
 from metalens.lens import Lens
 
-_BESIDE = 0.1  # weight of directions that miss the lens when the low-rank terms are chosen
+_BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when the low-rank terms are chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,45 +40,11 @@ class Bench:
     tangents: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Operators:
-    """From nodes to window for one wavelength and distance: along_y (Y, q), along_x (p, X), low-rank terms.
-
-    remainder: (rank,) relative size of what is left out before each term.
-    """
-
-    along_y: Array
-    along_x: Array
-    lens_terms: Array
-    window_terms: Array
-    remainder: Array
-
-    def terms(self, tolerance: float) -> int:
-        """How many terms leave a relative ``tolerance`` out."""
-        return max(1, int((self.remainder > tolerance).sum()))
-
-    def field(self, light: Array, *, terms: int | None = None) -> Array:
-        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or some."""
-        kind = self.along_y.dtype
-        out = np.zeros((*light.shape[:-2], len(self.along_y), self.along_x.shape[1]), kind)
-        light = light.astype(kind, copy=False)
-        flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
-
-        def some(first: int, last: int) -> None:
-            for lens, window in zip(self.lens_terms[:terms], self.window_terms[:terms], strict=True):
-                for i in range(first, last):
-                    result[i] += (self.along_y @ ((flat[i] * lens) @ self.along_x)) * window
-
-        with threads.one_blas_thread():
-            threads.split(len(flat), some)
-        return out
-
-
 class Reduced:
     """A lens on nodes for one field angle.
 
     nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same over the lens radius.
-    gathered: (r, q, p) one field for each function of :class:`Pillars`.
+    gathered: (r, q, p) one field for each function of :class:`Pillars`. kind: of the complex numbers.
 
     Tables and sums are in single precision where ``tolerance`` lets them be, else in double: see :func:`precision`.
     """
@@ -84,13 +53,14 @@ class Reduced:
         self, lens: Lens, pillars: Pillars, bench: Bench, *, window_um: float, depths_um: Array, tolerance: float
     ) -> None:
         self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
-        self._kind = precision(tolerance)
+        self.kind = precision(tolerance)
         self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, float, tuple[int, int]], Operators] = {}
         self._directions(depths_um)
-        self.gathered = self._gather(lens, pillars)
+        self.gathered = self._gather(lens, pillars).astype(self.kind)
+        self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
         self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
 
     def _directions(self, depths_um: Array) -> None:
@@ -115,6 +85,15 @@ class Reduced:
         r_w = d / np.sqrt(1 - self.p**2 - self.q**2)
         self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
 
+    def combined(self, weight: Array, series: Array) -> Array:
+        """(q, p) sum over r of the gathered fields times the series (b, r) in ``weight`` (b, q, p) real functions."""
+        flat, (real, imaginary) = weight.reshape(len(weight), -1), self._parts
+        c, s = (part.T.astype(weight.dtype) @ flat for part in _pair(series))
+        out = np.empty(flat.shape[1:], self.kind)
+        out.real = np.einsum("rn,rn->n", c, real) - np.einsum("rn,rn->n", s, imaginary)
+        out.imag = np.einsum("rn,rn->n", c, imaginary) + np.einsum("rn,rn->n", s, real)
+        return out.reshape(weight.shape[1:])
+
     @property
     def center_um(self) -> tuple[float, float]:
         """(x, y) of the window on the sensor at the nominal distance."""
@@ -126,18 +105,18 @@ class Reduced:
         x, y = d.x_um, d.y_um
         hy, hx = self.half_um
         n, r = self.nodes + 6, len(pillars.basis)
-        real_kind = np.empty(0, self._kind).real.dtype
+        real_kind = np.empty(0, self.kind).real.dtype
         across, along = (legendre.interpolation(n, t).astype(real_kind) for t in (x / hx, y / hy))
-        table = pillars.table().astype(self._kind)
+        table = pillars.table().astype(self.kind)
         block = max(1, 200_000 // len(x))
         parts = [slice(start, start + block) for start in range(0, len(y), block)]
-        sums = np.zeros((len(parts), r, n, n), self._kind)
+        sums = np.zeros((len(parts), r, n, n), self.kind)
 
         def some(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
                 path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
-                light = table[:, pillars.place(d.diameter_um[rows])] * turns(self.k * path, self._kind)
+                light = table[:, pillars.place(d.diameter_um[rows])] * turns(self.k * path, self.kind)
                 halves = np.concatenate([light.real, light.imag]).reshape(-1, len(x)) @ across
                 real, imaginary = along[rows].T @ halves.reshape(2, r, -1, n)
                 sums[i] = real + 1j * imaginary
@@ -163,50 +142,71 @@ class Reduced:
         centre = distance_um * tx, distance_um * ty
         return np.asarray(source_path(x, y, (tx, ty), 1 / bench.reference_um) + sensor_path(x, y, centre, distance_um))
 
-    def operators(self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
+    def operators(
+        self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array], edge_um: float = 0.0
+    ) -> Operators:
         """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples.
 
+        edge_um: width of a rim of the window where a tenfold error is allowed, since only its blur is seen.
         The last few are kept: most steps of a search move neither.
         """
         key = wavelength_um, distance_um, (len(axes_um[0]), len(axes_um[1]))
         if key not in self._operators:
             if len(self._operators) >= 6:
                 self._operators.pop(next(iter(self._operators)))
-            self._operators[key] = self._operators_of(wavelength_um, distance_um, axes_um)
+            self._operators[key] = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
         return self._operators[key]
 
-    def _operators_of(self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array]) -> Operators:
+    def _operators_of(
+        self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array], edge_um: float
+    ) -> Operators:
         kernel = Kernel(
             2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
         )
+        reach = [float(np.abs(axis).max()) for axis in axes_um]
+        bands = kernel.bands(reach[0], reach[1])
+        about: dict[str, Any] = {"k": kernel.k, "tolerance": self.tolerance}
+        y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
+        x, across = ways(kernel.by_x, self.p[0], axes_um[1], bands[1], **about)
+        terms = self._terms(kernel, (y, x), [one - edge_um for one in reach])
+        kind = self.kind
+        parts = [Ways(*(getattr(one, f.name).astype(kind) for f in dataclasses.fields(one))) for one in (down, across)]
+        return Operators(parts[0], parts[1], *(one.astype(kind) for one in terms[:3]), *terms[3:])
+
+    def _terms(self, kernel: Kernel, axes_um: tuple[Array, Array], inner_um: list[float]) -> tuple[Array, ...]:
+        """What is no product of both axes, as the last fields of :class:`Operators`; ``axes_um`` coarse."""
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
         w, m = kernel.counts(wy, wx, self.tolerance)
         Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
         P, Q = legendre.mapped(m, *self._p), legendre.mapped(m, *self._q)[:, None]
         weight = np.where(np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE)
-        table = np.empty((w, w, m, m), self._kind)
-        for layer, height in zip(table, Y, strict=True):
-            layer[:] = weight * kernel.rest(P, Q, X[:, None, None], height, self._kind)
+        seen = np.where((np.abs(Y)[:, None] <= inner_um[0]) & (np.abs(X) <= inner_um[1]), 1.0, _BESIDE)
+        table = np.empty((w, w, m, m), self.kind)
+        for layer, height, share in zip(table, Y, seen, strict=True):
+            layer[:] = weight * kernel.rest(P, Q, X[:, None, None], height, self.kind)
+            layer *= share[:, None, None]
         columns, rows, remainder = factors(table.reshape(w * w, m * m), self.tolerance)
+        columns = columns / seen.reshape(-1, 1)
         iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
-        window = np.einsum("Yj,jir,Xi->rYX", iy, columns.reshape(w, w, -1), ix, optimize=True)
+        window = np.einsum("Yj,jir,Xi->YrX", iy, columns.reshape(w, w, -1), ix, optimize=True)
+        window *= kernel.window(x, y[:, None])[:, None]
+        left, size, across = np.linalg.svd((rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False)
+        mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+        some = int((mixed > MIXED * self.tolerance).sum())
         to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
-        lens = np.einsum("bq,rqp,ap->rba", to_p, rows.reshape(-1, m, m) / weight, to_p, optimize=True)
-        ways = kernel.along_y(self.q[:, 0], y[:, None]), kernel.along_x(self.p[0][:, None], x)
-        terms = lens * self.pitch_um**2, window * kernel.window(x, y[:, None])
-        a, b, c, d = (part.astype(self._kind) for part in (*ways, *terms))
-        return Operators(a, b, c, d, remainder)
-
-    def small_change(self, axes_um: tuple[Array, Array]) -> float:
-        """Relative change of wavelength or distance that turns no path inside the window by more than 4 mrad."""
-        reach = max(float(np.abs(axis).max()) for axis in axes_um)
-        return 4e-3 / (self.k * reach * float(np.abs([self._p, self._q]).max()))
+        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.pitch_um**2
+        amounts = np.tensordot(to_p, amounts, 1)
+        return across[:some] @ to_p.T, amounts, window, remainder, mixed[:some]
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
+
+
+def _pair(values: Array) -> tuple[Array, Array]:
+    return values.real, values.imag
 
 
 def _at(count: int, span: tuple[float, float], values: Array) -> Array:
