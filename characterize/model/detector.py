@@ -44,14 +44,9 @@ class Grid:
         return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(columns, self.fine_um)[None]
 
     def sample(self, intensity: Array, transfer: Array) -> Array:
-        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres.
-
-        In the precision of the intensity.
-        """
+        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
         shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
-        seen = fft.rfft2(intensity)
-        seen = seen * shifted.astype(seen.dtype)
-        blurred = fft.irfft2(seen, s=intensity.shape[-2:])
+        blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
         return np.asarray(blurred[..., y, x])

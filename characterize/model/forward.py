@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -208,54 +208,54 @@ class ForwardModel:
     ) -> tuple[Array, dict[str, Array]]:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
-        kind = group.reduced.kind
-        phasor = turns(self._phase(x, group), kind)
-        pupil, by_bias, by_answers, by_wave = self._pupil(x, group, bool(names))
-        operators, lit = self._operators(x, group), pupil * phasor
-        field = operators.field(lit, terms=operators.terms(self.cut))
+        phase, kind = self._phase(x, group), group.reduced.kind
+        phasor = np.exp(1j * phase).astype(kind) if np.iscomplexobj(phase) else turns(phase, kind)
+        lens = self._pupil(x, group, bool(names))
+        operators, lit = self._operators(x, group), lens[0] * phasor
+        field = operators.field(lit, self.cut)
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
         out: dict[str, Array] = {}
-        growth = self._growth(x, group)
-        conjugate = field.conj()
-        power = np.vdot(lit, lit)
-
-        def sampled(change: Array, more: Array | float = 0.0) -> Array:
-            """Derivative of the light; the part of a change that is the light itself needs no sum."""
-            same = np.vdot(lit, change) / power
-            field = operators.field(change - same * lit, terms=operators.terms(_SLOPE_TOLERANCE)) + more
-            return np.asarray(self.grid.sample(2 * (conjugate * field).real, transfer) + 2 * same.real * light)
-
-        for name in names:
-            if name in WIDENING:
-                changed = by_bias * group.widening[WIDENING[name]]
-                out[name] = sampled(changed.astype(kind) * phasor)
-            elif name in ANSWERING:
-                out[name] = sampled(by_answers[ANSWERING[name]] * phasor)
-            elif (turning := group.turning(name)) is not None:
-                out[name] = sampled((1j * turning).astype(kind) * lit)
-            elif name in GEOMETRY:
-                changed = (1j * self._phase_slope(x, group, name)).astype(kind) * lit
-                if name == "wavelength_nm":
-                    changed += by_wave * phasor
-                more, level = self._by_window(x, name, operators, lit)
-                out[name] = sampled(changed, more) + level * light
-                if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
-                    disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
-                    out[name] = out[name] + self.grid.sample(intensity, disc)
-            elif name in blurs:
-                out[name] = self.grid.sample(intensity, blurs[name])
+        growth, conjugate, power = self._growth(x, group), field.conj(), np.vdot(lit, lit)
+        for name, changed in self._changes(x, group, names, (*lens[1:], phasor, lit)):
+            # the part of a change that is the light itself needs no sum, nor loses digits
+            same = np.vdot(lit, changed) / power
+            rate = operators.field(changed - same * lit, _SLOPE_TOLERANCE)
+            rate = rate + self._by_window(name, operators, lit)
+            out[name] = self.grid.sample(2 * (conjugate * rate).real, transfer) + 2 * same.real * light
+            if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
+                disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+                out[name] = out[name] + self.grid.sample(intensity, disc)
+        for name in blurs.keys() & set(names):
+            out[name] = self.grid.sample(intensity, blurs[name])
         return light, out
 
-    def _by_window(self, x: Array, name: str, operators: Operators, lit: Array) -> tuple[Array | float, float]:
-        """Derivatives of the field behind distance and wavelength's own move of the window, and of ln of the light."""
+    def _changes(
+        self, x: Array, group: _Group, names: list[str], parts: tuple[Array, ...]
+    ) -> Iterator[tuple[str, Array]]:
+        """(name, (frames, q, p) derivative of the light on the nodes) of all parameters that change it.
+
+        parts: derivatives of the lens by bias, answering causes and wavelength; phasors, and the light itself.
+        """
+        by_bias, by_answers, by_wave, phasor, lit = parts
+        for name in names:
+            if name in WIDENING:
+                yield name, (by_bias * group.widening[WIDENING[name]]).astype(lit.dtype) * phasor
+            elif name in ANSWERING:
+                yield name, by_answers[ANSWERING[name]] * phasor
+            elif (turning := group.turning(name)) is not None:
+                yield name, (1j * turning).astype(lit.dtype) * lit
+            elif name in GEOMETRY:
+                changed = (1j * self._phase_slope(x, group, name)).astype(lit.dtype) * lit
+                yield name, changed + by_wave * phasor if name == "wavelength_nm" else changed
+
+    def _by_window(self, name: str, operators: Operators, lit: Array) -> Array | float:
+        """Derivative of the field behind distance and wavelength's own move of the window."""
         if name not in _WINDOW:
-            return 0.0, 0.0
+            return 0.0
         rate, um = _WINDOW[name]
-        length = self.lens.sensor_distance_um if rate == "distance" else self.lens.wavelength_um
-        field = operators.rates(lit, rate, terms=operators.terms(_SLOPE_TOLERANCE))
-        return um * field, -2 * um / (length + um * float(x[PLACE[name]]))
+        return um * operators.rates(lit, rate, _SLOPE_TOLERANCE)
 
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by

@@ -9,14 +9,16 @@ sum for every smooth f.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from characterize.model import gather
 from characterize.model.kernel import Kernel, digits, factors, precision, turns
 from characterize.model.pillars import Pillars
-from characterize.model.window import MIXED, Operators, Ways, ways
+from characterize.model.window import MIXED, STEP, Operators, Terms, Ways, ways
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -107,23 +109,23 @@ class Reduced:
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = np.empty(0, self.kind).real.dtype
         across, along = (legendre.interpolation(n, t).astype(real_kind) for t in (x / hx, y / hy))
-        table = pillars.table().astype(self.kind)
-        block = max(1, 200_000 // len(x))
+        table = np.ascontiguousarray(pillars.table().astype(self.kind).T)
+        block = max(1, 100_000 // len(x))
         parts = [slice(start, start + block) for start in range(0, len(y), block)]
-        sums = np.zeros((len(parts), r, n, n), self.kind)
+        sums = np.zeros((len(parts), n, n, 2 * r), real_kind)
 
         def some(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
                 path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
-                light = table[:, pillars.place(d.diameter_um[rows])] * turns(self.k * path, self.kind)
-                halves = np.concatenate([light.real, light.imag]).reshape(-1, len(x)) @ across
-                real, imaginary = along[rows].T @ halves.reshape(2, r, -1, n)
-                sums[i] = real + 1j * imaginary
+                light = gather.lit(table, pillars.place(d.diameter_um[rows]), turns(self.k * path, self.kind))
+                halves = across.T @ light
+                sums[i] = (along[rows].T @ halves.reshape(len(halves), -1)).reshape(n, n, -1)
 
         with threads.one_blas_thread():
             threads.split(len(parts), some)
-        return self._to_directions(sums.sum(0, dtype=complex), n)
+        whole = np.moveaxis(sums.sum(0, dtype=float), -1, 0)
+        return self._to_directions(whole[:r] + 1j * whole[r:], n)
 
     def _to_directions(self, fields: Array, n: int) -> Array:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
@@ -165,16 +167,29 @@ class Reduced:
         )
         reach = [float(np.abs(axis).max()) for axis in axes_um]
         bands = kernel.bands(reach[0], reach[1])
-        about: dict[str, Any] = {"k": kernel.k, "tolerance": self.tolerance}
+        about: dict[str, Any] = {"k": kernel.k, "tolerance": self.tolerance, "step_um": STEP * distance_um}
         y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
         x, across = ways(kernel.by_x, self.p[0], axes_um[1], bands[1], **about)
-        terms = self._terms(kernel, (y, x), [one - edge_um for one in reach])
         kind = self.kind
         parts = [Ways(*(getattr(one, f.name).astype(kind) for f in dataclasses.fields(one))) for one in (down, across)]
-        return Operators(parts[0], parts[1], *(one.astype(kind) for one in terms[:3]), *terms[3:])
+        inner = reach[0] - edge_um, reach[1] - edge_um
 
-    def _terms(self, kernel: Kernel, axes_um: tuple[Array, Array], inner_um: list[float]) -> tuple[Array, ...]:
-        """What is no product of both axes, as the last fields of :class:`Operators`; ``axes_um`` coarse."""
+        def moved(name: str) -> Terms:
+            ends = [_moved(kernel, name, sign * STEP) for sign in (1, -1)]
+            step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
+            return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
+
+        return Operators(parts[0], parts[1], self._terms(kernel, [kernel], (1.0,), (y, x), inner), moved)
+
+    def _terms(
+        self,
+        kernel: Kernel,
+        rests: Sequence[Kernel],
+        shares: Sequence[float],
+        axes_um: tuple[Array, Array],
+        inner_um: tuple[float, float],
+    ) -> Terms:
+        """Terms of a sum of rests by shares, on coarse axes (y, x), turned as the window of ``kernel`` is."""
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
         w, m = kernel.counts(wy, wx, self.tolerance)
@@ -182,27 +197,33 @@ class Reduced:
         P, Q = legendre.mapped(m, *self._p), legendre.mapped(m, *self._q)[:, None]
         weight = np.where(np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE)
         seen = np.where((np.abs(Y)[:, None] <= inner_um[0]) & (np.abs(X) <= inner_um[1]), 1.0, _BESIDE)
-        table = np.empty((w, w, m, m), self.kind)
+        table, kind = np.empty((w, w, m, m), self.kind), self.kind if len(rests) == 1 else complex
         for layer, height, share in zip(table, Y, seen, strict=True):
-            layer[:] = weight * kernel.rest(P, Q, X[:, None, None], height, self.kind)
-            layer *= share[:, None, None]
+            parts = [s * of.rest(P, Q, X[:, None, None], height, kind) for of, s in zip(rests, shares, strict=True)]
+            layer[:] = share[:, None, None] * weight * sum(parts)
         columns, rows, remainder = factors(table.reshape(w * w, m * m), self.tolerance)
-        columns = columns / seen.reshape(-1, 1)
-        iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
-        window = np.einsum("Yj,jir,Xi->YrX", iy, columns.reshape(w, w, -1), ix, optimize=True)
-        window *= kernel.window(x, y[:, None])[:, None]
         left, size, across = np.linalg.svd((rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False)
         mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
         some = int((mixed > MIXED * self.tolerance).sum())
-        to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
         amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.pitch_um**2
-        amounts = np.tensordot(to_p, amounts, 1)
-        return across[:some] @ to_p.T, amounts, window, remainder, mixed[:some]
+        iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
+        to_p = legendre.interpolation(m, legendre.nodes(self.nodes)[0])
+        shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)
+        window = np.einsum("Yj,jir,Xi->YrX", iy, shown, ix, optimize=True) * kernel.window(x, y[:, None])[:, None]
+        arrays = (one.astype(self.kind) for one in (across[:some] @ to_p.T, np.tensordot(to_p, amounts, 1), window))
+        return Terms(*arrays, remainder, mixed[:some])
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
+
+
+def _moved(kernel: Kernel, name: str, share: float) -> Kernel:
+    """With the distance or the wavelength longer by a share of itself."""
+    if name == "distance":
+        return dataclasses.replace(kernel, distance_um=kernel.distance_um * (1 + share))
+    return dataclasses.replace(kernel, k=kernel.k / (1 + share))
 
 
 def _pair(values: Array) -> tuple[Array, Array]:

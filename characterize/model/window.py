@@ -18,7 +18,7 @@ MIXED = 0.1  # of the tolerance, for functions of p in the terms
 ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
 _TAPS = range(6, 42, 2)
-_STEP_UM = 0.5  # of the distance: paths bend over hundreds of um
+STEP = 1e-3  # of distance and wavelength, for derivatives: paths bend over as much as they are long
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,46 +35,58 @@ class Ways:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Operators:
-    """From nodes to window for one wavelength and distance.
-
-    Both axes, and the few terms of what is no product of them: functions of p (b, p), their amounts in every term
-    (q, r, b), and every term on coarse samples (Y, r, X).
+class Terms:
+    """What is no product of both axes, as few terms: functions of p (b, p), their amounts in every term (q, r, b), and
+    every term on coarse samples (Y, r, X).
 
     remainder, mixed: (r,), (b,) relative size of what is left out before each term, each function of p.
     """
 
-    y: Ways
-    x: Ways
     across: Array
     amounts: Array
-    window_terms: Array
+    window: Array
     remainder: Array
     mixed: Array
 
-    def terms(self, tolerance: float) -> tuple[int, int]:
-        """How many terms, and functions of p in them, leave a relative ``tolerance`` out."""
-        return max(1, int((self.remainder > tolerance).sum())), max(1, int((self.mixed > MIXED * tolerance).sum()))
+    def some(self, tolerance: float) -> tuple[Array, Array, Array]:
+        """Functions, amounts and terms that leave a relative ``tolerance`` out."""
+        r = max(1, int((self.remainder > tolerance).sum()))
+        b = max(1, int((self.mixed > MIXED * tolerance).sum()))
+        return self.across[:b], self.amounts[:, :r, :b], self.window[:, :r]
 
-    def field(self, light: Array, *, terms: tuple[int, int] | None = None) -> Array:
-        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or some."""
-        return self._sum(light, ((self.y.to, self.x.to),), terms)
 
-    def rates(self, light: Array, name: str, *, terms: tuple[int, int] | None = None) -> Array:
-        """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or ``distance`` per um, of unit level.
+@dataclass(frozen=True, eq=False, slots=True)
+class Operators:
+    """From nodes to window for one wavelength and distance: both axes, and the rest.
 
-        That of both factors: what the low-rank terms, the level and the window's own turns change is a hundredth of it,
-        or is not seen in an intensity.
+    moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its own.
+    """
+
+    y: Ways
+    x: Ways
+    rest: Terms
+    moved: Callable[[str], Terms]
+
+    def field(self, light: Array, tolerance: float = 0.0) -> Array:
+        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or with some left out."""
+        return self._sum(light, ((self.y.to, self.x.to, self.rest),), tolerance)
+
+    def rates(self, light: Array, name: str, tolerance: float = 0.0) -> Array:
+        """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or ``distance`` per um.
+
+        Less what turns places of the window by themselves, which no intensity sees.
         """
-        moved = [getattr(way, f"by_{name}") for way in (self.y, self.x)]
-        return self._sum(light, ((moved[0], self.x.to), (self.y.to, moved[1])), terms)
+        y, x = (getattr(way, f"by_{name}") for way in (self.y, self.x))
+        ways = (y, self.x.to, self.rest), (self.y.to, x, self.rest), (self.y.to, self.x.to, self.moved(name))
+        return self._sum(light, ways, tolerance)
 
-    def _sum(self, light: Array, pairs: tuple[tuple[Array, Array], ...], terms: tuple[int, int] | None) -> Array:
-        """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X)."""
-        r, b = terms or (len(self.remainder), len(self.mixed))
+    def _sum(self, light: Array, ways: tuple[tuple[Array, Array, Terms], ...], tolerance: float) -> Array:
+        """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X), for several (Fy, Fx, terms)."""
         ny, nx, kind = len(self.y.to), len(self.x.to), self.y.to.dtype
-        amounts, window = self.amounts[:, :r, :b], self.window_terms[:, :r]
-        ways = [(y, (self.across[:b, None] * x).reshape(b * nx, -1).T) for y, x in pairs]
+        products = []
+        for y, x, terms in ways:
+            across, amounts, window = terms.some(tolerance)
+            products.append((y, (across[:, None] * x).reshape(len(across) * nx, -1).T, amounts, window))
         light = light.astype(kind, copy=False)
         out = np.empty((*light.shape[:-2], len(self.y.fine), len(self.x.fine)), kind)
         flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
@@ -82,9 +94,10 @@ class Operators:
         def some(first: int, last: int) -> None:
             for i in range(first, last):
                 coarse = np.zeros((ny, nx), kind)
-                for y, x in ways:
-                    mixed = amounts @ (flat[i] @ x).reshape(-1, b, nx)
-                    coarse += np.einsum("YrX,YrX->YX", (y @ mixed.reshape(-1, r * nx)).reshape(ny, r, nx), window)
+                for y, x, amounts, window in products:
+                    mixed = amounts @ (flat[i] @ x).reshape(len(amounts), -1, nx)
+                    seen = (y @ mixed.reshape(len(mixed), -1)).reshape(ny, -1, nx)
+                    coarse += np.einsum("YrX,YrX->YX", seen, window)
                 np.matmul(self.y.fine @ coarse, self.x.fine.T, out=result[i])
 
         with threads.one_blas_thread():
@@ -93,20 +106,21 @@ class Operators:
 
 
 def ways(
-    by: Callable[..., Array], nodes: Array, at_um: Array, band: float, *, k: float, tolerance: float
+    by: Callable[..., Array], nodes: Array, at_um: Array, band: float, *, k: float, tolerance: float, step_um: float
 ) -> tuple[Array, Ways]:
     """(coarse samples, the way there from nodes and from there to the window's samples) along one axis.
 
     Args:
         by: path to a place of the window, :meth:`Kernel.by_x` or :meth:`Kernel.by_y`.
         nodes: (n,) direction cosines. at_um: (m,) even samples of the window. band: of the field, rad/um.
+        step_um: of the distance, for derivatives.
     """
     coarse, weights = _resampled(at_um, band, tolerance)
     middle = (nodes[0] + nodes[-1]) / 2
     turn = k * by(nodes, coarse[:, None])
     value = np.exp(1j * turn)
-    ends = [by(nodes, coarse[:, None], off) for off in (_STEP_UM, -_STEP_UM)]
-    by_distance = 1j * k * (ends[0] - ends[1]) / (2 * _STEP_UM) * value
+    ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
+    by_distance = 1j * k * (ends[0] - ends[1]) / (2 * step_um) * value
     by_wave = -1j * turn * k / (2 * np.pi) * value  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
     carrier = [np.exp(1j * k * by(middle, places)) for places in (at_um, coarse)]
     return coarse, Ways(value, carrier[0][:, None] * weights * carrier[1].conj(), by_wave, by_distance)

@@ -62,7 +62,8 @@ def test_low_rank_pillars_know_their_error():
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "bandwidth_nm"])
 def test_derivatives_match_finite_differences(model, name):
     x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0} | GLASS)
-    h = 0.1 * PARAMETERS[PLACE[name]].scale  # images are in single precision
+    # images are in single precision: of a wall, that acts little, its rounding would be 2 % of so small a difference
+    h = (0.3 if name == "sidewall_deg" else 0.1) * PARAMETERS[PLACE[name]].scale
     up, down = x.copy(), x.copy()
     up[PLACE[name]] += h
     down[PLACE[name]] -= h

@@ -1,12 +1,13 @@
 """Coarse samples of a window against plane waves of its band, and what moves it against differences."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from characterize.model.kernel import Kernel
-from characterize.model.window import Operators, ways
+from characterize.model.window import Operators, Terms, ways
 
 K = 2 * math.pi / 0.85
 KERNEL = Kernel(K, (-0.21, 0.27), (-0.17, 0.23), 1900.0, 1911.0, (0.03, -0.02))
@@ -16,7 +17,9 @@ AT = (np.arange(90) - 41.5) * 0.75  # not symmetric, as the samples of a window 
 def along(kernel, tolerance=1e-3, at=AT):
     """Coarse samples and ways along x."""
     nodes = np.linspace(*kernel.p, 23)
-    return nodes, ways(kernel.by_x, nodes, at, kernel.bands(40.0, 40.0)[1], k=kernel.k, tolerance=tolerance)
+    return nodes, ways(
+        kernel.by_x, nodes, at, kernel.bands(40.0, 40.0)[1], k=kernel.k, tolerance=tolerance, step_um=1.0
+    )
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-5])
@@ -58,11 +61,13 @@ def test_rates_are_the_differences_of_both_factors():
     light = rng.standard_normal((1, 19, 23)) + 1j * rng.standard_normal((1, 19, 23))
     bands = KERNEL.bands(40.0, 40.0)
     y, x = (
-        ways(by, nodes, AT, band, k=K, tolerance=1e-6)
+        ways(by, nodes, AT, band, k=K, tolerance=1e-6, step_um=1.0)
         for by, nodes, band in ((KERNEL.by_y, q, bands[0]), (KERNEL.by_x, p, bands[1]))
     )
     one = np.ones((len(y[0]), 1, len(x[0])), complex)
-    operators = Operators(y[1], x[1], np.ones((1, 23)), np.ones((19, 1, 1)), one, np.ones(1), np.ones(1))
+    rest = Terms(np.ones((1, 23)), np.ones((19, 1, 1)), one, np.ones(1), np.ones(1))
+    still = dataclasses.replace(rest, window=0 * one)
+    operators = Operators(y[1], x[1], rest, lambda name: still)
 
     def field(k, off_um):
         down, across = KERNEL.by_y(q, AT[:, None], off_um), KERNEL.by_x(p, AT[:, None], off_um)

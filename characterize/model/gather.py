@@ -1,0 +1,31 @@
+"""Compiled loop: the functions of every pillar times its phasor, one pillar after another, as matrices take them."""
+
+import numba
+import numpy as np
+
+from metalens.ground.arrays import Array
+
+
+def lit(table: Array, place: Array, turns: Array) -> Array:
+    """(rows, columns, 2 r) real parts, then imaginary parts, of table[:, place] times turns.
+
+    All r numbers of a pillar lie together: one look-up each, where r arrays would be walked through.
+
+    Args:
+        table: (entries, r) complex. place: (rows, columns) entries. turns: (rows, columns), of the table's kind.
+    """
+    real = np.empty(0, table.dtype).real.dtype
+    out = np.empty((*place.shape, 2 * table.shape[1]), real)
+    _lit(np.ascontiguousarray(table.real), np.ascontiguousarray(table.imag), place, turns, out)
+    return out
+
+
+@numba.njit(nogil=True, error_model="numpy", cache=True)  # type: ignore[untyped-decorator]
+def _lit(real: Array, imaginary: Array, place: Array, turns: Array, out: Array) -> None:
+    r = real.shape[1]
+    for i in range(place.shape[0]):
+        for j in range(place.shape[1]):
+            a, b, c, s = real[place[i, j]], imaginary[place[i, j]], turns[i, j].real, turns[i, j].imag
+            for k in range(r):
+                out[i, j, k] = a[k] * c - b[k] * s
+                out[i, j, r + k] = a[k] * s + b[k] * c
