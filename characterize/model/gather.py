@@ -20,7 +20,7 @@ def lit(table: Array, place: Array, turns: Array) -> Array:
     return out
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, error_model="numpy", cache=True)
 def _lit(real: Array, imaginary: Array, place: Array, turns: Array, out: Array) -> None:
     r = real.shape[1]
     for i in range(place.shape[0]):
