@@ -1,9 +1,12 @@
-"""Sources of one patch weighted for every kernel, compiled: ``forming.at_depth`` times the frames in one pass."""
+"""Compiled loops: sources of one patch weighted for every kernel (``forming.at_depth`` times the frames in one pass),
+and the light on the nodes of a pupil."""
 
 import numba
 import numpy as np
 
 from metalens.ground.arrays import Array
+from metalens.ground.threads import split
+from metalens.propagate import turns32
 
 
 def weighted(
@@ -63,3 +66,32 @@ def _weigh(radiance, coverage, place, table, energy, light, cover):  # type: ign
                 for r in range(few):
                     for x in range(wide):
                         cover[r, f, s, y, x] = lines[x, r] * coverage[f, s, y, x]
+
+
+def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
+    """(depths, y, x) complex64 weight exp(2πi (turns + Σ mix paths)).
+
+    Args:
+        weight, turns: (y, x) float64. paths: (few, y, x) float64 in turns; mix: (depths, few).
+    """
+    out = np.empty((len(mix), *turns.shape, 2), np.float32)
+    light = weight.astype(np.float32)
+    split(turns.shape[0], lambda a, b: _phasors(light[a:b], turns[a:b], paths[:, a:b], mix, out[:, a:b]))
+    return out.view(np.complex64)[..., 0]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
+    """Row by row, so that the sum of a depth stays in the nearest cache."""
+    depths, few = mix.shape
+    line = np.empty(turns.shape[1])
+    for y in range(turns.shape[0]):
+        for d in range(depths):
+            line[:] = turns[y]
+            for v in range(few):
+                share = mix[d, v]
+                for x in range(line.size):
+                    line[x] += share * paths[v, y, x]
+            for x in range(line.size):
+                c, s = turns32(line[x] - np.rint(line[x]))
+                out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s

@@ -126,10 +126,15 @@ def depth_nodes(grid: Grid, count: int) -> Tensor:
 
 def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, window: Window) -> Tensor:
     """(points, depths, h, w) PSFs summed over the spectrum; light of each wavelength with its weight."""
-    total = torch.zeros(())
-    for wave, weight in zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True):
-        total = total + weight * psfs(optics, at_um, depths_um=depths_um, wavelength_um=wave, window=window)
-    return total
+    pairs = list(zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True))
+    about = {"depths_um": depths_um, "window": window, "finest_um": min(wave for wave, _ in pairs)}
+    found = []
+    for place in at_um.unsqueeze(1):  # all wavelengths of a point share its rays
+        total = torch.zeros(())
+        for wave, weight in pairs:
+            total = total + weight * psfs(optics, place, wavelength_um=wave, **about)
+        found.append(total)
+    return torch.cat(found)
 
 
 def _corner(middle_um: tuple[float, float], half_um: list[float]) -> Tensor:

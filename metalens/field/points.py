@@ -19,12 +19,13 @@ import scipy.fft
 import torch
 from torch import Tensor
 
+from metalens.field import compiled
+from metalens.field.rays import Paths, Rays, rays, source_paths
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
-from metalens.lens import Layers, Media, media
+from metalens.lens import Layers, media
 
 SPARE = 1.06  # period of the nodes per width of the window
-VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 LARGEST_P = 0.9  # of a ray, in units of the rarest index
 
 
@@ -55,19 +56,14 @@ class Optics:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pupil:
-    """Rays from one field point's window: where they leave the lens, weight, phase; (nodes, nodes) float64.
+    """Weight and phase of the rays of a field point; (nodes, nodes) float64.
 
     given: sum of squares of the weights if no face of a film reflected: the light on the aperture.
-    aside: (nodes,) p - p0 along x and along y; middle: (x, y) of p0, the middle of the pupil.
     """
 
-    x_um: Tensor
-    y_um: Tensor
     weight: Tensor
     phase_rad: Tensor
     given: float
-    aside: Tensor
-    middle: Tensor
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -82,7 +78,8 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """period_um of the nodes, their number along an axis, size of the padded transform, harmonics that are kept.
+    """period_um of the nodes, their number along an axis and their step of p, size of the padded transform, harmonics
+    that are kept.
 
     beyond: share of the light that the rim bends beyond the window, 4√2 / (π² k p h) of a sharp round rim at p and a
         window of half width h; the transform folds it back, and it is taken off.
@@ -90,27 +87,30 @@ class Sampling:
 
     period_um: float
     nodes: int
+    step: float
     size: int
     harmonics: int
     beyond: float
     curved: bool
 
 
-def sampling(optics: Optics, window: Window, wavelength_um: float) -> Sampling:
-    """Nodes that fill the aperture for a window on the axis, where it is widest in p."""
+def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf) -> Sampling:
+    """Nodes that fill the aperture for a window on the axis, where it is widest in p; of the shorter wave."""
     after = optics.layers.after(optics.distance_um, wavelength_um)
     rim = torch.tensor(optics.wave.radius_um, dtype=torch.float64)
     edge = float(media.direction(after, rim))
     if edge > LARGEST_P * after.layers[0][0]:
         raise PropagationError(f"aperture of NA {edge:.2f}: the image engine is scalar, up to {LARGEST_P}")
-    period = window.samples * window.step_um * SPARE
-    nodes = 2 * math.ceil(edge * period / wavelength_um) + 2
+    step = min(wavelength_um, finest_um) / (window.samples * window.step_um * SPARE)
+    period = wavelength_um / step
+    nodes = 2 * math.ceil(edge / step) + 2
     harmonics = math.floor(2 * period / window.step_um)
     half = window.samples * window.step_um / 2
     beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * edge * half), 0.5)
     # neither the autocorrelation nor the harmonics that are kept of it may wrap round
     size = max(nodes + harmonics + 1, 2 * harmonics + 2)
-    return Sampling(period, nodes, scipy.fft.next_fast_len(size), harmonics, beyond, window.curved)
+    quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
+    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved)
 
 
 def psfs(
@@ -121,6 +121,7 @@ def psfs(
     wavelength_um: float,
     window: Window,
     shift_um: tuple[float, float] = (0.0, 0.0),
+    finest_um: float = math.inf,
 ) -> Tensor:
     """(points, depths, h, w) share of the light on the aperture that falls on each sample from a source of that size.
 
@@ -133,6 +134,7 @@ def psfs(
         depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in vacuum.
         shift_um: the window's rays are seen from a place (x, y) beside the field point; the samples stay. A check of
             what the transform neglects.
+        finest_um: shortest wavelength of a spectrum, whose nodes are then those of all its wavelengths.
 
     Returns:
         float32 on the device of ``at_um``; differentiable in what the wave's factor is.
@@ -140,7 +142,7 @@ def psfs(
     Raises:
         PropagationError: films thicker than the gaps, an aperture too wide for a scalar image.
     """
-    grid = sampling(optics, window, wavelength_um)
+    grid = sampling(optics, window, wavelength_um, finest_um)
     ends = tuple(_to_samples(grid, window, shift, at_um.device) for shift in shift_um)
     return torch.stack([_one(optics, grid, place, depths_um, wavelength_um, (*ends,), shift_um) for place in at_um])
 
@@ -155,26 +157,25 @@ def _one(
     shift_um: tuple[float, float],
 ) -> Tensor:
     """(depths, h, w) PSFs of one field point."""
-    pupil = seen(optics, place, grid, wavelength_um, shift_um)
+    found, pupil = seen(optics, place, grid, wavelength_um, shift_um)
     tangents = place / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    paths = source_paths(optics, tangents, (pupil.x_um, pupil.y_um), depths_um, wavelength_um)
-    turns = pupil.phase_rad / (2 * math.pi) + paths / wavelength_um
-    angle = ((turns - torch.round(turns)) * (2 * math.pi)).to(torch.float32)
-    light = torch.polar(pupil.weight.to(torch.float32).expand_as(angle), angle)
+    paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
+    light = leaving(pupil, paths, wavelength_um)
     tilt = math.atan(math.hypot(*tangents.tolist()))
-    factor = optics.wave.factor(pupil.x_um, pupil.y_um, wavelength_um, tilt)
+    factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
     spectrum = torch.fft.fft2(light, s=(grid.size, grid.size))
-    slope, curvature = bending(optics.layers.after(optics.distance_um, wavelength_um), pupil.middle)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
-    found = _moved(spectrum.real.square() + spectrum.imag.square(), ends, slope)
+    power = torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
+    plain, change = _moved(power, ends, found.slope)
+    shown = plain + change
     if not grid.curved:
-        return found / total
-    for j, aside in enumerate((pupil.aside, pupil.aside[:, None])):
+        return shown / total
+    for j, aside in enumerate((found.aside, found.aside[:, None])):
         other = torch.fft.fft2(light * aside.to(light.real), s=(grid.size, grid.size))
-        flux = spectrum.real * other.real + spectrum.imag * other.imag
-        found = found + _bent(flux, ends, curvature[:, j])
-    return found / total
+        flux = torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)
+        shown = shown + _moved(flux, ends, found.curvature[:, j])[1]
+    return shown / total
 
 
 def _on_samples(power: Tensor, ends: tuple[Samples, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -192,117 +193,36 @@ def _around(ends: tuple[Samples, ...]) -> Tensor:
     return torch.stack([x, y])
 
 
-def _moved(power: Tensor, ends: tuple[Samples, ...], slope: Tensor) -> Tensor:
-    """(depths, h, w) |U|² on the samples, moved by s(δ)_j = δᵀ slope_j δ / 2: I + ∇·(s I)."""
+def _moved(power: Tensor, ends: tuple[Samples, ...], slope: Tensor) -> tuple[Tensor, Tensor]:
+    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and ∇·(s P): how it changes where it is
+    moved by s(δ)_j = δᵀ slope_j δ / 2."""
     plain, across, down = _on_samples(power, ends)
     at = _around(ends)
     turned = torch.einsum("jab,byx->jayx", slope.to(at), at)
     s = torch.einsum("jayx,ayx->jyx", turned, at) / 2
-    return plain * (1 + turned[0, 0] + turned[1, 1]) + s[0] * across + s[1] * down
-
-
-def _bent(flux: Tensor, ends: tuple[Samples, ...], curvature: Tensor) -> Tensor:
-    """(depths, h, w) Σ_i ∂_i (M_i S) on the samples, M_i = δᵀ curvature_i δ / 2, S a component of the flux."""
-    return _moved(flux, ends, curvature) - _on_samples(flux, ends)[0]
-
-
-def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """(j, a, b) ∂H/∂p_j and (i, j, a, b) ∂²H/∂p_i∂p_j at a direction, 1/um.
-
-    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of 1e-3, exact to 1e-5 of them.
-    """
-    step = 1e-3
-    unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
-
-    def slope(p: Tensor) -> Tensor:
-        return torch.stack([_turning(after, p + e) - _turning(after, p - e) for e in unit]) / (2 * step)
-
-    return slope(middle), torch.stack([slope(middle + e) - slope(middle - e) for e in unit]) / (2 * step)
-
-
-def _turning(after: Media, p: Tensor) -> Tensor:
-    """(2, 2) H: how the direction towards a window turns as the window moves."""
-    size = torch.hypot(p[0], p[1]).clamp_min(1e-9)
-    reach, unit = media.reach(after, size), p / size
-    along, across = reach / (size * media.spread(after, size)), size / reach
-    flat = torch.eye(2, dtype=p.dtype, device=p.device)
-    turning: Tensor = across * flat + (along - across) * torch.outer(unit, unit)
-    return turning
+    return plain, plain * (turned[0, 0] + turned[1, 1]) + s[0] * across + s[1] * down
 
 
 def seen(
     optics: Optics, place: Tensor, grid: Sampling, wavelength_um: float, shift_um: tuple[float, float] = (0.0, 0.0)
-) -> Pupil:
+) -> tuple[Rays, Pupil]:
     """The rays of the nodes for one window centre, and the lens' carrier with the path to that centre."""
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    centre = place + torch.tensor(shift_um, dtype=place.dtype, device=place.device)
-    axis = (torch.arange(grid.nodes, dtype=torch.float64, device=place.device) - (grid.nodes - 1) / 2) * (
-        wavelength_um / grid.period_um
-    )
-    radius = optics.wave.radius_um
-    turn = torch.arange(256, dtype=torch.float64, device=place.device) * (2 * math.pi / 256)
-    rim = centre - radius * torch.stack([torch.cos(turn), torch.sin(turn)], -1)
-    far = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
-    edge = media.direction(after, far)[:, None] * rim / far[:, None]
-    middle = (edge.amin(0) + edge.amax(0)) / 2
-    py, px = torch.meshgrid(axis + middle[1], axis + middle[0], indexing="ij")
-    p = torch.hypot(px, py)
-    p = p.clamp(1e-12, 0.98 * after.layers[0][0])
-    out = media.reach(after, p) / p
-    x, y = centre[0] - out * px, centre[1] - out * py
-    r = torch.hypot(x, y).clamp_min(1e-9)
-    # width of a node across the rim: how fast the radius changes with p
-    step = torch.sqrt(media.spread(after, p)) * (wavelength_um / grid.period_um)
-    inside = ((radius - r) / step + 0.5).clamp(0, 1)
-    whole = inside * torch.sqrt(media.spread(after, p))
-    phase = optics.wave.carrier_rad(x, y) + 2 * math.pi / wavelength_um * media.path(after, p)
-    weight = whole * torch.sqrt(media.passed(after.order, p))
-    return Pupil(x, y, weight, phase, float((whole**2).sum()), axis, middle)
+    at = float(place[0]) + shift_um[0], float(place[1]) + shift_um[1]
+    found = rays(after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device)
+    phase = optics.wave.carrier_rad(found.x_um, found.y_um) + 2 * math.pi / wavelength_um * found.away_um
+    return found, Pupil(found.whole * found.passed, phase, float((found.whole**2).sum()))
 
 
-def source_paths(
-    optics: Optics, tangents: Tensor, at_um: tuple[Tensor, Tensor], depths_um: Tensor, wavelength_um: float
-) -> Tensor:
-    """(depths, *shape) optical path from each source to the lens at (x, y), less the path to its middle, um.
-
-    More depths than ``VERGENCES`` are interpolated between that many Chebyshev points of 1/z: the path is smooth there
-    (singular only where a source touches the lens), and the points cost what the sources would.
-    """
-    if len(depths_um) <= VERGENCES:
-        return _source_paths(optics, tangents, at_um, depths_um, wavelength_um)
-    low, high = float((1 / depths_um).min()), float((1 / depths_um).max())
-    unit = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
-    nodes = (low + high) / 2 + (high - low) / 2 * unit
-    value = np.polynomial.chebyshev.chebvander(unit, VERGENCES - 1)
-    wanted = (2 / depths_um.cpu().numpy() - low - high) / (high - low)
-    mix = np.polynomial.chebyshev.chebvander(wanted, VERGENCES - 1) @ np.linalg.inv(value)
-    few = _source_paths(optics, tangents, at_um, torch.from_numpy(1 / nodes), wavelength_um)
-    return (torch.from_numpy(mix).to(few) @ few.flatten(1)).reshape(-1, *at_um[0].shape)
-
-
-def _source_paths(
-    optics: Optics, tangents: Tensor, at_um: tuple[Tensor, Tensor], depths_um: Tensor, wavelength_um: float
-) -> Tensor:
-    """As :func:`source_paths`, one depth after the other."""
-    x, y = at_um
-    slope = float(torch.hypot(tangents[0], tangents[1]))
-    p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
-    out = []
-    for depth in depths_um.tolist():
-        if math.isinf(depth):
-            out.append((tangents[0] * x + tangents[1] * y) / math.hypot(1, slope))
-            continue
-        before = optics.layers.before(depth, wavelength_um)
-        back = media.reach(before, p) / slope if slope > 0 else torch.tensor(before.reduced_um, device=x.device)
-        sx, sy = -back * tangents[0], -back * tangents[1]
-        if len(before.layers) == 1:  # √(z² + ρ²) less the same at the middle, without cancellation
-            extra = x * x + y * y - 2 * (x * sx + y * sy)
-            chief = math.sqrt(depth**2 + float(sx) ** 2 + float(sy) ** 2)
-            out.append(before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief))
-        else:
-            away = torch.hypot(x - sx, y - sy)
-            out.append(media.chord(before, away) - media.chord(before, torch.hypot(sx, sy)))
-    return torch.stack(out)
+def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
+    """(depths, *shape) complex64 light on the nodes, the factor of the wave left out; compiled on the processor."""
+    turns = pupil.phase_rad / (2 * math.pi)
+    if turns.device.type == "cpu":
+        given = pupil.weight, turns, paths.few_um / wavelength_um, paths.mix
+        return torch.from_numpy(compiled.phasors(*(part.numpy() for part in given)))
+    turns = turns + paths.um / wavelength_um
+    angle = ((turns - torch.round(turns)) * (2 * math.pi)).to(torch.float32)
+    return torch.polar(pupil.weight.to(torch.float32).expand_as(angle), angle)
 
 
 @functools.lru_cache(maxsize=64)

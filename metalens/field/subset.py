@@ -50,6 +50,7 @@ def term(optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int) ->
         depths_um=plan.depths_um,
         wavelength_um=float(plan.waves.wavelengths_um[wave]),
         window=plan.window,
+        finest_um=float(plan.waves.wavelengths_um.min()),
     )[0]
     return len(places) * float(plan.waves.weights.sum()) * (gradient.flatten(0, 1)[point] * light).sum()
 

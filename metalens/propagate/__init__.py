@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from metalens.propagate.kernels import kernel as kernel
     from metalens.propagate.paths import chief_path as chief_path
     from metalens.propagate.paths import cosines as cosines
+    from metalens.propagate.sincos import turns32 as turns32
     from metalens.propagate.verbs import angles as angles
     from metalens.propagate.verbs import angular_spectrum as angular_spectrum
     from metalens.propagate.verbs import case as case
@@ -65,6 +66,7 @@ __getattr__, __dir__, __all__ = attach(
         "relative_error": "estimate",
         "scan": "estimate",
         "square_error": "estimate",
+        "turns32": "sincos",
         "windowed": "verbs",
     },
 )

@@ -243,12 +243,18 @@ def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
     real = torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
     cosines = torch.bmm(real, t["to_directions"]).view(count, e, b, 2, p).permute(0, 4, 1, 2, 3).contiguous()
     spread = torch.view_as_complex(cosines)
-    out = light.new_zeros((count, X, Y, b))
-    most = max(1, int(BUDGET_BYTES / (count * p * (Y + e) * light.element_size())))
-    for start in range(0, len(t["fields"]), most):
-        some = slice(start, start + most)
-        terms = t["lens_terms"][..., some] * spread.index_select(3, t["fields"][some])
-        columns = t["along_y"].flatten(0, 1) @ terms.flatten(0, 1)
-        window = (t["along_x"] @ columns.view(count, p, -1)).view(count, X, Y, -1)
-        out = out.index_add(3, t["fields"][some], window * t["window_terms"][..., some])
-    return out
+    pairs = len(t["fields"])
+    many = max(1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size())))  # pairs of one tile at once
+    step, few = min(pairs, many), max(1, many // pairs)
+    found = []
+    for first in range(0, count, few):
+        tile = slice(first, first + few)
+        out = light.new_zeros((len(spread[tile]), X, Y, b))
+        for start in range(0, pairs, step):
+            fields = t["fields"][start : start + step]
+            terms = t["lens_terms"][tile, ..., start : start + step] * spread[tile].index_select(3, fields)
+            columns = t["along_y"][tile].flatten(0, 1) @ terms.flatten(0, 1)
+            window = (t["along_x"][tile] @ columns.view(len(out), p, -1)).view(len(out), X, Y, -1)
+            out = out.index_add(3, fields, window * t["window_terms"][tile, ..., start : start + step])
+        found.append(out)
+    return torch.cat(found)

@@ -15,7 +15,7 @@ from metalens.psf.compute import Result, intensity
 from metalens.psf.extended import Extent
 from metalens.psf.vector import expanded
 
-HELD_BYTES = 512e6  # of the fields of all depths that are computed at once
+HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once; each share has a plan of its own
 SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
 STRICTER = 4  # settings for sources of finite size, whose estimate takes differences of PSFs
 

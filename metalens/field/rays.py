@@ -1,0 +1,161 @@
+"""Rays of one field point: where they leave the lens, how the window bends them, and their paths from the sources.
+
+None of it depends on the wavelength but through the indices of films, so that all wavelengths of a spectrum whose nodes
+are the same directions share it: what was computed last is kept.
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens.lens import Layers, Media, media
+
+VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
+KEPT = 4  # field points whose rays are kept: a few MB each
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rays:
+    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the lens.
+
+    whole: √spread of each, 0 beyond the rim; passed: root of the power that faces let through; away_um: path to the
+    window's centre less that along the normal. aside: (nodes,) p - p0 along x and along y; middle: (x, y) of p0, the
+    middle of the pupil. slope, curvature: :func:`bending` there.
+    """
+
+    x_um: Tensor
+    y_um: Tensor
+    whole: Tensor
+    passed: Tensor
+    away_um: Tensor
+    aside: Tensor
+    middle: Tensor
+    slope: Tensor
+    curvature: Tensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Paths:
+    """Optical paths of many depths as mixtures of a few: mix (depths, few) times few_um (few, *shape), float64."""
+
+    few_um: Tensor
+    mix: Tensor
+
+    @property
+    def um(self) -> Tensor:
+        """(depths, *shape) paths."""
+        return (self.mix @ self.few_um.flatten(1)).reshape(-1, *self.few_um.shape[1:])
+
+
+@functools.lru_cache(maxsize=KEPT)
+def rays(
+    after: Media, radius: float, at_um: tuple[float, float], nodes: tuple[int, float], device: torch.device
+) -> Rays:
+    """Rays to a place (x, y) of the sensor from a lens of this radius; nodes: their number and their step of p."""
+    count, width = nodes
+    centre = torch.tensor(at_um, dtype=torch.float64, device=device)
+    axis = (torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2) * width
+    turn = torch.arange(256, dtype=torch.float64, device=device) * (2 * math.pi / 256)
+    rim = centre - radius * torch.stack([torch.cos(turn), torch.sin(turn)], -1)
+    far = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
+    edge = media.direction(after, far)[:, None] * rim / far[:, None]
+    middle = (edge.amin(0) + edge.amax(0)) / 2
+    py, px = torch.meshgrid(axis + middle[1], axis + middle[0], indexing="ij")
+    p = torch.hypot(px, py).clamp(1e-12, 0.98 * after.layers[0][0])
+    out = media.reach(after, p) / p
+    x, y = centre[0] - out * px, centre[1] - out * py
+    r = torch.hypot(x, y).clamp_min(1e-9)
+    wide = torch.sqrt(media.spread(after, p))
+    inside = ((radius - r) / (wide * width) + 0.5).clamp(0, 1)  # of a node across the rim, as wide as r changes with p
+    passed = torch.sqrt(media.passed(after.order, p))
+    return Rays(x, y, inside * wide, passed, media.path(after, p), axis, middle, *bending(after, middle))
+
+
+def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """(j, a, b) ∂H/∂p_j and (i, j, a, b) ∂²H/∂p_i∂p_j at a direction, 1/um.
+
+    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of 1e-3, exact to 1e-5 of them.
+    """
+    step = 1e-3
+    unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
+
+    def slope(p: Tensor) -> Tensor:
+        return torch.stack([_turning(after, p + e) - _turning(after, p - e) for e in unit]) / (2 * step)
+
+    return slope(middle), torch.stack([slope(middle + e) - slope(middle - e) for e in unit]) / (2 * step)
+
+
+def _turning(after: Media, p: Tensor) -> Tensor:
+    """(2, 2) H: how the direction towards a window turns as the window moves."""
+    size = torch.hypot(p[0], p[1]).clamp_min(1e-9)
+    reach, unit = media.reach(after, size), p / size
+    along, across = reach / (size * media.spread(after, size)), size / reach
+    flat = torch.eye(2, dtype=p.dtype, device=p.device)
+    turning: Tensor = across * flat + (along - across) * torch.outer(unit, unit)
+    return turning
+
+
+def source_paths(layers: Layers, tangents: Tensor, seen: Rays, depths_um: Tensor, wavelength_um: float) -> Paths:
+    """Optical path from each source to the lens at (x, y), less the path to its middle.
+
+    More depths than ``VERGENCES`` are interpolated between that many Chebyshev points of 1/z: the path is smooth there
+    (singular only where a source touches the lens), and the points cost what the sources would.
+    """
+    wave = wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None
+    return _source_paths(layers, tuple(tangents.tolist()), seen, tuple(depths_um.tolist()), wave)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _source_paths(
+    layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float | None
+) -> Paths:
+    """As :func:`source_paths`; without films in front no wavelength is needed."""
+    given = layers, tangents, (seen.x_um, seen.y_um)
+    if len(depths_um) <= VERGENCES:
+        few = _each(*given, depths_um, wavelength_um)
+        return Paths(few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device))
+    inverse = 1 / np.array(depths_um)
+    low, high = float(inverse.min()), float(inverse.max())
+    unit = np.cos(np.pi * (np.arange(VERGENCES) + 0.5) / VERGENCES)
+    nodes = (low + high) / 2 + (high - low) / 2 * unit
+    value = np.polynomial.chebyshev.chebvander(unit, VERGENCES - 1)
+    wanted = (2 * inverse - low - high) / (high - low)
+    mix = np.polynomial.chebyshev.chebvander(wanted, VERGENCES - 1) @ np.linalg.inv(value)
+    few = _each(*given, tuple((1 / nodes).tolist()), wavelength_um)
+    return Paths(few, torch.from_numpy(mix).to(few))
+
+
+def _each(
+    layers: Layers,
+    tangents: tuple[float, float],
+    at_um: tuple[Tensor, Tensor],
+    depths_um: tuple[float, ...],
+    wavelength_um: float | None,
+) -> Tensor:
+    """(depths, *shape) paths in um, one depth after the other."""
+    x, y = at_um
+    slope = math.hypot(*tangents)
+    p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
+    out = []
+    for depth in depths_um:
+        if math.isinf(depth):
+            out.append((tangents[0] * x + tangents[1] * y) / math.hypot(1, slope))
+            continue
+        before = Media((1.0,), (depth,)) if wavelength_um is None else layers.before(depth, wavelength_um)
+        back = float(media.reach(before, p)) / slope if slope > 0 else before.reduced_um
+        sx, sy = -back * tangents[0], -back * tangents[1]
+        if len(before.layers) == 1:  # √(z² + ρ²) less the same at the middle, without cancellation
+            extra = x * x + y * y - 2 * (x * sx + y * sy)
+            chief = math.sqrt(depth**2 + sx**2 + sy**2)
+            out.append(before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief))
+        else:
+            away = torch.hypot(x - sx, y - sy)
+            out.append(
+                media.chord(before, away)
+                - media.chord(before, torch.tensor(math.hypot(sx, sy), dtype=p.dtype, device=x.device))
+            )
+    return torch.stack(out)

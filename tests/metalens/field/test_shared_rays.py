@@ -1,0 +1,63 @@
+"""Light on the nodes of a pupil against its formula, and wavelengths that share the rays of a field point."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.cell import Film, Index
+from metalens.design import Focus
+from metalens.field import Layers, Optics, SmoothWave, Window, compiled, psfs
+from metalens.field.plan import spectral
+from metalens.field.rays import rays, source_paths
+from metalens.psf import Nodes
+
+
+def test_the_light_on_the_nodes_is_its_formula():
+    """Polynomials of sine and cosine in float32: 2e-7 of the weight, times 3."""
+    draw = np.random.default_rng(8)
+    weight, turns = draw.uniform(0, 3, (7, 12)), draw.uniform(-40, 40, (7, 12))
+    paths, mix = draw.uniform(-900, 900, (3, 7, 12)), draw.normal(size=(5, 3))
+    want = weight * np.exp(2j * np.pi * (turns + np.tensordot(mix, paths, 1)))
+    got = compiled.phasors(weight, turns, paths, mix)
+    assert got.dtype == np.complex64
+    assert np.abs(got - want).max() < 1.5e-6
+
+
+@pytest.mark.parametrize("glass_um", [0.0, 130.0])
+def test_paths_from_sources_are_those_of_rays_drawn_to_each_point(glass_um):
+    """Fermat: of all points of the face between air and glass, the ray takes the one of the shortest path."""
+    layers = Layers(front=(Film(Index(1.6), glass_um),))
+    seen = rays(layers.after(240.0, 0.85), 50.0, (21.0, -13.0), (6, 0.06), torch.device("cpu"))
+    tangents, depths = torch.tensor([0.09, -0.05], dtype=torch.float64), np.linspace(700.0, 2100.0, 7)
+    got = source_paths(layers, tangents, seen, torch.tensor(depths), 0.85).um.numpy()
+    x, y = seen.x_um.numpy(), seen.y_um.numpy()
+
+    def path(depth, reach):
+        """Shortest optical path over a lateral distance, by a fine search of the place on the face."""
+        share = np.linspace(0, 1, 20_001)
+        return (np.hypot(depth - glass_um, reach * share) + 1.6 * np.hypot(glass_um, reach * (1 - share))).min()
+
+    for d in (0, 3, 6):
+        sine = math.hypot(*tangents) / math.sqrt(1 + float((tangents**2).sum()))
+        inside = sine / math.sqrt(1.6**2 - sine**2)
+        away = (depths[d] - glass_um) * math.hypot(*tangents) + glass_um * inside
+        sx, sy = (-away * float(t) / math.hypot(*tangents) for t in tangents)
+        for i, j in ((0, 0), (2, 5), (5, 1)):
+            want = path(depths[d], math.hypot(x[i, j] - sx, y[i, j] - sy)) - path(depths[d], math.hypot(sx, sy))
+            assert got[d, i, j] == pytest.approx(want, abs=2e-5)  # the search: 1e-9 of a square; 5 nodes of 1/z: 1e-5
+
+
+def test_wavelengths_that_share_their_rays_are_those_alone():
+    """The nodes of the longer ones lie closer than alone: what folds back from outside the window changes, 1e-3."""
+    optics = Optics(SmoothWave(Focus(0.85, 240.0, 6e3), 50.0), Layers(), 240.0)
+    at, depths = torch.tensor([[20.0, -31.0], [3.0, 8.0]], dtype=torch.float64), torch.tensor([3e3, 5e3, 9e3]).double()
+    waves, window = Nodes(np.array([0.87, 0.83, 0.85]), np.array([0.3, 0.2, 0.5]), 0.0), Window(15, 4.8, curved=True)
+    got = spectral(optics, at, depths, waves, window)
+    want = sum(
+        weight * psfs(optics, at, depths_um=depths, wavelength_um=wave, window=window)
+        for wave, weight in zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True)
+    )
+    assert got.shape == (2, 3, 15, 15)
+    assert float((got - want).norm() / want.norm()) < 2e-3
