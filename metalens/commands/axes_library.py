@@ -27,12 +27,13 @@ def run(options: Distributed, target: Path, cell: Cell, sweep: Sweep, about: sto
         made = dataclasses.replace(made, provenance=about)
         axes.save(draft.path, made)
         axes.figure(draft.path.with_suffix(".png"), made)
-    failures = _failures(made)
-    options.console.result(_values(made, seconds, failures), _text(target, made, seconds, failures))
-    return 1 if failures else 0
+    wrong = failures(made)
+    options.console.result(_values(made, seconds, wrong), _text(target, made, seconds, wrong))
+    return 1 if wrong else 0
 
 
-def _failures(made: AxesLibrary) -> list[str]:
+def failures(made: AxesLibrary) -> list[str]:
+    """What is wrong with a library, in words; nothing where it serves."""
     found, share = [], float(made.usable.mean())
     if share < LEAST_USABLE:
         found.append(
