@@ -98,6 +98,8 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
             if status in (0, 1):
                 store.append_line(Path(OUTCOMES), json.dumps([stage.words, status, values, seconds]))
             yield Outcome(stage, status, values, seconds)
+            if status == 130:
+                raise KeyboardInterrupt
             if status not in (0, 1):
                 raise MetalensError(f"the chain stopped: `metalens {' '.join(stage.words)}` refused its input")
 

@@ -96,3 +96,11 @@ def test_the_drawn_module_needs_nothing_from_outside_and_grows_with_the_lens():
     assert widths[1] > widths[0] + 0.9
     bottom = min(z for part in parts[0] for face in part["faces"] for _, _, z in face)
     assert bottom == pytest.approx(-2.7)  # 2 mm of air, 0.5 mm sensor, 0.2 mm flex
+
+
+def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
+    """It is not said to have refused its input, and nothing is noted as done."""
+    monkeypatch.setattr(demo, "run_verb", lambda words: 130)
+    with pytest.raises(KeyboardInterrupt):
+        list(demo._chain(tmp_path, chain.shipped()))
+    assert not (tmp_path / demo.OUTCOMES).exists()
