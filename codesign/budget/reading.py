@@ -161,12 +161,16 @@ class Reading:
         return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
 
     def turned(self, optics: Imager, base: Imager) -> float:
-        """Mean angle, rad, between the answers to frames through two optics; the persons stay calibrated."""
+        """Mean angle, rad, between the answers to frames through two optics; the persons stay calibrated.
+
+        Without noise: Poisson counts of frames that hardly differ are other draws, and would turn the answers more.
+        """
         stand = self._stand
         if stand is None:
             raise RuntimeError("changes are judged once the path is through")
         one, other = (
-            gaze_experiment.answered(stand.people, *self._frames(stand.frames, o), stand.trial) for o in (optics, base)
+            gaze_experiment.answered(stand.people, *self._frames(stand.frames, o, quiet=True), stand.trial)
+            for o in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
