@@ -89,7 +89,7 @@ def intensity(
     dim = False
     for setting, kind in tries:
         dtype = torch.float64 if dim else kind
-        result = _windowed((phase.to(dtype), level.to(dtype)), cases, weights, max(setting, FINEST), moving)
+        result = _windowed((phase, level), dtype, cases, weights, max(setting, FINEST), moving)
         error = math.hypot(result.error, OUTPUT[dtype])
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
@@ -107,9 +107,14 @@ def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights:
 
 
 def _windowed(
-    maps: tuple[torch.Tensor, torch.Tensor], cases: list[Case], weights: list[float], tolerance: float, moving: Any
+    maps: tuple[torch.Tensor, torch.Tensor],
+    dtype: torch.dtype,
+    cases: list[Case],
+    weights: list[float],
+    tolerance: float,
+    moving: Any,
 ) -> Result:
-    """One try: every wavelength and window, then the estimate from all of them."""
+    """One try with sums of a dtype: every wavelength and window, then the estimate from all of them."""
     choice = choose(cases[0], tolerance, differentiable=True)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
     total: Any = 0
@@ -119,10 +124,10 @@ def _windowed(
         for row in _windows(case, choice, tolerance):
             parts = []
             for window in row:
-                made = plan(window, tolerance, p.dtype, p.device, moving is not None)
+                made = plan(window, tolerance, dtype, p.device, moving is not None)
                 field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
                 _check(p, t, case, power, gathered)
-                noise = math.hypot(ROUNDING[p.dtype], tolerance / SHARE) * _incoherent(power, case)
+                noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(power, case)
                 values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
                 samples[index].append(Sample(window, weight, *values, noise, made.layout.parts))
                 parts.append(field)

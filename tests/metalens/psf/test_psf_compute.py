@@ -28,9 +28,8 @@ def test_noise_of_the_pillars_adds_up_as_random_phases_do(monkeypatch, tilt_rad)
     level = rng.uniform(0.2, 0.9, (12, 15))
     place = {"pitch_um": 0.41, "wavelength_um": 0.85, "sensor_distance_um": 90.0, "angle_rad": (tilt_rad, 0.0)}
     case = propagate.case(level.shape, **place, depths_um=[4000.0], window_um=130.0, samples=128)
-    compute._windowed(
-        (torch.zeros(1, 12, 15, dtype=torch.float64), torch.from_numpy(level)[None]), [case], [1.0], 1e-5, None
-    )
+    maps = torch.zeros(1, 12, 15, dtype=torch.float64), torch.from_numpy(level)[None]
+    compute._windowed(maps, torch.float64, [case], [1.0], 1e-5, None)
     [sample] = seen
     power = []
     for _ in range(400):
@@ -39,3 +38,17 @@ def test_noise_of_the_pillars_adds_up_as_random_phases_do(monkeypatch, tilt_rad)
         power.append(float(np.abs(field[0, 0, 0]) ** 2))
     phasor = math.hypot(1e-11, 1e-5 / 40)  # rounding of float64, and the share of the tolerance
     assert sample.noise == pytest.approx(phasor * math.sqrt(np.mean(power)), rel=0.08)
+
+
+def test_single_maps_are_summed_in_double_a_few_rows_at_a_time_as_if_they_were_double():
+    """No second copy of a map of gigabytes: the same bits as from maps that are double all over."""
+    rng = np.random.default_rng(8)
+    phase, level = (torch.from_numpy(rng.uniform(0, 1, (300, 211)).astype("f4")) for _ in range(2))
+    case = propagate.case(phase.shape, pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=150.0,
+                          depths_um=[900.0], window_um=9.0, samples=11)  # fmt: skip
+    made = propagate.plan(case, 1e-6, torch.float64, torch.device("cpu"))
+    one, _, light = propagate.field_windowed(phase, level, made)
+    other, _, same = propagate.field_windowed(phase.double(), level.double(), made)
+    assert one.dtype == torch.complex128
+    assert torch.equal(one, other)
+    assert light == pytest.approx(same, rel=1e-6)
