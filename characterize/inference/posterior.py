@@ -103,14 +103,14 @@ class Valley:
         shift: Array | float = 0.0,
         rounds: int = _SOLVES,
         least: float = 0.02,
-        exact: bool = False,
+        slopes: Array | None = None,
     ) -> tuple[Array, float]:
         """The least misfit from ``x`` on, one parameter ``held``: (place, misfit). ``shift``: added to the residual.
 
-        exact: slopes are those at ``x``, not those of the mode.
+        slopes: those to begin with, of :meth:`slopes_at`, where those of the mode do not hold.
         """
         free = np.array([j for j in range(len(x)) if j != held])
-        slopes, rest = self.slopes_at(x) if exact else self.slopes, self.residual(x) + shift
+        slopes, rest = self.slopes if slopes is None else slopes, self.residual(x) + shift
         value, damping = float(rest @ rest), 1e-6
         for _ in range(rounds):
             part = slopes[:, free]
@@ -194,10 +194,11 @@ def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tu
     """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
     mode, sigma, along = valley.mode, float(valley.sigma[i]), sign * valley.along(i)
     bound = valley.prior.low[i] if sign < 0 else valley.prior.high[i]
-    reach, direction, exact = goal, along, False
+    reach, direction = goal, along
+    slopes: Array | None = None  # those that hold at the end, once it is near
     seen: list[tuple[float, float]] = []
     for turn in range(_ROUNDS + _CHECKS):
-        x, misfit = valley.descend(valley.inside(mode + reach * direction), held=i, exact=exact)
+        x, misfit = valley.descend(valley.inside(mode + reach * direction), held=i, slopes=slopes)
         rise = misfit - valley.least
         seen.append((float(x[i]), max(rise, 0.0)))
         if rise < -0.5:
@@ -205,10 +206,10 @@ def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tu
         root = math.sqrt(max(rise, 1e-6))
         done = abs(root - goal) < _CLOSE or (x[i] == bound and root < goal)
         direction = (x - mode) / reach
-        if exact and done:
+        if slopes is not None and done:
             break
-        if not exact and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
-            exact, seen = True, []
+        if slopes is None and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
+            slopes, seen = valley.slopes_at(x), []
         else:
             reach *= float(np.clip(goal / root, 0.35, 2.0))
     place, roots = np.array([p for p, _ in seen]), np.sqrt([r for _, r in seen])

@@ -20,7 +20,7 @@ from metalens.ground.arrays import Array
 
 WALKED = ("bias_nm",)
 REACH = 2.5  # prior sigma to either side of what is thought
-SHOWN = 30.0  # rise of -2 ln L up to which a walk is a profile; beyond it, it looks for valleys
+SHOWN = 14.0  # rise of -2 ln L up to which a walk is a profile, a probability of 1e-3; beyond it, it looks for valleys
 _WIDEST = 0.35  # of the prior sigma: a step at most
 _VALLEYS, _AGAIN = 3, 3
 _NEAR = Settings(iterations=5, step_tolerance=0.3, secant=True, near=1.0, finish=False)
