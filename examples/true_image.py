@@ -32,7 +32,7 @@ from metalens.psf import Source
 torch.set_num_threads(2)
 WAVELENGTH, D, SOURCE, RADIUS = 0.85, 2000.0, 20e3, 500.0  # um: an eye tracker of 1 mm at NA 0.24
 LED = Source(850.0, 30.0)  # nm: peak and full width at half maximum
-GLASS = Layers(behind=(Film("BK7", 400.0),))  # cover of the sensor
+GLASS = Layers(behind=(Film("N-BK7", 400.0),))  # cover of the sensor
 GRID = Grid((96, 96), 12.0, (15e3, 28e3), margin=12, window=33)
 SIDE = GRID.samples[0] + 2 * GRID.margin
 half_deg = np.degrees(np.arctan(GRID.samples[0] / 2 * GRID.step_um / D))
@@ -121,8 +121,9 @@ for panel, (name, picture) in zip(axes, seen.items(), strict=True):
 plt.show()
 
 # %% [markdown]
-# Field curvature and astigmatism change most; then the diode. Glass that the design does not know moves the focus; a design
-# that knows it gets it back. What one PSF says about depth is therefore true near the axis alone.
+# Coma, field curvature and astigmatism change most. A diode of 30 nm adds little on samples of 12 um: the field's blur is
+# wider. Glass that the design does not know moves the focus; a design that knows it gets it back. What one PSF says about
+# depth is true near the axis alone.
 #
 # **Light over the field**: what a sample of the sensor gets of a scene of one radiance (cos⁴, and the light that leaves
 # the PSF's window).
