@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 README, TEMPLATE, RESULTS = HERE.parent / "README.md", HERE / "figures.md", HERE / "results"
 SENTENCES = (  # of the README's text, beside its table
     "{characterize_study; peak 8000 e & Cramér-Rao; error; 3} times the\nCramér-Rao bound",
-    "the fit of a 1 mm lens in 10 s ({characterize; fit & rms; seconds; 2} s)",
+    "the fit of a 1 mm lens in 8 s ({characterize; fit & rms; seconds; 2} s)",
 )
 REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
 
