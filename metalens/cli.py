@@ -67,8 +67,8 @@ VERBS: dict[str, tuple[str, str]] = {
 OBJECTIVES = {"scenes": "codesign.evaluate.scenes"}
 # and the module that turns PROCESS.toml into its limits
 OBJECTIVES["process"] = "layout.process.limits"
-# source of ``metalens psf`` by kind of file: module with its ``stack(path, view, tolerance)``
-PSF_SOURCES = {"asbuilt": "characterize.commands.psf"}
+# source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and its PSFs
+PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}
 # what ``metalens view`` shows of a kind: "module:function" with its panels
 VIEWS = {
     "mask": "layout.commands.view:panels",

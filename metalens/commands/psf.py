@@ -7,7 +7,7 @@ import importlib
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import tyro
@@ -22,9 +22,8 @@ from metalens.ground.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
 from metalens.psf import plots as psf_plots
 
-SOURCES: dict[
-    str, str
-] = {}  # module with ``design(path)``, ``stack(path, view, tolerance)`` by kind, filled by the command line
+# by kind of file, the module whose ``load`` gives a :class:`Built`; filled by the command line
+SOURCES: dict[str, str] = {}
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
     "montage": "PSFs over depth (across) and field angle (down); square root of intensity.",
@@ -106,14 +105,15 @@ def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
     settings = options.settings
     psf_export.check(options.output)
-    made, kind = _read(options.lens)
+    given = _read(options.lens)
+    made = given if isinstance(given, lens.Lens) else given.design
     made = made if settings.layers is None else replace(made, layers=settings.layers)
     settings = settings.about(made)
     target, view = options.output, settings.view
     pixels = len(view.depths_um) * len(view.angles_rad) * settings.samples * settings.samples_y
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
-        stack = _make(options, settings, made if kind == "lens" else None, draft.path)
+        stack = _make(options, settings, made if isinstance(given, lens.Lens) else given, draft.path)
     shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
@@ -121,18 +121,32 @@ def run(options: Options) -> int:
     return 0 if stack.converged else 1
 
 
-def _read(path: Path) -> tuple[lens.Lens, str]:
-    """The lens of a file, and the file's kind; of another kind that the command line knows, its design."""
-    kind = store.load(path).kind
-    if kind in SOURCES:
-        found: lens.Lens = importlib.import_module(SOURCES[kind]).design(path)
-        return found, kind
-    return lens.load(path), kind
+class Built(Protocol):
+    """A lens that was made, with the PSFs of what was made."""
+
+    @property
+    def design(self) -> lens.Lens:
+        """What was to be made."""
+
+    def psf_stack(self, view: psf.View, *, tolerance: float) -> psf.PsfStack:
+        """PSFs (angle, depth, y, x)."""
 
 
-def _make(options: Options, settings: Settings, made: lens.Lens | None, path: Path) -> psf.PsfStack:
+def _read(path: Path) -> "lens.Lens | Built":
+    """The lens of a file, or what a file of another kind that the command line knows holds."""
+    kind = store.kind_of(path)
+    if kind not in SOURCES:
+        return lens.load(path)
+    found: Built = importlib.import_module(SOURCES[kind]).load(path)
+    return found
+
+
+def _make(options: Options, settings: Settings, given: "lens.Lens | Built", path: Path) -> psf.PsfStack:
     """Compute, write, draw."""
-    stack = _of_design(options.lens, settings, made) if made is not None else _of_made(options.lens, settings)
+    if isinstance(given, lens.Lens):
+        stack = _of_design(options.lens, settings, given)
+    else:
+        stack = _of_made(options.lens, settings, given)
     psf_export.write(path, stack)
     pictures = psf_plots.pictures(stack)
     for name, image in pictures.items():
@@ -142,9 +156,9 @@ def _make(options: Options, settings: Settings, made: lens.Lens | None, path: Pa
     return stack
 
 
-def _of_made(path: Path, settings: Settings) -> psf.PsfStack:
+def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
     """PSFs of a kind of file that the command line knows a source for."""
-    kind = store.load(path).kind
+    kind = store.kind_of(path)
     for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
         if getattr(settings, name):
             raise ConfigError(
@@ -152,7 +166,7 @@ def _of_made(path: Path, settings: Settings) -> psf.PsfStack:
             )
     if settings.polarisation == "vector":
         raise ConfigError(f"{path}: polarisation = 'vector' is for a design; a {kind} file is one scalar")
-    found: psf.PsfStack = importlib.import_module(SOURCES[kind]).stack(path, settings.view, settings.tolerance)
+    found = given.psf_stack(settings.view, tolerance=settings.tolerance)
     return replace(found, provenance=_provenance(path, settings))
 
 

@@ -173,11 +173,13 @@ class Settings:
         Raises:
             ConfigError: depths or window are those of a lens, and no lens was named (:meth:`about`).
         """
-        if self.depths_mm is None and not self.sources_mm:
+        if self.sources_mm:
+            depths = np.array(self.sources_mm) * 1e3
+        elif self.depths_mm is None:
             raise ConfigError("depths_mm are left to the lens, and there is none")
-        near, far, step = self.depths_mm or (0.0, 0.0, 1.0)
-        depths = np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
-        depths = (np.array(self.sources_mm) if self.sources_mm else depths) * 1e3
+        else:
+            near, far, step = self.depths_mm
+            depths = np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1) * 1e3
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
         pairs = [tuple(np.deg2rad([x, y]).tolist()) for x, y in zip(self.angles_deg, along_y, strict=True)]
         angles = tuple(propagate.angles(pair) for pair in pairs)
