@@ -1,0 +1,221 @@
+"""Every number of what frames wear, pixel by pixel: loops over float64 from the words of the docstrings."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.eye import worn as wear
+from codesign.eye.renderer import Labels, Rendered
+from metalens.image import Frames
+
+N, FRAME = 40, 1  # pixels; the second of two frames wears, the first must stay as it is
+PLACE = (23.5, 17.5)  # x, y of the pupil, not in the middle
+ROUND = 2e-6  # float32 of amounts below 2, some ten operations
+RNG = np.random.default_rng(11)
+OPENING = np.clip(RNG.uniform(-0.4, 1.4, (N, N)), 0, 1).astype(np.float32)  # share of the eye in each pixel
+LIGHT = RNG.uniform(0.2, 0.8, (2, N, N)).astype(np.float32)
+DRAWS = np.array([0.68, 0.83, 0.27, 0.41, 0.58, 0.76, 0.36, 0.19, 0.68, 0.47, 0.23, 0.77])
+LINE = (np.arange(N) + 0.5) / N - 0.5
+X, Y = LINE[None, :], LINE[:, None]
+
+
+def scene():
+    """Two frames of random light; skin at 15 mm, the eye at 21 to 25 mm."""
+    cover = torch.from_numpy(np.stack([1 - OPENING, OPENING]))[None].repeat(2, 1, 1, 1)
+    light = torch.from_numpy(LIGHT)[None].repeat(2, 1, 1, 1)
+    depth = torch.full((2, 2, N, N), 15e3)
+    depth[:, 1] = torch.linspace(21e3, 25e3, N)
+    pupil = torch.from_numpy(OPENING.copy())[None].repeat(2, 1, 1)
+    two = torch.zeros(2, dtype=torch.float64)
+    three, place = torch.zeros(2, 3, dtype=torch.float64), torch.tensor([PLACE] * 2, dtype=torch.float64)
+    labels = Labels(three, three, three, three, three, place, place, two + 0.8, torch.zeros(2, 9, 2))
+    return Rendered(Frames(light, cover, depth), pupil, labels)
+
+
+def put_on(draws=DRAWS, **size):
+    """(light, coverage, depth, pupil) of the frame that wears, float64; the other frame is as it was."""
+    made = scene()
+    sizes = {name: np.zeros(2) for name in wear.CAUSES}
+    for name, value in size.items():
+        sizes[name][FRAME] = value
+    out = wear.dressed(made, wear.Worn(sizes, np.stack([np.zeros(12), draws])))
+    for name in Frames.__slots__:
+        assert torch.equal(getattr(out.frames, name)[0], getattr(made.frames, name)[0])
+    sheets = (getattr(out.frames, name)[FRAME].double().numpy() for name in Frames.__slots__)
+    return *sheets, out.pupil[FRAME].double().numpy()
+
+
+def test_amounts_of_what_may_be_worn():
+    """Shares at variety 2 and ranges: what presets and docs were measured with."""
+    table = {name: (c.share, c.low, c.high) for name, c in wear.CAUSES.items()}
+    assert table == {
+        "tilt": (0.6, -30.0, 30.0),
+        "liner": (0.25, 0.3, 0.9),
+        "lid_shadow": (0.25, 0.15, 0.6),
+        "rim": (0.2, 0.03, 0.10),
+        "reflection": (0.25, 0.15, 0.8),
+        "glints": (0.4, 0.4, 1.2),
+        "gradient": (0.6, 0.1, 0.7),
+        "shade": (0.25, 0.2, 0.7),
+        "movement": (0.3, 0.008, 0.04),
+    }
+
+
+def test_sizes_are_even_over_their_range_and_twice_the_variety_is_twice_the_share():
+    count = 4000
+    for variety, times in ((1.5, 0.5), (2.0, 1.0), (9.0, 8.0)):
+        got = wear.drawn(count, variety, np.random.default_rng(3))
+        assert got.draws.shape == (count, 12)
+        for name, cause in wear.CAUSES.items():
+            size = got.size[name][got.size[name] != 0]
+            share = min(times * cause.share, 1.0)
+            assert len(size) / count == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / count) + 1e-9)
+            middle, sigma = (cause.low + cause.high) / 2, (cause.high - cause.low) / math.sqrt(12)
+            assert size.mean() == pytest.approx(middle, abs=4.5 * sigma / math.sqrt(len(size)))
+
+
+def largest(cover, row, up, down):
+    """(x,) largest coverage of the rows from ``down`` above to ``up`` below a row."""
+    return cover[max(row - down, 0) : row + up + 1].max(0)
+
+
+@pytest.mark.parametrize(("side", "below"), [(0.49, 2), (0.51, 1)])
+def test_a_liner_takes_its_opacity_of_the_skin_within_its_width(side, below):
+    draws = DRAWS.copy()
+    draws[0], draws[1] = 0.98, side  # 0.015 + 0.025 x 0.98 of 40 pixels: 1.58, two rows
+    light = put_on(draws, liner=0.7)[0]
+    for row in range(N):
+        want = LIGHT[0, row] * (1 - 0.7 * largest(OPENING, row, 2, below))
+        assert light[0, row] == pytest.approx(want, abs=ROUND)
+    assert np.array_equal(light[1], LIGHT[1].astype(float))
+
+
+def test_a_darkened_lid_is_a_mean_over_a_square_of_half_its_height():
+    draws = DRAWS.copy()
+    draws[2] = 0.66  # 0.06 + 0.06 x 0.66 of 40 pixels: 3.98, four rows; the mean over 2 reach + 1 = 3 pixels
+    light = put_on(draws, lid_shadow=0.55)[0]
+    near = np.stack([largest(OPENING, row, 4, 0) for row in range(N)])
+    wide = np.pad(near, 1, mode="edge")
+    soft = sum(wide[i : i + N, j : j + N] for i in range(3) for j in range(3)) / 9
+    assert light[0] == pytest.approx(LIGHT[0] * (1 - 0.55 * soft), abs=ROUND)
+
+
+def test_glints_are_lorentzian_spots_about_the_pupil():
+    light = put_on(glints=0.9)[0]
+    px, py = (PLACE[0] + 0.5) / N - 0.5, (PLACE[1] + 0.5) / N - 0.5
+    added = np.zeros((N, N))
+    for k in range(4):  # 1 + int(4 x 0.76)
+        turn = 6.283 * 0.41 + 1.7 * k
+        apart, size = 0.02 + 0.07 * 0.58, 0.005 + 0.015 * ((0.36 + 0.37 * k) % 1)
+        away = (X - px - apart * math.cos(turn)) ** 2 + (Y - py - apart * math.sin(turn)) ** 2
+        added += 0.9 * OPENING / (1 + (away / size**2) ** 2)
+    assert light[1] == pytest.approx(LIGHT[1] + added, abs=5 * ROUND)  # (away / size²)² amplifies float32 near a spot
+    assert np.array_equal(light[0], LIGHT[0].astype(float))
+
+
+def test_a_gradient_is_a_plane_and_stays_above_a_tenth():
+    turn = 6.283 * 0.19
+    plane = 1 + 2 * 1.3 * (X * math.cos(turn) + Y * math.sin(turn))
+    assert plane.min() < 0
+    assert put_on(gradient=1.3)[0] == pytest.approx(LIGHT * np.maximum(plane, 0.1), abs=ROUND)
+
+
+def test_a_shade_is_a_soft_edge():
+    turn, edge, middle = 6.283 * 0.68, 0.02 + 0.1 * 0.47, (0.23 - 0.5) * 0.6
+    away = X * math.cos(turn) + Y * math.sin(turn) - middle
+    want = LIGHT * (1 - 0.6 / (1 + np.exp(-away / edge)))
+    assert put_on(shade=0.6)[0] == pytest.approx(want, abs=2 * ROUND)
+
+
+def test_mirrored_windows_are_rounded_boxes_that_lean():
+    """Their number, places and halves from the draws; both sheets have them as far as they are seen."""
+    light, cover, depth, _ = put_on(reflection=0.45)
+    added = np.zeros((N, N))
+    lean = 0.6 * (0.76 - 0.5)
+    for k in range(3):  # 1 + int(3 x 0.68)
+        at_x, at_y = (0.83 + 0.61 * k) % 1 - 0.5, (0.27 + 0.43 * k) % 1 - 0.5
+        half_x, half_y = 0.02 + 0.1 * ((0.41 + 0.29 * k) % 1), 0.02 + 0.08 * ((0.58 + 0.53 * k) % 1)
+        u, v = (X - at_x) + lean * (Y - at_y), (Y - at_y) - lean * (X - at_x)
+        added += 0.45 / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+    was = scene().frames
+    want = LIGHT + added * was.coverage[FRAME].double().numpy()
+    assert light == pytest.approx(want, abs=2e-5)  # sixth powers of float32 places
+    assert np.array_equal(cover, was.coverage[FRAME].double().numpy())
+    assert np.array_equal(depth, was.depth_um[FRAME].double().numpy())
+
+
+def test_a_rim_is_an_arc_that_hides_and_shines():
+    width = 0.09
+    light, cover, depth, pupil = put_on(rim=width)
+    radius, turn, gap = 0.45 + 0.5 * 0.36, 6.283 * 0.19, 0.30 + 0.17 * 0.68
+    squeeze = 0.8 + 0.4 * 0.47
+    x, y = X + (radius - gap) * math.cos(turn), Y + (radius - gap) * math.sin(turn)
+    away = np.hypot(x, squeeze * y) - radius
+    band = 1 / (1 + np.exp(-(width / 2 - np.abs(away - width / 2)) * N * 2))
+    shine = 0.02 + 0.5 * 0.23**2 * (1 + 0.6 * np.cos(away / width * 6.0))
+    was = scene()
+    open_ = was.frames.coverage[FRAME].double().numpy()
+    near = 2e-5  # slopes of the band: 2 N = 80 a frame width, times float32 places
+    assert light[0] == pytest.approx(LIGHT[0] * (1 - band) + band * shine, abs=near)
+    assert light[1] == pytest.approx(LIGHT[1] * (1 - band), abs=near)
+    assert cover[0] == pytest.approx(open_[0] * (1 - band) + band, abs=near)
+    assert cover[1] == pytest.approx(open_[1] * (1 - band), abs=near)
+    assert pupil == pytest.approx(was.pupil[FRAME].double().numpy() * (1 - band), abs=near)
+    middle = float(np.sort(was.frames.depth_um[FRAME, 1].numpy().ravel())[N * N // 2 - 1])  # torch: the lower of two
+    assert depth[0][np.abs(band - 0.5) > near] == pytest.approx(
+        np.where(band > 0.5, 0.7 * middle, 15e3)[np.abs(band - 0.5) > near], rel=1e-6
+    )
+    assert np.array_equal(depth[1], was.frames.depth_um[FRAME, 1].double().numpy())
+
+
+def test_a_movement_averages_along_its_line_and_depths_by_what_is_covered():
+    """Correlation with the kernel of the line: 0.0775 of 40 pixels at 3.1416 x 0.77 rad."""
+    kernel = wear.line_kernel(0.0775 * N, 3.1416 * 0.77).double().numpy()
+    assert kernel.shape == (5, 5)
+    light, cover, depth, pupil = put_on(movement=0.0775)
+    was = scene()
+
+    def moved(picture):
+        wide = np.pad(picture, 2, mode="edge")
+        return sum(kernel[i, j] * wide[i : i + N, j : j + N] for i in range(5) for j in range(5))
+
+    before = was.frames.coverage[FRAME].double().numpy()
+    for sheet in (0, 1):
+        kept = np.maximum(before[sheet], 1e-6)
+        assert light[sheet] == pytest.approx(moved(LIGHT[sheet].astype(float)), abs=ROUND)
+        assert cover[sheet] == pytest.approx(moved(before[sheet]), abs=ROUND)
+        far = was.frames.depth_um[FRAME, sheet].double().numpy()
+        assert depth[sheet] == pytest.approx(moved(kept * far) / moved(kept), rel=2e-6)
+    assert pupil == pytest.approx(moved(was.pupil[FRAME].double().numpy()), abs=ROUND)
+
+
+def test_a_line_of_five_pixels_weighs_its_pixels_by_what_of_it_lies_in_each():
+    """Taps of a straight horizontal line of 3 pixels: triangles of half a pixel about each end, whole between.
+
+    A point at u gives 1 - |u - k| to the pixels k beside it; over [-1.5, 1.5] that is 1 / 3 each to -1, 0 and 1 less
+    1 / 8 / 3 at both ends, which the outermost pixels take.
+    """
+    row = wear.line_kernel(3.0, 0.0).double().numpy()
+    assert row.shape == (5, 5)
+    assert row[2] == pytest.approx(np.array([1 / 8, 7 / 8, 1, 7 / 8, 1 / 8]) / 3, abs=2e-3)  # 32 places: 1 / 32² of it
+    assert np.abs(np.delete(row, 2, 0)).max() == 0
+    column = wear.line_kernel(3.0, math.pi / 2).double().numpy()
+    assert column == pytest.approx(row.T, abs=1e-6)
+    assert wear.line_kernel(99.0, 0.3).shape == (15, 15)  # TAPS at most
+
+
+def test_labels_follow_the_mask():
+    was, after = torch.zeros(2, 5, 5), torch.zeros(2, 5, 5)
+    was[0, 1:4, 1:4], after[0, 1, 2], after[0, 3, 3] = 1.0, 1.0, 0.5
+    was[1, 2, 2] = 1.0
+    place = torch.tensor([[9.0, 8.0], [7.0, 6.0]], dtype=torch.float64)
+    two, three = torch.tensor([0.8, 0.6], dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
+    labels = Labels(three, three, three, three, three, place, place, two, torch.zeros(2, 9, 2))
+    got = wear._labels(labels, was, after)
+    assert got.visible.tolist() == pytest.approx([0.8 * 1.5 / 9, 0.0])
+    assert got.centroid_px[0].tolist() == pytest.approx([3.5 / 1.5, 2.5 / 1.5])
+    assert got.centroid_px[1].tolist() == [7.0, 6.0]  # nothing is left: where the pupil is
+    grown = wear._labels(labels, after, was)
+    assert grown.visible.tolist() == [1.0, 0.6]  # not above 1; of nothing before, as it was
