@@ -25,7 +25,8 @@ class Graph:
     @functools.cached_property
     def compiled(self) -> set[str]:
         """Modules with compiled loops, and those that they import: their caches do not see a change of the latter."""
-        own = {name for name, path in self.modules.items() if "njit" in path.read_text(encoding="utf-8")}
+        words = re.compile(r"njit|^@compiled\b", re.M)
+        own = {name for name, path in self.modules.items() if words.search(path.read_text(encoding="utf-8"))}
         return own | {home for name in own for home in self._uses(self.modules[name])}
 
     def related(self, module: str, seconds: dict[str, float], budget_s: float) -> list[str]:

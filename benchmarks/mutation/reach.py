@@ -20,6 +20,7 @@ import pytest
 PACKAGES = ("metalens", "layout", "characterize", "codesign")
 CALLS = 40  # of one function within one test that are followed line by line
 MODULE = ""  # the name of what stands outside every function
+_LOOPS = re.compile(r"(^|[_.])n?jit\b|^(inside|compiled|overload)\b|vectorize")  # decorators that compile
 Line = tuple[str, int]
 Seen = dict[str, tuple[float, list[Line]]]  # test -> its seconds, the lines that it ran
 
@@ -199,7 +200,7 @@ def callers(root: Path, name: str) -> set[tuple[str, str]]:
 
 @functools.cache
 def _functions(path: Path) -> list[tuple[str, int, int, bool]]:
-    """(name, first line, last line, compiled) of every function of a module."""
+    """(name, first line, last line, compiled) of every function of a module; an overload has its function's name."""
     found = []
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -209,8 +210,10 @@ def _functions(path: Path) -> list[tuple[str, int, int, bool]]:
                 inside = f"{prefix}{child.name}."
             if isinstance(child, ast.FunctionDef):
                 words = " ".join(ast.unparse(d) for d in child.decorator_list)
-                loops = re.search(r"(^|[_.])n?jit\b|^inside\b|vectorize", words) is not None
-                found.append((inside[:-1], child.lineno, child.end_lineno or 0, loops))
+                loops, other = _LOOPS.search(words) is not None, re.match(r"overload\((\w+)", words)
+                found.append((other[1] if other else inside[:-1], child.lineno, child.end_lineno or 0, loops))
+                if loops:  # what stands in it is compiled with it
+                    continue
             walk(child, inside)
 
     walk(ast.parse(path.read_text(encoding="utf-8")), "")

@@ -5,6 +5,7 @@ import importlib.util
 import pytest
 
 from benchmarks.mutation import reach, rules, server
+from benchmarks.mutation.graph import Graph
 from benchmarks.mutation.reach import Reach
 
 MODULE = '''"""Numbers."""
@@ -68,6 +69,21 @@ def test_lines_are_known_by_their_function(tree):
     assert seen.tests(tree, where, 14, 0.2) == ["test_x.py::a"]
     seen.add(tree, "test_x.py", {})
     assert seen.tests(tree, where, 14, 9.0) == []
+
+
+def test_compiled_loops_are_not_changed_in_memory(tree):
+    """By numba's decorator, the layout's own or as an overload, which answers to the name of its function."""
+    path = tree / "metalens" / "loops.py"
+    path.write_text(
+        "@numba.njit(cache=True)\ndef one(x):\n    return two(x)\n\n\n"
+        "@compiled\ndef two(x):\n    return x\n\n\n"
+        "@overload(three, inline='always')\ndef _three(x):\n    def short(x):\n        return x\n    return short\n\n\n"
+        "def plain(x):\n    return one(x)\n"
+    )
+    assert reach.compiled(path) == {"one", "two", "three"}
+    assert [reach.home(path, line)[0] for line in (3, 8, 14, 19)] == ["one", "two", "three", "plain"]
+    assert reach.callers(tree, "two") == {("metalens/loops.py", "plain")}  # through the other
+    assert "metalens.loops" in Graph(tree).compiled
 
 
 def test_changed_functions_run_their_new_code_in_memory(tree):
