@@ -60,7 +60,7 @@ def test_the_rim_sees_the_discs_of_a_block(site):
     assert got == pytest.approx(rim(row, column, rows, columns, POINT), rel=1e-12)
 
 
-def around(monkeypatch, spots=None):
+def around(monkeypatch):
     """Fields with two bodies and pieces of a mark; classes as drawn above, the second body all of entry 2, class 1."""
     second = Body(2, 3, 0.9, 15.0, 2.0, lambda first, end: np.full((end - first, 3), 2, np.uint8))
 
@@ -75,8 +75,7 @@ def around(monkeypatch, spots=None):
         bodies=[lens(), second],
         table=table(),
         ranges=SimpleNamespace(far=far, middle=middle),
-        spots=spots
-        or (np.array([[3.0, 9.0], [2.5, 9.5], [14.0, 1.0]]), np.array([0.4, 0.7, 1.3]), np.array([0, 0, 1])),
+        spots=(np.array([[3.0, 9.0], [2.5, 9.5], [14.0, 1.0]]), np.array([0.4, 0.7, 1.3]), np.array([0, 0, 1])),
         rects=SimpleNamespace(goal=np.array([1.0, 1.2])),
         own=np.array([0.4, 0.35]),
         far=None,
