@@ -18,8 +18,8 @@ def curve_with(*poles):
 
 def test_diameters_are_even_and_denser_around_what_is_narrow():
     """Steps of 5 nm: half-widths above 0.1 and below 15 nm are followed at 0.3, 1 and 3 of them to both sides."""
-    made = sweep._diameters((0.1, 0.2), 21, [curve_with((0.1312, 0.004), (0.15, 0.016)), curve_with((0.17, 0.00009))])
-    added = [0.1312 + s * 0.004 for s in (-3, -1, -0.3, 0.3, 1, 3)]
+    made = sweep._diameters((0.1, 0.2), 21, [curve_with((0.1314, 0.004), (0.15, 0.016)), curve_with((0.17, 0.00009))])
+    added = [0.1314 + s * 0.004 for s in (-3, -1, -0.3, 0.3, 1, 3)]
     assert made == pytest.approx(np.sort([*np.linspace(0.1, 0.2, 21), *added]), abs=1e-12)
     edge = sweep._diameters((0.1, 0.2), 21, [curve_with((0.1011, 0.0011), (0.199, 0.0149))])
     inside = [0.1011 + s * 0.0011 for s in (-0.3, 0.3, 1, 3)] + [0.199 + s * 0.0149 for s in (-3, -1, -0.3)]
