@@ -83,7 +83,7 @@ def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
     drawn, error = laid.designed_nm[good][order], laid.error_nm[good][order]
     rows = []
     for part in np.array_split(np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))):
-        spread = float(error[part].std(ddof=1)) if len(part) > 1 else float("nan")
+        spread = float(error[part].std(ddof=1))  # of six pillars at least
         rows.append((float(drawn[part].mean()), float(error[part].mean()), spread / len(part) ** 0.5, len(part)))
     return rows
 

@@ -1,0 +1,141 @@
+"""Pillars of a micrograph, number by number: circles through typed edges, what counts as fallen, plateaus, shades."""
+
+import math
+
+import numpy as np
+import pytest
+
+from characterize.measure import sem
+from characterize.measure.lattice import Lattice
+
+LATTICE = Lattice(np.array([3.0, 4.0]), np.array([0.0, 50.0]), np.array([50.0, 0.0]))
+
+
+def test_diameters_are_twice_the_radii_less_twice_the_bias_of_an_edge(monkeypatch):
+    """Steps of 1, 0.41 and 0.39 of the usual one: the last site holds no pillar. Pixels of 3.5 nm, edges 1.2 nm out."""
+    place = np.array([[30.0, 40.0], [31.0, 90.0], [32.0, 140.0], [80.0, 41.0], [81.0, 91.0]])
+    site = np.array([[0, 0], [0, 1], [0, 2], [1, 0], [1, 1]])
+    steps = dict(zip(place[:, 1], (1.1, 1.0, 0.41, 0.39, 1.0), strict=True))
+    asked = []
+
+    def pillar(flat, row, column, pitch, *, there):
+        asked.append(there)
+        return row + 0.2, column - 0.3, 20.0 + row / 10, 0.05, not there, column == 90.0
+
+    monkeypatch.setattr(sem, "find", lambda flat, pitch: LATTICE)
+    monkeypatch.setattr(Lattice, "sites", lambda self, shape: (place, site))
+    monkeypatch.setattr(sem, "_step", lambda flat, row, column, pitch: steps[column])
+    monkeypatch.setattr(sem, "_pillar", pillar)
+    got = sem.measure(np.random.default_rng(1).normal(size=(160, 180)), sem.Micrograph(3.5, 175.0, 1.2))
+    assert asked == [True, True, True, False, True]
+    want = 2 * (20 + place[:, 0] / 10) * 3.5 - 2 * 1.2
+    want[[1, 3]] = np.nan
+    assert got.diameter_nm == pytest.approx(want, nan_ok=True)
+    assert got.sigma_nm == pytest.approx(np.full(5, 2 * 0.05 * 3.5))
+    assert got.missing.tolist() == [False, False, False, True, False]
+    assert got.collapsed.tolist() == [False, True, False, False, False]
+    assert got.row == pytest.approx(place[:, 0] + 0.2)
+    assert got.column == pytest.approx(place[:, 1] - 0.3)
+
+
+@pytest.mark.parametrize(
+    ("radius", "scatter", "collapsed"),
+    [(20.0, 2.9, False), (20.0, 3.1, True), (6.0, 1.4, False), (6.0, 1.6, True), (10.0, 1.51, True)],
+)
+def test_a_pillar_far_from_round_has_collapsed(monkeypatch, radius, scatter, collapsed):
+    """Edges scatter by more than 15 % of the radius, or by 1.5 pixels where that is more."""
+    monkeypatch.setattr(sem, "_edges", lambda flat, y, x, pitch: (0.0, 0.0, radius, 0.07, scatter))
+    got = sem._pillar(np.zeros((90, 95)), 40.0, 47.0, 50.0, there=True)
+    assert got == (40.0, 47.0, radius, 0.07, False, collapsed)
+
+
+@pytest.mark.parametrize(("off", "collapsed"), [(9.9, False), (10.1, True)])
+def test_a_pillar_a_fifth_of_the_pitch_off_its_site_has_collapsed(monkeypatch, off, collapsed):
+    """Found in three steps along a direction of 3 to -4."""
+    steps = iter([(0.6 * off / 2, -0.8 * off / 2), (0.6 * off / 2, -0.8 * off / 2), (5e-4, 5e-4), (7.0, 7.0)])
+    monkeypatch.setattr(sem, "_edges", lambda flat, y, x, pitch: (*next(steps), 12.0, 0.07, 0.3))
+    row, column, radius, sigma, missing, fallen = sem._pillar(np.zeros((90, 95)), 40.0, 47.0, 50.0, there=True)
+    assert (row, column) == pytest.approx((40 + 0.6 * off, 47 - 0.8 * off), abs=1e-3)
+    assert (radius, sigma, missing, fallen) == (12.0, 0.07, False, collapsed)
+
+
+def test_a_site_without_edges_has_collapsed_and_one_without_a_pillar_is_missing_or_lies_beside(monkeypatch):
+    monkeypatch.setattr(sem, "_edges", lambda *_: None)
+    flat = np.zeros((90, 95))
+    assert sem._pillar(flat, 40.0, 47.0, 50.0, there=True)[4:] == (False, True)
+    assert sem._pillar(flat, 40.0, 47.0, 50.0, there=False)[4:] == (True, False)
+    for side, lies in ((19, True), (12, False)):  # of a cell of 51 pixels a side: (19 - 2)² is 11 %, (12 - 2)² is 4 %
+        flat[20 : 20 + side, 40 : 40 + side] = 1.0
+        assert sem._pillar(flat, 40.0, 47.0, 50.0, there=False)[4:] == (not lies, lies)
+        flat[:] = 0
+
+
+def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
+    """From a place 1.3 beside and 0.8 below the middle: the step there, the radius, and the scatter of 72 rays."""
+    y, x = np.indices((81, 85))
+    away = np.hypot(y - 40.8, x - 43.3)
+    flat = np.clip(0.5 + (14.3 - away) / 3, 0, 1)  # half at the radius
+    dy, dx, radius, sigma, scatter = sem._edges(flat, 40.0, 42.0, 50.0)
+    assert (dy, dx) == pytest.approx((0.8, 1.3), abs=0.05)  # first order of the offset; its square over 4 R: 0.04
+    assert radius == pytest.approx(14.3, abs=0.1)
+    dy, dx, radius, sigma, scatter = sem._edges(flat, 40.8, 43.3, 50.0)
+    assert (dy, dx, radius) == pytest.approx((0, 0, 14.3), abs=0.03)  # linear interpolation of a cone
+    assert scatter < 0.05
+    wavy = np.clip(0.5 + (14.3 + 0.6 * np.cos(5 * np.arctan2(y - 40.8, x - 43.3)) - away) / 3, 0, 1)
+    *_, sigma, scatter = sem._edges(wavy, 40.8, 43.3, 50.0)
+    across = math.exp(-(math.radians(5 * 5) ** 2) / 2)  # smoothed over rays 5 degrees apart
+    assert scatter == pytest.approx(0.6 / math.sqrt(2) * across, rel=0.03)
+    assert sigma == pytest.approx(scatter / math.sqrt(72 / 4), rel=1e-9)
+    assert sem._edges(0.19 * flat, 40.8, 43.3, 50.0) is None  # too faint a step
+
+
+def test_edges_far_from_the_middle_one_are_left_out():
+    """A neighbour touches on one side: those rays see their edge beyond a fifth of the radius."""
+    y, x = np.indices((81, 85))
+    away = np.hypot(y - 40.0, x - 42.0)
+    flat = np.clip(0.5 + (12.0 - away) / 2, 0, 1)
+    flat[38:43, 50:] = 1.0
+    _, _, radius, sigma, scatter = sem._edges(flat, 40.0, 42.0, 50.0)
+    assert radius == pytest.approx(12.0, abs=0.1)
+    assert scatter < 0.4
+    assert sigma > scatter / math.sqrt(72 / 4)  # of fewer rays
+
+
+def test_plateaus_are_the_brightest_rim_and_the_darkest_eighth():
+    """A dark top of 0.5, a rim of 0.9 at 30, gaps of 0.1 with one darker ring: by the mean over rays."""
+    mean = np.concatenate([np.full(28, 0.5), [0.6, 0.8, 0.9, 0.85], [0.3], np.full(40, 0.1)])
+    mean[60] = 0.02
+    rays = mean[:, None] + np.array([0.03, -0.03, 0.0])
+    inner, outer, rim = sem._plateaus(rays)
+    assert rim == 30
+    assert inner == pytest.approx(0.9)
+    assert outer == pytest.approx(np.sort(mean)[: len(mean) // 8].mean())
+    far = np.concatenate([[0.65], np.full(60, 0.5), [0.6], np.full(40, 0.1)])  # bright beyond 16 samples of the fall
+    assert sem._plateaus(far[:, None])[2] == 61
+    wide = np.concatenate([np.full(70, 0.5), [0.9], np.full(17, 0.6), np.full(40, 0.1)])
+    assert sem._plateaus(wide[:, None])[2] == 70  # a fifth of 87: 17 samples
+
+
+def test_rays_run_from_a_place_in_all_directions():
+    y, x = np.indices((60, 70))
+    reach, angle, rays = sem._rays(0.02 * x - 0.05 * y, 31.0, 36.0, 40.0)
+    assert len(angle) == 72
+    assert angle[0] == pytest.approx(math.pi / 72)
+    assert (reach[1], reach[-1]) == (pytest.approx(0.25), pytest.approx(20.75))
+    for k in (0, 19, 50):
+        want = 0.02 * (36 + 10 * math.cos(angle[k])) - 0.05 * (31 + 10 * math.sin(angle[k]))
+        got = np.interp(10, reach, rays[:, k])
+        # across the rays a plane keeps its mean but for exp(-(5°)² / 2), 0.4 % of what it changes
+        assert got == pytest.approx(want, abs=0.004 * 0.55)
+    assert sem._rays(np.zeros((60, 70)), 31.0, 36.0, 18.0)[0][1] == pytest.approx(0.15)
+
+
+def test_charging_of_rows_and_slow_shades_come_off_and_contrast_is_one():
+    y, x = np.indices((240, 200))
+    pillars = ((y % 20 - 10) ** 2 + (x % 20 - 10) ** 2 < 49).astype(float)
+    shade = 3 * np.exp(-((x - 30) ** 2 + (y - 300) ** 2) / 2e4) + 0.01 * y
+    one, other = (sem.level(v, sem.Micrograph(5.0, 100.0)) for v in (pillars, 40 * (pillars + shade) + 7))
+    low, high = np.percentile(one, [10, 90])
+    assert (low, high) == pytest.approx((0, 1))
+    inside = slice(45, -45)
+    assert np.abs(one - other)[inside, inside].max() < 0.2  # of a shade of 4; its bend over 30 pixels is left
