@@ -159,6 +159,18 @@ def _hint(name: str) -> str:
     return f"; did you mean {meant!r}?" if meant else nearest(name, NAMES)
 
 
+def _kin(name: str, wavelength_um: float) -> str:
+    """Shipped tables of the same substance that hold at a wavelength, in the words of a message."""
+    alike = [known for known in NAMES if known != name and _substance(known) == _substance(name)]
+    ranges = {known: material(known).range_um for known in alike}
+    held = [repr(known) for known, (low, high) in ranges.items() if low <= wavelength_um <= high]
+    return f" ({' or '.join(held)} holds there)" if held else ""
+
+
+def _substance(name: str) -> list[str]:
+    return [word for word in name.split("-") if word not in ("a", "c", "o", "e", "rutile", "sputtered", "infrared")]
+
+
 def read_yaml(path: str | Path) -> Material:
     """A material from a page of refractiveindex.info.
 
@@ -289,7 +301,7 @@ def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> 
     if not low <= wavelength_um <= high:
         raise MaterialError(
             f"{record.name} at {wavelength_um} um: its source holds from {low} to {high} um ({record.source}); "
-            "choose a wavelength inside, another material, or plain n and k"
+            f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:
         n, k = (record.page[0].at(wavelength_um), record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0))
