@@ -2,6 +2,7 @@
 
 import importlib
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -37,6 +38,7 @@ from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
 
 MOST_SUMMED = 60_000_000  # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
+_WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
@@ -47,7 +49,7 @@ class Design:
 
     profile: which phase.
     aperture_mm: diameter of the round aperture, up to 10.
-    wavelength_nm: of the design.
+    wavelength_nm: of the design; left out, that of a library which holds one, else 850.
     sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a collimated beam).
     library: library.h5 of the pillar cell, relative to the config; without it ``cell`` is swept first.
     cell: the pillar cell, where no library is given.
@@ -63,7 +65,7 @@ class Design:
 
     profile: Profile = "hyperbolic"
     aperture_mm: float = 1.0
-    wavelength_nm: float = field(default=850.0, metadata={"above": 0})
+    wavelength_nm: float | None = field(default=None, metadata={"above": 0})
     sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
     source_distance_mm: float = field(default=20.0, metadata={"may_be_inf": True, "above": 0})
     library: Path | None = None
@@ -90,7 +92,12 @@ class Design:
     def focus(self) -> Focus:
         """What is imaged onto what, in um, through which films."""
         distances = self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3
-        return Focus(self.wavelength_nm * 1e-3, *distances, self.layers)
+        return Focus((self.wavelength_nm or _WAVELENGTH_NM) * 1e-3, *distances, self.layers)
+
+    def at(self, held_um: Iterable[float]) -> "Design":
+        """The same, its wavelength filled in from those that the library holds."""
+        told, only = self.wavelength_nm, {round(1e3 * wave, 6) for wave in held_um}
+        return replace(self, wavelength_nm=told or (only.pop() if len(only) == 1 else _WAVELENGTH_NM))
 
 
 @dataclass(frozen=True)
@@ -122,6 +129,7 @@ def run(options: Options) -> int:
         raise ConfigError("along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it")
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
+    wanted = made.wanted
     values = words.values(made.quality, made.check)
     text = words.text(_head(wanted, target, made.quality), wanted.layers, made.quality, made.check)
     if made.conversion is not None:
@@ -136,7 +144,7 @@ def run(options: Options) -> int:
 def _head(wanted: Design, target: Path, quality: Quality) -> str:
     return (
         f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
-        f"{wanted.wavelength_nm:g} nm"
+        f"{1e3 * wanted.focus.wavelength_um:g} nm"
     )
 
 
@@ -145,6 +153,7 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
     with options.claim(options.output, beside=(".png",), inputs=read) as draft:
         path = options.config.parent / (wanted.library or "")
         made_of, inputs = axes.load(path), {file.name: store.sha256(file) for file in (path, options.config)}
+        wanted = wanted.at(made_of.wavelength_um.tolist())
         made_of.at(wanted.focus.wavelength_um)
         if options.process is not None:
             wanted = replace(wanted, limits=_printable(options.process, made_of.cell, wanted.limits))
@@ -186,6 +195,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     made_of, inputs = _pillars(wanted, options.config, options.console)
     cell, proxy = made_of.cell, library.proxy_of(made_of)
     transaction.check_room(options.output, int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2))  # 4 each
+    wanted = wanted.at(proxy.wavelengths_um)
     proxy.at(wanted.focus.wavelength_um)  # outside the library it is refused here, not after the search for a phase
     if options.process is not None:
         wanted = replace(wanted, limits=_printable(options.process, cell, wanted.limits))
@@ -212,13 +222,15 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(quality, check, judged, conversion)
+    return Outcome(wanted, quality, check, judged, conversion)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a design is worth. check: of its focus; judged: of a free form; conversion: of circular light."""
+    """What a design is worth. wanted: as it was filled in; check: of its focus; judged: of a free form; conversion: of
+    circular light."""
 
+    wanted: Design
     quality: Quality
     check: FocusCheck | None
     judged: "_Judged | None"

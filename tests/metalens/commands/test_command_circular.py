@@ -53,6 +53,13 @@ def folder(tmp_path_factory):
     return where
 
 
+def test_a_design_without_a_wavelength_takes_the_one_of_its_library(folder, capsys):
+    (folder / "silent.toml").write_text(DESIGN.replace("HAND", "right").replace("wavelength_nm = 940.0\n", ""))
+    assert main(["design", str(folder / "silent.toml"), "-o", str(folder / "silent.h5"), "--skip-focus-check"]) == 0
+    assert "0.021 mm, 940 nm" in capsys.readouterr().out
+    assert lenses.load(folder / "silent.h5").wavelength_um == pytest.approx(0.94, rel=1e-12)  # nm to um and back
+
+
 @pytest.mark.parametrize("hand", ["right", "left"])
 def test_design_and_psf_of_either_hand(folder, capsys, hand):
     target = folder / f"{hand}_own.h5"
