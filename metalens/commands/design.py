@@ -27,6 +27,7 @@ from metalens.design import (
     Quality,
     check_focus,
     focuses,
+    meeting_um,
 )
 from metalens.design.free_form import Fisher
 from metalens.ground import config, store, transaction
@@ -215,14 +216,26 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     else:
         partial = options.accept_partial_turn
         made, quality = design.make(phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about)
-    meets = wanted.profile != "map" or focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
-    quality = replace(quality, focuses=meets)
+    quality = replace(
+        quality, focuses=wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
+    )
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
     return Outcome(wanted, quality, check, judged, conversion)
+
+
+def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
+    """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
+    if focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
+        return True
+    elsewhere = meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
+    if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
+        told = f"sensor_distance_mm = {focus.sensor_distance_um * 1e-3:g}"
+        console.say(f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}")
+    return False
 
 
 @dataclass(frozen=True, slots=True)

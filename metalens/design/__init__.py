@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from metalens.design.focus_check import FocusCheck as FocusCheck
     from metalens.design.focus_check import check_focus as check_focus
     from metalens.design.focusing import focuses as focuses
+    from metalens.design.focusing import meeting_um as meeting_um
     from metalens.design.of_phase import Limits as Limits
     from metalens.design.of_phase import Quality as Quality
     from metalens.design.of_phase import field_angle as field_angle
@@ -44,6 +45,7 @@ __getattr__, __dir__, __all__ = attach(
         "check_focus": "focus_check",
         "field_angle": "of_phase",
         "focuses": "focusing",
+        "meeting_um": "focusing",
         "hyperbolic": "profiles",
         "left_out": "own_cell",
         "make": "of_phase",

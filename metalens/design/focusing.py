@@ -4,6 +4,7 @@ import numpy as np
 
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf
+from metalens.ground.arrays import Array
 from metalens.lens import media
 
 RAYS = 25  # along an axis
@@ -14,19 +15,13 @@ DARK = 1e-3  # of the peak of a perfect lens, below which the place where they m
 def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> bool:
     """Whether rays from the design source meet in one bright spot of the sensor.
 
-    The slope of the phase is its difference over one pitch, wrapped; an axicon, a hologram and a plain vortex scatter
-    their rays, a vortex in a focus leaves the middle of its ring dark.
+    An axicon, a hologram and a plain vortex scatter their rays, a vortex in a focus leaves the middle of its ring dark.
     """
-    axis = (np.arange(RAYS) - (RAYS - 1) / 2) * (2 * radius_um / RAYS)
-    x, y = np.meshgrid(axis, axis)
-    inside = np.hypot(x, y) <= radius_um - pitch_um
+    axis, x, y, inside = _grid(radius_um, pitch_um)
     if inside.sum() < RAYS:
         return True  # a few pillars: every phase is a lens
-    half, k = pitch_um / 2, 2 * np.pi / focus.wavelength_um
-    steps = [phase(axis + half, axis) - phase(axis - half, axis), phase(axis, axis + half) - phase(axis, axis - half)]
-    slope = [((s + np.pi) % (2 * np.pi) - np.pi) / pitch_um / k for s in steps]
-    away = np.sqrt(x**2 + y**2 + focus.source_distance_um**2)
-    px, py = slope[0] + x / away, slope[1] + y / away
+    k = 2 * np.pi / focus.wavelength_um
+    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
     after = focus.layers.after(focus.sensor_distance_um, focus.wavelength_um)
     w = px**2 + py**2
     if (w[inside] >= after.layers[0][0] ** 2).mean() > SPREAD:
@@ -39,3 +34,45 @@ def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) 
     lit = np.exp(1j * (phase(axis, axis) + k * focus.path_um(x**2 + y**2)))[np.hypot(x, y) <= radius_um]
     centred = np.hypot(*(m.mean() for m in meets)) * radius_um * k / focus.sensor_distance_um < 1
     return not centred or abs(lit.mean()) ** 2 > DARK
+
+
+def meeting_um(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> float | None:
+    """Distance behind the lens, through air, where rays from the design source pass closest to one another.
+
+    Rays go from (x, y) along (p, q, sqrt(1 - p² - q²)); the sum of squared distances from their middle is least at
+    z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v alike, all less their means. None where they
+    spread there as widely as on the lens (:data:`SPREAD`), never meet in front of the lens, or films stand behind it.
+    """
+    axis, x, y, inside = _grid(radius_um, pitch_um)
+    if not focus.layers.plain or inside.sum() < RAYS:
+        return None
+    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
+    inside &= px**2 + py**2 < 1
+    if inside.sum() < RAYS:
+        return None
+    along = np.sqrt(1 - (px**2 + py**2)[inside])
+    places, slopes = np.stack([x[inside], y[inside]]), np.stack([px[inside], py[inside]]) / along
+    places, slopes = (a - a.mean(axis=1, keepdims=True) for a in (places, slopes))
+    power = float((slopes**2).sum())
+    if power < 1e-18 * slopes.size:  # parallel to rounding
+        return None
+    distance_um = float(-(places * slopes).sum() / power)
+    spread = np.linalg.norm(places + distance_um * slopes) / np.linalg.norm(places)
+    return distance_um if distance_um > 0 and spread <= SPREAD else None
+
+
+def _grid(radius_um: float, pitch_um: float) -> tuple[Array, Array, Array, Array]:
+    """Places of rays: (n,) axis, (n, n) x and y, and which lie on the lens."""
+    axis = (np.arange(RAYS) - (RAYS - 1) / 2) * (2 * radius_um / RAYS)
+    x, y = np.meshgrid(axis, axis)
+    return axis, x, y, np.hypot(x, y) <= radius_um - pitch_um
+
+
+def _leaving(phase: PhaseOf, focus: Focus, pitch_um: float, at: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Direction cosines behind the lens, in air; the slope of the phase is its difference over one pitch, wrapped."""
+    axis, x, y = at
+    half, k = pitch_um / 2, 2 * np.pi / focus.wavelength_um
+    steps = [phase(axis + half, axis) - phase(axis - half, axis), phase(axis, axis + half) - phase(axis, axis - half)]
+    slope = [((s + np.pi) % (2 * np.pi) - np.pi) / pitch_um / k for s in steps]
+    away = np.sqrt(x**2 + y**2 + focus.source_distance_um**2)
+    return slope[0] + x / away, slope[1] + y / away

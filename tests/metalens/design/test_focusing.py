@@ -1,0 +1,40 @@
+"""Where the rays of a map meet: of ideal lenses known in closed form, of maps without a focus nowhere."""
+
+import numpy as np
+import pytest
+
+from metalens.cell.record import Film, Index
+from metalens.design import Focus, meeting_um
+from metalens.lens import Layers
+
+K = 2 * np.pi / 1.31
+ABOUT = {"radius_um": 130.0, "pitch_um": 0.6}
+
+
+def lens(focal_um, source_um, aside_um=0.0):
+    """An ideal lens whose middle lies ``aside_um`` along x; phase of paper Eq. 1 on both sides."""
+
+    def phase(x, y):
+        x, y = np.meshgrid(x, y)
+        before = np.hypot(np.hypot(x, y), source_um) - source_um if np.isfinite(source_um) else 0.0
+        return -K * (np.hypot(np.hypot(x - aside_um, y), focal_um) + before)
+
+    return phase
+
+
+@pytest.mark.parametrize("told_um", [700.0, 2000.0])
+@pytest.mark.parametrize(("focal_um", "source_um", "aside_um"), [(900.0, np.inf, 0.0), (1100.0, 7e3, 17.0)])
+def test_rays_of_an_ideal_lens_meet_in_its_focus(focal_um, source_um, aside_um, told_um):
+    found = meeting_um(lens(focal_um, source_um, aside_um), Focus(1.31, told_um, source_um), **ABOUT)
+    # the difference over one pitch p misses the slope by p² / 24 of its second derivative: 0.015 um² / (900 um)²
+    assert found == pytest.approx(focal_um, rel=1e-6)
+
+
+def test_no_meeting_of_rays_that_spread_or_part():
+    focus = Focus(1.31, 800.0)
+    diverging = lambda x, y: -lens(900.0, np.inf)(x, y)  # noqa: E731
+    axicon = lambda x, y: -0.1 * K * np.hypot(x, y[:, None])  # noqa: E731
+    for phase in (diverging, axicon, lambda x, y: 0.03 * K * x + 0 * y[:, None]):
+        assert meeting_um(phase, focus, **ABOUT) is None
+    behind = Focus(1.31, 800.0, layers=Layers(behind=(Film(Index(1.5), 201.0),)))
+    assert meeting_um(lens(900.0, np.inf), behind, **ABOUT) is None
