@@ -8,6 +8,7 @@ from metalens.ground.arrays import Array
 from metalens.lens import media
 
 RAYS = 25  # along an axis
+_APART = 0.98764321  # of the even spacing of rays: never in step with the samples of a map
 SPREAD = 0.2  # rms distance of the rays on the sensor, of that on the lens, up to which they are said to meet
 DARK = 1e-3  # of the peak of a perfect lens, below which the place where they meet is dark: a vortex
 
@@ -63,7 +64,7 @@ def meeting_um(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: floa
 
 def _grid(radius_um: float, pitch_um: float) -> tuple[Array, Array, Array, Array]:
     """Places of rays: (n,) axis, (n, n) x and y, and which lie on the lens."""
-    axis = (np.arange(RAYS) - (RAYS - 1) / 2) * (2 * radius_um / RAYS)
+    axis = (np.arange(RAYS) - (RAYS - 1) / 2) * (2 * _APART * radius_um / RAYS)
     x, y = np.meshgrid(axis, axis)
     return axis, x, y, np.hypot(x, y) <= radius_um - pitch_um
 
