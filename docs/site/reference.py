@@ -17,6 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from metalens.cli import VERBS
+from metalens.ground import config
 
 # settings file: (module, record, command that reads it)
 SETTINGS = {
@@ -34,22 +35,6 @@ SETTINGS = {
     "PLAN.toml": ("codesign.budget.plan", "PlanConfig", "plan"),
     "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
 }
-KEY = re.compile(r"(?<!\S)((?:\w+, )*\w+): ")
-
-
-def texts(record: type[Any]) -> dict[str, str]:
-    """{field: what its docstring says of it}; lines ``name: text`` or ``name, other: text``, several to a line too."""
-    names = {f.name for f in dataclasses.fields(record)}
-    doc = inspect.getdoc(record) or ""
-    found: dict[str, str] = {}
-    places = [m for m in KEY.finditer(doc) if set(m.group(1).split(", ")) <= names]
-    for place, following in zip(places, [*places, None][1:], strict=True):
-        end = following.start() if following else len(doc)
-        text = doc[place.end() : end].split("\n\n")[0]
-        text = " ".join(text.split()).rstrip(" ;.")
-        for name in place.group(1).split(", "):
-            found.setdefault(name, text)
-    return found
 
 
 def _word(kind: Any) -> str:
@@ -97,7 +82,7 @@ def _table_of(kind: Any) -> type[Any] | None:
 
 def keys(record: type[Any], path: str = "") -> list[str]:
     """Markdown of a record's keys, then of the tables below it."""
-    hints, told = typing.get_type_hints(record, include_extras=True), texts(record)
+    hints, told = typing.get_type_hints(record, include_extras=True), config.described(record)
     lead = (inspect.getdoc(record) or "").split("\n\n")[0].replace("\n", " ")
     lines = [f"### `[{path}]`" if path else "### Top level", "", lead, ""]
     lines += ["| key | kind | default | |", "|---|---|---|---|"]
@@ -125,10 +110,10 @@ def _options(verb: str, module: str) -> list[str]:
     if parts:
         return [line for part, (where, _) in parts.items() for line in _options(f"{verb} {part}", where)]
     record = loaded.Options
-    told, hints = texts(record), typing.get_type_hints(record, include_extras=True)
+    told, hints = config.described(record), typing.get_type_hints(record, include_extras=True)
     for base in reversed(record.__mro__[1:-1]):
         if dataclasses.is_dataclass(base):
-            told = texts(base) | told
+            told = config.described(base) | told
     lines = [
         f"## metalens {verb}",
         "",

@@ -1,13 +1,16 @@
 """TOML configs read into frozen dataclasses; an unknown key is an error that names the nearest one."""
 
 import dataclasses
+import inspect
 import math
 import re
 import reprlib
+import textwrap
 import tomllib
 import types
 import typing
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +20,8 @@ Record = TypeVar("Record")
 _LARGEST = 1 << 24  # bytes of a config
 _WORDS = re.compile(r"[^\x00-\x08\x0b-\x1f\x7f]*")  # text: blanks and line ends, no other control characters
 _LONGEST = 500  # characters of what a record says of its values
+_TEXT = 160  # characters of what a key means, in a refusal
+_KEY = re.compile(r"(?<!\S)((?:\w+, )*\w+): ")  # in the docstring of a record
 _EITHER_SIGN = ("_rad", "_deg", "_offset")
 _MOST, _LARGE = (1 << 63) - 1, 1e9  # of a seed; of any other number, in the unit of its key
 
@@ -106,19 +111,53 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     for key in table:
         if key not in fields:
             raise ConfigError(f"{where}: unknown key {prefix + key!r}{nearest(key, fields)}")
-    values = {k: _convert(v, hints[k], where, prefix + k) for k, v in table.items()}
-    for key, value in values.items():
-        _check_range(fields[key], value, where, prefix + key)
+    values = {}
+    for key, value in table.items():
+        with _meaning(record, key):
+            values[key] = _convert(value, hints[key], where, prefix + key)
+            _check_range(fields[key], values[key], where, prefix + key)
     for name, f in fields.items():
         if _required(f) and name not in values:
-            raise ConfigError(f"{where}: missing key {prefix + name!r} in {record.__name__}")
+            with _meaning(record, name):
+                raise ConfigError(f"{where}: missing key {prefix + name!r} in {record.__name__}")
     try:
         made = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(f"{where}: {_culprit(record, values, prefix, str(error))}") from error
     for key, value in values.items():  # what the record lets pass
-        _check_sign(fields[key], value, where, prefix + key)
+        with _meaning(record, key):
+            _check_sign(fields[key], value, where, prefix + key)
     return made
+
+
+class _Meant(ConfigError):
+    """A refusal that says what its key means."""
+
+
+@contextmanager
+def _meaning(record: type[Any], key: str) -> Iterator[None]:
+    """Lets a refusal of a key end in what the key means."""
+    try:
+        yield
+    except _Meant:
+        raise
+    except ConfigError as error:
+        text = textwrap.shorten(described(record).get(key, ""), _TEXT, placeholder=" ...")
+        raise _Meant(f"{error} ({key}: {text})" if text else str(error)) from None
+
+
+def described(record: type[Any]) -> dict[str, str]:
+    """{field: what the docstring of a record says of it}: ``name: text`` or ``name, other: text``, to an empty line."""
+    names, doc = {f.name for f in dataclasses.fields(record)}, inspect.getdoc(record) or ""
+    if doc.startswith(f"{record.__name__}("):  # the signature that stands for a docstring
+        return {}
+    places = [m for m in _KEY.finditer(doc) if set(m.group(1).split(", ")) <= names]
+    found: dict[str, str] = {}
+    for place, following in zip(places, [*places, None][1:], strict=True):
+        text = doc[place.end() : following.start() if following else len(doc)].split("\n\n")[0]
+        for name in place.group(1).split(", "):
+            found.setdefault(name, " ".join(text.split()).rstrip(" ;."))
+    return found
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:

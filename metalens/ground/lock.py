@@ -30,18 +30,22 @@ def held(target: Path) -> Iterator[None]:
         OSError: the folder cannot be written.
     """
     path = target.with_name(f".{target.name}.lock")
-    handle = _taken(path, target)
+    handle = -1
     try:
+        with undisturbed():  # a signal that comes between making the file and knowing its handle is answered below
+            handle = _taken(path, target)
         owner = {"process": os.getpid(), "host": socket.gethostname(), "command": COMMAND.get()}
         os.ftruncate(handle, 0)
         os.pwrite(handle, json.dumps(owner).encode(), 0)
         _open.add(handle)
         yield
     finally:
-        _open.discard(handle)
-        with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True)
-        os.close(handle)
+        with undisturbed():
+            if handle >= 0:
+                _open.discard(handle)
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
+                os.close(handle)
 
 
 @contextlib.contextmanager

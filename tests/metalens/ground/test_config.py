@@ -62,6 +62,37 @@ def test_bad_config_is_refused_by_name(text, message):
         config.loads(text, Outer)
 
 
+@dataclass(frozen=True)
+class Told:
+    """Two keys, explained.
+
+    reach_um: (nearest, farthest) place of
+        the stage. count: how many, however long it takes to say what they are: WORDS
+
+    Not of any key.
+    """
+
+    reach_um: tuple[float, float]
+    count: int = 1
+    inner: Outer | None = None
+
+
+@pytest.mark.parametrize(
+    ("text", "ends"),
+    [
+        ("reach_um = [1.0]", "need 2 (reach_um: (nearest, farthest) place of the stage)"),
+        ("count = 2", "missing key 'reach_um' in Told (reach_um: (nearest, farthest) place of the stage)"),
+        ("reach_um = [1, 2]\ncount = -1", "need 0 or more (count: how many, however long it takes to say what ...)"),
+        ("reach_um = [1, 2]\n[inner]\npitch_um = true", "(bool), need float"),  # of a record that says nothing
+    ],
+)
+def test_a_refused_key_is_explained(monkeypatch, text, ends):
+    monkeypatch.setattr(config, "_TEXT", 48)
+    with pytest.raises(ConfigError) as refusal:
+        config.loads(text, Told)
+    assert str(refusal.value).endswith(ends)
+
+
 def test_missing_file_and_binary_file_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         config.load(tmp_path / "absent.toml", Outer)

@@ -2,6 +2,7 @@
 """Outputs appear whole or not at all, whatever ends the work; what is not ours stays, even with force."""
 
 import contextlib
+import fcntl
 import json
 import os
 import random
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from metalens.ground import manifest, store, transaction
+from metalens.ground import lock, manifest, store, transaction
 from metalens.ground.errors import OutputError, StoreError
 from metalens.ground.transaction import Terms
 
@@ -299,3 +300,18 @@ def test_kills_at_random_moments_mix_nothing_and_leave_nothing(tmp_path, kind):
     else:
         save(work / "out.h5", -1)
     assert sorted(os.listdir(work)) == (["out"] if kind == "folder" else ["out.h5", "out.png"])
+
+
+@pytest.mark.parametrize("call", ["flock", "unlink"])
+def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(tmp_path, monkeypatch, call):
+    where = {"flock": fcntl, "unlink": Path}[call]
+    real = getattr(where, call)
+
+    def interrupted(*words, **more):
+        signal.raise_signal(signal.SIGINT)
+        return real(*words, **more)
+
+    monkeypatch.setattr(where, call, interrupted)
+    with pytest.raises(KeyboardInterrupt), lock.held(tmp_path / "out.h5"):
+        pass
+    assert os.listdir(tmp_path) == []
