@@ -1,4 +1,4 @@
-"""Exposure by everything around a shape: wide Gaussians on pixels, narrower ones by a sum over neighbours.
+"""Exposure by everything around a shape through wide Gaussians, on pixels.
 
 Masses go to the nine pixels around them by a quadratic B-spline, a separable Gaussian blurs the pixels, and values come
 from nine pixels by the same spline. Both splines widen the Gaussian by one squared pixel: the kernel is narrower by as
@@ -18,7 +18,6 @@ from metalens.ground.arrays import Array
 _PIXELS = 4  # along the range of a wide Gaussian
 _CUT = 4.0  # ranges at which its kernel ends: exp(-16)
 _THREADS = 2
-_REACH = 4.0  # ranges at which a neighbour no longer counts: exp(-16)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,43 +76,6 @@ class Raster:
         out = np.empty(len(x_um))
         _take(x_um, y_um, self.left_um, self.bottom_um, self.pixel_um, image, out)
         return out
-
-
-def beside(at: tuple[Array, Array, Array, Array], around: tuple[Array, Array, Array, Array], range_um: float) -> Array:
-    """(n,) exposure of each rim by the other shapes within four ranges; discs as Gaussians of their second moment.
-
-    Args:
-        at, around: x, y, mass and radius of those that are looked at, and of all near them, themselves too.
-    """
-    bins = Bins.of(around[0], around[1], _REACH * range_um)
-    x, y, mass, radius = (v[bins.order] for v in around)
-    out = np.zeros(len(at[0]))
-    place = bins.columns, bins.left_um, bins.bottom_um, bins.side_um
-    _neighbours(*at, x, y, mass, radius, range_um, bins.starts, *place, out)
-    return out
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Bins:
-    """Places sorted into squares: order (n,) and starts (squares + 1,), rows of ``columns`` squares from the bottom."""
-
-    order: Array
-    starts: Array
-    columns: int
-    left_um: float
-    bottom_um: float
-    side_um: float
-
-    @classmethod
-    def of(cls, x_um: Array, y_um: Array, side_um: float) -> "Bins":
-        """Squares of ``side_um`` around some places."""
-        left, bottom = float(x_um.min()), float(y_um.min())
-        column, row = (v // side_um for v in (x_um - left, y_um - bottom))
-        columns = int(column.max()) + 1
-        cell = (row * columns + column).astype(np.int64)
-        order = np.argsort(cell, kind="stable")
-        starts = np.searchsorted(cell[order], np.arange((int(row.max()) + 1) * columns + 1))
-        return cls(order, starts, columns, left, bottom, side_um)
 
 
 @compiled
@@ -181,35 +143,3 @@ def _blur(image: Array, kernel: Array, out: Array, first: int, end: int) -> None
             weight, line = kernel[other - done + reach], ring[other % taps]
             for c in range(columns):
                 target[c] += weight * line[c]
-
-
-@compiled
-def _neighbours(
-    x: Array,
-    y: Array,
-    mass: Array,
-    radius: Array,
-    near_x: Array,
-    near_y: Array,
-    near_mass: Array,
-    near_radius: Array,
-    reach: float,
-    starts: Array,
-    columns: int,
-    left: float,
-    bottom: float,
-    bin_um: float,
-    out: Array,
-) -> None:
-    rows = (starts.shape[0] - 1) // columns
-    for n in range(x.shape[0]):
-        row, column = int((y[n] - bottom) // bin_um), int((x[n] - left) // bin_um)
-        total = -mass[n] / (np.pi * (reach**2 + 1.5 * radius[n] ** 2))  # itself, which is among them
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            for c in range(max(column - 1, 0), min(column + 2, columns)):
-                for k in range(starts[r * columns + c], starts[r * columns + c + 1]):
-                    square = reach**2 + near_radius[k] ** 2 / 2 + radius[n] ** 2
-                    away = (near_x[k] - x[n]) ** 2 + (near_y[k] - y[n]) ** 2
-                    if away < 16 * square:
-                        total += near_mass[k] * np.exp(-away / square) / (np.pi * square)
-        out[n] = total

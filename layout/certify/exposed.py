@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.certify import background, neighbours, outlines
+from layout.certify import neighbours, outlines
 from layout.certify.background import Raster
 from layout.certify.gathered import Exposed
 from layout.certify.places import Places, strip_of
@@ -176,8 +176,6 @@ class Simulation:
         reach = neighbours.reach_um(range_um, float(size.max()))
         more = int(np.ceil(reach / places.height_um))
         around = places.part(strips[0] - more, strips[1] + more)
-        if range_um > neighbours.WIDER * float(size.max()):
-            return background.beside(self._discs(pillars), self._discs(around), range_um)
         if range_um not in self._pairs:
             self._pairs[range_um] = neighbours.Pairs.of(size / 2, range_um)
         return self._pairs[range_um](self._discs(pillars), self._discs(around))

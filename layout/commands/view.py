@@ -34,7 +34,8 @@ def panels(path: Path) -> list[Panel]:
     flat.refuse_beyond(content, most)
     table = found.with_name("doses.csv")
     dose = doses.read(table) if table.is_file() else {}
-    outlines = [_outline(content, shape, dose) for top in content.tops for shape in _gathered(content, top)]
+    groups = flat.alike(content, lambda shape: (shape.cell, shape.layer))
+    outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:
         raise MaskFileError(f"{found} holds no shape to be shown")
     marks = _marks(found.with_suffix(".lyrdb"))
@@ -47,30 +48,15 @@ def panels(path: Path) -> list[Panel]:
     return [drawn, _layers(content, outlines, dose)]
 
 
-def _gathered(content: MaskContent, top: str) -> list[flat.Shapes]:
-    """Copies of one polygon together, wherever in the hierarchy they are placed."""
-    found: dict[tuple[str, LayerNumber, bytes], list[flat.Shapes]] = {}
-    for shape in flat.shapes(content, top):
-        found.setdefault((shape.cell, shape.layer, np.ascontiguousarray(shape.outline).tobytes()), []).append(shape)
-    return [
-        flat.Shapes(
-            some[0].cell,
-            some[0].layer,
-            some[0].outline,
-            np.concatenate([s.x for s in some]),
-            np.concatenate([s.y for s in some]),
-        )
-        for some in found.values()
-    ]
-
-
-def _outline(content: MaskContent, shape: flat.Shapes, dose: dict[LayerNumber, float]) -> Outline:
+def _outline(content: MaskContent, group: list[flat.Shapes], dose: dict[LayerNumber, float]) -> Outline:
+    """Copies of one polygon."""
+    shape = group[0]
     size = np.ptp(shape.outline, axis=0) * content.unit_nm
     number = "/".join(map(str, shape.layer))
     notes = {"layer": number, "cell": shape.cell, "width / nm": float(size[0]), "height / nm": float(size[1])}
     if shape.layer in dose:
         notes["relative dose"] = dose[shape.layer]
-    places = np.column_stack([shape.x, shape.y]).astype(np.int32)
+    places = np.concatenate([np.column_stack([some.x, some.y]) for some in group]).astype(np.int32)
     return Outline(_name(content, shape.layer), shape.outline, places, notes)
 
 

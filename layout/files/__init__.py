@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from layout.files import flat as flat
     from layout.files import handover as handover
     from layout.files import paths as paths
+    from layout.files import squares as squares
     from layout.files import verify as verify
     from layout.files.assembly import Assembly as Assembly
     from layout.files.assembly import Copies as Copies
@@ -59,6 +60,7 @@ __getattr__, __dir__, __all__ = attach(
         "paths": "",
         "placements": "read_loops",
         "sites_in": "dxf",
+        "squares": "",
         "sref_run": "read_loops",
         "verify": "",
     },

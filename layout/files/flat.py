@@ -1,6 +1,6 @@
 """The shapes of a mask with the hierarchy taken apart: each different polygon once, with all its places."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +67,20 @@ def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
                 alike.setdefault(len(points), []).append(points)
             for group in alike.values():
                 yield Stack(name, layer, _turned(np.stack(group).astype(np.int64), turn), x, y)
+
+
+def alike(content: MaskContent, key: Callable[[Shapes], Hashable]) -> dict[Hashable, list[Shapes]]:
+    """Shapes below all top cells by ``key`` and outline, wherever in the hierarchy they are placed; None: passed over.
+
+    Raises:
+        MaskFileError: as :func:`shapes`.
+    """
+    found: dict[Hashable, list[Shapes]] = {}
+    for top in content.tops:
+        for shape in shapes(content, top):
+            if (own := key(shape)) is not None:
+                found.setdefault((own, np.ascontiguousarray(shape.outline).tobytes()), []).append(shape)
+    return found
 
 
 def refuse_beyond(content: MaskContent, most: int) -> None:

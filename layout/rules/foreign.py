@@ -6,7 +6,7 @@ polygon, those that can be near each other found by sorting their places; all ot
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -81,44 +81,28 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
     return report
 
 
-@dataclass(eq=False, slots=True)
-class _Gathered:
-    """Shapes of one layer number while they come. number: {outline: index}; parts: kind, x, y of some."""
-
-    number: dict[bytes, int] = field(default_factory=dict)
-    outlines: list[Array] = field(default_factory=list)
-    cells: list[str] = field(default_factory=list)
-    parts: list[tuple[int, Array, Array]] = field(default_factory=list)
-
-    def take(self, shape: flat.Shapes) -> None:
-        key = np.ascontiguousarray(shape.outline, np.int64).tobytes()
-        if key not in self.number:
-            self.number[key] = len(self.outlines)
-            self.outlines.append(_plain(np.asarray(shape.outline, np.int64)))
-            self.cells.append(shape.cell)
-        self.parts.append((self.number[key], shape.x, shape.y))
-
-    def layer(self) -> _Layer:
-        """All of them; their parts are let go."""
-        total, at = sum(len(x) for _, x, _ in self.parts), 0
-        kind, x, y = (np.empty(total, np.int32) for _ in range(3))
-        while self.parts:
-            number, some_x, some_y = self.parts.pop()
-            kind[at : at + len(some_x)], x[at : at + len(some_x)] = number, some_x
-            y[at : at + len(some_x)] = some_y
-            at += len(some_x)
-        return _Layer(self.outlines, self.cells, kind, x, y)
-
-
 def _layers(content: MaskContent, skip: Sequence[int]) -> Iterator[tuple[int, _Layer]]:
     """(layer number, its shapes), rising."""
-    found: dict[int, _Gathered] = {}
-    for top in content.tops:
-        for shape in flat.shapes(content, top):
-            if shape.layer[0] not in skip:
-                found.setdefault(shape.layer[0], _Gathered()).take(shape)
+    found: dict[int, list[list[flat.Shapes]]] = {}
+    for group in flat.alike(content, lambda s: None if s.layer[0] in skip else s.layer[0]).values():
+        found.setdefault(group[0].layer[0], []).append(group)
     for number in sorted(found):
-        yield number, found.pop(number).layer()
+        yield number, _layer(found.pop(number))
+
+
+def _layer(groups: list[list[flat.Shapes]]) -> _Layer:
+    """All of them, those of one outline together; they are let go on the way."""
+    outlines = [_plain(np.asarray(group[0].outline, np.int64)) for group in groups]
+    cells = [group[0].cell for group in groups]
+    total, at = sum(len(shape.x) for group in groups for shape in group), 0
+    kind, x, y = (np.empty(total, np.int32) for _ in range(3))
+    for number, group in enumerate(groups):
+        while group:
+            shape = group.pop()
+            some = slice(at, at + len(shape.x))
+            kind[some], x[some], y[some] = number, shape.x, shape.y
+            at = some.stop
+    return _Layer(outlines, cells, kind, x, y)
 
 
 def _plain(points: Array) -> Array:

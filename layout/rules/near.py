@@ -1,14 +1,17 @@
 """Pairs of shapes that can be nearer than a rule, of any sizes, by bins in sorted order: no tree, no object for each.
 
-Shapes of like size (within a factor of four) are sorted into squares as wide as two of the largest and the rule; those
-that can be near each other lie in neighbouring squares, which are neighbours in the sorted order too.
+Shapes of like size (within a factor of four) are sorted into squares as wide as two of the largest and the rule: those
+that can be near each other lie in neighbouring squares.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from layout.files.squares import Squares, first_from
 from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
@@ -30,15 +33,11 @@ class Discs:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Sorted:
-    """Shapes of like size by square: order (n,) numbers, key (n,) rising; rows of ``columns`` from (left, bottom)."""
+class _Group:
+    """Shapes of like size by square. order: (n,) their numbers, in the order of the squares; widest: largest reach."""
 
     order: Array
-    key: Array
-    side: float
-    left: float
-    bottom: float
-    columns: int
+    squares: Squares
     widest: float
 
 
@@ -50,7 +49,7 @@ def pairs(discs: Discs, gap: float) -> tuple[Array, Array]:
     """
     sized = np.floor(np.log2(np.maximum(discs.reach, 1)) / _OCTAVES).astype(np.int64)
     used = np.bincount(discs.kind, minlength=len(sized)) > 0
-    groups = [_sorted(discs, sized == size, gap) for size in np.unique(sized[used])]
+    groups = [_group(discs, sized == size, gap) for size in np.unique(sized[used])]
     ones, twos, total = [], [], 0
     for one, two in _found(discs, groups, gap):
         total += len(one)
@@ -65,57 +64,35 @@ def pairs(discs: Discs, gap: float) -> tuple[Array, Array]:
     return np.concatenate([nothing, *ones]), np.concatenate([nothing, *twos])
 
 
-def _sorted(discs: Discs, kinds: Array, gap: float) -> _Sorted:
+def _group(discs: Discs, kinds: Array, gap: float) -> _Group:
     members = np.flatnonzero(kinds[discs.kind]).astype(np.int32)
     widest = float(discs.reach[kinds].max())
-    side = 2 * widest + gap
-    low = np.array([discs.x[members].min(), discs.y[members].min()]) + discs.middle[kinds].min(0)
-    wide = int((discs.x[members].max() + discs.middle[kinds, 0].max() - low[0]) // side) + 3
-    key = np.empty(len(members), np.int64)
-    _keys(members, discs.x, discs.y, discs.kind, discs.middle, low[0], low[1], side, wide, key)
-    order = np.argsort(key, kind="stable").astype(np.int32)
-    return _Sorted(members[order], key[order], side, float(low[0]), float(low[1]), wide, widest)
+    x, y, kind = (v[members] for v in (discs.x, discs.y, discs.kind))
+    squares = Squares.of(x, y, 2 * widest + gap, kind=kind, middle=discs.middle)
+    return _Group(members[squares.order], squares, widest)
 
 
-def _found(discs: Discs, groups: list[_Sorted], gap: float) -> Iterator[tuple[Array, Array]]:
+def _found(discs: Discs, groups: list[_Group], gap: float) -> Iterator[tuple[Array, Array]]:
     """Pairs within each group, and of each with all smaller ones."""
     shapes = (discs.x, discs.y, discs.kind, discs.middle, discs.reach)
     out = np.empty((2, _AT_ONCE), np.int32)
-    for n, group in enumerate(groups):
-        at, above = 0, 0
-        while at < len(group.key):
-            at, above, count = _within(group.order, group.key, group.columns, *shapes, gap, at, above, out)
-            yield out[0, :count].copy(), out[1, :count].copy()
-            if count == 0 and at < len(group.key):
-                raise MaskFileError(f"more than {_AT_ONCE:,} shapes lie on one; the file is no mask")
-        for other in groups[:n]:
-            place = other.left, other.bottom, other.side, other.columns, other.widest
-            first = 0
-            while first < len(group.order):
-                first, count = _across(group.order, other.order, other.key, *place, *shapes, gap, first, out)
-                yield out[0, :count].copy(), out[1, :count].copy()
-                if count == 0 and first < len(group.order):
-                    raise MaskFileError(f"more than {_AT_ONCE:,} shapes lie on one; the file is no mask")
+    for n, one in enumerate(groups):
+        own: tuple[Any, ...] = (one.order, one.squares.key, one.squares.columns)
+        yield from _collected(partial(_within, *own, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
+        for two in groups[:n]:
+            s = two.squares
+            other: tuple[Any, ...] = (one.order, two.order, s.key, s.left, s.bottom, s.side, s.columns, two.widest)
+            yield from _collected(partial(_across, *other, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
 
 
-@compiled
-def _keys(
-    members: Array,
-    x: Array,
-    y: Array,
-    kind: Array,
-    middle: Array,
-    left: float,
-    bottom: float,
-    side: float,
-    columns: int,
-    key: Array,
-) -> None:
-    for n in range(members.shape[0]):
-        i = members[n]
-        column = int((x[i] + middle[kind[i], 0] - left) // side) + 1
-        row = int((y[i] + middle[kind[i], 1] - bottom) // side)
-        key[n] = row * columns + column
+def _collected(step: Callable[[int, Array], tuple[int, int]], total: int, out: Array) -> Iterator[tuple[Array, Array]]:
+    """Pairs of all shapes, as many at once as ``out`` holds; ``step``: from a shape on, (next shape, pairs)."""
+    first = 0
+    while first < total:
+        first, count = step(first, out)
+        if count == 0 and first < total:
+            raise MaskFileError(f"more than {out.shape[1]:,} shapes lie on one; the file is no mask")
+        yield out[0, :count].copy(), out[1, :count].copy()
 
 
 @compiled
@@ -138,27 +115,25 @@ def _within(
     middle: Array,
     reach: Array,
     gap: float,
-    at: int,
-    above: int,
+    first: int,
     out: Array,
-) -> tuple[int, int, int]:
-    """Pairs of a group from its shape ``at`` on, until ``out`` is full: next shape, first in the row above, pairs."""
+) -> tuple[int, int]:
+    """Pairs of a group from its shape ``first`` on, until ``out`` is full: next shape, pairs."""
     count, total = 0, key.shape[0]
-    while at < total:
+    above = np.searchsorted(key, key[first] + columns - 1)
+    for at in range(first, total):
         begin, i, here = count, order[at], key[at]
-        while above < total and key[above] < here + columns - 1:
-            above += 1
+        above = first_from(key, here + columns - 1, above)
         for part in range(2):
             other, last = (at + 1, here + 1) if part == 0 else (max(above, at + 1), here + columns + 1)
             while other < total and key[other] <= last:
                 if _close(i, order[other], x, y, kind, middle, reach, gap):
                     if count == out.shape[1]:
-                        return at, above, begin
+                        return at, begin
                     out[0, count], out[1, count] = i, order[other]
                     count += 1
                 other += 1
-        at += 1
-    return at, above, count
+    return total, count
 
 
 @compiled

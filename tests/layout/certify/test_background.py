@@ -1,9 +1,8 @@
-"""Exposure from afar on pixels and from neighbours, against the direct sum over all shapes."""
+"""Exposure from afar on pixels, against the direct sum over all shapes."""
 
 import numpy as np
 import pytest
 
-from layout.certify import background
 from layout.certify.background import Raster
 from layout.certify.places import Listed, OnLattices, strip_of
 from layout.mask import Lattice
@@ -47,17 +46,6 @@ def test_a_band_of_pixels_is_the_same_as_all_of_them():
         images.append(raster.take(x[here], y[here], raster.blurred(image)))
     assert whole.between(low, high).rows < whole.rows
     assert images[1] == pytest.approx(images[0], rel=2e-6)  # float32, and what lies 4.5 ranges away
-
-
-def test_neighbours_are_summed_without_the_pillar_itself():
-    x, y, mass = disc_of_pillars(n=40)
-    radius = np.random.default_rng(5).uniform(0.05, 0.15, len(x))
-    some = slice(100, 160)
-    found = background.beside((x[some], y[some], mass[some], radius[some]), (x, y, mass, radius), 0.5)
-    square = 0.25 + radius**2 / 2 + radius[some, None] ** 2
-    away = (x - x[some, None]) ** 2 + (y - y[some, None]) ** 2
-    terms = mass * np.exp(-away / square) / (np.pi * square)
-    assert found == pytest.approx(terms.sum(1, where=away > 0), rel=1e-6)  # neighbours beyond exp(-16) are left out
 
 
 def test_lattices_and_lists_hold_the_same_pillars_each_in_one_strip():

@@ -1,14 +1,12 @@
-"""Sums over pillars and the verdict on them, typed in; weights of Gaussians; pairs of discs against an integral."""
+"""Sums over pillars and the verdict on them, typed in; weights of Gaussians."""
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import integrate, special
+from scipy import special
 
 from layout.certify import certificate
-from layout.certify.neighbours import Pairs, reach_um
 from layout.certify.verdict import Edges, Survey, Tally
 from layout.dose import assign
 from layout.process.process import Exposure
@@ -101,26 +99,6 @@ def test_gaussians_weigh_as_their_energies_with_sum_1():
     assert terms == [(0.04, pytest.approx(1 / 2)), (11.0, pytest.approx(0.35)), (2.5, pytest.approx(0.15))]
     terms = certificate._terms(SimpleNamespace(exposure=Exposure(alpha_um=0.04, beta_um=11.0, eta=0.6)))
     assert terms == [(0.04, pytest.approx(1 / 1.6)), (11.0, pytest.approx(0.6 / 1.6))]
-
-
-def test_the_rim_of_a_disc_by_another_is_the_mean_of_an_integral():
-    """Exposure at a distance s of a disc of radius R by exp(-r² / a²) / (pi a²), ring by ring, over the rim."""
-    a, seen, other, gap = 0.16, 0.071, 0.093, 0.11
-
-    def exposure(s):
-        return integrate.quad(
-            lambda r: 2 * r / a**2 * math.exp(-((r - s) ** 2) / a**2) * special.i0e(2 * r * s / a**2), 0, other
-        )[0]
-
-    apart, turns = seen + other + gap, (np.arange(64) + 0.5) * 2 * math.pi / 64
-    want = np.mean([exposure(math.sqrt(apart**2 + seen**2 - 2 * apart * seen * math.cos(t))) for t in turns])
-    pairs = Pairs.of(np.array([0.05, seen, other, 0.1]), a)
-    x, y = np.array([3.0, 3.0 + apart * 0.6]), np.array([7.0, 7.0 + apart * 0.8])
-    radius, dose = np.array([seen, other]), np.array([1.3, 0.8])
-    mass = dose * math.pi * radius**2
-    got = pairs((x[:1], y[:1], mass[:1], radius[:1]), (x, y, mass, radius))
-    assert got[0] == pytest.approx(0.8 * want, rel=3e-3)  # log linear in gaps of a tenth of the range: 0.1² / 4
-    assert reach_um(a, 0.2) == pytest.approx(0.2 + 6 * a)  # exp(-36) is nothing
 
 
 def test_an_edge_error_moves_both_edges_of_a_line():
