@@ -68,7 +68,9 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
         valleys = [_valley(task, mode) for mode in modes]
         profiles, _ = _profiles(task, valleys[0], modes[0])
     bent = [name for name in walk.WALKED if name in profiles and (len(modes) > 1 or not profiles[name].parabolic)]
-    return _joined(task, modes, valleys, profiles, {name: walk.walk(task, modes, name) for name in bent})
+    widened = max(1.0, modes[0].chi2_per_dof)
+    walks = {name: walk.walk(task, modes, name, widened=widened) for name in bent}
+    return _joined(task, modes, valleys, profiles, walks)
 
 
 def _valley(task: Task, mode: Solution) -> Valley:

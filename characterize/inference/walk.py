@@ -37,22 +37,26 @@ class Walk:
     index: of the parameter. value: (k, p) all parameters, the walked one's rising.
     rise: (k,) of -2 ln L above the best.
     spread: (k, p, p) covariance of the others with this one held; 0 in its row and column.
+    shown: rise up to which it is a profile.
     """
 
     index: int
     value: Array
     rise: Array
     spread: Array
+    shown: float = SHOWN
 
     @classmethod
-    def of(cls, task: Task, stops: Sequence[Solution], index: int, *, least: float = 0.0) -> "Walk":
+    def of(
+        cls, task: Task, stops: Sequence[Solution], index: int, *, least: float = 0.0, shown: float = SHOWN
+    ) -> "Walk":
         """By its stops, in any order; of two at one place the lower. Their merits are those of :func:`_measured`."""
         order: list[Solution] = []
         for one in sorted(stops, key=lambda s: (s.value[index], s.merit)):
             if not order or one.value[index] > order[-1].value[index]:
                 order.append(one)
         value, rise = np.array([one.value for one in order]), np.array([one.merit for one in order]) - least
-        return cls(index, value, rise, np.array([_held(task, one, index) for one in order]))
+        return cls(index, value, rise, np.array([_held(task, one, index) for one in order]), shown)
 
     def minima(self) -> list[int]:
         """Places lower than their neighbours, the lowest first."""
@@ -61,9 +65,9 @@ class Walk:
         return [int(k) for k in low[np.argsort(self.rise[low])]]
 
     def profile(self) -> tuple[Array, Array]:
-        """(m,) values of the walked parameter and (m,) rise, where it is below ``SHOWN``."""
+        """(m,) values of the walked parameter and (m,) rise, where it is below ``shown``."""
         at, rise, *_ = self._between()
-        keep = rise < SHOWN
+        keep = rise < self.shown
         return at[keep], rise[keep]
 
     def interval(self, level: float) -> tuple[Array, Array]:
@@ -111,7 +115,7 @@ class Walk:
         """
         at = self.value[:, self.index]
         some = slice(None)
-        close = np.flatnonzero(self.rise < SHOWN)
+        close = np.flatnonzero(self.rise < self.shown)
         if len(close):
             some = slice(max(int(close[0]) - 1, 0), int(close[-1]) + 2)
         at, known = at[some], self.rise[some]
@@ -149,12 +153,15 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
     return kept
 
 
-def walk(task: Task, modes: Sequence[Solution], name: str) -> Walk:
-    """Through the valleys of the modes, on all frames, as far as they are no higher than ``SHOWN`` above the best."""
+def walk(task: Task, modes: Sequence[Solution], name: str, *, widened: float = 1.0) -> Walk:
+    """Through the valleys of the modes, on all frames, as far as they are no higher than ``SHOWN`` above the best.
+
+    Times ``widened``, the factor of all variances: a wider posterior reaches that much higher.
+    """
     i, part = task.names.index(name), (task.problem(), task.data)
     lows = [dataclasses.replace(one, merit=_measured(task, task.data, one.value, one.image)) for one in modes]
     sigma = max(float(np.sqrt(one.covariance[i, i])) for one in modes)
-    step, most = min(sigma, _WIDEST * _wide(task, lows[0], i)), lows[0].merit + SHOWN
+    step, shown = min(sigma, _WIDEST * _wide(task, lows[0], i)), SHOWN * widened
     stops: list[Solution] = []
     for mode in lows:
         low, high = _ends(task, mode, i)
@@ -162,8 +169,8 @@ def walk(task: Task, modes: Sequence[Solution], name: str) -> Walk:
             low, high = max(low, mode.value[i] - 2 * step), min(high, mode.value[i] + 2 * step)
         stops.append(mode)
         for end in (low, high):
-            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=most)
-    return Walk.of(task, stops, i, least=lows[0].merit)
+            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=lows[0].merit + shown)
+    return Walk.of(task, stops, i, least=lows[0].merit, shown=shown)
 
 
 def _wide(task: Task, mode: Solution, i: int) -> float:
