@@ -1,0 +1,107 @@
+"""Optics that are known roughly: what the fit is told, and what comes back, number by number."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.pupil import free
+from characterize.pupil.record import PupilModel, PupilSpec
+
+SPEC = PupilSpec(
+    0.32, 0.5, 0.4, window=12, phase_order=7, amplitude_order=3, drift_order=1, model_error=0.0,
+    free=("numerical_aperture", "step_um", "pixel_um"),
+)  # fmt: skip
+Z = np.array([-6.0, -1.0, 2.0, 7.0])
+
+
+def test_factors_are_exponentials_and_the_aperture_stays_below_the_index():
+    images = free._Images(SPEC, Z)
+    made, position = images.optics(np.log([1.1, 0.7, 1.3]))
+    assert made.numerical_aperture == pytest.approx(0.352)
+    assert made.pixel_um == pytest.approx(0.52)
+    assert position == pytest.approx(0.7 * Z)
+    steep = dataclasses.replace(SPEC, numerical_aperture=0.9, free=("numerical_aperture", "index"))
+    made, position = free._Images(steep, Z).optics(np.log([1.2, 0.9]))
+    assert (made.index, made.numerical_aperture) == pytest.approx((1.0, 0.98))  # no less than air, 0.98 of it
+    assert position == pytest.approx(Z)
+    assert images.orders == {"phase_order": 6, "amplitude_order": 2}
+
+
+def test_all_apertures_and_steps_share_the_nodes_of_the_widest():
+    widest = dataclasses.replace(SPEC, numerical_aperture=1.2 * 0.32)
+    want = PupilModel(widest, 1.1 * Z, phase_order=6, amplitude_order=2).nodes
+    assert free._Images(SPEC, Z).nodes == want
+    assert free._Images(SPEC, Z)._at(np.array([-0.2, 0.1, 0.0])).nodes == want
+    high = dataclasses.replace(SPEC, numerical_aperture=0.9, free=("numerical_aperture",))
+    limit = dataclasses.replace(high, numerical_aperture=0.97)
+    assert free._Images(high, Z).nodes == PupilModel(limit, 1.1 * Z, phase_order=6, amplitude_order=2).nodes
+
+
+def test_slopes_by_the_factors_are_differences_of_images():
+    """One by one, the rest as the model has them; compared with steps ten times as fine."""
+    images = free._Images(SPEC, Z)
+    layout = images.model.layout()
+    x = np.concatenate([np.random.default_rng(2).normal(0, 0.1, layout.size), [0.02, -0.03, 0.01]])
+    x[layout.size - 2 * layout.frames - 1] = 0.3
+    image, slopes = images(x, True)
+    plain, none = images(x, False)
+    assert none is None
+    assert image == pytest.approx(plain)
+    assert len(slopes) == len(x)
+    own = images._at(x[-3:]).images(x[:-3], True)[1]
+    assert slopes[:-3] == pytest.approx(own)
+    for k in range(3):
+        step = 1e-4 * np.eye(3)[k]
+        up, down = (images._at(x[-3:] + s * step).images(x[:-3], False)[0] for s in (1, -1))
+        want = (up - down) / 2e-4
+        assert np.abs(slopes[-3 + k] - want).max() < 1e-4 * np.abs(want).max()  # third derivatives times 1e-6
+
+
+@pytest.mark.parametrize(("chi2", "widened"), [(0.3, 1.0), (2.25, 1.5)])
+def test_what_is_freed_is_known_to_its_usual_error_and_its_bar_grows_with_a_misfit(monkeypatch, chi2, widened):
+    """10 % of aperture, step and pixel, 0.3 of the logarithm at most; gains to 30 %; blur of 5 % to 4 pixels."""
+    given = []
+    logs = np.log([1.05, 0.9, 1.02])
+
+    def fit(images, data, start, *, prior, settings):
+        given.append((start, prior, settings))
+        covariance = np.diag(np.arange(1.0, len(start) + 1) * 1e-4)
+        value = start.copy()
+        value[-3:] = logs
+        return SimpleNamespace(value=value, covariance=covariance, chi2_per_dof=chi2)
+
+    monkeypatch.setattr(free.leastsquares, "fit", fit)
+    size = free._Images(SPEC, Z).model.layout().size
+    coarse = np.random.default_rng(1).normal(size=size)
+    made, optics, longer = free.freed(SPEC, Z, None, lambda model: coarse, step_um=2.6)
+    (start, prior, settings), n = given[0], size + 3
+    assert start == pytest.approx(np.concatenate([coarse, np.zeros(3)]))
+    assert np.array_equal(prior.mean, start)
+    sigma = np.full(n, np.inf)
+    sigma[size - 8 : size - 4], sigma[-3:] = 0.3, 0.1
+    assert np.array_equal(prior.sigma, sigma)
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    low[-3:], high[-3:] = -0.3, 0.3
+    low[size - 9], high[size - 9] = 0.05 * 0.4, 4 * 0.4
+    assert np.array_equal(prior.low, low)
+    assert np.array_equal(prior.high, high)
+    assert (settings.iterations, settings.step_tolerance, settings.near, settings.secant) == (40, 0.1, 1.0, True)
+    assert made.numerical_aperture == pytest.approx(0.336)
+    assert longer == pytest.approx(0.9)
+    assert [name for name, *_ in optics] == list(SPEC.free)
+    assert [value for _, value, _ in optics] == pytest.approx([0.336, 0.9 * 2.6, 0.408])
+    spread = widened * np.sqrt(np.arange(n - 2, n + 1) * 1e-4)
+    assert [bar for *_, bar in optics] == pytest.approx(np.array([0.336, 2.34, 0.408]) * spread)
+    assert free.freed(dataclasses.replace(SPEC, free=()), Z, None, None, step_um=1.0)[1:] == ((), 1.0)
+
+
+def test_what_was_freed_is_said_beside_what_was_stated():
+    told = free.told(SPEC, (("numerical_aperture", 0.336, 0.004), ("step_um", 2.34, 0.05)))
+    assert told == [
+        "numerical_aperture = 0.336 +- 0.004 was fitted, stated 0.32",
+        "step_um = 2.34 +- 0.05 was fitted",
+    ]
+    assert math.isnan(SPEC.step_um)
