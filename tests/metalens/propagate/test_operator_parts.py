@@ -1,0 +1,98 @@
+"""Parts of the windowed engine on few pillars: bases of depths, carriers of blocks, where a plan is missing."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.ground import legendre
+from metalens.propagate import Case, blocks, choice, operators, window
+
+CASE = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400, 1 / 900, 1 / 2500), (14.0, -8.5), 0.6, (3, 4))
+NODES = legendre.mapped(9, -5.365, 5.365), legendre.mapped(11, -7.4, 7.4)
+
+
+def phases(case=CASE, nodes=NODES):
+    """(depth, y, x) of sources at -z (0.21, -0.13, 1), less that of the middle of 1/z, by plain distances."""
+    y, x = nodes[0][:, None], nodes[1]
+
+    def path(inverse):
+        z = 1 / inverse
+        return np.sqrt((x + 0.21 * z) ** 2 + (y - 0.13 * z) ** 2 + z**2) - z * np.sqrt(1 + 0.21**2 + 0.13**2)
+
+    middle = path((1 / 400 + 1 / 2500) / 2)
+    return np.stack([np.exp(2j * np.pi / 0.85 * (path(v) - middle)) for v in case.inverse_depths_per_um])
+
+
+def test_depths_are_sums_of_fields_that_are_orthonormal_under_the_weights_of_the_nodes():
+    made = operators.depth_basis(CASE, NODES, 1e-9)
+    weight = np.outer(legendre.nodes(9)[1], legendre.nodes(11)[1])
+    flat = made.basis.reshape(len(made.basis), -1)
+    assert (flat * weight.ravel()) @ flat.conj().T == pytest.approx(np.eye(len(flat)), abs=1e-10)
+    got = np.einsum("zb,byx->zyx", made.coefficients, made.basis)
+    assert got == pytest.approx(phases(), abs=1e-7)  # paths of 1e4 rad in float64, and the tolerance
+    size = np.linalg.svd((phases() * np.sqrt(weight)).reshape(3, -1), compute_uv=False)
+    assert made.strength == pytest.approx(size / size[0], rel=1e-6)
+
+
+def test_a_loose_tolerance_leaves_weak_fields_out():
+    """Root mean square of what is left of all depths together, against the singular values."""
+    weight = np.outer(legendre.nodes(9)[1], legendre.nodes(11)[1])
+    size = np.linalg.svd((phases() * np.sqrt(weight)).reshape(3, -1), compute_uv=False)
+    tail = [np.sqrt((size[k:] ** 2).sum() / (size**2).sum()) for k in range(3)]
+    assert tail[1] > 2 * tail[2]
+    for tolerance, rank in ((1.01 * tail[1], 1), (0.99 * tail[1], 2), (1.01 * tail[2], 2), (0.99 * tail[2], 3)):
+        assert len(operators.depth_basis(CASE, NODES, tolerance).basis) == rank
+
+
+def test_coefficients_that_move_are_those_of_the_basis():
+    made = operators.depth_basis(CASE, NODES, 1e-9)
+    sizes = SimpleNamespace(nodes=(9, 11))
+    plan = SimpleNamespace(
+        case=CASE, nodes_um=NODES, layout=SimpleNamespace(sizes=sizes), depths=made,
+        tensors={"coefficients": torch.zeros(1, dtype=torch.complex128)},
+    )  # fmt: skip
+    moving = SimpleNamespace(
+        tangents=torch.tensor([0.21, -0.13], dtype=torch.float64),
+        inverse_depths=torch.tensor(CASE.inverse_depths_per_um, dtype=torch.float64),
+    )
+    got = window._coefficients(plan, moving).numpy()
+    assert got == pytest.approx(made.coefficients, abs=1e-9)
+
+
+@pytest.mark.parametrize(("itemsize", "least"), [(4, 2e-8), (8, 1e-11)])
+def test_a_carrier_is_a_polynomial_where_that_is_as_exact_as_asked(monkeypatch, itemsize, least):
+    """An error put into one row of one block is refused from the limit on: in turns, and 4e-15 of the largest path."""
+    case = replace(CASE, shape=(96, 41))
+    real = blocks._powers
+    x, y = case.pillars_um[1], case.pillars_um[0]
+    limit = least + 4e-15 * np.abs(blocks.carrier_turns(case, 1 / 800, x, y[:, None])).max()
+    for sign in (1, -1):
+        for off, kept in ((0.5, True), (2.0, False)):
+
+            def powers(case, reference, rows, x, order, off=off, sign=sign):
+                out = real(case, reference, rows, x, order)  # blocks of two rows: exact to rounding
+                out[1, 0, 1] += sign * off * limit
+                return out
+
+            monkeypatch.setattr(blocks, "_powers", powers)
+            found = blocks._carried(case, 1 / 800, 2, itemsize)
+            assert found == kept
+
+
+def test_both_corners_of_a_window_need_a_plan(monkeypatch):
+    for missing in ((0, 0), (-1, -1)):
+        asked = []
+
+        def plan(one, tolerance, missing=missing, asked=asked):
+            rows = choice.windows(CASE, 1)
+            asked.append(one)
+            whole = one.samples == CASE.samples
+            corner = choice.windows(CASE, 2)[missing[0]][missing[1]] if not whole else rows[0][0]
+            return None if one == corner else "plan"
+
+        monkeypatch.setattr(choice, "_layout", plan)
+        found = choice._windows(CASE, 1e-4)
+        assert [len(row) for row in found] == [4, 4, 4]  # three rows of one sample, not two
