@@ -11,10 +11,10 @@ from metalens.ground.arrays import Array
 
 COLUMNS = {  # of a frame's record, and as the page has them
     "name": "frame",
-    "depth_um": "depth / um",
+    "depth_um": "depth / µm",
     "angle_deg": "angle / deg",
-    "spot.fwhm_um": "width at half maximum / um",
-    "spot.ee80_um": "radius of 80 % of the light / um",
+    "spot.fwhm_um": "width at half maximum / µm",
+    "spot.ee80_um": "radius of 80 % of the light / µm",
     "mtf50_x_per_um": "MTF at one half, x / (1/um)",
     "mtf50_y_per_um": "MTF at one half, y / (1/um)",
     "strehl": "Strehl ratio",
@@ -31,7 +31,7 @@ def frames_page(path: Path, found: frames.Quality) -> None:
     ]
     fields = list(found.best_depth_um.items())
     if fields:
-        head = ("angle / deg", "depth of the sharpest frame / um")
+        head = ("angle / deg", "depth of the sharpest frame / µm")
         sections.append(report.Section("Field curvature", "", [report.Table(head, fields)]))
     if found.distortion:
         table = report.Table(("angle / deg", "distortion"), [(a, f"{d:+.3%}") for a, d in found.distortion.items()])
@@ -52,9 +52,9 @@ def _curves(found: frames.Quality) -> bytes:
         keep = curve.frequency_per_um <= 0.5 / found.step_um
         mtf.plot(curve.frequency_per_um[keep], curve.modulation[keep], linewidth=0.8)
         energy.plot(radius, metrics.encircled_energy(image, step_um=found.step_um, radius_um=radius), label=row.name)
-    mtf.set_xlabel("cycles / um")
+    mtf.set_xlabel("cycles / µm")
     mtf.set_ylabel("modulation along x")
-    energy.set_xlabel("radius / um")
+    energy.set_xlabel("radius / µm")
     energy.set_ylabel("share of the light")
     return report.png(figure)
 
@@ -69,7 +69,7 @@ def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) 
     picture.set_axis_off()
     curve.plot(found.frequency_per_um, found.modulation)
     curve.axvline(0.5 / pixel_um, color="0.6", linestyle=":")
-    curve.set_xlabel("cycles / um")
+    curve.set_xlabel("cycles / µm")
     curve.set_ylabel("modulation")
     caption = f"Modulation one half at {found.mtf50_per_um:.4g} per um; dotted: Nyquist's frequency of the pixels."
     report.write(path, "Slanted edge", [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])])

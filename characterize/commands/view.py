@@ -6,9 +6,10 @@ import numpy as np
 
 from characterize.captures import capture as captures
 from characterize.inference import AsBuilt
+from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
 from metalens.psf import PsfStack
-from metalens.view import Axis, Images, Numbers, Panel
+from metalens.view import Axis, Images, Numbers, Panel, at_brightest
 
 
 def capture(path: Path) -> list[Panel]:
@@ -24,14 +25,14 @@ def capture(path: Path) -> list[Panel]:
     ]
     about: list[tuple[str, object]] = [
         ("converter / bits", read.bits),
-        ("pixel / um", read.pixel_um),
-        ("wavelength / um", read.wavelength_um),
+        ("pixel / µm", read.pixel_um),
+        ("wavelength / µm", read.wavelength_um),
     ]
     about += [(key, str(value)) for key, value in sorted(read.about.items())]
     about += [("put right", text) for text in read.corrections]
     return [
         Images("Frames", frames, [Axis("frame", list(read.names))], step, "counts"),
-        Numbers("Stage", ("frame", "position / um", "x angle / deg", "y angle / deg", "exposure / s"), rows),
+        Numbers("Stage", ("frame", "position / µm", "x angle / deg", "y angle / deg", "exposure / s"), rows),
         Numbers("As captured", ("name", "value"), about),
     ]
 
@@ -44,15 +45,18 @@ def asbuilt(path: Path) -> list[Panel]:
     panels: list[Panel] = [
         Numbers(
             "Parameters",
-            ("parameter", "value", "95 % from", "to"),
-            [(name, float(v), *made.interval(name)) for name, v in zip(made.names, made.value, strict=True)],
+            ("parameter", "value", "95 % from", "to", "meaning"),
+            [
+                (name, float(v), *made.interval(name), PARAMETERS[PLACE[name]].meaning)
+                for name, v in zip(made.names, made.value, strict=True)
+            ],
         ),
         Images(
             "Frames as captured and as fitted",
             np.stack([made.measured, made.predicted]) / peak,
             [Axis("shown", ["captured", "fitted"], blink=True), *axis],
             made.pixel_um,
-            "of the brightest pixel captured",
+            "of the brightest pixel",
         ),
         Images("Captured less fitted", made.residual_sigma, axis, made.pixel_um, "sigma", signed=True),
         Numbers("What is known", ("", "in words"), _words(made)),
@@ -68,7 +72,9 @@ def _psf(stack: PsfStack) -> Panel:
     ]
     values = values.reshape(len(axes[0].values), len(axes[1].values), *values.shape[-2:])
     peak = float(values.max())
-    return Images("PSF as built", values / peak, axes, stack.step_um, "of the highest peak", optics=True)
+    return Images(
+        "PSF as built", values / peak, at_brightest(axes, values), stack.step_um, "of the highest peak", optics=True
+    )
 
 
 def _said(depth_um: float | None, angle_rad: Array) -> str:

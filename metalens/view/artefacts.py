@@ -13,7 +13,7 @@ from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.pillars import axes
 from metalens.view import standing
-from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, classes_of
+from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, at_brightest, classes_of
 
 MOST_SAMPLES = 40_000_000  # float32 values of one figure: 160 MB before they are deflated
 
@@ -110,7 +110,7 @@ def _section(diameter: Array, lens: lenses.Lens) -> Curves:
     phase = lens.phase_rad()[len(diameter) // 2]
     x = lens.diameters.x_um[held]
     wrapped = (phase[held] / (2 * math.pi)) % 1
-    return Curves("Phase along the middle row", x, "x / um", {"phase modulo a turn": wrapped}, "turns")
+    return Curves("Phase along the middle row", x, "x / µm", {"phase modulo a turn": wrapped}, "turns")
 
 
 def psf_panels(path: Path) -> list[Panel]:
@@ -124,7 +124,7 @@ def psf_panels(path: Path) -> list[Panel]:
         names.insert(0, Axis("field angle", [_angle(pair) for pair in stack.angles_rad]))
     while values.ndim - 2 > len(names):
         names.insert(0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))))
-    peak = float(values.max())
+    peak, names = float(values.max()), at_brightest(names, values)
     depth, energy = 1e-3 * stack.depths_um, np.asarray(stack.energy_um2)
     lines = {"peak": values.max(axis=(-2, -1)) / peak, "light in the window": energy / energy.max()}
     return [

@@ -111,7 +111,7 @@ def _table(panel: Numbers) -> dict[str, Any]:
 
 def _axis(axis: Axis) -> dict[str, Any]:
     values = [_number(v) for v in axis.values]
-    return {"name": axis.name, "values": values, "unit": axis.unit, "blink": axis.blink}
+    return {"name": axis.name, "values": values, "unit": axis.unit, "blink": axis.blink, "first": axis.first}
 
 
 def _number(value: Any) -> Any:

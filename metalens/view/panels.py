@@ -1,7 +1,7 @@
 """What a page can show: images with sliders, curves with error bars, maps of classes, numbers. Data, no drawing."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,12 +12,22 @@ from metalens.ground.errors import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A slider: its name, its values, and their unit. blink: steps through its values by itself, on one scale."""
+    """A slider: its name, its values, and their unit.
+
+    blink: steps through its values by itself, on one scale. first: place of the value that is shown at first.
+    """
 
     name: str
     values: Sequence[float | str]
     unit: str = ""
     blink: bool = False
+    first: int = 0
+
+
+def at_brightest(axes: Sequence[Axis], values: Array) -> list[Axis]:
+    """The sliders of images (*axes, y, x), set to the one with the highest peak."""
+    places = np.unravel_index(int(values.argmax()), values.shape)
+    return [replace(axis, first=int(place)) for axis, place in zip(axes, places, strict=False)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -25,11 +25,11 @@ function colour(scale, t) {
 const TABLE = (scale) => Array.from({ length: 256 }, (_, i) => colour(scale, i / 255));
 
 function sliders(panel, controls, changed) {
-  const at = panel.axes.map(() => 0);
+  const at = panel.axes.map((axis) => axis.first);
   panel.axes.forEach((axis, i) => {
     if (axis.values.length < 2) return;
     const label = element("label", controls, {}, axis.name);
-    const input = element("input", label, { type: "range", min: 0, max: axis.values.length - 1, value: 0, step: 1 });
+    const input = element("input", label, { type: "range", min: 0, max: axis.values.length - 1, value: axis.first, step: 1 });
     const shown = element("output", label);
     const say = () => { const v = `${text(axis.values[at[i]])} ${axis.unit}`; shown.textContent = v; input.setAttribute("aria-valuetext", v); };
     const go = (k) => { at[i] = k; input.value = k; say(); changed(); };

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from metalens.view import Axis, Classes, Curves, Images, Numbers, page
+from metalens.view import Axis, Classes, Curves, Images, Numbers, at_brightest, page
 from tests.metalens.view.browser_page import BROWSER, told
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
@@ -50,6 +50,16 @@ def test_images_that_blink_share_a_scale(tmp_path):
     axes = [Axis("shown", ["captured", "fitted"], blink=True), Axis("frame", ["a", "b"])]
     drawn = _canvas(tmp_path, [Images("frames", values, axes, 0.5)], "canvas.image")
     wanted = _colour(values[0, 0] / values[:, 0].max())
+    assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
+
+
+def test_sliders_stand_at_the_image_with_the_highest_peak(tmp_path):
+    values = np.random.default_rng(8).uniform(0, 1, (2, 3, 5, 5))
+    values[1, 2, 0, 4] = 3.0
+    axes = at_brightest([Axis("field angle", ["a", "b"]), Axis("depth", [1.0, 2.0, 3.0], "mm")], values)
+    assert [axis.first for axis in axes] == [1, 2]
+    drawn = _canvas(tmp_path, [Images("psf", values, axes, 0.5)], "canvas.image")
+    wanted = _colour(values[1, 2] / 3.0)
     assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
 
 
