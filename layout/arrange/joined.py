@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from layout.arrange.parts import UNIT_NM, Part, compact, relayered
 from layout.arrange.record import At
-from layout.files import Assembly, CellContent, Copies, Turn
+from layout.files import Assembly, CellContent, Copies, Sites, Turn
 from layout.process import LayerNumber
 from metalens.ground.errors import ProcessError
 
@@ -73,23 +73,28 @@ def die(name: str, placed: Sequence[Placing], *, kept: frozenset[LayerNumber], i
     layers = Layers(kept)
     cells: dict[str, CellContent] = {}
     copies: dict[str, tuple[Copies, ...]] = {}
+    sites: dict[str, Sites] = {}
     top = name
     if into is not None:
-        _take(into, layers, cells, copies)
+        _take(into, layers, cells, copies, sites)
         top = into.top
     here: list[Copies] = []
     for one in placed:
-        new = _take(one.part, layers, cells, copies)
+        new = _take(one.part, layers, cells, copies, sites)
         here += one.copies(new[one.part.top])
     if into is None and name in cells:
         raise ProcessError(f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another")
     cells.setdefault(top, CellContent(top))
     copies[top] = (*copies.get(top, ()), *here)
-    return Assembly(name, cells, copies, UNIT_NM, layers.names, layers.doses)
+    return Assembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
 
 
 def _take(
-    part: Part, layers: Layers, cells: dict[str, CellContent], copies: dict[str, tuple[Copies, ...]]
+    part: Part,
+    layers: Layers,
+    cells: dict[str, CellContent],
+    copies: dict[str, tuple[Copies, ...]],
+    sites: dict[str, Sites],
 ) -> dict[str, str]:
     """The cells of a part with numbers and names of their own; {old: new name}."""
     numbers = layers.take(part)
@@ -104,6 +109,8 @@ def _take(
         )
         if found:
             copies[new[name]] = tuple(dataclasses.replace(one, child=new[one.child]) for one in found)
+        if name in part.sites:
+            sites[new[name]] = part.sites[name].renamed(new)
     return new
 
 
@@ -118,13 +125,15 @@ def _free(name: str, cells: Mapping[str, CellContent], new: Mapping[str, str]) -
 def wafer(name: str, one: Assembly, steps: tuple[Copies, ...], marks: Placing | None) -> Assembly:
     """Dies, and the wafer's marks beside them, in one cell ``name``."""
     layers = Layers(frozenset(), dict(one.doses), dict(one.layer_names))
-    cells, copies = dict(one.cells), dict(one.copies)
+    cells, copies, sites = dict(one.cells), dict(one.copies), dict(one.sites)
     here = list(steps)
     if marks is not None:
-        new = _take(marks.part, layers, cells, copies)
+        new = _take(marks.part, layers, cells, copies, sites)
         here += marks.copies(new[marks.part.top])
     if name in cells:
         raise ProcessError(f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another")
     cells[name] = CellContent(name)
     copies[name] = tuple(here)
-    return dataclasses.replace(one, name=name, cells=cells, copies=copies, doses=layers.doses, layer_names=layers.names)
+    return dataclasses.replace(
+        one, name=name, cells=cells, copies=copies, sites=sites, doses=layers.doses, layer_names=layers.names
+    )

@@ -2,13 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from layout.files import CellContent, Copies, MaskContent, arrays, doses, flat
-from layout.mask import UNDRAWN, MaskPlan
+from layout.files import NOTHING, CellContent, Copies, MaskContent, Sites, arrays, doses, flat
+from layout.mask import UNDRAWN, Lattice, MaskPlan
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
@@ -27,6 +27,7 @@ class Part:
     is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; a
     lattice of pillars is one box. extent: (4,) around everything, outline included. corrected: whether its doses make
     up for the scattered electrons of its own shapes, and of no others. texts: that are left out, as they draw nothing.
+    sites: of cells, beside what their content places.
     """
 
     name: str
@@ -38,10 +39,22 @@ class Part:
     extent: Array
     corrected: bool = False
     texts: int = 0
+    sites: Mapping[str, Sites] = field(default_factory=dict)
 
 
-def of_plan(name: str, plan: MaskPlan, content: MaskContent, process: Process, *, corrected: bool) -> Part:
-    """The mask of a plan, as it was read back; its cells are named after the part."""
+def of_plan(
+    name: str,
+    plan: MaskPlan,
+    content: MaskContent,
+    process: Process,
+    *,
+    corrected: bool,
+    lattices: Mapping[str, Lattice] | None = None,
+) -> Part:
+    """The mask of a plan, as it was read back; its cells are named after the part.
+
+    lattices: of cells of which only the sums were kept, which agree with them.
+    """
     new = {cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells}
     cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
     boxes = {PILLARS: [_lattice_box(plan, n) for n in range(len(plan.lattices))], APERTURE: []}
@@ -52,9 +65,19 @@ def of_plan(name: str, plan: MaskPlan, content: MaskContent, process: Process, *
             every += some
             if figure.name not in UNDRAWN:
                 boxes[APERTURE if layer[0] == process.layers.aperture[0] else PILLARS] += some
-    extent = _around(np.array(every))
+    classes = tuple(new.get(made.name, "") for made in plan.classes)
+    known = lattices or {}
+    sites = {new[c.name]: Sites(known[c.name], classes) for c in content.cells.values() if c.sums is not None}
     return Part(
-        name, name, cells, plan.doses, plan.layer_names, {k: _stacked(v) for k, v in boxes.items()}, extent, corrected
+        name,
+        name,
+        cells,
+        plan.doses,
+        plan.layer_names,
+        {k: _stacked(v) for k, v in boxes.items()},
+        _around(np.array(every)),
+        corrected,
+        sites=sites,
     )
 
 
@@ -147,9 +170,12 @@ def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
 
 
 def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
-    placed = cell.kept()
+    """With other names of cells; placements of which only sums were kept are left out."""
+    placed = cell.placed if cell.sums is None else NOTHING
     children = tuple(new[child] for child in placed.children)
-    return dataclasses.replace(cell, name=new[cell.name], placed=dataclasses.replace(placed, children=children))
+    return dataclasses.replace(
+        cell, name=new[cell.name], placed=dataclasses.replace(placed, children=children), sums=None
+    )
 
 
 def relayered(cell: CellContent, new: Mapping[LayerNumber, LayerNumber]) -> CellContent:

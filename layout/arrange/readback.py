@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from layout.files import Assembly, CellContent, Copies, Digest, MaskContent, Turn, flat
+from layout.files import QUARTERS, Assembly, CellContent, Copies, Digest, MaskContent, Sites, Turn, flat
 from metalens.ground.arrays import Array
 
 
@@ -23,9 +23,11 @@ def differences(made: Assembly, content: MaskContent) -> list[str]:
         read = content.cells[name]
         if _shapes(cell) != _shapes(read):
             found.append(f"cell {name}: shapes differ")
-        planned, there = _sums(cell, made.copies.get(name, ())), _sums(read, ())
+        merged = read.sums is not None
+        planned = _sums(cell, made.copies.get(name, ()), made.sites.get(name), merged=merged)
+        there = _sums(read, (), None, merged=merged)
         if planned != there:
-            unlike = sorted({child for child, _ in planned.items() ^ there.items()}, key=str)
+            unlike = sorted({who for who, _ in planned.items() ^ there.items()}, key=str)
             found.append(f"cell {name}: copies of {unlike[0][0]} are not all at their places")
     return found
 
@@ -47,9 +49,14 @@ def _canonical(points: Array) -> tuple[int, ...]:
     return tuple(np.roll(p, -first, axis=0).ravel().tolist())
 
 
-def _sums(cell: CellContent, copies: tuple[Copies, ...]) -> dict[tuple[str, Turn], tuple[int, ...]]:
-    """{(child, turn): count, sums and hash of its places}."""
-    digests: dict[tuple[str, Turn], Digest] = {}
+def _sums(
+    cell: CellContent, copies: tuple[Copies, ...], sites: Sites | None, *, merged: bool
+) -> dict[tuple[str, Turn | None], tuple[int, ...]]:
+    """{(child, turn): count, sums and hash of its places}; ``merged``: all turns together, as a reader sums them."""
+    if cell.sums is not None:
+        every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
+        return {(child, None): tuple(told) for child, *told in every}
+    digests: dict[tuple[str, Turn | None], Digest] = {}
     placed = cell.kept()
     key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
     order = np.argsort(key, kind="stable")
@@ -57,15 +64,22 @@ def _sums(cell: CellContent, copies: tuple[Copies, ...]) -> dict[tuple[str, Turn
     for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         child, turn = divmod(int(key[order[first]]), len(placed.turns))
         some = order[first:end]
-        _add(digests, (placed.children[child], _rounded(placed.turns[turn])), placed.x[some], placed.y[some])
+        _add(digests, placed.children[child], placed.turns[turn], (placed.x[some], placed.y[some]), merged)
     for one in copies:
-        _add(digests, (one.child, _rounded(one.turn)), *one.places())
-    return {who: _told(digest) for who, digest in digests.items()}
+        _add(digests, one.child, one.turn, one.places(), merged)
+    told = {who: _told(digest) for who, digest in digests.items()}
+    of_sites = {} if sites is None else sites.sums()
+    return told | {(child, None if merged else QUARTERS[0]): sums for child, sums in of_sites.items()}
 
 
-def _add(digests: dict[tuple[str, Turn], Digest], who: tuple[str, Turn], x: Array, y: Array) -> None:
-    nothing = np.zeros(len(x), np.uint8)
-    digests.setdefault(who, Digest()).take(nothing.astype(np.int64), x, y, nothing)
+def _add(
+    digests: dict[tuple[str, Turn | None], Digest], child: str, turn: Turn, place: tuple[Array, Array], merged: bool
+) -> None:
+    """Take in copies; the turn counts in the sums where it is no part of who they are."""
+    who, zeros = _rounded(turn), np.zeros(len(place[0]), np.int64)
+    index = QUARTERS.index(who) if who in QUARTERS else len(QUARTERS)
+    turned = np.full(len(zeros), index if merged else 0, np.uint8)
+    digests.setdefault((child, None if merged else who), Digest()).take(zeros, *place, turned)
 
 
 def _told(digest: Digest) -> tuple[int, ...]:

@@ -61,15 +61,17 @@ def run(options: Options) -> int:
     return 0 if found.ok and not form else 1
 
 
-def read(path: Path, most: int | None = None) -> MaskContent:
+def read(path: Path, most: int | None = None, *, keep: int | None = None) -> MaskContent:
     """A mask of either format; more placements than ``most`` (by default what its size allows) are not taken apart.
+
+    keep: most placements of a cell that are kept; of more only their sums. None: all.
 
     Raises:
         MaskFileError: more than these, or a file that cannot be read.
     """
     is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
     return (oasis_read.read if is_oasis else gdsii_read.read)(
-        path, limit=foreign.most_of(path) if most is None else most
+        path, limit=foreign.most_of(path) if most is None else most, keep=keep
     )
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from layout.files import verify as verify
     from layout.files.assembly import Assembly as Assembly
     from layout.files.assembly import Copies as Copies
+    from layout.files.assembly import Sites as Sites
     from layout.files.assembly import arrays as arrays
     from layout.files.content import NOTHING as NOTHING
     from layout.files.content import QUARTERS as QUARTERS
@@ -46,6 +47,7 @@ __getattr__, __dir__, __all__ = attach(
         "NOTHING": "content",
         "Placed": "content",
         "QUARTERS": "content",
+        "Sites": "assembly",
         "Sums": "digest",
         "Turn": "content",
         "Window": "dxf",

@@ -1,11 +1,14 @@
 """Cells of several masks and files put together in one: what a writer needs, arrays of copies kept as arrays."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from layout.files.content import QUARTERS, CellContent, Placed, Turn
+from layout.files.digest import Digest
+from layout.mask import Lattice
 from layout.process import LayerNumber
 from metalens.ground.arrays import Array
 
@@ -39,11 +42,39 @@ class Copies:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Sites:
+    """What a cell of pillars places, never all in memory: class k of ``lattice`` is the cell ``children[k - 1]``."""
+
+    lattice: Lattice
+    children: tuple[str, ...]
+
+    def renamed(self, new: Mapping[str, str]) -> "Sites":
+        """With cells of other names; classes that do not occur have none."""
+        return dataclasses.replace(self, children=tuple(new.get(child, "") for child in self.children))
+
+    def numbered(self, number: Mapping[str, int]) -> Lattice:
+        """The lattice with ``number`` + 1 of each cell in place of its class; 0 for those without one."""
+        lookup = np.array([0, *(number.get(child, -1) + 1 for child in self.children)], np.int32)
+        source = self.lattice.source
+        made: Lattice = dataclasses.replace(self.lattice, source=lambda a, b: lookup[source(a, b)], array=None)
+        return made
+
+    def sums(self) -> dict[str, tuple[int, ...]]:
+        """{cell: count, sums of x and y, turned, hash} of those that occur."""
+        l, digest = self.lattice, Digest()
+        for first, block in l.blocks(max(1, _MOST // max(1, l.columns))):
+            digest.sites(block, l.x0, l.y0 - first * l.down, (l.pitch, l.down))
+        found = digest.of(np.arange(1, len(self.children) + 1))
+        every = (tuple(int(v[k]) for v in found) for k in range(len(self.children)))
+        return {child: sums for child, sums in zip(self.children, every, strict=True) if sums[0]}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Assembly:
     """A mask file to be written.
 
-    name: of the library. cells: by name, all that are placed among them. copies: of a cell, beside what its content
-    places. layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
+    name: of the library. cells: by name, all that are placed among them. copies, sites: of a cell, beside what its
+    content places. layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
     """
 
     name: str
@@ -52,6 +83,7 @@ class Assembly:
     unit_nm: float = 1.0
     layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
     doses: Mapping[LayerNumber, float] = field(default_factory=dict)
+    sites: Mapping[str, Sites] = field(default_factory=dict)
 
 
 def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:

@@ -1,7 +1,8 @@
 """Millions of placements by their sums alone: for each child how many, where on average, and a hash of all places.
 
-Each place (x, y) becomes 64 well-mixed bits (splitmix64); their sum over the placements of a child, modulo 2^64, does
-not depend on their order. Two different sets of places agree in count, both sums and hash by chance once in 2^64.
+Each place (x, y) becomes 64 well-mixed bits (splitmix64), times an odd number for its quarter turn (1 for none); their
+sum over the placements of a child, modulo 2^64, does not depend on their order. Two different sets of places agree in
+count, both sums and hash by chance once in 2^64.
 """
 
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from metalens.ground.errors import MaskFileError
 _FIRST, _SECOND, _THIRD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _ROOM = 256
 _MOST = 1 << 24  # children
+_OTHER = 8  # turns from here on are no quarter turns: alike in the hash
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,7 +100,7 @@ def _take(slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Arr
         sums[k, 1] += x[n]
         sums[k, 2] += y[n]
         sums[k, 3] += turn[n] != 0
-        hashes[k] += _mixed(x[n], y[n])
+        hashes[k] += _mixed(x[n], y[n]) * np.uint64(2 * min(turn[n], _OTHER) + 1)
 
 
 @compiled

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import QUARTERS, Assembly, CellContent, Copies, Placed, Turn, flat
+from layout.files import QUARTERS, Assembly, CellContent, Copies, Placed, Sites, Turn, flat
 from layout.gdsii import bytes as gds
-from layout.gdsii.write import begin, boundary
+from layout.gdsii.write import begin, boundary, references
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -32,6 +32,8 @@ def write(made: Assembly, path: str | Path) -> None:
                 file.writelines(boundary(layer, polygon) for polygon in polygons)
             file.writelines(_array(one) for one in made.copies.get(name, ()))
             file.writelines(_references(cell.kept()))
+            if name in made.sites:
+                file.writelines(_sites(made.sites[name]))
             file.write(gds.record(gds.ENDSTR))
         file.write(gds.record(gds.ENDLIB))
 
@@ -66,6 +68,14 @@ def _array(one: Copies) -> bytes:
         raise ProcessError(f"an array of {one.child} reaches beyond 32 bits; GDSII cannot hold it, write OASIS")
     size = gds.shorts(gds.COLROW, one.columns, one.rows)
     return _head(one.child, one.turn, array=True) + size + gds.points(corners) + gds.record(gds.ENDEL)
+
+
+def _sites(some: Sites) -> Iterator[memoryview]:
+    """References of a lattice, cells with equally long names together."""
+    for long in sorted({len(child) for child in some.children if child}):
+        alike = [child for child in some.children if len(child) == long]
+        lattice = some.numbered({child: n for n, child in enumerate(alike)})
+        yield from references(alike, lattice, np.zeros(len(alike) + 1, np.int64))
 
 
 def _references(placed: Placed) -> Iterator[bytes]:

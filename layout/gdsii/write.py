@@ -4,7 +4,7 @@ Bytes are the same for the same plan: the time stamps are fixed. Memory is one b
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -71,7 +71,7 @@ def _pieces(plan: MaskPlan) -> Iterator[bytes | memoryview]:
     counts = np.zeros(len(plan.classes) + 1, np.int64)
     for lattice in plan.lattices:
         yield begin(lattice.name)
-        yield from _references(plan, lattice, counts)
+        yield from references([made.name for made in plan.classes], lattice, counts)
         yield gds.record(gds.ENDSTR)
     yield b"".join(_class_structure(made) for made, n in zip(plan.classes, counts[1:], strict=True) if n)
     yield begin(plan.name)
@@ -114,9 +114,12 @@ def _reference(name: str, x: int = 0, y: int = 0) -> bytes:
     return gds.record(gds.SREF) + gds.text(gds.SNAME, name) + gds.points(np.array([[x, y]])) + gds.record(gds.ENDEL)
 
 
-def _references(plan: MaskPlan, lattice: Lattice, counts: Array) -> Iterator[memoryview]:
-    """The references of a lattice, in two buffers that are filled in turn; ``counts`` adds up the classes."""
-    templates = _templates(plan)
+def references(children: Sequence[str], lattice: Lattice, counts: Array) -> Iterator[memoryview]:
+    """References of a lattice to the cells of its classes, in two buffers filled in turn; ``counts`` adds them up.
+
+    A piece stays as it is until the next but one is asked for.
+    """
+    templates = _templates(children)
     word = templates.dtype.itemsize
     buffers = np.empty((2, _BLOCK // (templates.shape[1] * word), templates.shape[1]), templates.dtype)
     turn = 0
@@ -132,9 +135,9 @@ def _references(plan: MaskPlan, lattice: Lattice, counts: Array) -> Iterator[mem
                 turn = 1 - turn  # the last one is still being written
 
 
-def _templates(plan: MaskPlan) -> Array:
+def _templates(children: Sequence[str]) -> Array:
     """(classes, words) a reference to each class at (0, 0), in words of 4 or 2 bytes; x, y and the end come last."""
-    made = [_reference(kind.name) for kind in plan.classes]
+    made = [_reference(name) for name in children]
     longest = max(map(len, made))
     if any(len(m) != longest for m in made):
         raise ProcessError("cell names of the pillar classes differ in length; give them as many digits")

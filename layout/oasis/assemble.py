@@ -1,5 +1,6 @@
 """OASIS of an assembly: cells of any kind, arrays of copies as repetitions."""
 
+import itertools
 import struct
 import zlib
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ import numpy as np
 from layout.files import QUARTERS, Assembly, CellContent, Copies, Placed, Turn
 from layout.oasis import bytes as oasis
 from layout.oasis import tiles
-from layout.oasis.write import cell_begin, cell_name, layer_name, polygon, vector
+from layout.oasis.write import cell_begin, cell_name, layer_name, polygon, tiled, vector
 from layout.process import LayerNumber
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -31,7 +32,7 @@ def write(made: Assembly, path: str | Path) -> None:
         layers = b"".join(layer_name(layer, name) for layer, name in sorted(made.layer_names.items()))
         number = {name: k for k, name in enumerate(made.cells)}
         checksum, written = 0, 0
-        for piece in (head, layers, *(_cells(made, number))):
+        for piece in itertools.chain((head, layers), _cells(made, number)):
             file.write(piece)
             checksum, written = zlib.crc32(piece, checksum), written + len(piece)
         table = b"".join(cell_name(k, name) for name, k in number.items())
@@ -48,6 +49,9 @@ def _cells(made: Assembly, number: dict[str, int]) -> Iterator[bytes]:
         yield b"".join(_circle(layer, *one) for layer, circles in cell.circles.items() for one in circles)
         yield b"".join(_array(one, number[one.child]) for one in made.copies.get(name, ()))
         yield from _placements(cell, number)
+        if name in made.sites:
+            counts = np.zeros(len(number) + 1, np.int64)
+            yield from tiled(made.sites[name].numbered(number), _LEVEL, counts)
 
 
 def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:

@@ -174,11 +174,20 @@ def vector(dx: int, dy: int) -> bytes:
 
 
 def _sites(lattice: Lattice, settings: _Settings, counts: Array) -> Iterator[bytes]:
-    form = _repetitions if settings.reader else _tiles
+    form = _repetitions if settings.reader else tiled
     return form(lattice, settings.level, counts)
 
 
-def _tiles(lattice: Lattice, level: int, counts: Array) -> Iterator[bytes]:
+def placed_lattices(plan: MaskPlan) -> dict[str, Lattice]:
+    """{cell: its lattice} of the files of a plan: of all lattices, and of the pieces of those that are folded."""
+    alike = all(_square_symmetric(made) for made in plan.classes)
+    folded = [piece.lattice for lattice in plan.lattices for piece in _piece_list(lattice, alike)]
+    return {lattice.name: lattice for lattice in (*folded, *plan.lattices)}
+
+
+def tiled(lattice: Lattice, level: int, counts: Array) -> Iterator[bytes]:
+    """Placements, tile by tile, of the cells 0, 1, ... that a lattice numbers from 1; ``counts`` adds them up."""
+
     def jobs() -> Iterator[Callable[[], bytes]]:
         for first, block in lattice.blocks(tiles.TILE_ROWS):
             tiles.count_classes(block, counts)
