@@ -3,12 +3,14 @@
 import json
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from layout.certify import MadeRows, Survey, survey
+from layout.commands import page
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
 from layout.files import MaskContent, doses, dxf, handover, verify
@@ -40,9 +42,11 @@ def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") 
     """
     job = _prepare(options, furniture)
     doses.write(job.plan, job.process, folder / "doses.csv")
-    _write_masks(job, folder)
-    with job.stages("report"):
-        _accompany(job, folder)
+    with ThreadPoolExecutor(1, thread_name_prefix="pictures") as pool:
+        shots = pool.submit(page.drawn, job.stages.rows.unwatched(job.plan), job.drc)
+        _write_masks(job, folder)
+        with job.stages("report"):
+            _accompany(job, shots.result(), folder)
     store.write_text(folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n")
     return job
 
@@ -154,10 +158,8 @@ def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float
     return survey(content, job.plan, table, job.process, height_um=job.source.cell.height_um, keep=keep)
 
 
-def _accompany(job: Job, target: Path) -> None:
-    """Layer properties, markers, report and pictures."""
-    from layout.commands import page
-
+def _accompany(job: Job, shots: dict[str, bytes], target: Path) -> None:
+    """Layer properties, markers, report and its pictures."""
     markers.write_lyp(job.plan, target / "mask.lyp")
     markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
@@ -165,7 +167,7 @@ def _accompany(job: Job, target: Path) -> None:
     store.write_text(target / "job.txt", job.sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))
-    page.write(job, target)
+    page.write(job, shots, target)
 
 
 def values_of(job: Job) -> dict[str, Any]:

@@ -7,6 +7,8 @@ import numpy as np
 from layout.commands import pictures
 from layout.commands.job import Job
 from layout.files import Window, handover
+from layout.mask import MaskPlan
+from layout.rules import DrcReport
 from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.report import Figure, KeyFigure, Section, Table
@@ -15,14 +17,18 @@ from metalens.ground.units import nm
 _LISTED = 40  # write fields in the report
 
 
-def write(job: Job, target: Path) -> None:
-    """Write report.html and the pictures beside it."""
-    shots = {
-        "die.png": pictures.whole_die(job.plan, job.drc),
-        "pillars.png": pictures.pillars(job.plan, (Window(0, 0, 8), pictures.edge_window(job.plan, 8))),
-        "diameters.png": pictures.diameters(job.plan),
-        "margins.png": pictures.margins(job.drc),
+def drawn(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
+    """{file name: picture} of what will be written."""
+    return {
+        "die.png": pictures.whole_die(plan, found),
+        "pillars.png": pictures.pillars(plan, (Window(0, 0, 8), pictures.edge_window(plan, 8))),
+        "diameters.png": pictures.diameters(plan),
+        "margins.png": pictures.margins(found),
     }
+
+
+def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
+    """Write report.html and the pictures (:func:`drawn`) beside it."""
     for name, png in shots.items():
         (target / name).write_bytes(png)
     sections = [

@@ -17,10 +17,11 @@ class Rows:
 
     def __init__(self) -> None:
         self.end, self.total, self.start = 0, 0, 0.0
+        self._lens: Lattice | None = None
 
     def watched(self, plan: MaskPlan) -> MaskPlan:
         """``plan``, whose first lattice tells when blocks of its rows are taken."""
-        lens = plan.lattices[0]
+        lens = self._lens = plan.lattices[0]
         self.total = lens.rows
 
         def source(first: int, end: int) -> Array:
@@ -31,6 +32,10 @@ class Rows:
 
         lattice: Lattice = dataclasses.replace(lens, source=source)
         return plan.replace(lattices=(lattice, *plan.lattices[1:]))
+
+    def unwatched(self, plan: MaskPlan) -> MaskPlan:
+        """A watched plan as it was, for what is made beside the stages."""
+        return plan if self._lens is None else plan.replace(lattices=(self._lens, *plan.lattices[1:]))
 
     @property
     def text(self) -> str:

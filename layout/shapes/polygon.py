@@ -196,8 +196,8 @@ def _turn(points: Array) -> Array:
 def twice_area(points: Array) -> int:
     """Twice the area that (n, 2) integer points enclose, exact."""
     p = points.astype(object) if np.abs(points).max(initial=0) > 2**30 else points.astype(np.int64)
-    q = np.roll(p, -1, axis=0)
-    return int((p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]).sum())
+    x, y = p[:, 0], p[:, 1]
+    return int((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() + x[-1] * y[0] - x[0] * y[-1])
 
 
 def edge_error(points: Array, radius: float) -> float:
