@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
+from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
 from codesign.eye.population import Rig
 from codesign.gaze import bench, personal
 from codesign.gaze.axis import EyeGeometry, optical_axis, pupil_of
@@ -213,3 +214,32 @@ def test_folds_that_leave_fewer_than_three_points_are_not_tried(monkeypatch, cou
     gaze = np.stack([np.arange(count), np.zeros(count)], 1)
     personal._penalty(np.zeros((count, 5)), np.ones((count, 2)), gaze, hidden=2, seed=0)
     assert asked == [3] * (4 * fitted)
+
+
+def test_directions_and_angles_of_the_face():
+    """Across and down of 0.5 and -0.3 rad: right sin x cos y, down sin y, out cos x cos y; back through the camera."""
+    angles = np.array([[0.5, -0.3], [-0.2, 0.7]])
+    got = personal.direction(angles)
+    want = [[math.sin(x) * math.cos(y), math.sin(y), math.cos(x) * math.cos(y)] for x, y in angles]
+    assert got == pytest.approx(np.array(want), rel=1e-12)
+    s, c = math.sin(0.31), math.cos(0.31)
+    camera = got @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
+    assert personal.face_angles(camera, 0.31) == pytest.approx(np.degrees(angles), rel=1e-9)
+    assert personal.angle_deg(np.degrees(angles[:1]), np.degrees(angles[1:])) == pytest.approx(
+        degrees_between(got[:1], got[1:]), rel=1e-9
+    )
+
+
+def test_people_keep_their_eyes_and_move_anew():
+    """Three people of four frames: traits of each, twelve gazes, frames of a step one after the other."""
+    scenes = EyeScenes(SceneConfig(pixels=32, margin=4), 36.0, 2000.0, 0, TEST)
+    group = bench.people(scenes, 3, 4, seed=5)
+    assert (len(group.states), group.each, group.people) == (12, 4, 3)
+    for one in (group.states.traits, group.states.mount_rad):
+        rows = one.reshape(3, 4, -1)
+        assert bool((rows == rows[:, :1]).all())
+        assert not torch.equal(rows[0, 0], rows[1, 0])
+    assert len(torch.unique(group.states.gaze_rad, dim=0)) == 12
+    batch = group.batch(1, 4)
+    assert batch.slip_mm.double().numpy() == pytest.approx(group.labels.slip_um[4:8].numpy() * 1e-3, rel=1e-6)
+    assert (group.margin, group.stream) == (4, 7)

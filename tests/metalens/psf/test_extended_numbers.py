@@ -153,3 +153,23 @@ def test_unlike_is_what_a_blur_leaves_of_a_change_along_the_source():
         assert moved == pytest.approx(95 * change, rel=1e-9)  # the window follows the chief ray
         assert np.abs(change).max() == pytest.approx(50 / (900, 2100)[depth] / 4, rel=1e-6)
     assert {depth for depth, *_ in asked} == {0, 1}
+
+
+def test_a_source_seen_through_glass_is_drawn_along_its_slanted_image():
+    """A Gaussian of covariance M Mᵀ times its variance, M with both axes coupled; the frequencies go with Mᵀ."""
+    case = replace(CASE, samples=(81, 97), front=((1.6, 600.0),), inverse_depths_per_um=(1 / 900,))
+    extent = Extent("gaussian", size_um=25.0)
+    turn = extended.images(case, extent)[0] * extended.SIGMA["gaussian"]
+    y, x = ((np.arange(n) - (n - 1) / 2) * 0.5 for n in (81, 97))
+    covariance = 1.6**2 * np.eye(2) + turn @ turn.T
+    assert abs(covariance[0, 1]) > 0.002
+    place = np.stack(np.meshgrid(x, y), -1)
+    spot = np.exp(-(place**2).sum(-1) / (2 * 1.6**2))
+    got = extended._filtered(torch.from_numpy(spot)[None], case, extent, 0)[0].numpy()
+    inverse = np.linalg.inv(covariance)
+    want = (
+        np.exp(-np.einsum("yxi,ij,yxj->yx", place, inverse, place) / 2) * 1.6**2 / math.sqrt(np.linalg.det(covariance))
+    )
+    flipped = np.exp(-np.einsum("yxi,ij,yxj->yx", place * [1, -1], inverse, place * [1, -1]) / 2)
+    assert np.abs(got - want).max() < 1e-6
+    assert np.abs(flipped * want.max() - want).max() > 1e-5
