@@ -13,6 +13,7 @@ from codesign.budget.entry import NONE, Entry, total
 from codesign.budget.task import TaskSetting
 from codesign.eye import POPULATION
 from codesign.optics import Numerics
+from metalens.ground.errors import LensError
 from metalens.image import Frames
 
 RNG = np.random.default_rng(31)
@@ -308,6 +309,47 @@ def test_what_is_seen_spans_the_depths_that_something_covers():
 def test_a_mean_gaze_error_is_of_angles_over_eyes():
     shift = torch.tensor([[0.3, -0.4, 9.0], [0.0, 1.2, 9.0]])
     assert task.gaze_mean(shift) == pytest.approx((0.5 + 1.2) / 2)
+    draws = torch.stack([shift, 2 * shift, 5 * shift])
+    assert task.gaze_mean(draws) == pytest.approx(8 / 3 * (0.5 + 1.2) / 2)
+    assert task.gaze_rms(draws) == pytest.approx(math.sqrt(30 / 3 * (0.25 + 1.44) / 2))
+
+
+def test_views_are_of_both_sides_of_every_unknown(monkeypatch):
+    monkeypatch.setattr(task, "shifted", lambda states, unknown, amount: (states, unknown, amount))
+    monkeypatch.setattr(task, "_frames", lambda states, lit, setting: (states, lit, setting))
+    made = task.views("setting", "states", exposed="lit")
+    assert made.anchor == ("states", "lit", "setting")
+    steps = task._steps()
+    assert made.moved == tuple(
+        ((("states", k, step), "lit", "setting"), (("states", k, -step), "lit", "setting"))
+        for k, step in enumerate(steps)
+    )
+    assert task.views("setting", "states").anchor == ("states", "states", "setting")
+
+
+@pytest.mark.parametrize(
+    ("off", "refused"),
+    [
+        ((1.019, 1, 1), False),
+        ((1.021, 1, 1), True),
+        ((1, 0.979, 1), True),
+        ((1, 1, 1.021), True),
+        ((1, 1, 0.981), False),
+    ],
+)
+def test_a_reader_of_another_lens_is_refused_beyond_two_per_cent(off, refused):
+    """Sensor distance, wavelength and aperture of the lens against those of the run, in its units."""
+    lens = SimpleNamespace(
+        sensor_distance_um=1900.0 * off[0], wavelength_um=0.81 * off[1],
+        diameters=SimpleNamespace(radius_um=350.0 * off[2]),
+    )  # fmt: skip
+    optics = SimpleNamespace(sensor_distance_mm=1.9, wavelength_nm=810.0, aperture_mm=0.7)
+    run = SimpleNamespace(settings=SimpleNamespace(optics=optics))
+    if refused:
+        with pytest.raises(LensError, match="trained before another lens"):
+            prepared._same(lens, run)
+    else:
+        prepared._same(lens, run)
 
 
 def test_an_estimate_comes_to_rest_by_gauss_newton(monkeypatch):

@@ -40,7 +40,7 @@ class Stand:
 @pytest.mark.parametrize("count", [40, 300])
 def test_intervals_are_calibrated_by_rank_and_judged_on_others(count):
     """The 0.9 (n + 1)-th smallest error over spread of the frames to spare, times the spread of those judged."""
-    spare, judged = frames(count, 1), frames(57, 2)
+    spare, judged = frames(count, 1), frames(263, 2)  # more than are told at once
     got = reader._judge(Stand(spare, judged), spare[0], judged[0], 0.043)
     scale = np.array([1.4, 1.2, 2.3])
 
@@ -179,3 +179,20 @@ def test_what_the_reader_s_sensor_is():
     assert (sensor.pitch_um, sensor.base_pitch_um, sensor.exposure_e) == (13.0, 9.0, 1500.0)
     assert (sensor.ambient_e, sensor.full_well_e, sensor.read_noise_e, sensor.bits) == (0.0, 3000.0, 5.0, 10)
     assert blur.FEATURES == 9 * 16 + 1
+
+
+def test_a_lens_is_imaged_truly_over_its_depths_in_micrometres(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        reader, "imager", lambda lens, grid, *, spectrum, tolerance: seen.append((grid, spectrum, tolerance))
+    )
+    lens = SimpleNamespace(wavelength_um=0.81)
+    config = ReaderConfig(pixels=48, pitch_um=13.0, depths_mm=(14.0, 37.0), fwhm_nm=25.0, tolerance=0.02)
+    reader.lens_imager(lens, config)
+    reader.lens_imager(lens, ReaderConfig(pixels=48, pitch_um=13.0))
+    (grid, spectrum, tolerance), (plain, none, usual) = seen
+    assert (grid.samples, grid.step_um, grid.depths_um) == ((48, 48), 13.0, (14e3, 37e3))
+    assert (grid.margin, grid.window) == (12, 25)
+    assert (spectrum.peak_nm, spectrum.fwhm_nm) == (pytest.approx(810.0), 25.0)
+    assert tolerance == 0.02
+    assert (none, usual, plain.depths_um) == (None, 0.03, (12e3, 50e3))

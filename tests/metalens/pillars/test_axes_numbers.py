@@ -43,7 +43,13 @@ def test_first_nodes_are_chebyshev_s_and_the_search_ends_where_few_pairs_stay_ab
 
         return surface
 
-    nodes = SimpleNamespace(grid=lambda x, y, console, label: (np.zeros((len(x), len(y), 4)), None), swaps=False)
+    gridded = []
+
+    def grid(x, y, console, label):
+        gridded.append((x, y))
+        return np.zeros((len(x), len(y), 4)), None
+
+    nodes = SimpleNamespace(grid=grid, swaps=False)
     rows = np.arange(61 * 61).reshape(61, 61)
     few, many = int(0.03 * 3721), int(0.03 * 3721) + 1  # 111 of 3721 pairs may stay above 0.04
     monkeypatch.setattr(
@@ -56,6 +62,7 @@ def test_first_nodes_are_chebyshev_s_and_the_search_ends_where_few_pairs_stay_ab
     assert [v.size for v in asked[0][1]] == [61, 61]
     assert (asked[0][1][0][0], asked[0][1][0][-1], asked[0][1][1][0], asked[0][1][1][-1]) == (0.1, 0.4, 0.2, 0.3)
     assert asked[0][2] == 0.1
+    assert all(np.array_equal(a, b) for (a, b) in zip(gridded[0], asked[0][0], strict=True))
     assert len(asked) == 2  # one round more: two nodes on each axis
     assert (len(x), len(y)) == (9, 9)
 
@@ -150,28 +157,116 @@ def test_half_a_distance_of_nodes_in_places():
 
 
 def test_the_doubt_is_the_larger_disagreement_around_a_place(monkeypatch):
-    """Interpolations made by hand: along x first 0, along y first apart in one place, the rival in another."""
-    x, y = np.linspace(0, 1, 5), np.linspace(0, 2, 5)
-    at_x, at_y = np.linspace(0, 1, 9), np.linspace(0, 2, 9)
+    """Interpolations made by hand on unlike axes: along y first apart in one place, the rival in another."""
+    x, y = np.linspace(0, 1, 5), np.linspace(0, 2, 7)
+    at_x, at_y = np.linspace(0, 1, 9), np.linspace(0, 2, 19)
+    values = np.arange(5 * 7 * 2.0).reshape(5, 7, 2)
     calls = []
 
     def both(a, b, values, at_a, at_b, tolerance):
-        calls.append((len(a), len(b), values.shape, tolerance))
-        out = np.zeros((len(at_a), len(at_b), 2), complex)
+        calls.append((a, b, values, at_a, at_b, tolerance))
+        out = np.full((len(at_a), len(at_b), 2), 0.5 + 0.1j)
         if len(calls) == 2:  # the other order: rows along y
-            out[6, 1] = 0.02, -0.08j
+            out[15, 1] += 0.02, -0.08j
         if len(calls) == 3:
-            out[7, 7] = 0.05
+            out[7, 3] += 0.05
         return out
 
     monkeypatch.setattr(between, "_both", both)
-    made = between.surface((x, y), np.zeros((5, 5, 2)), (at_x, at_y), tolerance=0.4)
-    assert calls == [(5, 5, (5, 5, 2), 0.4)] * 2 + [(4, 4, (4, 4, 2), 0.4)]
-    assert made.value[1, 6].tolist() == [0.01, -0.04j]
-    want = np.full((9, 9), 0.02)  # a twentieth of the tolerance
-    want[0:3, 5:8] += 0.08  # within half a node's distance: one place each way
-    want[6:9, 6:9] += 0.05
-    assert made.doubt == pytest.approx(want, abs=1e-15)
+    made = between.surface((x, y), values, (at_x, at_y), tolerance=0.4)
+    fewer = [0, 1, 3, 4], [0, 1, 3, 4, 5, 6]
+    want = [
+        (x, y, values, at_x, at_y), (y, x, values.swapaxes(0, 1), at_y, at_x),
+        (x[fewer[0]], y[fewer[1]], values[np.ix_(*fewer)], at_x, at_y),
+    ]  # fmt: skip
+    for got, arrays in zip(calls, want, strict=True):
+        assert all(np.array_equal(one, other) for one, other in zip(got, arrays, strict=False))
+        assert got[5] == 0.4
+    assert made.value[1, 15] == pytest.approx([0.51 + 0.1j, 0.5 + 0.06j])
+    assert made.value[0, 0] == pytest.approx([0.5 + 0.1j] * 2)
+    doubt = np.full((9, 19), 0.02)  # a twentieth of the tolerance
+    # half of a node's distance: 0.125 of 0.125 along x, one place; 1/6 of 1/9 along y, two
+    doubt[0:3, 13:18] = 0.1
+    doubt[6:9, 1:6] = 0.07
+    assert made.doubt == pytest.approx(doubt, abs=1e-12)
+
+
+def test_lines_are_fitted_along_x_and_their_values_along_y(monkeypatch):
+    """A tenth of the tolerance each; every line of nodes on its own, all elements of the matrix together."""
+    asked = []
+
+    def fit(nodes, values, *, tolerance):
+        asked.append((nodes, values, tolerance))
+        slope = (values[-1] - values[0]) / (nodes[-1] - nodes[0])
+        return lambda at: values[0] + (np.asarray(at) - nodes[0])[:, None] * slope
+
+    monkeypatch.setattr(between.rational, "fit", fit)
+    x, y, at_x, at_y = np.array([0.0, 1.0, 3.0]), np.array([1.0, 2.0]), np.array([0.5, 2.0]), np.array([1.0, 1.5, 1.75])
+    values = np.stack([x[:, None] * y, x[:, None] - 2 * y], axis=-1)
+    got = between._both(x, y, values, at_x, at_y, 0.3)
+    assert got == pytest.approx(np.stack([at_x[:, None] * at_y, at_x[:, None] - 2 * at_y], axis=-1))
+    assert [one[2] for one in asked] == pytest.approx([0.03] * 4)
+    assert [len(one[0]) for one in asked] == [3, 3, 2, 2]
+
+
+def test_a_grid_of_nodes_is_solved_pair_by_pair(monkeypatch):
+    """Of pairs that may be exchanged the larger size first; x and y change places in the matrix of the other."""
+    asked = []
+    monkeypatch.setattr(solving, "sized", lambda cell, x, y: (x, y))
+    monkeypatch.setattr(
+        solving.workers, "jones_task", lambda cell, x, wave, *, tolerance, reach: (*cell, wave, tolerance, reach)
+    )
+
+    def run(tasks, console, label):
+        asked.extend(tasks)
+        for a, b, *_ in tasks:
+            yield {"t": [[a, 0], [0, b], [a * b, 1], [2, a + b]], "error": [a, 3 * b]}
+
+    settings = swept((0.1, 0.4), (0.2, 0.3), 31)
+    for swaps in (False, True):
+        asked.clear()
+        monkeypatch.setattr(solving, "swaps", lambda cell, sweep, swaps=swaps: swaps)
+        nodes = solving._Nodes("cell", settings, 0.7, 6, SimpleNamespace(run=run))
+        t, bars = nodes.grid(np.array([0.2, 0.3]), np.array([0.2, 0.3, 0.4]), None, "")
+        assert (t.shape, bars.shape) == ((2, 3, 4), (2, 3))
+        assert t[1, 2 if not swaps else 0] == pytest.approx(
+            [0.3, 0.4j, 0.12 + 1j, 2 + 0.7j] if not swaps else [0.3, 0.2j, 0.06 + 1j, 2 + 0.5j]
+        )
+        if swaps:
+            assert asked == [(0.2, 0.2, 0.7, 0.1, 6), (0.3, 0.2, 0.7, 0.1, 6), (0.4, 0.2, 0.7, 0.1, 6),
+                             (0.3, 0.3, 0.7, 0.1, 6), (0.4, 0.3, 0.7, 0.1, 6)]  # fmt: skip
+            assert t[0, 2] == pytest.approx([2 + 0.6j, 0.08 + 1j, 0.2j, 0.4])  # both axes turned round
+        assert bars[0, 2] == pytest.approx(1.2 if not swaps else 0.6)
+        assert nodes.solves == (6 if not swaps else 5)
+
+
+def test_the_truncation_is_the_least_that_meets_its_share_at_four_probes(monkeypatch):
+    from metalens import rcwa
+
+    asked = []
+
+    def jones(cell, size, wavelength, *, tolerance, harmonics):
+        asked.append((cell, size, wavelength, tolerance, harmonics))
+        return SimpleNamespace(converged=harmonics >= 7)
+
+    monkeypatch.setattr(solving, "sized", lambda cell, x, y: (x, y))
+    monkeypatch.setattr(rcwa, "jones", jones)
+    settings = swept((0.1, 0.4), (0.2, 0.3), 31)
+    settings.wavelengths_um = (0.7, 0.8)
+    for most, want in ((12, 7), (6, 6), (4, 4)):
+        monkeypatch.setattr(rcwa, "most_harmonics", lambda cell, size, most=most: most)
+        asked.clear()
+        assert solving._reach("cell", settings) == want
+    monkeypatch.setattr(rcwa, "most_harmonics", lambda cell, size: 12)
+    asked.clear()
+    solving._reach("cell", settings)
+    last = [one for one in asked if one[4] == 7]
+    places = [(0.1 + 0.3 * a, 0.2 + 0.1 * b) for a, b in ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))]
+    assert [one[0] for one in last] == [pytest.approx(p) for p in places for _ in (0, 1)]
+    assert [one[1] for one in last] == pytest.approx([p[0] for p in places for _ in (0, 1)])
+    assert [one[2] for one in last] == [0.7, 0.8] * 4
+    assert [one[3] for one in last] == pytest.approx([0.06] * 8)
+    assert asked[0][4] == 5
 
 
 @pytest.mark.parametrize(("ratio", "wide"), [(0.8, 1.6), (0.1, 0.5)])
