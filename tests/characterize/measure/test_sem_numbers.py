@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from characterize.measure import sem
 from characterize.measure.lattice import Lattice
@@ -22,12 +23,14 @@ def test_diameters_are_twice_the_radii_less_twice_the_bias_of_an_edge(monkeypatc
         asked.append(there)
         return row + 0.2, column - 0.3, 20.0 + row / 10, 0.05, not there, column == 90.0
 
-    monkeypatch.setattr(sem, "find", lambda flat, pitch: LATTICE)
+    pitches = []
+    monkeypatch.setattr(sem, "find", lambda flat, pitch: pitches.append(pitch) or LATTICE)
     monkeypatch.setattr(Lattice, "sites", lambda self, shape: (place, site))
     monkeypatch.setattr(sem, "_step", lambda flat, row, column, pitch: steps[column])
     monkeypatch.setattr(sem, "_pillar", pillar)
     got = sem.measure(np.random.default_rng(1).normal(size=(160, 180)), sem.Micrograph(3.5, 175.0, 1.2))
     assert asked == [True, True, True, False, True]
+    assert pitches == [50.0]
     want = 2 * (20 + place[:, 0] / 10) * 3.5 - 2 * 1.2
     want[[1, 3]] = np.nan
     assert got.diameter_nm == pytest.approx(want, nan_ok=True)
@@ -68,6 +71,12 @@ def test_a_site_without_edges_has_collapsed_and_one_without_a_pillar_is_missing_
         flat[20 : 20 + side, 40 : 40 + side] = 1.0
         assert sem._pillar(flat, 40.0, 47.0, 50.0, there=False)[4:] == (not lies, lies)
         flat[:] = 0
+    # flush with an edge of the cell, rows 15 to 65 and columns 22 to 72: 14 x 15 pixels above 0.6 of 2601 are 8.07 %
+    for rows, columns in ((slice(20, 37), slice(58, 73)), (slice(20, 37), slice(22, 37)),
+                          (slice(15, 30), slice(40, 57)), (slice(51, 66), slice(40, 57))):  # fmt: skip
+        flat[rows, columns] = 1.0
+        assert sem._pillar(flat, 40.0, 47.0, 50.0, there=False)[4:] == (False, True)
+        flat[:] = 0
 
 
 def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
@@ -81,6 +90,7 @@ def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
     dy, dx, radius, sigma, scatter = sem._edges(flat, 40.8, 43.3, 50.0)
     assert (dy, dx, radius) == pytest.approx((0, 0, 14.3), abs=0.03)  # linear interpolation of a cone
     assert scatter < 0.05
+    assert sem._edges(0.2 + 0.7 * flat, 40.8, 43.3, 50.0)[2] == pytest.approx(radius, abs=1e-6)  # half of the step
     wavy = np.clip(0.5 + (14.3 + 0.6 * np.cos(5 * np.arctan2(y - 40.8, x - 43.3)) - away) / 3, 0, 1)
     *_, sigma, scatter = sem._edges(wavy, 40.8, 43.3, 50.0)
     across = math.exp(-(math.radians(5 * 5) ** 2) / 2)  # smoothed over rays 5 degrees apart
@@ -110,7 +120,9 @@ def test_plateaus_are_the_brightest_rim_and_the_darkest_eighth():
     assert rim == 30
     assert inner == pytest.approx(0.9)
     assert outer == pytest.approx(np.sort(mean)[: len(mean) // 8].mean())
-    far = np.concatenate([[0.65], np.full(60, 0.5), [0.6], np.full(40, 0.1)])  # bright beyond 16 samples of the fall
+    far = np.concatenate(
+        [[0.65], np.full(29, 0.5), [0.7], np.full(30, 0.5), [0.6], np.full(40, 0.1)]
+    )  # bright beyond 16 samples of the fall
     assert sem._plateaus(far[:, None])[2] == 61
     wide = np.concatenate([np.full(70, 0.5), [0.9], np.full(17, 0.6), np.full(40, 0.1)])
     assert sem._plateaus(wide[:, None])[2] == 70  # a fifth of 87: 17 samples
@@ -139,3 +151,13 @@ def test_charging_of_rows_and_slow_shades_come_off_and_contrast_is_one():
     assert (low, high) == pytest.approx((0, 1))
     inside = slice(45, -45)
     assert np.abs(one - other)[inside, inside].max() < 0.2  # of a shade of 4; its bend over 30 pixels is left
+
+
+def test_levels_are_less_row_medians_and_a_shade_over_their_percentiles():
+    """Medians of rows smoothed over two pitches, the rest over one and a half; 0 and 1 at 10 and 90 %."""
+    image = np.random.default_rng(9).normal(size=(90, 70)) + 0.02 * np.arange(70)
+    rows = ndimage.gaussian_filter1d(np.median(image, axis=1), 16.0)
+    rest = image - rows[:, None]
+    rest = rest - ndimage.gaussian_filter(rest, 12.0)
+    low, high = np.percentile(rest, [10, 90])
+    assert sem.level(image, sem.Micrograph(5.0, 40.0)) == pytest.approx((rest - low) / (high - low))

@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from layout.dose import bodies, sampled
 from layout.dose.assign import Ladder
 from layout.dose.bodies import NONE, Body
 from layout.dose.exposure import CLEARS, PointExposure, disc, rim_of_own_disc
+from metalens.ground.errors import ProcessError
 
 PITCH = 0.43
 DIAMETER = np.array([0.0, 0.21, 0.33, 0.17])
@@ -86,6 +88,7 @@ def around(monkeypatch):
 
 
 def test_what_is_far_is_summed_over_all_but_the_sites_within_five(monkeypatch):
+    monkeypatch.setattr(bodies, "_BLOCK_SITES", 7 * 23)  # seven rows at a time
     fields, steps = around(monkeypatch), Ladder(DOSES)
     rows, columns = np.array([2, 9, 16]), np.array([20, 11, 1])
     got = sampled._distant(fields, steps, GIVEN, (rows, columns))
@@ -114,7 +117,7 @@ def test_the_error_is_relative_to_what_the_edge_should_get(monkeypatch):
     picked = np.array([0, 4, 9, 18]), np.array([0, 22, 11, 3])
     picked = tuple(v[SITES[picked] > 0] for v in picked)
     assert len(picked[0]) > 2
-    distant = np.array([0.03, 0.05, 0.02, 0.04])[: len(picked[0])]
+    distant = np.array([0.03, 0.45, 0.02, 0.04])[: len(picked[0])]  # the exact sum is the larger in the second
     monkeypatch.setattr(sampled, "_some", lambda body, samples: picked)
     monkeypatch.setattr(sampled, "_distant", lambda *_: distant)
     found = SimpleNamespace(far=None, near=None)
@@ -127,6 +130,7 @@ def test_the_error_is_relative_to_what_the_edge_should_get(monkeypatch):
         exact = distant[n] + rim(row, column, rows, columns, POINT)
         off.append(abs(dose * table().own[entry] + fields.background[row, column] - exact) / (CLEARS * GOAL[entry]))
     assert got == pytest.approx(max(off), rel=1e-12)
+    assert got > 0.3
 
 
 def test_sampled_pillars_spread_over_rows_and_columns():
@@ -184,3 +188,25 @@ def test_the_table_takes_from_each_pillar_what_the_far_field_counts_for_it():
         assert made.area_um2[k] == pytest.approx(area, rel=1e-12)
     assert (made.own[3], made.slope[3], made.area_um2[3]) == (0, 0, 0)  # does not occur
     assert bodies.count([lens(), lens()], 4).tolist() == [0, *(2 * np.bincount(SITES.ravel())[1:]).tolist()]
+
+
+def test_boxes_and_areas_of_what_is_exposed():
+    assert lens().box_um == pytest.approx((4.0, 7.7 - 18 * PITCH, 4.0 + 22 * PITCH, 7.7))
+    assert lens().columns_um == pytest.approx(4.0 + PITCH * np.arange(23))
+    assert lens().rows_um(3, 4) == pytest.approx(7.7 - PITCH * np.arange(3, 7))
+    rects = bodies.Rects(np.array([[1.0, 2.0, 4.0, 2.5], [-1.0, 0.0, 1.0, 7.0]]), np.zeros(2, int), np.ones(2))
+    assert rects.area_um2 == pytest.approx([1.5, 14.0])
+
+
+@pytest.mark.parametrize(("own", "refused"), [(0.021, False), (0.019, True)])
+def test_pillars_that_their_own_dose_hardly_reaches_are_refused(own, refused):
+    """At least 0.02 at the edge, where a half clears; the core is made as wide as that asks."""
+    width = brentq(lambda a: float(rim_of_own_disc(0.21, a)) - own, 0.1, 5.0)
+    point = PointExposure(np.array([width]), np.array([1.0]))
+    near = bodies.Ranges(*(PointExposure(np.zeros(0), np.zeros(0)) for _ in range(2)), point)
+    number = np.array([0, 5, 0, 0])
+    if refused:
+        with pytest.raises(ProcessError, match=r"a pillar of 210 nm gives its own edge an exposure of 0\.019 only"):
+            bodies.table(DIAMETER, GOAL, number, point=point, ranges=near)
+    else:
+        assert bodies.table(DIAMETER, GOAL, number, point=point, ranges=near).own[1] == pytest.approx(own)
