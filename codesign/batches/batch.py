@@ -1,6 +1,7 @@
 """What training takes a step: frames and what is true of them."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -19,3 +20,14 @@ class Batch:
     frames: Frames | Flat
     mask: Tensor
     slip_mm: Tensor
+
+
+class Scenes(Protocol):
+    """Where frames come from: the same step gives the same frames."""
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frames that are blurred in but not seen."""
+
+    def batch(self, step: int, size: int) -> Batch:
+        """``size`` frames of training step ``step``."""

@@ -8,58 +8,22 @@ gradients of phase coefficients are a hundred times smaller than those of weight
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Batch, Flat, depth_um, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, Name, Space, Supernet, blur, cost, losses, make, smallest
+from codesign.batches import Batch, Flat, PoolScenes, Scenes, depth_um, irradiance, parallel, samples
+from codesign.network import Architecture, Baseline, blur, cost, losses, smallest
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
+from codesign.train.ahead import Ahead
 from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, network_macs, read_out
 from codesign.train.light import Light
+from codesign.train.moving import Model, Schedule, model
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, Sensor, UniformImager
-
-
-class Scenes(Protocol):
-    """Where frames come from: the same step gives the same frames."""
-
-    @property
-    def margin(self) -> int:
-        """Samples around the frames that are blurred in but not seen."""
-
-    def batch(self, step: int, size: int) -> Batch:
-        """``size`` frames of training step ``step``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own clip.
-
-    rate: largest learning rate; 0 keeps the group fixed.
-    start, end: part of the run in which it moves.
-    clip: largest norm of its gradient.
-    """
-
-    rate: float
-    start: float = 0.0
-    end: float = 1.0
-    clip: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (self.rate >= 0 and 0 <= self.start < self.end <= 1 and self.clip > 0):
-            raise ConfigError(f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0")
-
-    def at(self, progress: float) -> float:
-        """Learning rate at this part of the run."""
-        if not self.start <= progress < self.end:
-            return 0.0
-        inside = (progress - self.start) / (self.end - self.start)
-        return self.rate * min(1.0, inside / 0.1 + 0.01) * (0.5 + 0.5 * math.cos(math.pi * inside))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,21 +70,20 @@ class InnerConfig:
             )
 
 
-@dataclass(eq=False)
-class Model:
-    """What training moves.
+@dataclass(frozen=True, eq=False, slots=True)
+class Given:
+    """What a step trains on.
 
-    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um.
+    light: (batch, y, x) on the sensor. vergence: (batch, windows, windows) of :func:`blur.window_vergence`.
+    seen: (batch, 1, rows, columns) frames of the sensor; None where the pitch moves, and members see it differently.
     """
 
-    net: Supernet | Baseline
-    coefficients_rad: nn.Parameter
-    log_pitch: nn.Parameter
-
-    @property
-    def pitch_um(self) -> Tensor:
-        """Pixel pitch, always above 0."""
-        return self.log_pitch.exp()
+    step: int
+    batch: Batch
+    light: Tensor
+    optics_loss: Tensor
+    vergence: Tensor
+    seen: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,20 +100,6 @@ class Record:
     pitch_um: float
     mmacs: float
     skipped: int
-
-
-def model(
-    settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None, network: Name = "supernet"
-) -> Model:
-    """A fresh model: network weights from the seed, a lens without added phase."""
-    torch.manual_seed(seed)
-    net = Supernet(space) if network == "supernet" else make(network)
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
-    return Model(
-        net,
-        nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
-        nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
-    )
 
 
 class Trainer:
@@ -202,8 +151,10 @@ class Trainer:
             TrainingError: no finite gradient for ``patience`` steps, with the cause.
         """
         self.model.net.train()
-        while self.step < min(until or self.inner.steps, self.inner.steps):
-            yield self._advance()
+        end = min(until or self.inner.steps, self.inner.steps)
+        with Ahead(lambda step: self._given(step, live=False, seen=True), end=end) as ahead:
+            while self.step < end:
+                yield self._advance(ahead if self._still else None)
 
     def state(self) -> dict[str, object]:
         """Everything that the next step depends on."""
@@ -229,14 +180,22 @@ class Trainer:
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
-    def _advance(self) -> Record:
+    def _advance(self, ahead: Ahead[Given] | None) -> Record:
         progress = self.step / self.inner.steps
         rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        task, optics_loss, each = self._losses(
-            live=rates["optics"] > 0 and "optics" in self.optimisers, pitch_moves=rates["pitch"] > 0
-        )
+        if ahead is not None:
+            given = ahead.take(self.step)
+            with ahead.beside():
+                return self._stepped(given, rates)
+        moves, live = rates["pitch"] > 0, rates["optics"] > 0 and "optics" in self.optimisers
+        return self._stepped(self._given(self.step, live=live, seen=not moves), rates)
+
+    def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
+        """A step of every optimiser on what is given."""
+        task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
+        optics_loss = given.optics_loss
         total, macs = task + self.inner.optics_weight * optics_loss, each.mean()
         if self._budget:
             total = total + self.inner.budget_weight * losses.over_budget(each, self._budget).mean()
@@ -249,41 +208,56 @@ class Trainer:
         loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of([float(v.detach()) for v in values])
         return Record(self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped)
 
-    def _losses(self, *, live: bool, pitch_moves: bool) -> tuple[Tensor, Tensor, Tensor]:
-        batch = parallel.part_of(self.scenes.batch(self.step, self.inner.batch))
+    @property
+    def _still(self) -> bool:
+        """Whether what a step is given depends on its number alone, and comes from a pool."""
+        fixed = self.inner.optics.rate == 0 or "optics" not in self.optimisers
+        drawn = not self.light.stacks and self._lens_error(0) is not None
+        return fixed and self.inner.pitch.rate == 0 and not drawn and isinstance(self.scenes, PoolScenes)
+
+    def _given(self, step: int, *, live: bool, seen: bool) -> Given:
+        """What a step trains on; ``seen``: as the pixels give it, which takes a pitch that does not move."""
+        batch = parallel.part_of(self.scenes.batch(step, self.inner.batch))
         with torch.set_grad_enabled(live):
-            optics, optics_loss = self._light(batch.frames, live)
+            optics, optics_loss = self._light(step, batch.frames, live)
             light = irradiance(batch.frames, optics, margin=self.scenes.margin)
+        vergence = blur.window_vergence(depth_um(batch.frames, margin=self.scenes.margin))
+        pitch = self.model.pitch_um.detach()
+        return Given(step, batch, light, optics_loss, vergence, self._read(step, light, pitch, False) if seen else None)
+
+    def _read(self, step: int, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
+        """Frames of the sensor. All readings of a step begin the same noise: networks differ by what they see."""
+        noise = self._generator(1, step)
+        return read_out(light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False, resized=resized)
+
+    def _losses(self, given: Given, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
+        """Mean task loss of the step's members, and the multiply-accumulates of each."""
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
         scale = torch.tensor(self.inner.slip_scale_mm)
-        size = light.shape[-1] * self.optics.sample_um
+        size = given.light.shape[-1] * self.optics.sample_um
         self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
         members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
-
-        seen = {}  # every reading starts the same stream of noise: networks differ by what they see, not by luck
-        for resized in {pitch_moves and a.resolution < 1 for a in members}:
-            noise = self._generator(1)
-            seen[resized] = read_out(
-                light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False, resized=resized
-            )
-        vergence = blur.window_vergence(depth_um(batch.frames, margin=self.scenes.margin))
-        parts = []
+        finer = {a: pitch_moves and a.resolution < 1 for a in members}
+        frames = {False: given.seen} if given.seen is not None else {
+            resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
+        }  # fmt: skip
+        batch, parts = given.batch, []
         for a in members:
-            answer = self.model.net(seen[pitch_moves and a.resolution < 1], a)
+            answer = self.model.net(frames[finer[a]], a)
             parts.append(losses.task(answer, batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight))
             parts[-1] = parts[-1] + losses.reading(
-                answer, vergence, batch.slip_mm, scale, depth_weight=self.inner.depth_weight
+                answer, given.vergence, batch.slip_mm, scale, depth_weight=self.inner.depth_weight
             )
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
-        return torch.stack(parts).mean(), optics_loss, macs
+        return torch.stack(parts).mean(), macs
 
-    def _light(self, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
+    def _light(self, step: int, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
         """What images this step's frames, and the optics loss."""
         coefficients = self.model.coefficients_rad
-        optics = self.light.at(self.step, coefficients, samples(frames), self.scenes.margin, live=live)
+        optics = self.light.at(step, coefficients, samples(frames), self.scenes.margin, live=live)
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
-        made = lens.stack(self.optics, coefficients, error=self._lens_error())
+        made = lens.stack(self.optics, coefficients, error=self._lens_error(step))
         return optics, depth_loss(made, self.optics, energy=self.inner.energy)
 
     def _lens_error(self, step: int | None = None) -> LensError | None:

@@ -1,0 +1,53 @@
+"""The frames of the next step formed beside the training of this one: another thread, the same numbers."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, Self, TypeVar
+
+import torch
+
+Made = TypeVar("Made")
+
+
+class Ahead(Generic[Made]):
+    """``work(step)`` of the step that is asked for, while that of the next begins on a thread of its own.
+
+    For work that depends on the step alone. It takes one of torch's threads from the steps (:meth:`beside`) and is done
+    on one thread always; where torch has only one it is done when it is asked for. So the bytes of both depend on how
+    many threads there are, never on what was ready when, and one and two threads give the same.
+    """
+
+    def __init__(self, work: Callable[[int], Made], *, end: int) -> None:
+        """``end``: the first step that is not wanted any more."""
+        self.work, self.end, self.threads = work, end, torch.get_num_threads()
+        self._pool: ThreadPoolExecutor | None = None
+        self._begun: dict[int, Future[Made]] = {}
+
+    def __enter__(self) -> Self:
+        if self.threads > 1:
+            self._pool = ThreadPoolExecutor(1, "ahead", torch.set_num_threads, (1,))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(self.threads)  # also of threads that begin later: the worker's 1 was for all of them
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[None]:
+        """The threads that the work leaves, and all of them again after."""
+        torch.set_num_threads(max(1, self.threads - 1))
+        try:
+            yield
+        finally:
+            torch.set_num_threads(self.threads)
+
+    def take(self, step: int) -> Made:
+        """What the work makes of a step."""
+        if self._pool is None:
+            return self.work(step)
+        for one in (step, step + 1):
+            if one not in self._begun and one < max(self.end, step + 1):
+                self._begun[one] = self._pool.submit(self.work, one)
+        return self._begun.pop(step).result()

@@ -1,0 +1,68 @@
+"""What training moves, and how: network weights, phase of the lens, pixel pitch, each on a schedule of its own."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from codesign.network import Baseline, Name, Space, Supernet, make
+from codesign.optics import OpticsConfig
+from metalens.ground.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own clip.
+
+    rate: largest learning rate; 0 keeps the group fixed.
+    start, end: part of the run in which it moves.
+    clip: largest norm of its gradient.
+    """
+
+    rate: float
+    start: float = 0.0
+    end: float = 1.0
+    clip: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.rate >= 0 and 0 <= self.start < self.end <= 1 and self.clip > 0):
+            raise ConfigError(f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0")
+
+    def at(self, progress: float) -> float:
+        """Learning rate at this part of the run."""
+        if not self.start <= progress < self.end:
+            return 0.0
+        inside = (progress - self.start) / (self.end - self.start)
+        return self.rate * min(1.0, inside / 0.1 + 0.01) * (0.5 + 0.5 * math.cos(math.pi * inside))
+
+
+@dataclass(eq=False)
+class Model:
+    """What training moves.
+
+    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um.
+    """
+
+    net: Supernet | Baseline
+    coefficients_rad: nn.Parameter
+    log_pitch: nn.Parameter
+
+    @property
+    def pitch_um(self) -> Tensor:
+        """Pixel pitch, always above 0."""
+        return self.log_pitch.exp()
+
+
+def model(
+    settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None, network: Name = "supernet"
+) -> Model:
+    """A fresh model: network weights from the seed, a lens without added phase."""
+    torch.manual_seed(seed)
+    net = Supernet(space) if network == "supernet" else make(network)
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
+    return Model(
+        net,
+        nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
+        nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
+    )
