@@ -121,10 +121,11 @@ class Outcome:
 
 def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None) -> Lenses:
     """PSFs of the nominal, fitted, drawn and (where known) true lens."""
-    draws = [made.stack(x) for x in built.posterior(result, config.draws + config.judge, seed=config.seed)]
-    judges = tuple(draws[config.draws :]) if truth is None else (made.stack(truth.vector()),)
+    rows = list(built.posterior(result, config.draws + config.judge, seed=config.seed))
+    drawn = tuple(made.stack(x) for x in rows[: config.draws])
+    judging = rows[config.draws :] if truth is None else [truth.vector()]
     best = made.stack(result.parameters())
-    return Lenses(made.stack(), best, tuple(draws[: config.draws]), judges, truth is not None)
+    return Lenses(made.stack(), best, drawn, tuple(made.stack(x) for x in judging), truth is not None)
 
 
 def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from codesign.batches.flat import depth_um as depth_um
     from codesign.batches.flat import irradiance as irradiance
     from codesign.batches.flat import samples as samples
+    from codesign.batches.pool import Pool as Pool
     from codesign.batches.pool import PoolScenes as PoolScenes
     from codesign.batches.pool import fill as fill
     from codesign.batches.scenes import EXPERIMENT as EXPERIMENT
@@ -31,6 +32,7 @@ __getattr__, __dir__, __all__ = attach(
         "EXPERIMENT": "scenes",
         "EyeScenes": "scenes",
         "Flat": "flat",
+        "Pool": "pool",
         "PoolScenes": "pool",
         "SceneConfig": "scenes",
         "Scenes": "batch",

@@ -22,6 +22,7 @@ FEATURES = COLUMNS * ROWS + 1  # and the mean of the window
 PLACES = 5  # polynomials of the place in the frame
 FLOOR = 1e-2  # of the power, in units of the frame's variance a pixel
 HIDDEN = (64, 32)
+REACH = 5  # windows along a side that the depth of one is read from: a face is smooth, and its neighbours tell of it
 SLIP_FEATURES = 3 * GRID**2 + 2  # vergence, its spread and the mean of every window; their means
 
 VERGENCE_PER_M, VERGENCE_UNIT_PER_M = 45.0, 8.0  # 1 / depth of a face before the camera: mean and spread
@@ -38,7 +39,7 @@ def macs(size: int) -> int:
     width, rows = 2 * step, (GRID + 1) * step
     along_x = rows * GRID * 2 * COLUMNS * width
     along_y = GRID**2 * COLUMNS * 2 * ROWS * 2 * width
-    layers = (FEATURES + PLACES) * HIDDEN[0] + HIDDEN[0] * HIDDEN[1] + HIDDEN[1] * 2
+    layers = (FEATURES + PLACES) * HIDDEN[0] + HIDDEN[0] * REACH**2 + 2 * HIDDEN[0] * HIDDEN[1] + HIDDEN[1] * 2
     return along_x + along_y + GRID**2 * layers
 
 
@@ -118,7 +119,8 @@ class BlurBranch(nn.Module):
     the logarithm of its standard deviation. features: (batch, SLIP_FEATURES) for the slippage.
 
     A PSF differs from window to window of the field, so every window weighs the spectra that the first layer has
-    learned by gains and offsets of its own; they cost next to nothing.
+    learned by gains and offsets of its own; they cost next to nothing. Its depth is then read together with its
+    neighbours'.
     """
 
     place: Tensor
@@ -130,7 +132,8 @@ class BlurBranch(nn.Module):
         self.first = nn.Conv2d(FEATURES + PLACES, HIDDEN[0], 1)
         self.gain = nn.Parameter(torch.ones(HIDDEN[0], GRID, GRID))
         self.offset = nn.Parameter(torch.zeros(HIDDEN[0], GRID, GRID))
-        self.second = nn.Conv2d(HIDDEN[0], HIDDEN[1], 1)
+        self.around = nn.Conv2d(HIDDEN[0], HIDDEN[0], REACH, padding=REACH // 2, groups=HIDDEN[0])
+        self.second = nn.Conv2d(2 * HIDDEN[0], HIDDEN[1], 1)
         self.depth = nn.Conv2d(HIDDEN[1], 2, 1)
         line = torch.linspace(-1, 1, GRID)
         x, y = line.expand(GRID, GRID), line[:, None].expand(GRID, GRID)
@@ -141,7 +144,8 @@ class BlurBranch(nn.Module):
         told = self.norm(torch.cat([torch.log(power + FLOOR), mean], 1))
         told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
         seen = F.hardswish(self.first(told) * self.gain + self.offset)
-        depth = self.depth(F.hardswish(self.second(seen)))
+        near = torch.cat([seen, F.hardswish(self.around(seen))], 1)
+        depth = self.depth(F.hardswish(self.second(near)))
         spread = depth[:, 1].clamp(-3, 2)
         depth = torch.stack([depth[:, 0], spread], 1)
         trust = torch.exp(-2 * spread)

@@ -68,6 +68,7 @@ class MadeLens:
         d = design.diameters
         self.focus = Focus(design.wavelength_um, design.sensor_distance_um, design.source_distance_um)
         self._block = max(1, round(CELL_UM / d.pitch_um))
+        self._rim_um = d.radius_um  # looks through all pillars
         self._diameter_um = np.ascontiguousarray(d.diameter_um, np.float32)
         self._carrier = np.empty(d.diameter_um.shape, np.complex64)
         for rows in range(0, len(d.y_um), 128):
@@ -121,15 +122,15 @@ class MadeLens:
 
         parts = torch.from_numpy(np.stack([filled.real, filled.imag])).float()
         bent = added if made.bends() else None
-        return PillarCells(self.focus, d.radius_um + d.pitch_um / 2, parts, half, (centre[0], centre[1]), bent)
+        return PillarCells(self.focus, self._rim_um + d.pitch_um / 2, parts, half, (centre[0], centre[1]), bent)
 
     def _aberration(self, known: State, nodes_x: Array, nodes_y: Array) -> Array:
-        rim = self.design.diameters.radius_um
+        rim = self._rim_um
         return known.phase_rad(nodes_x / rim, nodes_y / rim)
 
     def _pupil(self, distance_um: float) -> Pupil:
         d, s = self.design, self.settings
-        rough = Pupil(d.diameters.radius_um + d.diameters.pitch_um / 2, distance_um, d.wavelength_um)
+        rough = Pupil(self._rim_um + d.diameters.pitch_um / 2, distance_um, d.wavelength_um)
         width = (s.window_samples + SPARE) * s.sample_um
         return Pupil(
             rough.radius_um, distance_um, d.wavelength_um, max(64, math.ceil(width * rough.edge / d.wavelength_um) * 2)
@@ -144,7 +145,7 @@ class MadeLens:
         count = int((float(self._diameter_um.max()) + reach - low) / TABLE_STEP_UM) + 2
         grid = low + TABLE_STEP_UM * np.arange(count)
         t = transmission(self.design.proxy, self.response, grid, self.design.wavelength_um, known.answers())
-        u, v = d.x_um / d.radius_um, d.y_um / d.radius_um
+        u, v = d.x_um / self._rim_um, d.y_um / self._rim_um
         table = t.astype(np.complex64), low, TABLE_STEP_UM
         return np.asarray(_gather(self._diameter_um, self._carrier, *table, u, v, bias, self._block))
 

@@ -176,6 +176,7 @@ class Trainer:
             self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
+            _laid_out(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
@@ -318,6 +319,14 @@ class Trainer:
             if any(p.grad is not None and not bool(torch.isfinite(p.grad).all()) for p in parameters)
         ]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
+
+
+def _laid_out(optimiser: torch.optim.Optimizer) -> None:
+    """Moments laid out in memory as their parameters: a fused step walks through both in one order without asking."""
+    for parameter, kept in optimiser.state.items():
+        for name, value in kept.items():
+            if value.shape == parameter.shape:
+                kept[name] = torch.empty_like(parameter).copy_(value)
 
 
 __all__ = ["Batch", "InnerConfig", "Model", "Record", "Scenes", "Schedule", "Trainer", "model"]

@@ -1,5 +1,6 @@
 """A co-design run from its config: joint training, search over architectures under budgets, and what is kept of it."""
 
+import functools
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -9,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from codesign.batches import VALIDATION, EyeScenes, PoolScenes, SceneConfig, fill, parallel
+from codesign.batches import VALIDATION, EyeScenes, Pool, PoolScenes, SceneConfig, fill, parallel
 from codesign.network import Architecture, Name, Space, cost
 from codesign.optics import OpticsConfig
 from codesign.train import assess, checkpoint, evolution
@@ -140,7 +141,8 @@ def start(settings: RunConfig) -> Run:
     fresh = EyeScenes(settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, seed)
     scenes: Scenes = fresh
     if settings.scenes.pool:
-        scenes = PoolScenes(fill(fresh, settings.scenes.pool), fresh.margin, settings.scenes.scale, seed)
+        pool = _pool(settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed)
+        scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
     if parallel.ranks() > 1 and settings.network != "supernet":
         raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
     budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
@@ -157,6 +159,12 @@ def start(settings: RunConfig) -> Run:
     if settings.network == "supernet":
         _affordable(run, moves=inner.pitch.rate > 0)
     return run
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int) -> Pool:
+    """The rendered frames of a run; kept for whoever goes on with it in this process, as its retraining does."""
+    return fill(EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool)
 
 
 def _affordable(run: Run, *, moves: bool) -> None:

@@ -63,6 +63,18 @@ def test_the_count_is_that_of_a_counted_pass(size):
     assert features.shape == (1, blur.SLIP_FEATURES)
 
 
+def test_the_depth_of_a_window_is_read_from_it_and_the_two_windows_around_it():
+    branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
+    frames = _frames(2, 64)
+    changed = frames.clone()
+    changed[..., :8, -8:] += 1.0  # a step of the windows: seen by the upper right one alone
+    with torch.no_grad():
+        moved = (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > 0
+    wanted = torch.zeros(blur.GRID, blur.GRID, dtype=torch.bool)
+    wanted[:3, -3:] = True
+    assert torch.equal(moved, wanted)
+
+
 def test_windows_hold_the_vergence_under_them():
     depth = torch.full((1, 64, 96), 25e3)
     depth[:, :8] = 12.5e3  # the first 8 rows, which a quarter of the first row of windows' weight sees … and no other
