@@ -76,7 +76,8 @@ def _faults(
     for _, angle, wavelength, centre, width in library.resonances:
         if width < half_width and len(d) and d[0] <= centre <= d[-1]:
             near = np.abs(d - centre) <= REACH * width
-            near[[max(0, np.searchsorted(d, centre) - 1), min(len(d) - 1, np.searchsorted(d, centre))]] = True
+            after = int(np.searchsorted(d, centre))
+            near[[max(0, after - 1), after]] = True
             text = f"resonance at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({wavelength:g} um"
             faults.append((near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")))
     return faults

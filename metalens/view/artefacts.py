@@ -117,15 +117,15 @@ def psf_panels(path: Path) -> list[Panel]:
     """PSFs with sliders over all that they depend on."""
     stack = psf.load(path)
     values = np.asarray(stack.intensity)
-    if values.size > MOST_SAMPLES:
-        values = values[..., :: math.ceil(values.size / MOST_SAMPLES), :, :]
-    names = [Axis("depth", (1e-3 * stack.depths_um[: values.shape[-3]]).tolist(), "mm")]
+    some = slice(None, None, math.ceil(values.size / MOST_SAMPLES))  # of the depths
+    values, depth = values[..., some, :, :], 1e-3 * stack.depths_um[some]
+    names = [Axis("depth", depth.tolist(), "mm")]
     if values.ndim >= 4:
         names.insert(0, Axis("field angle", [_angle(pair) for pair in stack.angles_rad]))
     while values.ndim - 2 > len(names):
         names.insert(0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))))
     peak, names = float(values.max()), at_brightest(names, values)
-    depth, energy = 1e-3 * stack.depths_um, np.asarray(stack.energy_um2)
+    energy = np.asarray(stack.energy_um2)[..., some]
     lines = {"peak": values.max(axis=(-2, -1)) / peak, "light in the window": energy / energy.max()}
     return [
         Images(
@@ -137,7 +137,7 @@ def psf_panels(path: Path) -> list[Panel]:
             f"Samples of {stack.step_um:g} um; stated relative error {stack.error:.1e} ({stack.reason}).",
             optics=True,
         ),
-        Curves("Over depth", depth[: values.shape[-3]], "depth / mm", lines, "of the largest", names[:-1]),
+        Curves("Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]),
     ]
 
 

@@ -89,7 +89,7 @@ D = np.linspace(0.10, 0.40, 61)  # 5 nm apart
 
 def library(level=None, phase=None, poles=()):
     """Two polarisations, two angles, two wavelengths; all pass 0.9 of the amplitude and turn by 20 rad per um."""
-    turn = 20 * (D - 0.1) + np.array([0.0, 6.0])[:, None] + np.array([0.0, 5.9])[:, None, None]
+    turn = 20 * (D - 0.1) + 2.0 + np.array([0.0, 2.0])[:, None] + np.array([0.0, 1.7])[:, None, None]
     shape = (2, 2, 2, 61)
     t = np.broadcast_to(0.9 * np.exp(1j * turn), shape).copy()
     t[1] *= np.exp(0.02j)
@@ -108,23 +108,28 @@ def test_a_clean_library_is_one_stretch_with_its_phases_unwrapped_along_every_ax
     made = cut()
     assert made.diameter_um == pytest.approx(D)
     assert made.notes == ()
-    slope = 20 * (D - 0.1) + 0.01  # the mean of both polarisations
+    slope = 20 * (D - 0.1) + 2.01  # the mean of both polarisations
     offsets = made.phase - slope
     assert np.ptp(offsets, axis=-1).max() < 1e-9
-    # 6.0 and 5.9 rad between neighbours are taken as the nearest turn: less 2 pi each
-    assert offsets[:, 1, 0] - offsets[:, 0, 0] == pytest.approx([6 - 2 * np.pi] * 2)
-    assert offsets[1, :, 0] - offsets[0, :, 0] == pytest.approx([5.9 - 2 * np.pi] * 2)
+    # angles of 4, 3.7 and 5.7 rad are beyond half a turn: neighbours are followed across the seam
+    assert offsets[:, 1, 0] - offsets[:, 0, 0] == pytest.approx([2.0] * 2)
+    assert offsets[1, :, 0] - offsets[0, :, 0] == pytest.approx([1.7] * 2)
     assert made.level == pytest.approx(np.full((2, 2, 61), 0.9 * math.cos(0.01)))
     assert made.polarization_spread == pytest.approx(0.9 * math.sin(0.01))
 
 
 def test_dark_diameters_of_any_light_cut_the_stretch():
     level = np.ones(61)
-    level[20:22] = 0.77  # 0.693 of amplitude
+    level[21] = 0.77  # 0.693 of amplitude
     level[30] = 0.79  # 0.711
     made = cut(level=level)
     assert made.diameter_um == pytest.approx(D[22:])
     assert made.notes == (f"cut at {D[22]:.4f} um: |t| falls to 0.69, below 0.7",)
+    level[:] = 1
+    level[0] = level[60] = 0.7
+    ends = cut(level=level)
+    assert ends.diameter_um == pytest.approx(D[1:60])
+    assert [note[:14] for note in ends.notes] == ["cut at 0.1050 ", "cut at 0.3950 "]
 
 
 def test_a_falling_phase_takes_both_ends_of_the_fall():
@@ -160,6 +165,9 @@ def test_the_stretch_of_most_phase_wins_over_the_longer_one_and_short_ones_are_n
     level[:] = np.where(np.arange(61) % 12 == 0, 0.5, 1)  # 11 in a row
     with pytest.raises(DomainError, match=r"no 12 diameters .*\|t\| falls to 0\.45"):
         cut(level=level)
+    level[:] = np.where(np.arange(61) % 13 == 0, 0.5, 1)  # 12 in a row
+    assert len(cut(level=level).diameter_um) == 12
+    level[:] = np.where(np.arange(61) % 12 == 0, 0.5, 1)
     level[24] = 1.0
     assert cut(level=level).diameter_um == pytest.approx(D[13:36])
     within = stretch.stretch(library(), least_transmission=0.7, least_half_width_um=0.004, within_um=(0.12, 0.2))

@@ -63,6 +63,18 @@ def test_every_pillar_is_in_the_page(folder):
     assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(turns, rel=1e-5)
 
 
+def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(folder, monkeypatch):
+    """Two angles of three depths of 28 x 28 samples: half of them leave the first and the last depth."""
+    stack = psf.load(folder / "psf.h5")
+    monkeypatch.setattr(artefacts, "MOST_SAMPLES", stack.intensity.size // 2)
+    images, curves = artefacts.psf_panels(folder / "psf.h5")
+    assert images.axes[-1].values == pytest.approx([0.7, 1.4])
+    assert images.values == pytest.approx(stack.intensity[..., ::2, :, :] / stack.intensity[..., ::2, :, :].max())
+    assert curves.x == pytest.approx([0.7, 1.4])
+    energy = stack.energy_um2[..., ::2]
+    assert curves.lines["light in the window"] == pytest.approx(energy / energy.max())
+
+
 def test_psfs_keep_their_axes(folder):
     stack = psf.load(folder / "psf.h5")
     panel = _content(page.html("psf", artefacts.psf_panels(folder / "psf.h5")))["panels"][0]
@@ -134,4 +146,5 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
     if what == "psf":  # the number under the cross is that of the file
         stack = psf.load(folder / "psf.h5").intensity
         number = float(re.search(r"x 0.25 µm, y 0.25 µm: ([0-9.e-]+) of", shown).group(1))
-        assert number == pytest.approx(float(stack[0, 0, 14, 14] / stack.max()), rel=1e-3)  # four digits are shown
+        angle, depth, *_ = np.unravel_index(int(stack.argmax()), stack.shape)  # sliders begin at the highest peak
+        assert number == pytest.approx(float(stack[angle, depth, 14, 14] / stack.max()), rel=1e-3)  # four digits
