@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from layout.arrange import joined as joined
     from layout.arrange import parts as parts
     from layout.arrange import readback as readback
+    from layout.arrange import seen as seen
     from layout.arrange import wafer as wafer
     from layout.arrange.record import Arrangement as Arrangement
     from layout.arrange.record import At as At
@@ -32,6 +33,7 @@ __getattr__, __dir__, __all__ = attach(
         "joined": "",
         "parts": "",
         "readback": "",
+        "seen": "",
         "wafer": "",
     },
 )

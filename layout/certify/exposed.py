@@ -137,11 +137,12 @@ class Simulation:
         """What comes out, band by band from the bottom; two are worked on at once."""
         bands = self._bands()
         with ThreadPoolExecutor(_THREADS) as pool:
-            waiting = [pool.submit(self._band, *some) for some in bands[: _THREADS + 1]]
+            waiting = [pool.submit(self._band, *some) for some in bands[:_THREADS]]
             for number in range(len(bands)):
-                yield waiting.pop(0).result()
-                if number + _THREADS + 1 < len(bands):
-                    waiting.append(pool.submit(self._band, *bands[number + _THREADS + 1]))
+                done = waiting.pop(0).result()
+                if number + _THREADS < len(bands):
+                    waiting.append(pool.submit(self._band, *bands[number + _THREADS]))
+                yield done
 
     def _band(self, first: int, end: int) -> Band:
         x, y, kind = self.scene.places.part(first, end)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import Arrangement, At, Wafer, apart, joined, readback, wafer
+from layout.commands import arranged_page
 from layout.commands import placed as standing
 from layout.commands.check import read
 from layout.commands.job import Options
@@ -69,8 +70,8 @@ def _whole(work: Work) -> Assembly:
     into = None if record.into is None else standing.file_part(work, "INTO", record.into)
     every = placed if into is None else [*placed, joined.Placing(into, (At(),))]
     with work.stages("room between parts"):
-        found = apart.check(every, work.process)
-    told = [f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}" for v in found]
+        work.placed, work.near = every, apart.check(every, work.process)
+    told = [f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}" for v in work.near]
     work.failures += told[:_LISTED] + ([f"{len(told) - _LISTED} more"] if len(told) > _LISTED else [])
     layers = work.process.layers
     name = record.name if record.wafer is None else f"{record.name}_DIE"
@@ -120,7 +121,7 @@ def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path]
 
 
 def _accompany(work: Work, made: Assembly) -> None:
-    """Dose table, list of dies, job sheet, values."""
+    """Dose table, list of dies, job sheet, values, report."""
     doses.write(made, work.process, work.folder / "doses.csv")
     most, held = work.process.exposure.maximum_classes, len({round(dose, 6) for dose in made.doses.values()})
     if held > most:
@@ -136,6 +137,7 @@ def _accompany(work: Work, made: Assembly) -> None:
     store.write_text(work.folder / "arrangement.toml", config.dumps(work.record))
     store.write_text(work.folder / "job.txt", "\n".join(_sheet(work, made)) + "\n")
     store.write_text(work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n")
+    arranged_page.write(work, made)
 
 
 def _values(work: Work, made: Assembly) -> dict[str, Any]:
@@ -193,5 +195,7 @@ def _text(work: Work, made: Assembly) -> str:
     lines = [work.verdict, *work.notes]
     lines += [f"  {target / name}: {size / 1e6:.3g} MB, read back" for name, size in work.written.items()]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
-    lines.append(f"  {dies}{len(made.cells):,} cells; {target / 'job.txt'}; {sum(work.stages.seconds.values()):.1f} s")
+    lines.append(
+        f"  {dies}{len(made.cells):,} cells; {target / 'report.html'}; {sum(work.stages.seconds.values()):.1f} s"
+    )
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from layout.files import MaskContent, flat, verify
 from layout.mask import build
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
-from layout.rules import DrcReport, check, foreign
+from layout.rules import DrcReport, Violation, check, foreign
 from metalens import lens as lenses
 from metalens.ground.errors import MaskFileError
 from metalens.lens import Lens
@@ -28,7 +28,8 @@ KEPT = 1 << 16  # placements of a cell that are kept when a mask is read back; o
 class Work:
     """What is known so far of an arrangement.
 
-    failures: what keeps the mask from the writer. notes: what a person should know.
+    failures: what keeps the mask from the writer. notes: what a person should know. placed: parts on the die. near:
+    those that stand too near each other. rules: what was found of each part that is checked here.
     """
 
     options: Options
@@ -41,6 +42,9 @@ class Work:
     lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
     written: dict[str, int] = field(default_factory=dict)
     dies: wafer.Dies | None = None
+    placed: list[joined.Placing] = field(default_factory=list)
+    near: list[Violation] = field(default_factory=list)
+    rules: dict[str, DrcReport] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -48,7 +52,8 @@ class Work:
         return "FAILS: " + "; ".join(self.failures) if self.failures else "The mask passes its own checks."
 
     def broken(self, name: str, found: DrcReport) -> None:
-        """Enter the rules that a part breaks."""
+        """Enter what was found of the rules of a part."""
+        self.rules[name] = found
         text = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
         if text:
             self.failures.append(f"{name}: design rules broken: {text}")

@@ -129,6 +129,10 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
     lone = [(tmp_path / "m" / "A" / file).stat().st_size for file in ("mask.gds", "mask.oas")]
     assert sizes[0] < 5 * lone[0]
     assert sizes[1] < 5 * lone[1]
+    page = (tmp_path / "m" / "report.html").read_text()
+    assert "The mask passes its own checks. 2 lenses with" in page
+    assert all(text in page for text in ("mirrored", "pads.gds", f"{len(dies)} whole dies"))
+    assert (tmp_path / "m" / "wafer.png").is_file()
     held = doses.read(tmp_path / "m" / "doses.csv")
     assert held[1, 0] == 1.0
     assert held[1, 1] == held[20, 3] == 1.5
@@ -156,7 +160,9 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder,
     assert "A at (0, 0) um to A at (5.5, 0) um, pillars: 0.000 um apart" in capsys.readouterr().out
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
     assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
-    assert "PADS: design rules broken: 1 feature" in capsys.readouterr().out.splitlines()[0]
+    assert "FAILS: PADS: design rules broken: 1 feature" in capsys.readouterr().out
+    page = (tmp_path / "m" / "report.html").read_text()
+    assert "FAILS: PADS: design rules broken: 1 feature" in page[page.index("<h1") : page.index("<h2")]
     assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0
 
 

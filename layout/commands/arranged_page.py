@@ -1,0 +1,183 @@
+"""report.html of an arrangement: what stands where on the die, its doses, counts and checks."""
+
+from typing import Any
+
+import numpy as np
+
+from layout.arrange import apart, joined, seen
+from layout.commands.placed import Work
+from layout.files import Assembly
+from metalens.ground import report
+from metalens.ground.arrays import Array
+from metalens.ground.report import Figure, KeyFigure, Section, Table
+
+_POINTS = 600  # of the picture, each way
+_LISTED = 60
+
+
+def write(work: Work, made: Assembly) -> None:
+    """Write report.html and die.png (and wafer.png) beside the masks."""
+    box = apart.extent(work.placed)
+    die = _die(work, box)
+    (work.folder / "die.png").write_bytes(die)
+    items: list[Figure | Table] = [
+        Figure(die, "Share of the area that is covered, averaged.", wide=True),
+        _places(work),
+    ]
+    sections = [Section("Die", _text(work), items)]
+    if work.dies is not None:
+        shot = _wafer(work, box)
+        (work.folder / "wafer.png").write_bytes(shot)
+        text = f"{len(work.dies.index):,} whole dies; dies.csv lists them."
+        sections.append(Section("Wafer", text, [Figure(shot, "Dies within the edge exclusion, and marks.", wide=True)]))
+    sections += [_checks(work), _doses(work, made), _files(work)]
+    figures = [
+        KeyFigure("parts", str(len(work.placed))),
+        KeyFigure("dies", f"{1 if work.dies is None else len(work.dies.index):,}"),
+        KeyFigure("doses", str(len(made.doses))),
+        KeyFigure("what fails", str(len(work.failures)), not work.failures),
+    ]
+    report.write(
+        work.folder / "report.html",
+        f"Mask {made.name}",
+        sections,
+        lead=f"{work.verdict} {_lead(work)}",
+        key_figures=figures,
+    )
+
+
+def _lead(work: Work) -> str:
+    pillars = sum(values["pillars"] * _number(work, name) for name, values in work.lenses.items())
+    return f"{len(work.lenses)} lenses with {pillars:,} pillars on a die; process “{work.process.name}”."
+
+
+def _number(work: Work, name: str) -> int:
+    """Copies of a part on the die."""
+    return sum(c.count for one in work.placed if one.part.name == name for c in one.copies(one.part.top))
+
+
+def _text(work: Work) -> str:
+    notes = " ".join(f"{note}." for note in work.notes)
+    return f"Seen from the pillar side, +y up, as a microscope of the picture's resolution sees it. {notes}".strip()
+
+
+def _die(work: Work, box: Array) -> bytes:
+    view = seen.View.over(box, _POINTS)
+    images = seen.covered(work.placed, work.process, view)
+    count = max(1, len(images))
+    figure, axes = report.canvas(1, count, size=(6.4 * count, 5.6), squeeze=False)
+    x, y = ((low, low + n * view.side) for low, n in ((view.left, view.columns), (view.bottom, view.rows)))
+    for ax, (kind, image) in zip(axes[0], sorted(images.items()), strict=False):
+        extent = [v / joined.PER_UM for v in (*x, *y)]
+        shown = ax.imshow(100 * image, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
+        ax.grid(False)
+        ax.set(xlabel="x / µm", ylabel="y / µm", title=kind)
+        figure.colorbar(shown, ax=ax, label="area covered / %", shrink=0.8)
+        _named(ax, work)
+    return report.png(figure)
+
+
+def _named(ax: Any, work: Work) -> None:
+    """Names of the parts where they stand, and crosses where they are too near."""
+    for one in work.placed:
+        for at in one.at[:_LISTED]:
+            ax.annotate(one.part.name, (at.x_um, at.y_um), color="white", fontsize=7, ha="center", va="center")
+    if work.near:
+        x, y = np.array([v.centre for v in work.near]).T / joined.PER_UM
+        ax.plot(x, y, "x", color="red", ms=6, mew=1.5)
+
+
+def _wafer(work: Work, box: Array) -> bytes:
+    from matplotlib.collections import PolyCollection
+
+    size, dies = work.record.wafer, work.dies
+    if size is None or dies is None:
+        return b""
+    figure, ax = report.canvas(size=(6.4, 6.2))
+    left, bottom, right, top = (box / joined.PER_UM / 1e3).tolist()
+    corner = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    ax.add_collection(
+        PolyCollection(
+            list(dies.place_um[:, None] / 1e3 + corner), facecolors="#1f6feb55", edgecolors="#355070", linewidths=0.4
+        )
+    )
+    turn, radius = np.linspace(0, 2 * np.pi, 400), size.diameter_mm / 2
+    for r, style in ((radius, "-"), (radius - size.edge_exclusion_mm, ":")):
+        ax.plot(r * np.cos(turn), r * np.sin(turn), style, color="#444", lw=1)
+    for mark in size.marks:
+        ax.plot(mark.x_mm, mark.y_mm, "+", color="#d1495b", ms=9)
+    ax.set(aspect="equal", xlabel="x / mm", ylabel="y / mm")
+    return report.png(figure)
+
+
+def _places(work: Work) -> Table:
+    files = {part.name: str(part.file) for part in work.record.lens}
+    files |= {part.name: str(part.file) for part in work.record.cell}
+    rows = []
+    for one in work.placed:
+        left, bottom, right, top = (one.part.extent / joined.PER_UM).tolist()
+        for at in one.at:
+            turned = f"{at.turn_deg:g}{' mirrored' if at.mirrored else ''}"
+            size = f"{right - left:.3f} x {top - bottom:.3f}"
+            rows.append(
+                [one.part.name, files.get(one.part.name, "own"), at.x_um, at.y_um, turned, at.columns * at.rows, size]
+            )
+    head = ("part", "file", "x / µm", "y / µm", "turn / degrees", "copies", "size / µm")
+    most = f"The first {_LISTED} of {len(rows)} places." if len(rows) > _LISTED else "Where each part stands."
+    return Table(head, rows[:_LISTED], most, digits=8)
+
+
+def _checks(work: Work) -> Section:
+    """Rules, exposure and read-back of each part, and what stands too near what."""
+    rows = [_lens_row(name, values) for name, values in work.lenses.items()]
+    for name, found in work.rules.items():
+        broken = sum(found.counts.values())
+        sizes = [f"{found.pillars:,}", found.minimum_gap_nm, found.minimum_feature_nm, broken]
+        rows.append([name, *sizes, "", "", "FAILS" if broken else "passes"])
+    head = (
+        "part",
+        "shapes",
+        "least gap / nm",
+        "least feature / nm",
+        "broken rules",
+        "exposure",
+        "read back",
+        "verdict",
+    )
+    items: list[Figure | Table] = [Table(head, rows, "Each lens has a report of its own, in the folder of its name.")]
+    if work.near:
+        near = [[v.text, v.value / 1e3, v.limit / 1e3] for v in work.near[:_LISTED]]
+        items.append(Table(("what", "apart / µm", "needed / µm"), near, "Parts that stand too near each other."))
+    wrong = "\n\n".join(work.failures) or "Every part keeps its rules, and all stand far enough from each other."
+    return Section("Checks", wrong, items)
+
+
+def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
+    """Of layout.json of a lens."""
+    exposed = [
+        f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm" for e in values["exposure"].values()
+    ]
+    same = "DIFFERENT" if any(values["differences"].values()) else "as planned"
+    sizes = [f"{values['pillars']:,}", values["minimum_gap_nm"], values["minimum_feature_nm"]]
+    told = [sum(values["violations"].values()), exposed[0] if exposed else "not certified", same]
+    return [name, *sizes, *told, "passes" if values["ok"] else "FAILS"]
+
+
+def _doses(work: Work, made: Assembly) -> Section:
+    base = work.process.exposure.base_uC_cm2
+    rows = [
+        [*layer, f"{dose:.6f}", dose * base, made.layer_names.get(layer, "")]
+        for layer, dose in sorted(made.doses.items())
+    ]
+    head = ("layer", "datatype", "relative dose", "µC/cm²", "name")
+    return Section("Dose", "One dose for each layer and datatype, as in doses.csv.", [Table(head, rows)])
+
+
+def _files(work: Work) -> Section:
+    wrong = {
+        name: any(text.startswith(f"{name} does not read back") for text in work.failures) for name in work.written
+    }
+    rows = [[n, f"{s / 1e6:.3f}", "DIFFERENT" if wrong[n] else "as planned"] for n, s in work.written.items()]
+    times = [[stage, seconds] for stage, seconds in work.stages.seconds.items()]
+    items = [Table(("file", "MB", "read back"), rows), Table(("stage", "seconds"), times, digits=3)]
+    return Section("Files", "Each file was read back: every cell, shape and copy.", items)
