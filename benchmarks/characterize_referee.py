@@ -95,25 +95,28 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
     except (CaptureError, FitError) as refusal:
         return {"seed": seed, "refused": str(refusal), "seconds": time.process_time() - start}
     seconds, wall = time.process_time() - start, time.perf_counter() - clock
-    inside, error = {}, {}
+    inside, outer, error = {}, {}, {}
     for i, name in enumerate(found.names):
         if name in hidden_lens.TRUTHS:
             low, high = found.interval(name)
             inside[name] = bool(low <= values[name] <= high)
+            low, high = found.outer(name)
+            outer[name] = bool(low <= values[name] <= high)
             error[name] = float((found.value[i] - values[name]) / math.sqrt(found.covariance[i, i]))
     words = [w for w in found.cautions if "residuals" in w or "left out" in w or "fitted too" in w or "phase of" in w]
-    declared = [w for w in found.degeneracies if "is not fitted" in w]
+    wider = {n: math.hypot(1, found.unstated[i] / found.sigma[i]) for i, n in enumerate(found.names) if n in inside}
     return {
         "seed": seed,
         "seconds": seconds,
         "wall_seconds": wall,
         "inside": inside,
+        "outer": outer,
+        "wider": wider,
         "z": error,
         "parabolic": len(found.draws) == 0,
         "chi2_per_dof": found.chi2_per_dof,
         "problems": list(found.problems),
         "words": words,
-        "declared": declared,
         "verdicts": list(found.verdicts),
     }
 

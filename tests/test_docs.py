@@ -22,7 +22,7 @@ from metalens.ground import config
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")])
 MADE = re.compile(r"(\.\./)?reference/(\w+)\.md")  # pages that the site makes from the code
-OF_A_CAPTURE = {"pixel_um", "wavelength_um", "wavelength_sigma_nm", "bits", "gain_e", "channel"}
+OF_A_CAPTURE = {"pixel_um", "pixel_sigma_um", "wavelength_um", "wavelength_sigma_nm", "bits", "gain_e", "channel"}
 TEXTS = [*PAGES, ROOT / "README.md", ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.model import PLACE, Known, extra_path, incidence_rad, made, spectrum, vector
+from characterize.model import LIGHT, PLACE, Known, extra_path, incidence_rad, light_maps, made, spectrum, vector
 from metalens import psf
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -161,8 +161,12 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
     """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
     camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
     wavelength_um = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
+    across, down = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
+    uneven = x[[PLACE[name] for name in LIGHT]]
+    if uneven.any():
+        radius = lens.diameters.radius_um
+        t = t * np.exp(np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2)
     if x[PLACE["glass_um"]]:
-        across, down = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
         path = extra_path(across, down, tangents=way.source, depth_um=float(depth_um[0]), values=x)
         t = t * np.exp(2j * math.pi / wavelength_um * path)
     side = camera.pixels + 2 * _MARGIN

@@ -103,6 +103,10 @@ def clean(capture: Capture, *, gain: Gain | None = None) -> Frames:
     notes.append(f"{int(bad.sum())} of {bad.size} pixels hot, dead or in a dead row: masked")
     top = saturation_level(capture)
     saturated = raw >= top
+    if not saturated.any() and gain.known:
+        well = full_well(raw - dark, gain)
+        saturated = raw - dark >= well
+        top = well
     if saturated.any():
         notes.append(f"{saturated.mean():.2%} of the pixels saturated at {top:g} counts: taken as lower bounds")
     if bad.all() or (saturated | bad).all():
@@ -131,6 +135,21 @@ def saturation_level(capture: Capture) -> float:
     clipped = plateau >= 4 and plateau > 0.5 * near and highest > float(np.median(frames)) + 16
     clipped |= plateau > 0.05 * frames.size and highest > float(np.median(frames)) + 2  # no light is so even
     return highest if clipped else float(capture.full_scale)
+
+
+def full_well(counts: Array, gain: Gain) -> float:
+    """Counts above the dark level from which on pixels are full; inf where none shows it.
+
+    Light that fills no well scatters by s = sqrt(counts / gain) at least, so that two pixels alike are within w of each
+    other by a chance of w / (sqrt(pi) s); wells that are full all read the same, to within rounding and the error of
+    the dark level. So: three pixels or more within w = 2 counts, most of those within 1.5 s of the highest, by a chance
+    below a hundredth.
+    """
+    highest, width = float(counts.max()), 2.0
+    shot = math.sqrt(max(highest, 1e-9) / gain.gain_e)
+    alike, near = (int((counts >= highest - reach).sum()) for reach in (width, 1.5 * shot))
+    chance = (width / (math.sqrt(math.pi) * shot)) ** (alike - 1)
+    return highest - width if alike >= 3 and alike > 0.5 * near and chance < 0.01 else math.inf
 
 
 def bad_pixels(capture: Capture) -> Array:

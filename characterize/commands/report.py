@@ -60,7 +60,10 @@ def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | 
         "One column a frame. Square root of the light above background, one scale down each column; the residual runs "
         "from -5 (blue) to 5 sigma (red): noise alone looks like even speckle, structure is what the model leaves over."
     )
-    bars = "95 % intervals in the typical uncertainty of each parameter; grey: what was known beforehand."
+    bars = (
+        "95 % intervals in the typical uncertainty of each parameter, within the model (dark) and with what these "
+        "captures cannot tell (light); grey: what was known beforehand."
+    )
     correlated = report.Figure(
         _correlation(result), "Correlation of the parameters: deep colours cannot be told apart."
     )
@@ -131,12 +134,12 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
 
 
 def _parameters(result: AsBuilt) -> report.Table:
-    low_high = [result.interval(name) for name in result.names]
-    rows = [
-        (name, float(v), float(s), f"{low:.4g} to {high:.4g}", PARAMETERS[PLACE[name]].meaning)
-        for name, v, s, (low, high) in zip(result.names, result.value, result.sigma, low_high, strict=True)
-    ]
-    return report.Table(("parameter", "value", "1 sigma", "95 % interval", "meaning"), rows)
+    rows = []
+    for name, v, s in zip(result.names, result.value, result.sigma, strict=True):
+        ends = ("{:.4g} to {:.4g}".format(*of(name)) for of in (result.interval, result.outer))
+        rows.append((name, float(v), float(s), *ends, ", ".join(result.most(name)), PARAMETERS[PLACE[name]].meaning))
+    heads = "95 % within the model", "95 % with what cannot be told", "mostly"
+    return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
 
 
 def scale(name: str) -> float:
@@ -167,6 +170,8 @@ def _intervals(result: AsBuilt) -> bytes:
     axis.barh(rows, 2 * 1.96 * np.minimum(prior, 1e3), left=-1.96 * np.minimum(prior, 1e3), color="#e4e4e4")
     ends = np.array([result.interval(name) for name in names]) / unit[:, None]
     reach = np.abs(ends - value[:, None]).T
+    outer = np.array([result.outer(name) for name in names]) / unit[:, None]
+    axis.errorbar(value, rows, xerr=np.abs(outer - value[:, None]).T, fmt="none", ecolor="#9ec1f7", linewidth=3.5)
     axis.errorbar(value, rows, xerr=reach, fmt="o", markersize=3, color="#1f6feb", capsize=2, linewidth=1.2)
     axis.axvline(0, color="#444", linewidth=0.8)
     axis.set_yticks(rows, [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)], fontsize=7)

@@ -52,6 +52,8 @@ class AsBuilt:
     residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty where none was kept.
     low, high: (p,) 95 % intervals by profile over all valleys; draws: (m, p) of the posterior where it is no parabola.
     verdicts: how well the PSF is known, and how well the process, in words.
+    causes, by_cause, unstated: what the captures cannot tell apart and nobody stated: names (c,), (c, p) shift of every
+        parameter by each of plausible size, (p,) by all of them together, standard deviations.
     curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there with all others fitted.
     """
 
@@ -81,6 +83,9 @@ class AsBuilt:
     high: Array = field(default_factory=lambda: np.empty(0))
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
     verdicts: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    by_cause: Array = field(default_factory=lambda: np.empty((0, 0)))
+    unstated: Array = field(default_factory=lambda: np.empty(0))
     curves: dict[str, Array] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -101,12 +106,34 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter: by its profile where there is one, else 1.96 sigma to either side."""
+        """95 % interval of a parameter within the model: by its profile where there is one, else 1.96 sigma each way.
+
+        It holds where what the model lacks is absent, or stated; see :meth:`outer` for where that is not known.
+        """
         i = self.names.index(name)
         if len(self.low):
             return float(self.low[i]), float(self.high[i])
         reach = 1.959964 * float(self.sigma[i])
         return float(self.value[i]) - reach, float(self.value[i]) + reach
+
+    def outer(self, name: str) -> tuple[float, float]:
+        """95 % interval of a parameter with what the captures cannot tell: :meth:`interval`, and 1.96 ``unstated`` in
+        quadrature."""
+        low, high = self.interval(name)
+        i = self.names.index(name)
+        value, more = float(self.value[i]), 1.959964 * float(self.unstated[i]) if len(self.unstated) else 0.0
+        return value - math.hypot(value - low, more), value + math.hypot(high - value, more)
+
+    def most(self, name: str) -> tuple[str, ...]:
+        """Causes that nobody stated and that widen the interval of a parameter, the most telling first.
+
+        Those that alone move it by a quarter of its standard error and by a third of what the worst does.
+        """
+        i = self.names.index(name)
+        own = self.by_cause[:, i] if len(self.causes) else np.empty(0)
+        low, high = self.interval(name)
+        least = max(0.25 * (high - low) / 3.92, float(own.max(initial=0.0)) / 3)
+        return tuple(self.causes[k] for k in np.argsort(-own) if own[k] > least)
 
     def parameters(self, value: Array | None = None) -> Array:
         """All parameters in the order of ``parameters.NAMES``; ``value``: of the fitted ones, the best without it."""
@@ -189,7 +216,7 @@ _ARRAYS = (
     "nominal",
     "residual_sigma",
 )
-_WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts")
+_WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts", "causes")
 
 
 def save(path: str | Path, result: AsBuilt) -> None:
@@ -198,7 +225,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
-    for name in ("low", "high", "draws"):
+    for name in ("low", "high", "draws", "by_cause", "unstated"):
         if len(getattr(result, name)):
             arrays[name] = getattr(result, name)
     if len(result.residual_modes):
@@ -237,7 +264,7 @@ def load(path: str | Path) -> AsBuilt:
     design = lenses.from_parts(a, about, where=str(path), group="design/")
     fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
     fields |= {name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS}
-    fields |= {name: a[name] for name in ("low", "high", "draws") if name in a}
+    fields |= {name: a[name] for name in ("low", "high", "draws", "by_cause", "unstated") if name in a}
     return AsBuilt(
         design=design,
         response=_response(a, about),

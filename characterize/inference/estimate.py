@@ -12,12 +12,13 @@ from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
-from characterize.inference.missing import Lean
+from characterize.inference.missing import Looked, Unstated
 from characterize.inference.prepare import check_depths, check_enough, data_of, merged, quick_enough, setting_of, stated
 from characterize.inference.search import Task, with_values
 from characterize.model import (
     NAMES,
     PLACE,
+    UNFITTED,
     ForwardModel,
     Known,
     slopes,
@@ -31,6 +32,7 @@ from metalens.made import Sensitivity
 
 LIKENESS = 0.45
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
+_CAUSES = 2  # that are found in the residuals, one after the other
 _LEFT_OUT = 1.25  # chi-square a pixel of frames left out, with what their prediction is uncertain by
 
 
@@ -69,6 +71,7 @@ def fit(
     check_depths(setting.depth_um, lens)
     data = data_of(frames, window)
     known = {k.name: k for k in (*stated(capture, lens), *options.known)}
+    unfitted = {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
     check_enough(data, search.names_of(known, options.free))
     model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
     start = vector({name: k.value for name, k in known.items()})
@@ -78,20 +81,24 @@ def fit(
     cautions = [*frames.corrections, *_arranged_words(found)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
-    task = Task(model, _rearranged(data, found), start, known, found, options.free)
+    task = Task(model, _rearranged(data, found), start, known, found, options.free, unfitted)
     task = dataclasses.replace(task, model=quick_enough(model, task.data, search.starts(task, biases_nm=(0.0,))[0]))
     task, ends = _ends(task, frames.gain, cautions)
+    task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     if frames.gain.known and verdict.left_over(ends[0]):
         rest = residual.attempt(task.model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
         if rest is not None:
             task = dataclasses.replace(task, model=task.model.with_residual(rest.modes, thinplate.basis))
-            ends = [rest.solution]
+            ends, looked = [rest.solution], None
             cautions.append(
                 f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
                 f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
             )
     _refuse(_problems(task, ends[0], frames.gain), options)
-    result = _result(capture, task, explore.explore(task, ends), cautions, frames.gain)
+    posterior = explore.explore(task, ends)
+    if frames.gain.known and (looked is None or posterior.best is not looked[0]):
+        looked = posterior.best, missing.look(task, posterior.best)
+    result = _result(capture, task, posterior, cautions, frames.gain, looked[1] if looked else None)
     _refuse(result.problems, options)
     return result
 
@@ -118,6 +125,30 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
         return task, ends
     cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
     return more, wide
+
+
+def _with_what_is_there(
+    task: Task, ends: list[Solution], gain: Gain, cautions: list[str]
+) -> tuple[Task, list[Solution], tuple[Solution, Looked] | None]:
+    """The task with parameters of causes that the residuals lean to, while these explain the frames better.
+
+    With the last look beside the fit and the solution it was at; None without a known gain.
+    """
+    if not gain.known:
+        return task, ends, None
+    looked = missing.look(task, ends[0])
+    for _ in range(_CAUSES):
+        first = looked.leans[0] if looked.leans else None
+        if first is None or first.chance > missing.CHANCE or not first.frees or not ends[0].converged:
+            break
+        more = dataclasses.replace(task, free=(*task.free, *first.frees))
+        wide = search.wider(more, task.all_of(ends[0].value))
+        if wide is None or wide[0].merit > ends[0].merit - first.chi2 / 2:
+            break
+        cautions.append(f"{first.cause} shows in the residuals: {', '.join(first.frees)} fitted too")
+        task, ends = more, wide
+        looked = missing.look(task, ends[0])
+    return task, ends, (ends[0], looked)
 
 
 def _spoken_of(options: Options) -> set[str]:
@@ -158,13 +189,15 @@ def _rearranged(data: Data, found: Arrangement) -> Data:
     return Data(part[0], part[1], part[2], part[3], part[4], **common)
 
 
-def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain) -> AsBuilt:
+def _result(
+    capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked | None
+) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
     fitted = dict(zip(names, solution.value.tolist(), strict=True))
-    bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
     unseen = explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
-    absent = missing.leans(task, solution) if gain.known else []
+    unstated = looked.reckoned() if looked else Unstated((), np.zeros((0, len(names))), np.zeros(len(names)))
+    counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
     return AsBuilt(
         design=model.lens,
         response=model.response,
@@ -179,40 +212,52 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         measured=data.electrons,
         predicted=solution.image,
         residual_modes=model.modes,
-        nominal=model.with_residual(np.empty(0), thinplate.basis).images(with_values(task.start, bench))[0],
+        nominal=_nominal(task, fitted),
         residual_sigma=solution.residual_sigma,
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
-        degeneracies=_open(task, found, covariance, absent),
-        cautions=(*cautions, *(_seen(task, solution, absent, unseen) if gain.known else ())),
+        degeneracies=_open(task, found, covariance, looked),
+        cautions=(*cautions, *(_seen(task, solution, looked, unseen) if looked else ())),
         problems=(*_problems(task, solution, gain), *verdict.held_back(names, solution, task.prior)),
-        low=np.minimum(found.low, solution.value - explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
-        high=np.maximum(found.high, solution.value + explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)),
+        low=np.minimum(found.low, solution.value - counted),
+        high=np.maximum(found.high, solution.value + counted),
         draws=found.draws,
         curves={name: np.stack([one.value, one.rise]) for name, one in found.profiles.items()},
-        verdicts=(
-            _psf_verdict(explore.predicted_error(task, found), unseen),
-            verdict.process_verdict(names, found.low, found.high, _told(task, found)),
-        ),
+        verdicts=_verdicts(task, found, unseen, unstated),
+        causes=unstated.causes,
+        by_cause=unstated.by_cause,
+        unstated=unstated.sigma,
     )
 
 
-def _seen(task: Task, solution: Solution, absent: list[Lean], unseen: float) -> list[str]:
+def _nominal(task: Task, fitted: dict[str, float]) -> Array:
+    """(n, y, x) electrons as designed, with the fitted gain, background, place and blur."""
+    bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
+    plain = task.model.with_residual(np.empty(0), thinplate.basis)
+    return plain.images(with_values(task.start, bench))[0]
+
+
+def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
+    known = verdict.process_verdict(task.names, found.low, found.high, _told(task, found), unstated)
+    return _psf_verdict(explore.predicted_error(task, found), unseen), known
+
+
+def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:
     """What is in the frames and in no parameter: structure of the residuals, causes, frames left out."""
     noise = np.sqrt(task.data.variance(solution.image))
     shared = task.data.shared(solution.image) / noise
-    words = [*verdict.structure(solution.residual_sigma, shared), *missing.words(absent)]
+    words = [*verdict.structure(solution.residual_sigma, shared), *missing.words(looked.leans)]
     if unseen > _LEFT_OUT:
         words.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
     return words
 
 
-def _open(task: Task, found: Posterior, covariance: Array, absent: list[Lean]) -> tuple[str, ...]:
+def _open(task: Task, found: Posterior, covariance: Array, looked: Looked | None) -> tuple[str, ...]:
     """What cannot be told apart: bent and double posteriors, pairs, and causes that nobody fitted."""
     pairs = knowable.degeneracies(task.names, covariance, task.prior.sigma)
-    return (*explore.words(task, found), *pairs, *missing.untold(absent))
+    return (*explore.words(task, found), *pairs, *(missing.untold(looked.leans) if looked else ()))
 
 
 def _named(names: tuple[str, ...]) -> Array:

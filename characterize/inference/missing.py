@@ -4,44 +4,27 @@ With residuals r over their noise at the mode, the fitted slopes A (priors inclu
 a cause G, both over the noise, what the fit cannot make up for is G' = G - A (AᵀA)⁻¹ AᵀG. Then s = Gᵀr scatters with
 covariance I = GᵀG' where the cause is absent, and sᵀI⁻¹s follows chi-square of as many degrees (Rao 1948). One number
 for each cause: more telling than the chi-square of all pixels, in which a twentieth of a sigma a pixel drowns.
+
+What the frames cannot tell goes into the intervals as considered parameters (Schmidt 1966), c of plausible size each:
+the fit moves by M c with M = (AᵀA)⁻¹ AᵀG, and the frames know of c what its score says and no more.
 """
 
-import contextlib
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import stats
 
+from characterize.inference import causes
 from characterize.inference.leastsquares import Solution
 from characterize.inference.search import Task
-from characterize.model import MODES, PLACE, Setting, basis, prior_rad
 from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
-from metalens.lens import Lens
 
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
-_STITCH_UM = 0.05
-_WALL_DEG = 1.5
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
-
-_TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
-_OF_MODEL: tuple[tuple[str, dict[str, float], str, float], ...] = (  # cause, from, name and amount that is added
-    ("a source of finite size", {}, "pinhole_um", 6),
-    ("a spectrum of finite width", {}, "bandwidth_nm", 2),
-    ("a tilt of the lens about y", {}, "tilt_x_deg", 0.3),
-    ("a tilt of the lens about x", {}, "tilt_y_deg", 0.3),
-    ("a saddle of the diameters", {}, "bias_a_nm", 3),
-    ("an oblique saddle of the diameters", {}, "bias_o_nm", 3),
-    ("a tilted side wall", {}, "sidewall_deg", 0.5),
-    ("another refractive index", {}, "index", 0.01),
-    ("a plate of glass in the beam", {}, "glass_um", 100),
-    ("a tilt of 100 um of glass about y", _TILTED, "glass_tilt_x_deg", 5),
-    ("a tilt of 100 um of glass about x", _TILTED, "glass_tilt_y_deg", 5),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +32,7 @@ class Lean:
     """One cause: its words, chi-square by which the residuals lean along it, its degrees, and the chance of that.
 
     taken: what takes it up, in words, where the fit cannot tell it from what is fitted; empty where it can.
+    frees: parameters that describe it.
     """
 
     cause: str
@@ -56,10 +40,48 @@ class Lean:
     degrees: int
     chance: float
     taken: str = ""
+    frees: tuple[str, ...] = ()
 
 
-def leans(task: Task, mode: Solution) -> list[Lean]:
-    """Every cause that is not fitted and can be told apart from what is, the most telling first."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Looked:
+    """What was looked for beside the fit: leans, the most telling first, of every cause that can be told apart or is
+    taken for something else; the fit, and the causes that are reckoned with as changes (k, pixels) over the noise, of
+    one standard deviation each. roughly: those whose change is known too roughly for the frames to bound them."""
+
+    leans: list[Lean]
+    fit: "Fitted"
+    unstated: dict[str, Array]
+    roughly: frozenset[str] = frozenset()
+
+    def reckoned(self) -> "Unstated":
+        """What the causes may have done to the parameters; see :meth:`Fitted.likely`."""
+        names, p = tuple(self.unstated), len(self.fit.names)
+        if not names:
+            return Unstated((), np.zeros((0, p)), np.zeros(p))
+        every = np.concatenate([self.unstated[name] for name in names])
+        moved, second = self.fit.moved_by(every), np.eye(len(every))
+        exact = np.concatenate([np.full(len(part), name not in self.roughly) for name, part in self.unstated.items()])
+        if exact.any():
+            second[np.ix_(exact, exact)] = self.fit.likely(every[exact])
+        first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
+        own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
+        by_cause = [np.einsum("pi,ij,pj->p", moved[:, some], second[some, some], moved[:, some]) for some in own]
+        whole = np.einsum("pi,ij,pj->p", moved, second, moved)
+        return Unstated(names, np.sqrt(np.maximum(by_cause, 0)), np.sqrt(np.maximum(whole, 0)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Unstated:
+    """What the captures cannot tell: causes, (c, p) root mean square shift of every parameter by each, (p,) by all."""
+
+    causes: tuple[str, ...]
+    by_cause: Array
+    sigma: Array
+
+
+def look(task: Task, mode: Solution) -> Looked:
+    """Look for every cause that is not fitted."""
     model, x = task.model, task.all_of(mode.value)
     image, slopes = model.images(x, task.names)
     root = np.where(task.data.usable & ~task.data.saturated, 1 / np.sqrt(task.data.variance(image)), 0.0)
@@ -68,15 +90,18 @@ def leans(task: Task, mode: Solution) -> list[Lean]:
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
     fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread), task.data.shared(image) * root)
-    found = []
-    for cause, amount, told, changes in _changes(
-        task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))
-    ):
-        change = (changes * root).reshape(len(changes), -1)
-        taken = fit.taken(change[0], amount, told) if told else ""
-        found.append(dataclasses.replace(fit.lean(cause, change), taken=taken))
+    found, unstated, roughly = [], {}, set()
+    for one in causes.changes(task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))):
+        change = (one.images * root).reshape(len(one.images), -1)
+        if one.sigma > 0:
+            unstated[one.cause] = one.sigma * change
+            roughly |= {one.cause} if one.roughly else set()
+        if one.sought:
+            taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
+            found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees))
     found.append(_ghost(task, x, image, root, fit))
-    return sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
+    told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
+    return Looked(told, fit, unstated, frozenset(roughly))
 
 
 def words(found: list[Lean]) -> list[str]:
@@ -129,8 +154,27 @@ class Fitted:
 
     def left(self, changes: Array) -> tuple[Array, Array]:
         """(k, pixels) what the fit does not take up of changes, and (k,) how much of it is in the residuals."""
-        left = changes - np.linalg.solve(self.known, self.slopes @ changes.T).T @ self.slopes
+        left = changes - self.moved_by(changes).T @ self.slopes
         return left, left @ self.rest
+
+    def moved_by(self, changes: Array) -> Array:
+        """(p, k) shift M of the parameters by (k, pixels) changes."""
+        return np.asarray(np.linalg.solve(self.known, self.slopes @ changes.T))
+
+    def likely(self, changes: Array) -> Array:
+        """(k, k) second moment of the factors c of (k, pixels) changes of one standard deviation each, by the frames.
+
+        With H = GᵀG' and S the scatter of their scores s, c is (1 + H S⁻¹ H)⁻¹ H S⁻¹ s, known to (1 + H S⁻¹ H)⁻¹. As
+        the error is counted from the fit, a cause that seems to be there widens intervals to where they would be.
+        """
+        left, score = self.left(changes)
+        seen = changes @ left.T
+        scatter = seen + self.in_common(left)
+        scatter += 1e-9 * np.trace(scatter) * np.eye(len(scatter))
+        weight = np.linalg.solve(scatter, seen)
+        open_ = np.linalg.inv(np.eye(len(seen)) + seen @ weight)
+        likely = open_ @ weight.T @ score
+        return np.asarray(open_ + np.outer(likely, likely))
 
     def in_common(self, left: Array) -> Array:
         """(k, k) by which scores scatter more since errors of dark and flat are one in all frames."""
@@ -154,62 +198,9 @@ class Fitted:
         return f"{told.format(share * amount)} would be taken for {parts}; state it if there is any" if most else ""
 
 
-def _changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[tuple[str, float, str, Array]]:
-    """(cause, amount and its words where it is one, (k, n, y, x) changes of the images by it)."""
-    model, n = task.model, len(image)
-    for cause, base, name, amount in _OF_MODEL:
-        if name not in task.names and all(key == name or x[PLACE[key]] == 0 for key in base):
-            before, after = x.copy(), x.copy()
-            for key, value in base.items():
-                before[PLACE[key]] = after[PLACE[key]] = value
-            after[PLACE[name]] += amount
-            with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows, a plate with no room
-                first = model.images(before)[0] if base else image
-                yield cause, amount, name + " {:.3g}", (model.images(after)[0] - first)[None]
-    leaning = model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
-    if "sidewall_deg" not in task.names:
-        told = "an angle whose square is {:.3g} deg²"
-        yield "a side wall that leans about half height", _WALL_DEG**2, told, leaning[None]
-    for along, name in enumerate(("x", "y")):
-        shape = _field_off(model.lens, along)
-        moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
-        if not len(model.modes):
-            yield f"a write field off along {name}", _STITCH_UM * 1e3, "{:.3g} nm of the right half", moved[None]
-    if n > 2:
-        light = image - _background(x, model.setting)
-        yield "a lamp or exposure that changes from frame to frame", 0.0, "", _each(light)
-        yield "shifts from frame to frame", 0.0, "", np.concatenate([_each(np.gradient(light, axis=a)) for a in (1, 2)])
-        yield "vibration or blur in single frames", 0.0, "", _each(_curvature(light))
-        yield "a stage error in single frames", 0.0, "", _each(slopes["stage_zero_um"])
-        if "wavelength_nm" in slopes:
-            ramp = np.linspace(-1, 1, n)[:, None, None]
-            yield "a wavelength that drifts", 0.0, "", (slopes["wavelength_nm"] * ramp)[None]
-    stretched = _stretched(image - _background(x, model.setting))
-    yield "a wrong pixel pitch", 1.0, "{:.3g} % of the pitch", 0.01 * stretched[None]
-    if not len(model.modes):
-        step = 0.05
-        uneven = [model.with_residual(-1j * step * np.eye(5)[i], _low_orders).images(x)[0] - image for i in range(5)]
-        yield "uneven illumination", 10.0, "{:.3g} % more light at the right rim", np.array(uneven)
-        names = [f"residual_{k}" for k in range(MODES)]
-        bent = model.with_residual(np.zeros(MODES), basis).images(x, names)[1]
-        yield "a smooth phase that no parameter describes", 0.0, "", np.asarray(bent) * prior_rad()[:, None, None, None]
-
-
-def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
-    """Phase for 1 um by which the pillars right of the axis are moved along x (0) or y (1): that of the focus there."""
-    k, radius, d = 2 * math.pi / lens.wavelength_um, lens.diameters.radius_um, lens.sensor_distance_um
-
-    def phase(u: Array, v: Array, count: int) -> Array:
-        r = radius * np.hypot(u, v)
-        sine = 1 / np.hypot(r, d) + (1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0)
-        return np.asarray((k * radius * (u, v)[along] * sine * (u > 0))[None])
-
-    return phase
-
-
 def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean:
     """The shift of the light at which a fainter copy of it explains most; its chance is that of the best of many."""
-    light = image - _background(x, task.model.setting)
+    light = image - causes.background(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
     places = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
     places = [p for p in places if max(abs(p[0]), abs(p[1])) >= _NEAREST_PX]
@@ -234,34 +225,3 @@ def _moved(light: Array, shift: tuple[int, int]) -> Array:
         :, max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)
     ]
     return out
-
-
-def _each(change: Array) -> Array:
-    """(n, n, y, x): every frame's change alone."""
-    out = np.zeros((len(change), *change.shape))
-    out[np.arange(len(change)), np.arange(len(change))] = change
-    return out
-
-
-def _curvature(light: Array) -> Array:
-    return np.stack([ndimage.laplace(frame, mode="nearest") for frame in light])
-
-
-def _stretched(light: Array) -> Array:
-    """r dI/dr about the window's centre: the images on pixels of another pitch."""
-    rows, columns = light.shape[1:]
-    y, x = (np.arange(rows) - rows // 2)[:, None], (np.arange(columns) - columns // 2)[None]
-    return np.asarray(np.gradient(light, axis=1) * y + np.gradient(light, axis=2) * x)
-
-
-def _low_orders(u: Array, v: Array, count: int) -> Array:
-    """u, v, u², v², uv: illumination that leans, or falls off to the rim."""
-    return np.stack([u, v, u * u, v * v, u * v][:count])
-
-
-def _background(x: Array, setting: Setting) -> Array:
-    rows, columns = setting.rows, setting.columns
-    edge_y = (np.arange(rows) - rows // 2)[:, None] / (rows / 2)
-    edge_x = (np.arange(columns) - columns // 2)[None] / (columns / 2)
-    along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
-    return np.asarray(x[PLACE["background_e"]] + along)

@@ -143,6 +143,8 @@ def stated(capture: Capture, lens: Lens) -> list[Known]:
     known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
     held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
     known += [Known(name, _number(capture, name), 0.0) for name in held if name in capture.about]
+    if "pixel_sigma_um" in capture.about:
+        known.append(Known("pixel_percent", 0.0, 100 * _number(capture, "pixel_sigma_um") / capture.pixel_um))
     return known
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,7 +25,10 @@ _WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is foll
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Task:
-    """What is searched: the model and its data, all start values, what is known, how the frames lie, what is free."""
+    """What is searched: the model and its data, all start values, what is known, how the frames lie, what is free.
+
+    unfitted: how large is stated to be what no parameter describes (``characterize.model.UNFITTED``).
+    """
 
     model: ForwardModel
     data: Data
@@ -33,6 +36,7 @@ class Task:
     known: dict[str, Known]
     found: Arrangement
     free: tuple[str, ...] = ()
+    unfitted: dict[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:

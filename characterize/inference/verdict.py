@@ -6,6 +6,7 @@ import numpy as np
 
 from characterize.captures import Gain
 from characterize.inference.leastsquares import Prior, Solution
+from characterize.inference.missing import Unstated
 from characterize.inference.search import WAVES_RAD
 from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
@@ -140,16 +141,27 @@ def _together(one: Array, other: Array) -> Array:
     return np.asarray(product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1)))
 
 
-def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array) -> str:
+def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array, unstated: Unstated) -> str:
     """Which causes the frames fix, and which come from prior knowledge or only with others.
 
-    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing.
+    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing. Those that ``unstated`` causes
+    may have moved by more than their standard error are known within the model alone, and called so.
     """
     causes = [i for i, n in enumerate(names) if n.endswith(("_nm", "_rad", "_deg")) or n == "index"]
-    good = [i for i in causes if (high[i] - low[i]) / 3.92 <= PARAMETERS[PLACE[names[i]]].scale]
-    known = ", ".join(f"{names[i]} +- {(high[i] - low[i]) / 3.92:.2g}" for i in good) or "no cause alone"
+    own = (high - low) / 3.92
+    close = [i for i in causes if own[i] <= PARAMETERS[PLACE[names[i]]].scale]
+    good = [i for i in close if unstated.sigma[i] <= own[i]]
+    known = ", ".join(f"{names[i]} +- {math.hypot(own[i], unstated.sigma[i]):.2g}" for i in good) or "no cause alone"
     prior = [names[i] for i in causes if told[i] > 0.7]
     more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""
-    open_ = [i for i in causes if i not in good and told[i] <= 0.7]
+    moved = [i for i in close if i not in good]
+    if moved:
+        worst = np.argsort(-(unstated.by_cause[:, moved] / own[moved]).max(1))[:3]
+        parts = ", ".join(
+            f"{names[i]} +- {own[i]:.2g} (else +- {math.hypot(own[i], unstated.sigma[i]):.2g})" for i in moved
+        )
+        without = ", ".join(unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst)
+        more = f"; within the model only, that is without {without}: {parts}" + more
+    open_ = [i for i in causes if i not in close and told[i] <= 0.7]
     wide = ", ".join(f"{names[i]} {low[i]:.3g} to {high[i]:.3g}" for i in open_)
     return f"the process is known to {known}" + (f"; loosely: {wide}" if wide else "") + more

@@ -14,12 +14,15 @@ if TYPE_CHECKING:
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
     from characterize.model.parameters import PLACE as PLACE
+    from characterize.model.parameters import UNFITTED as UNFITTED
     from characterize.model.parameters import Known as Known
     from characterize.model.parameters import state as state
     from characterize.model.parameters import vector as vector
     from characterize.model.pillar_slopes import slopes as slopes
     from characterize.model.pillars import incidence_rad as incidence_rad
+    from characterize.model.setting import LIGHT as LIGHT
     from characterize.model.setting import Setting as Setting
+    from characterize.model.setting import light_maps as light_maps
     from characterize.model.setting import spectrum as spectrum
     from characterize.model.setting import true_depth as true_depth
     from characterize.model.thinplate import MODES as MODES
@@ -31,15 +34,18 @@ __getattr__, __dir__, __all__ = attach(
     {
         "ForwardModel": "forward",
         "Known": "parameters",
+        "LIGHT": "setting",
         "MODES": "thinplate",
         "NAMES": "parameters",
         "PARAMETERS": "parameters",
         "PLACE": "parameters",
         "Setting": "setting",
+        "UNFITTED": "parameters",
         "basis": "thinplate",
         "detector": "",
         "extra_path": "glass",
         "incidence_rad": "pillars",
+        "light_maps": "setting",
         "made": "",
         "oversampling": "forward",
         "prior_rad": "thinplate",

@@ -15,7 +15,7 @@ from characterize.model.kernel import turns
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
-from characterize.model.setting import Setting, spectrum, true_depth
+from characterize.model.setting import LIGHT, Setting, light_maps, spectrum, true_depth
 from characterize.model.window import Operators
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -57,9 +57,11 @@ class _Group:
     residual: Array
 
     def turning(self, name: str) -> Array | None:
-        """Phase on the nodes for one unit of a wave-front parameter; None for any other."""
+        """Phase on the nodes for one unit of a wave-front parameter, imaginary of uneven light; None for any other."""
         if name.startswith("residual_"):
             return np.asarray(self.residual[int(name.removeprefix("residual_"))])
+        if name in LIGHT:
+            return np.asarray(-0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)])
         return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
 
 
@@ -186,8 +188,7 @@ class ForwardModel:
 
     def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
-        names = [] if wanted is None else list(wanted)
-        s = self.setting
+        names, s = list(wanted or ()), self.setting
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
@@ -277,14 +278,12 @@ class ForwardModel:
         return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
     def _phase(self, x: Array, group: _Group) -> Array:
-        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, plus aberrations."""
-        reduced, index = group.reduced, group.index
-        nominal = reduced.bench
+        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, aberrations; light."""
+        reduced, index, nominal = group.reduced, group.index, group.reduced.bench
         k = 2 * math.pi / (nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
         d = nominal.distance_um + x[PLACE["distance_um"]]
-        tx, ty = (
-            t + math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a, t in zip("xy", nominal.tangents, strict=True)
-        )
+        lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
+        tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
         centre = d * tx + x[PLACE["decentre_x_um"]], d * ty + x[PLACE["decentre_y_um"]]
         exit_path = sensor_path(reduced.x_um, reduced.y_um, centre, d)
         known = reduced.k * reduced.path(reduced.x_um, reduced.y_um, nominal.distance_um, nominal)
@@ -297,7 +296,9 @@ class ForwardModel:
                 path = path + extra_path(reduced.x_um, reduced.y_um, tangents=tangents, depth_um=float(z), values=x)
             out[i] = k * path - known
         out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
-        return out + np.tensordot(self.modes, group.residual, 1) if len(self.modes) else out
+        uneven = x[[PLACE[name] for name in LIGHT]]
+        light = -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1) if uneven.any() else 0.0
+        return out + light + (np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0)
 
     def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
         """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""

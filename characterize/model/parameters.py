@@ -19,7 +19,8 @@ class Parameter:
     """One number that describes lens or bench.
 
     scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without any metrology (inf: none).
-    low, high: bounds. free: fitted unless told otherwise.
+    low, high: bounds. free: fitted unless told otherwise. plausible: standard deviation that is reckoned with where
+    it is neither fitted nor stated; sigma where 0.
     """
 
     name: str
@@ -30,10 +31,33 @@ class Parameter:
     high: float = math.inf
     start: float = 0.0
     free: bool = True
+    plausible: float = 0.0
+
+    @property
+    def unstated(self) -> float:
+        """Standard deviation that is reckoned with where nobody states it."""
+        return self.plausible or self.sigma
+
+
+@dataclass(frozen=True, slots=True)
+class Unfitted:
+    """What bench or mask may add that no parameter describes: never fitted, reckoned with in the intervals.
+
+    sigma: its size (standard deviation) where nobody states it; ``[[known]]`` with value 0 and a sigma states it.
+    """
+
+    name: str
+    meaning: str
+    sigma: float
 
 
 def _of(row: Cause) -> Parameter:
-    return Parameter(row.name, row.meaning, row.scale, row.sigma, row.low, row.high, free=row.free)
+    bounds = row.low, row.high
+    return Parameter(row.name, row.meaning, row.scale, row.sigma, *bounds, free=row.free, plausible=row.plausible)
+
+
+def _light(name: str, meaning: str) -> Parameter:
+    return Parameter(name, meaning, 0.1, 0.3, -2.0, 2.0, free=False, plausible=0.2)
 
 
 _OF_LENS = {row.name: _of(row) for row in CAUSES}
@@ -50,19 +74,30 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("source_y_um", "source off the stage's axis", 5.0, 50.0, -300.0, 300.0, free=False),
     Parameter("stage_zero_um", "true source depth minus stated (with the substrate's plate shift)", 50.0, 1000.0),
     Parameter("stage_scale", "true stage step over stated, minus 1", 1e-3, 0.01, -0.05, 0.05),
-    Parameter("glass_um", "plane glass of index 1.51 between source and lens", 20.0, math.inf, 0.0, 3000.0, free=False),
+    Parameter(
+        "glass_um", "plane glass of index 1.51 between source and lens", 20.0, math.inf, 0.0, 3000.0, free=False,
+        plausible=100.0,
+    ),
     Parameter("glass_tilt_x_deg", "tilt of that glass about the y axis", 1.0, 5.0, -45.0, 45.0, free=False),
     Parameter("glass_tilt_y_deg", "tilt of that glass about the x axis", 1.0, 5.0, -45.0, 45.0, free=False),
     *(_OF_LENS[name] for name in named(Bends)),
-    Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False),
+    _light("light_x", "ln of the irradiance at the +x rim of the lens over that at its axis"),
+    _light("light_y", "ln of the irradiance at the +y rim of the lens over that at its axis"),
+    _light("light_r", "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2"),
+    Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False, plausible=5.0),
     Parameter("crosstalk_px", "standard deviation of pixel crosstalk and vibration", 0.1, 0.3, 0.02, 3.0, start=0.2),
     Parameter("log_gain", "logarithm of the electrons through the aperture in a frame at the reference depth", 0.02),
     Parameter("background_e", "background at the window's centre", 2.0),
     Parameter("background_x_e", "background at the right edge less that at the centre", 2.0),
     Parameter("background_y_e", "background at the lower edge less that at the centre", 2.0),
+)  # fmt: skip
+UNFITTED: tuple[Unfitted, ...] = (
+    Unfitted("stitching_nm", "shift of each write field of the mask, four across the lens", 60.0),
+    Unfitted("pixel_percent", "true pixel pitch over the stated one, less 1", 1.0),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}
+_UNFITTED = tuple(row.name for row in UNFITTED)
 _CAUSES = [PLACE[row.name] for row in CAUSES]
 
 
@@ -70,7 +105,8 @@ _CAUSES = [PLACE[row.name] for row in CAUSES]
 class Known:
     """What metrology says of a parameter: spectrometer (wavelength), AFM (height), SEM (bias), ellipsometer (index).
 
-    sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely.
+    sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely. Of what is never fitted
+    (:data:`UNFITTED`) ``value`` is 0 and ``sigma`` says how large it may be.
     """
 
     name: str
@@ -78,8 +114,13 @@ class Known:
     sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.name not in PLACE:
-            raise ConfigError(f"unknown parameter {self.name!r}{nearest(self.name, NAMES)}")
+        if self.name not in PLACE and self.name not in _UNFITTED:
+            raise ConfigError(f"unknown parameter {self.name!r}{nearest(self.name, (*NAMES, *_UNFITTED))}")
+        if self.name in _UNFITTED and not (self.value == 0 and math.isfinite(self.sigma)):
+            raise ConfigError(
+                f"{self.name} = {self.value} +- {self.sigma}: it is never fitted; need value = 0, and how large it may "
+                "be as sigma"
+            )
         if not math.isfinite(self.value) or not self.sigma >= 0:
             raise ConfigError(f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0")
 
@@ -92,6 +133,8 @@ def vector(values: Mapping[str, float] | None = None) -> Array:
     """
     out = np.array([p.start for p in PARAMETERS])
     for name, value in (values or {}).items():
+        if name in _UNFITTED:
+            raise ConfigError(f"{name} is never fitted: it belongs in [[known]] of --metrology alone")
         if name not in PLACE:
             raise ConfigError(f"unknown parameter {name!r}{nearest(name, NAMES)}")
         out[PLACE[name]] = value

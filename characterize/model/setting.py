@@ -43,6 +43,14 @@ def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
     return np.asarray(np.maximum(depth, 0.2 * stated))
 
 
+LIGHT = ("light_x", "light_y", "light_r")
+
+
+def light_maps(u: Array, v: Array) -> Array:
+    """(3, *shape) ln of the irradiance at lens places over the radius, for one unit of each of ``LIGHT``."""
+    return np.stack([u, v, u * u + v * v - 0.5])
+
+
 def spectrum(bandwidth_nm: float) -> list[tuple[float, float]]:
     """(offset in nm, weight) of a Gaussian line by 5-point Gauss-Hermite quadrature; one line for no width."""
     if bandwidth_nm <= 0:

@@ -89,7 +89,8 @@ class Cause:
 
     meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without metrology.
     low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name. free: fitted unless told
-    otherwise. drawn: how the process spreads it, where it does.
+    otherwise. drawn: how the process spreads it, where it does. plausible: standard deviation that is reckoned with
+    where it is neither fitted nor stated; sigma where 0.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Cause:
     unit: float = 1.0
     free: bool = True
     drawn: Drawn | None = None
+    plausible: float = 0.0
 
 
 def _by_height(g: Guide) -> Array:
@@ -176,7 +178,7 @@ CAUSES: tuple[Cause, ...] = (
     ),
     Cause(
         "sidewall_deg", "sidewall angle minus design", 0.3, 0.5, -1.6, 1.6,
-        Answers(_by_sidewall, _leaning, DEG / 2), DEG, free=False, drawn=Drawn("sidewall_deg", 0.5),
+        Answers(_by_sidewall, _leaning, DEG / 2), DEG, free=False, drawn=Drawn("sidewall_deg", 0.5), plausible=2.0,
     ),
     _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _bends("oblique_astigmatism", 6, ((2, 1, 1),)),

@@ -305,3 +305,30 @@ def test_groups_keep_the_order_in_which_they_come():
     assert merged.scale[1, 0, 0] == pytest.approx(1.2, rel=1e-12)
     alone, _ = clean.merge_brackets(made, np.array([0.02, 0.06, 0.2]), np.arange(3))
     assert alone.corrections == ("as made",)
+
+
+def test_full_wells_are_seen_through_their_pixels_own_offsets():
+    """Three wells that read 1080 counts above their dark level to half a count, where light scatters by 17."""
+    counts = np.random.default_rng(8).uniform(0, 700, (4, NY, NX))
+    gain = clean.Gain(3.7, 0.1, 3.1)
+    counts[1, 3, 4:7] = 1080.3, 1079.9, 1080.6
+    assert clean.full_well(counts, gain) == pytest.approx(1078.6)
+    spread = counts.copy()
+    spread[1, 3, 4:7] = 1080.3, 1062.0, 1049.6
+    assert clean.full_well(spread, gain) == math.inf
+    assert clean.full_well(np.minimum(counts, 30.0), gain) == math.inf  # dim: all light is as even as that
+
+
+def test_a_full_well_is_masked_and_said():
+    rng = np.random.default_rng(3)
+    fixed = 97 + 2 * rng.standard_normal((NY, NX))
+    light = rng.uniform(0, 500, (3, NY, NX))
+    light[:, 4, 5:8] = 1080.0
+    shots = capture(
+        np.rint(light + fixed).astype(np.uint16), dark=np.rint(np.tile(fixed, (4, 1, 1))).astype(np.uint16),
+        about={"gain_e": 3.7},
+    )  # fmt: skip
+    found = clean.clean(shots)
+    assert found.saturated[:, 4, 5:8].all()
+    assert found.saturated.sum() == 9
+    assert any("saturated" in note for note in found.corrections)

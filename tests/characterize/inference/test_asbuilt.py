@@ -53,6 +53,11 @@ def test_tilt_and_source_beside_the_axis_agree_too(model):
     assert against_all_pillars(model, tilt_x_deg=0.3, source_x_um=5.0, source_y_um=-3.0, pinhole_um=6.0) < 2e-3
 
 
+def test_uneven_light_agrees_with_the_sum_over_every_pillar(model):
+    """30 % more light at one rim, 20 % less at another: amplitudes, one by one, on the bench."""
+    assert against_all_pillars(model, light_x=0.26, light_y=-0.22, light_r=0.15) < 1e-3
+
+
 def test_low_rank_pillars_know_their_error():
     pillars = Pillars(b.lens(), b.RESPONSE)
     assert len(pillars.basis) < 16
@@ -123,12 +128,27 @@ def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fi
     assert any("glass" in words and "would be taken for" in words for words in fitted.degeneracies)
 
 
+def test_what_cannot_be_told_is_reckoned_with_beside_the_model(fitted):
+    """A plate of glass moves the stage zero, a source of some size the blur; the outer interval holds the inner one."""
+    assert "a plate of glass in the beam" in fitted.most("stage_zero_um")
+    assert "a source of finite size" in fitted.most("crosstalk_px")
+    for name in fitted.names:
+        low, high = fitted.interval(name)
+        i = fitted.names.index(name)
+        middle = float(fitted.value[i])
+        want = middle + np.hypot(high - middle, 1.959964 * fitted.unstated[i])
+        assert fitted.outer(name)[1] == pytest.approx(want, rel=1e-9)
+        assert fitted.outer(name)[0] <= low
+
+
 def test_saved_result_comes_back(fitted, tmp_path):
     asbuilt.save(tmp_path / "a.h5", fitted)
     again = asbuilt.load(tmp_path / "a.h5")
     assert again.names == fitted.names
     assert np.array_equal(again.covariance, fitted.covariance)
     assert again.degeneracies == fitted.degeneracies
+    assert again.causes == fitted.causes
+    assert again.outer("bias_nm") == fitted.outer("bias_nm")
     assert np.array_equal(again.diameters.diameter_um, fitted.diameters.diameter_um)
     assert again.samples(3, seed=1).shape == (3, len(fitted.names))
     asbuilt.save(tmp_path / "b.h5", fitted)
@@ -222,6 +242,26 @@ def test_missing_numbers_are_refused(change, words):
 def test_unknown_parameters_name_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'height_nm'"):
         Known("heigth_nm", 0.0)
+
+
+def test_what_is_never_fitted_is_stated_by_its_size_alone():
+    assert Known("stitching_nm", 0.0, 8.0).sigma == 8.0
+    with pytest.raises(ConfigError, match="value = 0"):
+        Known("stitching_nm", 3.0, 8.0)
+    with pytest.raises(ConfigError, match="never fitted"):
+        vector({"stitching_nm": 0.0})
+
+
+def test_what_is_stated_is_not_reckoned_with():
+    """No glass, a point source, a mask of one field, a measured pixel: none of them widens an interval any more."""
+    stated = {"glass_um": 0.0, "pinhole_um": 0.0, "pixel_sigma_um": 0.0}
+    shots = b.capture(b.electrons())
+    shots = dataclasses.replace(shots, about=shots.about | stated)
+    options = dataclasses.replace(USUAL, known=(Known("stitching_nm", 0.0), Known("sidewall_deg", 0.0)))
+    found = characterize.fit(shots, b.lens(), options, response=b.RESPONSE)
+    assert found.causes
+    for word in ("glass", "source of finite", "write field", "pixel", "side wall"):
+        assert not any(word in cause for cause in found.causes), word
 
 
 def test_effective_index_slopes_scale_as_a_waveguide():

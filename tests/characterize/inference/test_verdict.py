@@ -8,8 +8,10 @@ import pytest
 
 from characterize.captures import Gain
 from characterize.inference import verdict
+from characterize.inference.missing import Unstated
 
 RNG = np.random.default_rng(2)
+NOTHING = Unstated((), np.zeros((0, 3)), np.zeros(3))
 
 
 def solution(chi2, pixels=800):
@@ -121,8 +123,22 @@ def test_what_is_known_is_an_interval_within_the_usual_uncertainty():
     scales = [PARAMETERS[PLACE[name]].scale for name in names]
     low = np.array([50.0, -1.9 * scales[1], 0.0])
     high = np.array([50.0 + 3.9 * scales[0], 2.1 * scales[1], 1.0])
-    words = verdict.process_verdict(names, low, high, np.array([0.2, 0.69, 0.9]))
+    words = verdict.process_verdict(names, low, high, np.array([0.2, 0.69, 0.9]), NOTHING)
     assert f"known to bias_nm +- {3.9 * scales[0] / 3.92:.2g}" in words
     assert f"loosely: height_nm {low[1]:.3g} to {high[1]:.3g}" in words
     assert "prior" not in words
-    assert "from prior knowledge only: height_nm" in verdict.process_verdict(names, low, high, np.array([0.2, 0.71, 0]))
+    words = verdict.process_verdict(names, low, high, np.array([0.2, 0.71, 0]), NOTHING)
+    assert "from prior knowledge only: height_nm" in words
+
+
+def test_what_others_may_have_moved_is_known_within_the_model_alone():
+    """Two causes of 1.5 and 0.4 standard errors: the first takes its parameter out of what is known, by its name."""
+    names = ("bias_nm", "height_nm", "coma_x_rad")
+    sigma = np.array([0.8, 1.0, 0.01])
+    low, high = -1.96 * sigma, 1.96 * sigma
+    by_cause = np.array([[1.2, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.003]])
+    unstated = Unstated(("a plate of glass", "an oblique saddle", "uneven light"), by_cause, by_cause.sum(0))
+    words = verdict.process_verdict(names, low, high, np.full(3, 0.1), unstated)
+    assert words.startswith("the process is known to height_nm +- 1.1, coma_x_rad +- 0.01;")
+    assert "within the model only, that is without plate of glass" in words
+    assert "bias_nm +- 0.8 (else +- 1.4)" in words

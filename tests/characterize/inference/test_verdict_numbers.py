@@ -8,9 +8,11 @@ from scipy import stats
 
 from characterize.inference import verdict
 from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.missing import Unstated
 from characterize.model import PARAMETERS, PLACE
 
 RNG = np.random.default_rng(41)
+NOTHING = Unstated((), np.zeros((0, 4)), np.zeros(4))
 
 
 def test_a_cause_is_known_to_its_interval_over_3_92():
@@ -20,7 +22,7 @@ def test_a_cause_is_known_to_its_interval_over_3_92():
     sigma = np.array([0.5 * scale["bias_nm"], 9.0, 1.1 * scale["height_nm"], 1.2 * scale["index"]])
     middle = np.array([37.0 * scale["bias_nm"], 2.0, -61.0 * scale["height_nm"], 0.3])
     said = verdict.process_verdict(
-        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.69, 0.71])
+        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.69, 0.71]), NOTHING
     )
     assert said.startswith(f"the process is known to bias_nm +- {sigma[0]:.2g};")
     low, high = middle[2] - 1.96 * sigma[2], middle[2] + 1.96 * sigma[2]
@@ -28,7 +30,9 @@ def test_a_cause_is_known_to_its_interval_over_3_92():
     assert said.endswith("from prior knowledge only: index")
     assert "log_gain" not in said
     sigma[2] = 0.98 * scale["height_nm"]
-    said = verdict.process_verdict(names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.8, 0.7]))
+    said = verdict.process_verdict(
+        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.8, 0.7]), NOTHING
+    )
     assert f"height_nm +- {sigma[2]:.2g}" in said
     assert "loosely: index" in said
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from characterize.inference import arrange, estimate, missing, prepare, residual, verdict
+from characterize.inference import arrange, causes, estimate, missing, prepare, residual, verdict
 from characterize.inference.leastsquares import Data
 from characterize.inference.missing import Lean
 
@@ -73,9 +73,9 @@ def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spr
         model=model, all_of=lambda x: x, data=data, names=("bias_nm",), prior=SimpleNamespace(sigma=np.array([prior]))
     )
     mode = SimpleNamespace(value=np.zeros(1), residual_sigma=off, chi2_per_dof=chi2)
-    monkeypatch.setattr(missing, "_changes", lambda *_: [("made", 1.0, "", change[None])])
+    monkeypatch.setattr(causes, "changes", lambda *_: [causes.Change("made", change[None])])
     monkeypatch.setattr(missing, "_ghost", lambda *_: Lean("ghost", 0.0, 0, 1.0))
-    (lean,) = missing.leans(task, mode)
+    (lean,) = missing.look(task, mode).leans
     own = other - fitted * (fitted @ other) / (fitted @ fitted + prior**-2)
     want = (own @ rest) ** 2 / spread / (own @ other)
     assert lean.chi2 == pytest.approx(want, rel=1e-9)

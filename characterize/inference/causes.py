@@ -1,0 +1,208 @@
+"""Causes that the fit leaves out, each by what it does to the images, and how large it may be where nobody says."""
+
+import contextlib
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from characterize.inference.search import Task
+from characterize.model import LIGHT, MODES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Setting, basis, prior_rad
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.lens import Lens
+from metalens.made import Bends, maps, named
+
+_STITCH_UM = 0.05
+_WALL_DEG = 1.5
+_GRID = 41  # places across the lens where write fields are told apart
+
+_TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
+_OF_MODEL: tuple[tuple[str, str, float], ...] = (  # cause, name and amount that is added
+    ("a source of finite size", "pinhole_um", 6),
+    ("a spectrum of finite width", "bandwidth_nm", 2),
+    ("a tilt of the lens about y", "tilt_x_deg", 0.3),
+    ("a tilt of the lens about x", "tilt_y_deg", 0.3),
+    ("a saddle of the diameters", "bias_a_nm", 3),
+    ("an oblique saddle of the diameters", "bias_o_nm", 3),
+    ("a tilted side wall", "sidewall_deg", 0.5),
+    ("another refractive index", "index", 0.01),
+    ("a plate of glass in the beam", "glass_um", 100),
+    ("a tilt of {:g} um of glass about y", "glass_tilt_x_deg", 5),
+    ("a tilt of {:g} um of glass about x", "glass_tilt_y_deg", 5),
+)
+_SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Change:
+    """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
+
+    amount, told: of the first, in words with a place for the number; empty where no amount is said.
+    sigma: of each change, how much of it is reckoned with where nobody states it: a standard deviation, 0 for none.
+    frees: parameters that describe it. sought: whether it is looked for alone. roughly: the change is of the right kind
+    but of an unknown pattern, so that the frames cannot bound it by what they show of it.
+    """
+
+    cause: str
+    images: Array
+    amount: float = 0.0
+    told: str = ""
+    sigma: float = 0.0
+    frees: tuple[str, ...] = ()
+    sought: bool = True
+    roughly: bool = False
+
+
+def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+    """Every cause that is not among the fitted parameters."""
+    yield from _of_model(task, x, image)
+    if "sidewall_deg" not in task.names or task.model.lens.cell.sidewall_rad == 0:
+        leaning = task.model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
+        told = "an angle whose square is {:.3g} deg²"
+        sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
+        words = "a side wall that leans about half height"
+        yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True)  # resonances are left out of it
+    light = image - background(x, task.model.setting)
+    if len(image) > 2:
+        yield from _of_frames(light, slopes)
+    stretched = (_on_pixels(task.model, 1.01).images(x)[0] - image)[None]
+    yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
+    if not set(LIGHT) & set(task.names):
+        uneven, step = np.asarray(task.model.images(x, LIGHT)[1]), 0.2
+        told = "{:.3g} % more light at the right rim"
+        sigma = _size(task, "light_x") / step
+        yield Change("uneven illumination", step * uneven, 100 * step, told, sigma, LIGHT)
+    if not len(task.model.modes):
+        yield from _of_phase(task, x, image, slopes)
+
+
+def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
+    """Parameters of the model that are held."""
+    for cause, name, amount in _OF_MODEL:
+        base: dict[str, float] = {}
+        if name.startswith("glass_tilt") and x[PLACE["glass_um"]] == 0:
+            if "glass_um" in task.known:
+                continue
+            base = _TILTED
+        if name in task.names:
+            continue
+        before, after = x.copy(), x.copy()
+        for key, value in base.items():
+            before[PLACE[key]] = after[PLACE[key]] = value
+        after[PLACE[name]] += amount
+        with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows, a plate with no room
+            first = task.model.images(before)[0] if base else image
+            change = (task.model.images(after)[0] - first)[None]
+            sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
+            words = cause.format(before[PLACE["glass_um"]])
+            yield Change(words, change, amount, name + " {:.3g}", sigma, () if base else (name,))
+
+
+def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+    """What changes from frame to frame."""
+    yield Change("a lamp or exposure that changes from frame to frame", _each(light))
+    sideways = [_each(np.gradient(light, axis=a)) for a in (1, 2)]
+    yield Change("shifts from frame to frame", np.concatenate(sideways))
+    yield Change("vibration or blur in single frames", _each(_curvature(light)))
+    yield Change("a stage error in single frames", _each(slopes["stage_zero_um"]))
+    if "wavelength_nm" in slopes:
+        ramp = np.linspace(-1, 1, len(light))[:, None, None]
+        yield Change("a wavelength that drifts", (slopes["wavelength_nm"] * ramp)[None])
+
+
+def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+    """Phases that no parameter describes: half of the mask off, smooth ones, write fields."""
+    model = task.model
+    for along, name in enumerate("xy"):
+        shape = _field_off(model.lens, along)
+        moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
+        told = "{:.3g} nm of the right half"
+        yield Change(f"a write field off along {name}", moved[None], _STITCH_UM * 1e3, told)
+    names = [f"residual_{k}" for k in range(MODES + 3)]
+    bent = np.asarray(model.with_residual(np.zeros(MODES + 3), smooth).images(x, names)[1])
+    sized = bent[:MODES] * prior_rad()[:, None, None, None]
+    yield Change("a smooth phase that no parameter describes", sized)
+    known = [slopes.get(name, np.zeros_like(image)) for name in named(Bends)]
+    every = np.concatenate([bent, np.stack(known)])
+    fields = np.tensordot(write_fields(model.lens), every, 1)
+    sigma = _size(task, "stitching_nm") * 1e-3
+    yield Change("write fields out of place", fields, sigma=sigma, sought=False, roughly=True)
+
+
+def _size(task: Task, name: str) -> float:
+    """Standard deviation of a cause that is reckoned with: as it is stated, 0 where it is held as stated."""
+    if name in task.unfitted:
+        return task.unfitted[name]
+    known = task.known.get(name)
+    if known is not None:
+        return math.hypot(known.sigma, known.value) if name == "sidewall_deg" else known.sigma
+    return next((row.sigma for row in UNFITTED if row.name == name), 0.0) or PARAMETERS[PLACE[name]].unstated
+
+
+def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
+    """Phase for 1 um by which the pillars right of the axis are moved along x (0) or y (1)."""
+
+    def phase(u: Array, v: Array, count: int) -> Array:
+        return np.asarray((_moved_phase(lens, u, v, along) * (u > 0))[None])
+
+    return phase
+
+
+def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
+    """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus there."""
+    k, radius, d = 2 * math.pi / lens.wavelength_um, lens.diameters.radius_um, lens.sensor_distance_um
+    r = radius * np.hypot(u, v)
+    sine = 1 / np.hypot(r, d) + (1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0)
+    return np.asarray(k * radius * (u, v)[along] * sine)
+
+
+def write_fields(lens: Lens) -> Array:
+    """(fields, modes and known phases) of :func:`smooth` and the wave-front parameters for 1 um along x, then y.
+
+    Four fields across the lens each way. What is no smooth phase is left out: it scatters light and moves nothing.
+    """
+    t = np.linspace(-1, 1, _GRID)
+    u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 1] for part in np.meshgrid(t, t))
+    shapes = np.concatenate([smooth(u, v, MODES + 3), maps(Bends, u, v), np.ones((1, len(u)))])
+    field = (np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)).astype(int)
+    parts = [phase * (field == k) for phase in (_moved_phase(lens, u, v, a) for a in (0, 1)) for k in range(16)]
+    return np.asarray(np.linalg.lstsq(shapes.T, np.array(parts).T, rcond=None)[0][:-1].T)
+
+
+def smooth(u: Array, v: Array, count: int) -> Array:
+    """Smooth phases that no parameter describes, then leans and defocus."""
+    return np.concatenate([basis(u, v, MODES), np.stack([u, v, u * u + v * v])])[:count]
+
+
+def _each(change: Array) -> Array:
+    """(n, n, y, x): every frame's change alone."""
+    out = np.zeros((len(change), *change.shape))
+    out[np.arange(len(change)), np.arange(len(change))] = change
+    return out
+
+
+def _curvature(light: Array) -> Array:
+    return np.stack([ndimage.laplace(frame, mode="nearest") for frame in light])
+
+
+def _on_pixels(model: ForwardModel, share: float) -> ForwardModel:
+    """The model with pixels of another pitch."""
+    part = copy.copy(model)
+    pixel_um = model.setting.pixel_um * share
+    part.setting = dataclasses.replace(model.setting, pixel_um=pixel_um)
+    part.grid = dataclasses.replace(model.grid, pixel_um=pixel_um)
+    return part
+
+
+def background(x: Array, setting: Setting) -> Array:
+    """(rows, columns) electrons of the background plane."""
+    rows, columns = setting.rows, setting.columns
+    edge_y = (np.arange(rows) - rows // 2)[:, None] / (rows / 2)
+    edge_x = (np.arange(columns) - columns // 2)[None] / (columns / 2)
+    along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
+    return np.asarray(x[PLACE["background_e"]] + along)
