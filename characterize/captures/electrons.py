@@ -143,13 +143,14 @@ def full_well(counts: Array, gain: Gain) -> float:
     Light that fills no well scatters by s = sqrt(counts / gain) at least, so that two pixels alike are within w of each
     other by a chance of w / (sqrt(pi) s); wells that are full all read the same, to within rounding and the error of
     the dark level. So: three pixels or more within w = 2 counts, most of those within 1.5 s of the highest, by a chance
-    below a hundredth.
+    below a hundredth; not a quarter of all, which is even light and no image.
     """
     highest, width = float(counts.max()), 2.0
     shot = math.sqrt(max(highest, 1e-9) / gain.gain_e)
     alike, near = (int((counts >= highest - reach).sum()) for reach in (width, 1.5 * shot))
-    chance = (width / (math.sqrt(math.pi) * shot)) ** (alike - 1)
-    return highest - width if alike >= 3 and alike > 0.5 * near and chance < 0.01 else math.inf
+    chance = min(width / (math.sqrt(math.pi) * shot), 1.0) ** (alike - 1)
+    some = 3 <= alike < counts.size / 4 and highest > 2 * abs(float(np.median(counts)))
+    return highest - width if some and alike > 0.5 * near and chance < 0.01 else math.inf
 
 
 def bad_pixels(capture: Capture) -> Array:

@@ -19,6 +19,7 @@ from metalens.made import Bends, maps, named
 
 _STITCH_UM = 0.05
 _WALL_DEG = 1.5
+_LIGHT_STEP = 0.2
 _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
@@ -43,7 +44,8 @@ class Change:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
     amount, told: of the first, in words with a place for the number; empty where no amount is said.
-    sigma: of each change, how much of it is reckoned with where nobody states it: a standard deviation, 0 for none.
+    sigma: of every change, one for all or each its own, how much of it is reckoned with where nobody states it: a
+    standard deviation, 0 for none.
     frees: parameters that describe it. sought: whether it is looked for alone. roughly: the change is of the right kind
     but of an unknown pattern, so that the frames cannot bound it by what they show of it.
     """
@@ -52,7 +54,7 @@ class Change:
     images: Array
     amount: float = 0.0
     told: str = ""
-    sigma: float = 0.0
+    sigma: float | Array = 0.0
     frees: tuple[str, ...] = ()
     sought: bool = True
     roughly: bool = False
@@ -72,11 +74,11 @@ def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Ite
         yield from _of_frames(light, slopes)
     stretched = (_on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
-    if not set(LIGHT) & set(task.names):
-        uneven, step = np.asarray(task.model.images(x, LIGHT)[1]), 0.2
-        told = "{:.3g} % more light at the right rim"
-        sigma = _size(task, "light_x") / step
-        yield Change("uneven illumination", step * uneven, 100 * step, told, sigma, LIGHT)
+    held = tuple(name for name in LIGHT if name not in task.names)
+    if held:
+        uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
+        sizes = np.array([_size(task, name) for name in held]) / _LIGHT_STEP
+        yield Change("uneven illumination", uneven, _LIGHT_STEP, held[0] + " {:.3g}", sizes, held)
     if not len(task.model.modes):
         yield from _of_phase(task, x, image, slopes)
 

@@ -19,6 +19,14 @@ _WHY = {
     frozenset(
         {"height_nm", "bias_nm"}
     ): "both shift the phase and efficiency of all pillars; measure CDs (SEM) or height (AFM)",
+    frozenset(
+        {"bias_x_nm", "light_x"}
+    ): "light that falls off to one side and a gradient of the bias look alike; measure "
+    "the lamp's profile without the lens",
+    frozenset(
+        {"bias_y_nm", "light_y"}
+    ): "light that falls off to one side and a gradient of the bias look alike; measure "
+    "the lamp's profile without the lens",
     frozenset({"bias_x_nm", "decentre_x_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
     frozenset({"bias_y_nm", "decentre_y_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
     frozenset({"pinhole_um", "crosstalk_px"}): "both blur; measure the pinhole, or take frames at more distant depths",

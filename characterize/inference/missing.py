@@ -93,8 +93,8 @@ def look(task: Task, mode: Solution) -> Looked:
     found, unstated, roughly = [], {}, set()
     for one in causes.changes(task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))):
         change = (one.images * root).reshape(len(one.images), -1)
-        if one.sigma > 0:
-            unstated[one.cause] = one.sigma * change
+        if np.any(one.sigma):
+            unstated[one.cause] = np.reshape(one.sigma, (-1, 1)) * change
             roughly |= {one.cause} if one.roughly else set()
         if one.sought:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
