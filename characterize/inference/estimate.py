@@ -193,8 +193,7 @@ def _result(
     capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked | None
 ) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
-    fitted = dict(zip(names, solution.value.tolist(), strict=True))
-    unseen = explore.left_out(task, solution)
+    fitted, unseen = dict(zip(names, solution.value.tolist(), strict=True)), explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
     unstated = looked.reckoned() if looked else Unstated((), np.zeros((0, len(names))), np.zeros(len(names)))
     counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
