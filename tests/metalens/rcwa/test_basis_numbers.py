@@ -60,7 +60,7 @@ def test_normals_are_the_radial_field_softened_inside_the_disc(diameter):
 
 @pytest.mark.parametrize(("diameter", "share", "near"), [(DIAMETER, 1e-3, 1e-5), (0.0009, 0.01, 1e-3)])
 def test_rates_are_differences(diameter, share, near):
-    """The thin one lies below x = 0.01, where series stand for the Bessel functions: parabolas, and x⁴ beside: rounding."""
+    """The thin one lies below x = 0.01, where series stand for Bessel functions; its differences are rounding."""
     step = share * diameter
     up, down = (basis.normals(WHOLE, np.array(diameter + s), PITCH) for s in (step, -step))
     for one, a, b in zip(basis.normals_rate(WHOLE, np.array(diameter), PITCH), up, down, strict=True):
