@@ -21,8 +21,8 @@ from benchmarks import Row, fastest
 from benchmarks.rivals import lowrank
 from benchmarks.rivals.radial import Radial, field_radial
 from metalens import propagate, psf
+from metalens.propagate.direct import transfer
 from metalens.propagate.estimate import draw, scan, square_error
-from metalens.propagate.textbook import transfer
 
 PITCH, WAVELENGTH, D, SOURCE, RADIUS = 0.4, 0.85, 2000.0, 20e3, 500.0
 K = 2 * np.pi / WAVELENGTH
@@ -165,6 +165,9 @@ def _main_rows() -> list[Row]:
     maps, threads = lens("free-form"), torch.get_num_threads()
     start = time.perf_counter()
     stack = forward(maps)
+    cold = time.perf_counter() - start
+    start = time.perf_counter()
+    forward(maps, window_um=47.0)
     first = time.perf_counter() - start
     once, both = fastest(lambda: forward(maps), repeats=15), fastest(lambda: gradient(maps), repeats=15)
     memory = peak_mb(lambda: forward(maps)), peak_mb(lambda: gradient(maps))
@@ -178,10 +181,11 @@ def _main_rows() -> list[Row]:
         f"{slow[0] / once:.0f}x textbook (300x, goal 600x), 1e-4, 150 MB",
         f"{slow[1] / both:.0f}x textbook (250x, goal 800x), 2e-4, 250 MB",
     )
-    judged = "gradient in float64 at 1e-9"
+    judged, planned = "gradient in float64 at 1e-9", f"{slow[0] / first:.0f}x textbook (300x), with the plan"
     return [
         Row(case_name, "windowed 1e-4", once, wrong, about, threads, memory[0], goals[0]),
-        Row(case_name, "windowed 1e-4, first call of the geometry", first, wrong, about, threads, goal="with the plan"),
+        Row(case_name, "windowed 1e-4, first call of the geometry", first, wrong, about, threads, goal=planned),
+        Row(case_name, "windowed 1e-4, first call of the process", cold, wrong, about, threads, goal="code is read"),
         Row(
             case_name,
             "windowed 1e-4, with gradient",

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from metalens.propagate.geometry import Case as Case
     from metalens.propagate.geometry import axis as axis
     from metalens.propagate.geometry import check_aperture as check_aperture
-    from metalens.propagate.kernels import kernel as kernel
     from metalens.propagate.paths import chief_path as chief_path
     from metalens.propagate.paths import cosines as cosines
+    from metalens.propagate.paths import kernel as kernel
     from metalens.propagate.sincos import turns32 as turns32
     from metalens.propagate.verbs import angles as angles
     from metalens.propagate.verbs import angular_spectrum as angular_spectrum
@@ -33,9 +33,11 @@ if TYPE_CHECKING:
     from metalens.propagate.verbs import chief as chief
     from metalens.propagate.verbs import exact as exact
     from metalens.propagate.verbs import windowed as windowed
+    from metalens.propagate.wide import light_wide as light_wide
     from metalens.propagate.window import Moving as Moving
     from metalens.propagate.window import field_windowed as field_windowed
     from metalens.propagate.window import plan as plan
+    from metalens.propagate.window import plan_wide as plan_wide
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -60,9 +62,11 @@ __getattr__, __dir__, __all__ = attach(
         "field_at": "direct",
         "field_exact": "direct",
         "field_windowed": "window",
-        "kernel": "kernels",
+        "kernel": "paths",
+        "light_wide": "wide",
         "paths": "",
         "plan": "window",
+        "plan_wide": "window",
         "relative_error": "estimate",
         "scan": "estimate",
         "square_error": "estimate",

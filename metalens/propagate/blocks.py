@@ -79,19 +79,22 @@ class Blocks:
 Kernel = Callable[[Any, Any], Array]
 
 
-def choose(case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int) -> tuple[Blocks, Blocks]:
+def choose(
+    case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int, nodes: int = 60
+) -> tuple[Blocks, Blocks]:
     """(rows, columns) blocks that cost least.
 
     Args:
         kernel: (y, x) in um to (line, …) values whose variation over a block must be met, broadcasting.
         tolerance: root mean square error of the interpolation, relative.
+        nodes: of the lens along an axis, to which the light of every block's goes on, about.
     """
     height = next(n for n in LENGTHS[0] if n <= case.shape[0] and _carried(case, reference, n, itemsize))
     found = []
     for axis, longest in ((0, height), (1, LENGTHS[1][0])):
         options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
         blocks = [_needed(case, axis, n, kernel, tolerance) for n in options]
-        found.append(min(blocks, key=lambda b: b.nodes * (1 + 60 / b.length)))
+        found.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
     return found[0], found[1]
 
 

@@ -4,6 +4,8 @@ import functools
 from dataclasses import dataclass
 
 from metalens.ground.errors import PropagationError
+from metalens.ground.threads import one_blas_thread
+from metalens.propagate import grids
 from metalens.propagate.geometry import Case, windows
 from metalens.propagate.nodes import MOST_NODES, Layout, layout
 
@@ -17,8 +19,8 @@ _PLAN_SECONDS = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """method: ``exact``, ``windowed`` or ``tiled``; tiles: windows that are computed apart; seconds: expected, one
-    core, planning included."""
+    """method: ``exact``, ``windowed``, ``tiled`` or ``wide``; tiles: windows that are computed apart; seconds:
+    expected, one core, planning included."""
 
     method: str
     reason: str
@@ -27,21 +29,27 @@ class Choice:
 
 
 @functools.lru_cache(maxsize=1024)
-def choose(case: Case, tolerance: float, *, differentiable: bool = False) -> Choice:
+def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving: bool = False) -> Choice:
     """The cheapest method that meets the tolerance.
 
     Args:
         differentiable: leave out the exact sum, which has no derivatives.
+        moving: leave out the transforms too, which have none in the geometry.
 
     The angular spectrum is never chosen: its error (lattice, padding) has no bound. Radial lenses known by their
     radial profile have a faster way of their own, :mod:`benchmarks.rivals.radial`.
     """
-    cut = _windows(case, tolerance)
-    found = [_layout(window, tolerance) for row in cut for window in row]
     pillars = case.shape[0] * case.shape[1]
+    exact = exact_seconds(case)
+    apart = grids.seconds(case, tolerance) + _PLAN_SECONDS + 2 * pillars * _PILLAR
+    if not moving and apart < exact and grids.is_wide(case, tolerance):
+        reason = f"wide window by Fourier transforms: {apart:.2g} s, exact sum {exact:.2g} s"
+        return Choice("wide", reason, ((case,),), apart)
+    with one_blas_thread():
+        cut = _windows(case, tolerance)
+        found = [_layout(window, tolerance) for row in cut for window in row]
     plans = [(one.seconds + one.parts**2 * _PLAN_SECONDS, one.nodes) for one in found if one is not None]
     windowed = sum(seconds + pillars * _PILLAR for seconds, _ in plans)
-    exact = exact_seconds(case)
     if exact < windowed and not differentiable:
         size = f"{pillars} pillars at {_points(case)} points"
         reason = f"exact sum: {size} take {exact:.2g} s, windowed {windowed:.2g} s"

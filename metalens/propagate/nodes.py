@@ -1,6 +1,6 @@
 """How many nodes, directions and correction samples a propagation needs, and how a window is cut.
 
-The kernel (:mod:`metalens.propagate.kernels`) is smooth in everything, so each of its dependencies is sampled just
+The kernel (:mod:`metalens.propagate.paths`) is smooth in everything, so each of its dependencies is sampled just
 finely enough: every count below is the least whose Legendre tail on probing lines is under the tolerance. The smaller
 the window, the smoother the kernel: so the light on the nodes of the whole window is passed on to the fewer nodes of
 its tiles.
@@ -17,8 +17,7 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.kernels import correction, direction_range, kernel, probe
-from metalens.propagate.paths import cosine_y
+from metalens.propagate.paths import correction, cosine_y, direction_range, kernel, probe
 
 MOST_NODES = 400
 MOST_TABLE = 4e6

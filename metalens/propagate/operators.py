@@ -8,9 +8,17 @@ import numpy as np
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.propagate.geometry import Case
-from metalens.propagate.kernels import correction, direction_range
 from metalens.propagate.nodes import Sizes
-from metalens.propagate.paths import chief_path, cosine_y, cosines, from_source, reference_depth, slopes
+from metalens.propagate.paths import (
+    chief_path,
+    correction,
+    cosine_y,
+    cosines,
+    direction_range,
+    from_source,
+    reference_depth,
+    slopes,
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

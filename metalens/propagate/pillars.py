@@ -6,13 +6,13 @@ polynomials are taken there: the moments stand for those nodes, which give the s
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
 from metalens.propagate.blocks import CHUNK, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
@@ -56,16 +56,22 @@ class Moments:
 def moments(
     case: Case,
     reference: float,
-    counts: tuple[int, int],
+    weights: tuple[Callable[[Array], Array], ...],
     kernel: Kernel,
     *,
     tolerance: float,
     dtype: torch.dtype,
     device: torch.device | None = None,
+    nodes: int = 60,
 ) -> Moments:
-    """Blocks and polynomials for ``counts`` = (m, n) moments; ``kernel`` as :func:`propagate_blocks.choose`."""
+    """Blocks, and what light at their nodes is worth in each moment.
+
+    Args:
+        weights: of the rows and of the columns, (place,) um to (place, m): polynomials, or shares of an even grid.
+        kernel, nodes: as :func:`metalens.propagate.blocks.choose`.
+    """
     itemsize = torch.finfo(dtype).bits // 8
-    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize)
+    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize, nodes)
     rows, columns = blocks
     width = columns.length
     wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
@@ -75,7 +81,7 @@ def moments(
         places = case.pillars_um
     elif case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
-    found = [legendre.values(n, p / h) for n, p, h in zip(counts, places, case.half_size_um, strict=True)]
+    found = [weight(place) for weight, place in zip(weights, places, strict=True)]
     polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found]
     return Moments(blocks, wave, table, polynomials[0], polynomials[1])
 

@@ -15,9 +15,9 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, Media, media
 from metalens.propagate.choice import Choice, choose
+from metalens.propagate.direct import angular_spectrum as _angular_spectrum
 from metalens.propagate.direct import field_at, field_exact
 from metalens.propagate.geometry import Case
-from metalens.propagate.textbook import angular_spectrum as _angular_spectrum
 
 __all__ = ["Case", "Choice", "angular_spectrum", "case", "choose", "exact", "field_at", "field_exact", "windowed"]
 
@@ -165,7 +165,7 @@ def angular_spectrum(
     single: bool = False,
     **geometry: Any,
 ) -> Array:
-    """Textbook angular spectrum on the zero-padded pillar lattice (see :mod:`metalens.propagate.textbook`).
+    """Textbook angular spectrum on the zero-padded pillar lattice (see :mod:`metalens.propagate.direct`).
 
     Args:
         pad, band_limited, single: padding factor, band limit, complex64.

@@ -1,9 +1,11 @@
 """Windowed propagation: only the field on the sensor window, from Legendre moments of the lens."""
 
 import dataclasses
+import functools
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -11,13 +13,14 @@ import torch
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
+from metalens.ground.threads import one_blas_thread
 from metalens.propagate.estimate import MORE
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.kernels import over_blocks
 from metalens.propagate.nodes import Layout, layout
 from metalens.propagate.operators import Depths, depth_basis, depth_factors, operators, pairs
-from metalens.propagate.paths import reference_depth, to_sensor
+from metalens.propagate.paths import over_blocks, reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, moments, reduce
+from metalens.propagate.wide import WidePlan, wide_plan
 
 KEPT_BYTES = 400e6  # of plans that are kept
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
@@ -65,7 +68,8 @@ class Moving:
     centre: torch.Tensor
 
 
-_kept: dict[tuple[Any, ...], Plan] = {}  # used last at the end
+Kept = TypeVar("Kept", Plan, WidePlan)
+_kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
 _lock = threading.Lock()
 
 
@@ -78,13 +82,29 @@ def plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device,
     Raises:
         PropagationError: the window is too large for the method.
     """
-    key = (case, tolerance, dtype, device, moving)
+    made = functools.partial(_planned, case, tolerance, dtype, device, moving=moving)
+    return _keep((case, tolerance, dtype, device, moving), made)
+
+
+def plan_wide(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device) -> WidePlan:
+    """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
+
+    Raises:
+        PropagationError: rays too steep for the method.
+    """
+    made = functools.partial(wide_plan, case, tolerance, dtype, device)
+    return _keep((case, tolerance, dtype, device, "wide"), made)
+
+
+def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
+    """The plan that is kept under a key, or a new one."""
     with _lock:
         found = _kept.pop(key, None)
         if found is not None:
             _kept[key] = found
-            return found
-    found = _planned(case, tolerance, dtype, device, moving=moving)
+            return found  # type: ignore[no-any-return]
+    with one_blas_thread():
+        found = made()
     with _lock:
         _kept[key] = found
         room = KEPT_BYTES
@@ -105,7 +125,7 @@ def _planned(case: Case, tolerance: float, dtype: torch.dtype, device: torch.dev
     pillars = moments(
         case,
         reference,
-        (ny + MORE, nx + MORE),
+        polynomials(case, (ny + MORE, nx + MORE)),
         over_blocks(case),
         tolerance=tolerance,
         dtype=dtype,
@@ -114,6 +134,15 @@ def _planned(case: Case, tolerance: float, dtype: torch.dtype, device: torch.dev
     depths = depth_basis(case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving)
     tensors = _shared(case, found, depths, dtype, device) | _stacked(case, found, depths, tolerance, (dtype, device))
     return Plan(case, tolerance, found, depths, pillars, tensors)
+
+
+def polynomials(case: Case, counts: tuple[int, int]) -> tuple[Callable[[Array], Array], ...]:
+    """Legendre polynomials over the rows and over the columns of the lens, as weights of :func:`moments`."""
+
+    def over(count: int, half_um: float) -> Callable[[Array], Array]:
+        return lambda places_um: legendre.values(count, places_um / half_um)
+
+    return tuple(over(n, h) for n, h in zip(counts, case.half_size_um, strict=True))
 
 
 def _complex(dtype: torch.dtype) -> torch.dtype:

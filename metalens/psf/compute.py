@@ -19,7 +19,9 @@ from metalens.propagate import (
     choose,
     field_exact,
     field_windowed,
+    light_wide,
     plan,
+    plan_wide,
     relative_error,
 )
 
@@ -115,8 +117,11 @@ def _windowed(
     moving: Any,
 ) -> Result:
     """One try with sums of a dtype: every wavelength and window, then the estimate from all of them."""
-    choice = choose(cases[0], tolerance, differentiable=True)
+    choice = choose(cases[0], tolerance, differentiable=True, moving=moving is not None)
+    if choice.method == "wide":
+        return _wide(maps, dtype, cases, weights, tolerance, choice)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
+    seen: list[Any] = [0.0] * len(samples)
     total: Any = 0
     light = 0.0
     for p, t, case, weight in zip(*maps, cases, weights, strict=True):
@@ -128,21 +133,67 @@ def _windowed(
                 field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
                 _check(p, t, case, power, gathered)
                 noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(power, case)
-                values = field.detach().cpu().numpy(), gathered.cpu().numpy().astype(complex)
-                samples[index].append(Sample(window, weight, *values, noise, made.layout.parts))
-                parts.append(field)
+                moments = gathered.cpu().numpy().astype(complex)
+                samples[index].append(Sample(window, weight, moments, noise, made.layout.parts))
+                here = weight * (field.real**2 + field.imag**2)
+                parts.append(here)
+                seen[index] = seen[index] + here.detach().cpu().numpy()
                 index += 1
             rows.append(torch.cat(parts, -1))
         light += weight * power
-        field = torch.cat(rows, -2)
-        total = total + weight * (field.real**2 + field.imag**2)
+        total = total + torch.cat(rows, -2)
+    return _judged(total, samples, seen, (cases, weights, light), choice)
+
+
+def _wide(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    dtype: torch.dtype,
+    cases: list[Case],
+    weights: list[float],
+    tolerance: float,
+    choice: Choice,
+) -> Result:
+    """One try of a wide window by Fourier transforms, as :func:`_windowed`."""
+    total: Any = None
+    power, samples = 0.0, []
+    for p, t, case, weight in zip(*maps, cases, weights, strict=True):
+        made = plan_wide(case, tolerance, dtype, p.device)
+        light, gathered, given = light_wide(p, t, made)
+        _check(p, t, case, given, gathered)
+        noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(given, case)
+        samples.append(Sample(case, weight, gathered.cpu().numpy().astype(complex), noise, 1, made.nodes_um))
+        light = light if weight == 1 else light * weight
+        total = light if total is None else total + light
+        power += weight * given
+    return _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
+
+
+def _judged(
+    total: torch.Tensor,
+    samples: list[list[Sample]],
+    seen: list[Any],
+    given: tuple[list[Case], list[float], float],
+    choice: Choice,
+) -> Result:
+    """The result of a try with its estimate; seen: intensity of each part of the window; given: cases, weights, sum of
+    squares of the transmission.
+
+    Raises:
+        PropagationError: no light in the window.
+    """
+    cases, weights, light = given
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
         raise PropagationError("no light reaches the window at some depth; move or widen the window")
-    lit = total.detach().mean((-1, -2)).min()
+    seen_light = total.detach().flatten(-2)
+    if choice.method == "wide":  # of the light itself: what is dim about it weighs as little in the error
+        lit = torch.stack([(row @ row) / row.sum() for row in seen_light]).min()
+    else:
+        lit = seen_light.mean(-1).min()
     brightness = float(lit) / sum(
         weight * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
     )
-    return Result(total, relative_error(samples), choice.reason, light, brightness=brightness / max(light, 1e-300))
+    error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
+    return Result(total, error, choice.reason, light, brightness=brightness)
 
 
 def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:

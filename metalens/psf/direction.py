@@ -71,7 +71,7 @@ def direction(
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
     found = [_lens(Light(pair, cases, weights), wanted, moving) for pair in lenses]
-    light, results = torch.stack([one for one, _ in found]), [result for _, result in found]
+    light, results = _stacked([one for one, _ in found]), [result for _, result in found]
     power = torch.tensor([result.power for result in results], dtype=torch.float64).view(shape[:-3])
     return light.view(*shape[:-3], *light.shape[1:]), results, power * _passed(cases[0])
 
@@ -95,7 +95,12 @@ def _lens(given: Light, wanted: Wanted, moving: Moving | None) -> tuple[torch.Te
     if fine.points > 1:
         why = f"; light integrated over cells of {fine.points} x {fine.points} points"
         result = replace(result, reason=result.reason + why)
-    return torch.cat(lit), result
+    return lit[0] if len(lit) == 1 else torch.cat(lit), result
+
+
+def _stacked(parts: list[torch.Tensor]) -> torch.Tensor:
+    """As torch.stack, but for a single part, which is not copied."""
+    return parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(parts)
 
 
 def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:

@@ -251,12 +251,12 @@ def score(phase, level, **geometry):
 
 
 def test_gradcheck_of_the_moments_and_of_the_window():
-    from metalens.propagate.kernels import over_blocks
+    from metalens.propagate.paths import over_blocks
     from metalens.propagate.pillars import moments, reduce
-    from metalens.propagate.window import plan, zoom
+    from metalens.propagate.window import plan, polynomials, zoom
 
     case = propagate.case((9, 70), **GEOMETRY | dict(samples=3))
-    made = moments(case, 1e-3, (3, 4), over_blocks(case), tolerance=1e-9, dtype=torch.float64)
+    made = moments(case, 1e-3, polynomials(case, (3, 4)), over_blocks(case), tolerance=1e-9, dtype=torch.float64)
     assert made.blocks[1].nodes < made.blocks[1].length  # light is moved to fewer nodes than pillars
     maps = [torch.tensor(m).requires_grad_() for m in lens((9, 70), kind="noisy")]
     assert torch.autograd.gradcheck(lambda p, t: torch.view_as_real(reduce(p, t, made)[0]), maps)

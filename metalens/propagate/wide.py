@@ -1,0 +1,229 @@
+"""Wide windows: the field by three Fourier transforms, on grids as fine as aperture and window ask for.
+
+    U(c + δ) = Σ_x L(x) h(c + δ - x),    h(ρ) = ∫ √passed(p) exp(ik[p·ρ + Φ(p)]) d²p/λ²,    Φ = Σ t √(n² - p²)
+
+(the exact transfer of plane waves through plane-parallel media). Φ is split into the quadratic that follows its rays
+best, reach(p) ≈ A + D (p - p0) along each axis, and the rest ψ. The quadratic gives
+
+    V(δ) = exp(ikδ²/2D)/(iλD) Σ_x [L(x) exp(ik((x - x0)²/2D - p0 x))] exp(-ikδ(x - x0)/D),    x0 = c - A,
+
+one transform of the light on an even grid of the lens; U = F⁻¹[√passed exp(ikψ) F[V]] moves light by a few tens of
+um at most, by which the window is padded. Pillars are handed to the even grid as to the nodes of the windowed method
+(:mod:`metalens.propagate.pillars`), by a sinc under Kaiser's window, since the kernel's carrier is taken off first.
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.special
+import torch
+
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
+from metalens.lens import media
+from metalens.propagate.geometry import Case
+from metalens.propagate.grids import Axis, axes, grid_um, spread_weights
+from metalens.propagate.operators import depth_basis
+from metalens.propagate.paths import from_source, over_blocks, reference_depth, to_sensor
+from metalens.propagate.pillars import Moments, moments, reduce
+
+BAND_BYTES = 2e7  # of the depths that are mixed at once
+CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WidePlan:
+    """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x) depth fields on the grid of the
+    lens, its phases included; coefficients: (depth, b); chirp, transfer: (Y, X) behind the first and second transform.
+    """
+
+    case: Case
+    axes: tuple[Axis, Axis]
+    moments: Moments
+    fields: torch.Tensor
+    coefficients: torch.Tensor
+    chirp: torch.Tensor
+    transfer: torch.Tensor
+
+    @property
+    def nodes_um(self) -> tuple[Array, Array]:
+        """(e,), (x,) positions of the grid over the lens."""
+        y, x = (grid_um(axis) for axis in self.axes)
+        return y, x
+
+    @property
+    def bytes(self) -> int:
+        """Memory that its arrays take."""
+        held = [self.fields, self.coefficients, self.chirp, self.transfer, self.moments.rows, self.moments.columns]
+        table = self.moments.table
+        return sum(int(t.nbytes) for t in held) + (int(table.nbytes) if table is not None else 0)
+
+
+def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device) -> WidePlan:
+    """A new plan.
+
+    Raises:
+        PropagationError: rays too steep, or too unlike a quadratic, for the method.
+    """
+    found = axes(case, tolerance)
+    if found is None:
+        raise PropagationError("rays to this window are too steep for Fourier transforms; see propagate.choose")
+    pillars = moments(
+        case,
+        reference_depth(case),
+        tuple(functools.partial(spread_weights, axis) for axis in found),
+        over_blocks(case),
+        tolerance=tolerance,
+        dtype=dtype,
+        device=device,
+        nodes=max(axis.count for axis in found) // 2,
+    )
+    kind = torch.complex64 if dtype == torch.float32 else torch.complex128
+    fields, coefficients = _depth_fields(case, found, tolerance / 2)
+    lens = _lens_phase(case, found)
+    given = [torch.tensor(a, dtype=kind, device=device) for a in (coefficients, *_behind(case, found))]
+    table = torch.empty((len(fields), *lens.shape), dtype=kind, device=device)
+    for one, field in zip(table, fields, strict=True):
+        one.copy_(torch.from_numpy(field * lens))
+    return WidePlan(case, found, pillars, table, given[0], given[1], given[2])
+
+
+def _depth_fields(case: Case, found: tuple[Axis, Axis], tolerance: float) -> tuple[Any, Array]:
+    """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth, b) coefficients."""
+    grids = [grid_um(axis) for axis in found]
+    counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
+    e, x = (legendre.mapped(n, g[0], g[-1]) for n, g in zip(counts, grids, strict=True))
+    depths = depth_basis(case, (e, x), tolerance)
+    to = [legendre.interpolation(n, g / g[-1]) for n, g in zip(counts, grids, strict=True)]
+    return [to[0] @ one @ to[1].T for one in depths.basis], depths.coefficients
+
+
+def _coarse(case: Case, i: int, grid: Array) -> int:
+    """Legendre nodes that hold the phase of the extreme depths along an axis: two a turn, and some."""
+    far = [np.array([0.0, *case.half_size_um])[:, None], grid[[0, -1]]]
+    y, x = (far[1], far[0]) if i == 0 else (far[0], far[1])
+    turns = 0.0
+    for inverse in (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)):
+        path = from_source(case, x, y, case.tangents, inverse)
+        path = path - from_source(case, x, y, case.tangents, reference_depth(case))
+        turns = max(turns, float(np.abs(path).max()) / case.wavelength_um)
+    return 24 + math.ceil(6 * turns)
+
+
+def _lens_phase(case: Case, found: tuple[Axis, Axis]) -> Array:
+    """(y, x) what the light of the grid is multiplied by before the first transform, all constants included."""
+    k, lam = case.wavenumber, case.wavelength_um
+    total, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
+    for i, (axis, c) in enumerate(zip(found, case.centre_um[::-1], strict=True)):
+        x, x0 = grid_um(axis), c - axis.reach_um
+        path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (c - x)
+        turn = np.exp(2j * np.pi * (axis.size // 2) * np.arange(axis.count) / axis.first)
+        total, ramp = (total + path[:, None], ramp * turn[:, None]) if i == 0 else (total + path, ramp * turn)
+    y, x = (grid_um(axis) for axis in found)
+    away = np.asarray(to_sensor(case, x, y[:, None]))
+    scale = case.area_um2 / (1j * lam * math.sqrt(found[0].stretch_um * found[1].stretch_um))
+    start = float(_phase_path(case, found[0].middle ** 2 + found[1].middle ** 2))
+    return np.asarray(scale * ramp * np.exp(1j * k * (total - away + start)))
+
+
+def _phase_path(case: Case, w: Any) -> Any:
+    """Φ = Σ t √(n² - w), um."""
+    pairs = [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
+    return sum(t * (n * n - w) ** 0.5 for n, t in pairs)
+
+
+def _behind(case: Case, found: tuple[Axis, Axis]) -> tuple[Array, Array]:
+    """(Y, X) chirp of the window behind the first transform, and transfer of what the quadratic leaves."""
+    k = case.wavenumber
+    chirps, ramps, squares, paths = [], [], [], []
+    for axis, samples, c in zip(found, case.samples, case.centre_um[::-1], strict=True):
+        period = axis.fine * case.step_um / axis.every
+        n, width = np.arange(axis.size) - axis.size // 2, period / axis.size
+        place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
+        chirps.append(np.exp(1j * k * (n * width) ** 2 / (2 * axis.stretch_um) - 2j * np.pi * n * place / axis.first))
+        order = np.fft.fftfreq(axis.size) * axis.size
+        u = order * case.wavelength_um / period
+        first = -(samples - 1) / 2 * case.step_um / width + axis.size // 2
+        ramps.append(np.exp(2j * np.pi * order * first / axis.size) * _fade(axis, np.abs(u) - axis.most) / axis.size)
+        squares.append((axis.middle + u) ** 2)
+        paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
+    w = squares[0][:, None] + squares[1]
+    narrow = max(found, key=lambda axis: axis.guard)
+    seen = w < (narrow.steepest + 1.1 * narrow.guard) ** 2
+    w = np.where(seen, w, 0.0)
+    psi = _phase_path(case, w) - _phase_path(case, found[0].middle ** 2 + found[1].middle ** 2)
+    psi = psi + paths[0][:, None] + paths[1]
+    level = _fade(narrow, np.sqrt(w) - narrow.steepest)
+    if case.behind is not None:
+        level = level * np.sqrt(media.passed_at(case.behind.order, w))
+    transfer = np.where(seen, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0)
+    return chirps[0][:, None] * chirps[1], transfer
+
+
+def _fade(axis: Axis, past: Array) -> Array:
+    """1 for rays to the window, 0 past the end of the band, by the integral of a Gaussian between."""
+    return np.asarray(scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * past / axis.guard - 1)) / 2)
+
+
+def light_wide(
+    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: WidePlan
+) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """|U|² on the window (depth, y, x); light on the even grid of the lens; the sum of squares of the transmission.
+
+    Differentiable in phase and transmission (y, x).
+    """
+    gathered, power = reduce(phase_rad, transmission, plan.moments)
+    return _mixed(fields_wide(gathered, plan), plan.coefficients), gathered.detach(), power
+
+
+def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
+    """(b, y, x) field of every depth field on the window from the light on the grid of the lens, up to a phase of each
+    sample that all share."""
+    y, x = plan.axes
+    my, mx = plan.case.samples
+    step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
+    parts = []
+    out = None if gathered.requires_grad else gathered.new_empty((len(plan.fields), my, mx))
+    for start in range(0, len(plan.fields), step):
+        some = plan.fields[start : start + step] * gathered
+        seen = torch.fft.fft(some, n=x.first)[..., : x.size]
+        seen = torch.fft.fft(seen, n=y.first, dim=-2)[..., : y.size, :] * plan.chirp
+        wide = torch.fft.ifft2(_padded(torch.fft.fft2(seen) * plan.transfer, (y.fine, x.fine)), norm="forward")
+        seen = wide[..., : my * y.every : y.every, : mx * x.every : x.every]
+        if out is None:
+            parts.append(seen)
+        else:
+            out[start : start + step] = seen
+    return torch.cat(parts) if out is None else out
+
+
+def _padded(spectrum: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A spectrum in more points, zero where it had none."""
+    if tuple(spectrum.shape[-2:]) == size:
+        return spectrum
+    out = spectrum.new_zeros((*spectrum.shape[:-2], *size))
+    parts = [(slice(0, (n + 1) // 2), slice(-(n // 2), None)) for n in spectrum.shape[-2:]]
+    for rows in parts[0]:
+        for columns in parts[1]:
+            out[..., rows, columns] = spectrum[..., rows, columns]
+    return out
+
+
+def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+    """(depth, y, x) |Σ_b coefficients[depth, b] fields[b]|², some rows at a time."""
+    depths, (count, my, mx) = len(coefficients), fields.shape
+    step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
+    bands, out = [], None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
+    for start in range(0, my, step):
+        some = fields[:, start : start + step]
+        field = (coefficients @ some.reshape(count, -1)).view(depths, -1, mx)
+        light = field.real.square() + field.imag.square()
+        if out is None:
+            bands.append(light)
+        else:
+            out[:, start : start + step] = light
+    return torch.cat(bands, 1) if out is None else out
