@@ -27,6 +27,9 @@ def test_factors_are_exponentials_and_the_aperture_stays_below_the_index():
     made, position = free._Images(steep, Z).optics(np.log([1.2, 0.9]))
     assert (made.index, made.numerical_aperture) == pytest.approx((1.0, 0.98))  # no less than air, 0.98 of it
     assert position == pytest.approx(Z)
+    oil = dataclasses.replace(SPEC, numerical_aperture=1.35, index=1.5, free=("numerical_aperture",))
+    assert free._Images(oil, Z).optics(np.log([1.3]))[0].numerical_aperture == pytest.approx(0.98 * 1.5)
+    assert free._Images(oil, Z).optics(np.log([1.05]))[0].numerical_aperture == pytest.approx(1.35 * 1.05)
     assert images.orders == {"phase_order": 6, "amplitude_order": 2}
 
 
@@ -38,6 +41,9 @@ def test_all_apertures_and_steps_share_the_nodes_of_the_widest():
     high = dataclasses.replace(SPEC, numerical_aperture=0.9, free=("numerical_aperture",))
     limit = dataclasses.replace(high, numerical_aperture=0.97)
     assert free._Images(high, Z).nodes == PupilModel(limit, 1.1 * Z, phase_order=6, amplitude_order=2).nodes
+    oil = dataclasses.replace(high, numerical_aperture=1.35, index=1.5)
+    limit = dataclasses.replace(oil, numerical_aperture=0.97 * 1.5)
+    assert free._Images(oil, Z).nodes == PupilModel(limit, 1.1 * Z, phase_order=6, amplitude_order=2).nodes
 
 
 def test_slopes_by_the_factors_are_differences_of_images():

@@ -150,3 +150,14 @@ def bilinear(value, row, column):
             share = max(1 - abs(float(row) - i), 0) * max(1 - abs(float(column) - j), 0)
             total = total + share * value[i, j]
     return total
+
+
+def test_sizes_of_the_networks_are_those_that_their_costs_were_counted_with():
+    net = NVGaze()
+    assert (net.space.resolution, net.sampling_macs(64)) == ((1.0, 1.0), 0)
+    assert (net.answer.in_features, net.answer.out_features) == (4 * 122, 5)
+    assert [m.kernel_size[0] for m in net.modules() if isinstance(m, nn.Conv2d)] == [5, 3, 3, 3, 3, 3]
+    assert {m.stride[0] for m in net.modules() if isinstance(m, nn.Conv2d)} == {2}
+    eyeball = Eyeball()
+    assert (eyeball.hidden.in_features, eyeball.hidden.out_features, eyeball.answer.out_features) == (56 * 16, 64, 7)
+    assert [m.skip.out_channels for m in eyeball.body] == [24, 40, 56]
