@@ -1,7 +1,7 @@
 """STEP assemblies with shared instances, labels and colours, the same bytes for the same input.
 
-The CAD kernel writes shapes and structure; occurrences are renumbered and colours added here, since the kernel counts
-on from file to file and writes colours in the order of memory addresses.
+The CAD kernel writes shapes, structure and colours. It counts occurrences on from file to file, and writes styles in
+the order of memory addresses: both are renumbered here.
 """
 
 import itertools
@@ -16,9 +16,9 @@ from metalens.ground import store
 from metalens.ground.errors import ProcessError
 
 _TIME = "2000-01-01T00:00:00"  # in the header of every file
-_SOLID = re.compile(
-    r"PRODUCT\('([^']*)','|ADVANCED_BREP_SHAPE_REPRESENTATION\s*\(\s*'[^']*'\s*,\s*\(\s*#\d+\s*,\s*#(\d+)\s*\)\s*,\s*#(\d+)"
-)
+_STYLES = "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"  # one for each solid, its styles behind it
+_ENTITY = re.compile(r"^#(\d+) = (.*?;)$", re.MULTILINE | re.DOTALL)
+_REFERENCE = re.compile(r"#(\d+)")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,14 +64,18 @@ def write_pieces(path: str | Path, label: str, pieces: Sequence[Piece], *, unit_
         ProcessError: the kernel could not write. OSError: the target cannot be written.
     """
     from OCP.gp import gp_Trsf, gp_Vec
+    from OCP.Quantity import Quantity_Color, Quantity_TypeOfColor
     from OCP.TopLoc import TopLoc_Location
+    from OCP.XCAFDoc import XCAFDoc_ColorType
 
-    document, shapes = _document(unit_m)
+    document, shapes, colours = _document(unit_m)
     root = shapes.NewShape()
     _name(root, label)
     for piece in pieces:
         stored = shapes.AddShape(piece.wrapped, False)
         _name(stored, piece.label)
+        shade = Quantity_Color(*piece.colour, Quantity_TypeOfColor.Quantity_TOC_sRGB)
+        colours.SetColor(stored, shade, XCAFDoc_ColorType.XCAFDoc_ColorGen)
         for place in piece.places:
             move = gp_Trsf()
             move.SetTranslation(gp_Vec(*place))
@@ -81,7 +85,7 @@ def write_pieces(path: str | Path, label: str, pieces: Sequence[Piece], *, unit_
         if not _write(document, part):
             raise ProcessError(f"{path}: the CAD kernel could not write the STEP file; is the disk full?")
         text = part.read_text(encoding="utf-8")
-        part.write_text(_painted(_renumbered(text), {p.label: p.colour for p in pieces}), encoding="utf-8")
+        part.write_text(_ordered(_renumbered(text)), encoding="utf-8")
 
 
 def _pillar(foot_um: float, top_um: float, height_um: float) -> Any:
@@ -92,8 +96,8 @@ def _pillar(foot_um: float, top_um: float, height_um: float) -> Any:
     return Solid.make_cone(foot_um / 2, top_um / 2, height_um).wrapped
 
 
-def _document(unit_m: float) -> tuple[Any, Any]:
-    """(document, its tool for shapes)."""
+def _document(unit_m: float) -> tuple[Any, Any, Any]:
+    """(document, its tools for shapes and colours)."""
     from OCP.TCollection import TCollection_ExtendedString
     from OCP.TDocStd import TDocStd_Document
     from OCP.XCAFApp import XCAFApp_Application
@@ -104,7 +108,7 @@ def _document(unit_m: float) -> tuple[Any, Any]:
     XCAFDoc_DocumentTool.SetLengthUnit_s(document, unit_m)
     shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     shapes.SetAutoNaming_s(False)
-    return document, shapes
+    return document, shapes, XCAFDoc_DocumentTool.ColorTool_s(document.Main())
 
 
 def _name(label: Any, text: str) -> None:
@@ -126,6 +130,7 @@ def _write(document: Any, path: Path) -> bool:
         printer.SetTraceLevel(Message_Gravity.Message_Fail)  # else it prints statistics
     writer = STEPCAFControl_Writer()
     writer.SetNameMode(True)
+    writer.SetColorMode(True)
     writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
     header = APIHeaderSection_MakeHeader(writer.Writer().Model())
     header.SetTimeStamp(TCollection_HAsciiString(_TIME))
@@ -139,26 +144,25 @@ def _renumbered(text: str) -> str:
     return re.sub(found, lambda _: f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{next(count)}'", text)
 
 
-def _painted(text: str, colours: dict[str, tuple[float, float, float]]) -> str:
-    """Colours of the solids, by the name of their product (ISO 10303-46 surface styles)."""
-    end = text.rindex("ENDSEC;")
-    number = itertools.count(1 + max(int(n) for n in re.findall(r"^#(\d+) = ", text, re.MULTILINE)))
-    lines, product = [], ""
-    for name, solid, context in _SOLID.findall(text):
-        product = name or product
-        if not solid or product not in colours:
-            continue
-        n = [next(number) for _ in range(9)]
-        red, green, blue = colours[product]
-        lines += [
-            f"#{n[0]} = COLOUR_RGB('',{red:.6f},{green:.6f},{blue:.6f});",
-            f"#{n[1]} = FILL_AREA_STYLE_COLOUR('',#{n[0]});",
-            f"#{n[2]} = FILL_AREA_STYLE('',(#{n[1]}));",
-            f"#{n[3]} = SURFACE_STYLE_FILL_AREA(#{n[2]});",
-            f"#{n[4]} = SURFACE_SIDE_STYLE('',(#{n[3]}));",
-            f"#{n[5]} = SURFACE_STYLE_USAGE(.BOTH.,#{n[4]});",
-            f"#{n[6]} = PRESENTATION_STYLE_ASSIGNMENT((#{n[5]}));",
-            f"#{n[7]} = STYLED_ITEM('color',(#{n[6]}),#{solid});",
-            f"#{n[8]} = MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION('',(#{n[7]}),#{context});",
-        ]
-    return text[:end] + "\n".join(lines) + "\n" + text[end:]
+def _ordered(text: str) -> str:
+    """Styles, which stand last, in the order of the solids that they style."""
+    if _STYLES not in text:
+        return text
+    start, end = text.rindex("#", 0, text.index(_STYLES)), text.rindex("ENDSEC;")
+    styles = {int(n): body for n, body in _ENTITY.findall(text[start:end])}
+    uses = {n: [int(m) for m in _REFERENCE.findall(body)] for n, body in styles.items()}
+    new: dict[int, int] = {}
+
+    def number(n: int) -> None:
+        if n in styles and n not in new:
+            new[n] = min(styles) + len(new)
+            for other in uses[n]:
+                number(other)
+
+    def solid(n: int) -> list[int]:
+        return sorted(m for item in uses[n] for m in uses.get(item, ()) if m not in styles)
+
+    for n in sorted((n for n, body in styles.items() if body.startswith(_STYLES)), key=solid):
+        number(n)
+    lines = [f"#{new[n]} = " + _REFERENCE.sub(lambda m: f"#{new.get(int(m[1]), int(m[1]))}", styles[n]) for n in new]
+    return text[:start] + "\n".join(lines) + "\n" + text[end:]

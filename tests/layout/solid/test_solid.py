@@ -315,3 +315,25 @@ def test_a_full_disk_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path
     pytest.importorskip("build123d")
     done = subprocess.run([sys.executable, "-c", FULL_DISK, str(tmp_path)], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n")[:3] == ["a.stl old 1", "a.glb old 1", "a.step old 1"]
+
+
+def test_colours_stay_with_their_solids_wherever_these_lie_in_memory(tmp_path):
+    build123d = pytest.importorskip("build123d")
+    colours = [(0.75, 0.85, 0.95), (0.25, 0.35, 0.75), (0.9, 0.1, 0.2), (0.25, 0.35, 0.75), (0.3, 0.31, 0.0)]
+    made, kept = [], []
+    for turn in range(4):
+        pieces = []
+        for k in np.random.default_rng(turn).permutation(5).tolist():  # other addresses each time
+            kept.append(build123d.Solid.make_box(1 + k, 2, 3))
+            pieces.append(
+                (k, solid_step.Piece(f"p{k}", kept[-1].wrapped, colours[k], [(9.0 * k, 0, 0), (0, 5.0 * k, 1)]))
+            )
+        pieces.sort(key=lambda piece: piece[0])
+        solid_step.write_pieces(tmp_path / "a.step", "all", [piece for _, piece in pieces], unit_m=1e-3)
+        made.append((tmp_path / "a.step").read_bytes())
+    assert len(set(made)) == 1
+    assert made[0].count(b"COLOUR_RGB") == 4  # one for each colour
+    found = [(part.label, tuple(part.color)[:3]) for part in build123d.import_step(tmp_path / "a.step").children]
+    assert len(found) == 10
+    for label, colour in found:
+        assert colour == pytest.approx(colours[int(label[1])], abs=1e-6)
