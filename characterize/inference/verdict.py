@@ -144,22 +144,21 @@ def _together(one: Array, other: Array) -> Array:
 def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array, unstated: Unstated) -> str:
     """Which causes the frames fix, and which come from prior knowledge or only with others.
 
-    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing. Those that ``unstated`` causes
-    may have moved by more than their standard error are known within the model alone, and called so.
+    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing. Numbers are those with what
+    ``unstated`` causes may have moved; where these are too large, a cause is known in the model alone, and so said.
     """
     causes = [i for i, n in enumerate(names) if n.endswith(("_nm", "_rad", "_deg")) or n == "index"]
     own = (high - low) / 3.92
     close = [i for i in causes if own[i] <= PARAMETERS[PLACE[names[i]]].scale]
-    good = [i for i in close if unstated.sigma[i] <= own[i]]
-    known = ", ".join(f"{names[i]} +- {math.hypot(own[i], unstated.sigma[i]):.2g}" for i in good) or "no cause alone"
+    whole = np.hypot(own, unstated.sigma)
+    good = [i for i in close if whole[i] <= PARAMETERS[PLACE[names[i]]].scale]
+    known = ", ".join(f"{names[i]} +- {whole[i]:.2g}" for i in good) or "no cause alone"
     prior = [names[i] for i in causes if told[i] > 0.7]
     more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""
     moved = [i for i in close if i not in good]
     if moved:
         worst = np.argsort(-(unstated.by_cause[:, moved] / own[moved]).max(1))[:3]
-        parts = ", ".join(
-            f"{names[i]} +- {own[i]:.2g} (else +- {math.hypot(own[i], unstated.sigma[i]):.2g})" for i in moved
-        )
+        parts = ", ".join(f"{names[i]} +- {own[i]:.2g} (else +- {whole[i]:.2g})" for i in moved)
         without = ", ".join(unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst)
         more = f"; within the model only, that is without {without}: {parts}" + more
     open_ = [i for i in causes if i not in close and told[i] <= 0.7]

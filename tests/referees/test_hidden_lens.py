@@ -91,6 +91,30 @@ def test_a_hidden_lens_lies_within_its_intervals(response, seed):
 
 
 @pytest.mark.slow
+def test_uneven_light_is_found_fitted_and_the_rest_comes_back(response):
+    """Amplitudes 15 % higher at one rim and lower at the other: without it decentre misses by 13 standard errors."""
+    session = bench.with_faults(hidden.session(0), gradient=0.15)
+    found = characterize.fit(bench.shoot(hidden.lens(), session).capture, hidden.lens(), USUAL, response=response)
+    assert any("light_x, light_y, light_r fitted too" in words for words in found.cautions)
+    low, high = found.interval("light_x")
+    assert low < np.log(1.15 / 0.85) < high  # half the ln of the ratio of the rims' irradiances
+    for name in ("decentre_x_um", "bias_x_nm", "astigmatism_rad"):
+        low, high = found.interval(name)
+        assert low < session.of(name) < high, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [{"glass_um": 100.0}, {"stitch_nm": 60.0}, {"sidewall_deg": 1.5}])
+def test_what_cannot_be_told_lies_within_the_outer_interval(response, fault):
+    """19 outer intervals: one may miss by chance."""
+    session = bench.with_faults(hidden.session(0), **fault)
+    found = characterize.fit(bench.shoot(hidden.lens(), session).capture, hidden.lens(), USUAL, response=response)
+    ends = {name: found.outer(name) for name in hidden.TRUTHS}
+    missed = [name for name, (low, high) in ends.items() if not low <= session.of(name) <= high]
+    assert len(missed) < 2, missed
+
+
+@pytest.mark.slow
 def test_a_ghost_is_refused_or_spoken_of(response):
     """The other faults have their rows in ``benchmarks.characterize_referee``: not all are found."""
     session = bench.with_faults(hidden.session(0), ghost=0.08)

@@ -1,5 +1,6 @@
 """Widths told, causes scored, terms dropped and noise added up, on models made by hand."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -117,3 +118,26 @@ def test_the_noise_of_a_frame_is_that_of_its_usable_pixels():
     variance = (data.variance_e2 + light / 1.6) * data.usable
     assert found.noise == pytest.approx([math.sqrt(v.sum()) for v in variance], rel=1e-12)
     assert found.clipped == pytest.approx([0, 3 / 42])
+
+
+@pytest.mark.parametrize(("chance", "gained", "freed"), [(1e-6, 20.0, True), (1e-3, 20.0, False), (1e-6, 5.0, False)])
+def test_what_shows_in_the_residuals_is_fitted_where_that_explains_it(monkeypatch, chance, gained, freed):
+    """A lean of chi-square 24 beyond chance; kept where the misfit falls by half of that or more."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Asked:
+        free: tuple = ()
+        all_of = staticmethod(lambda value: value)
+
+    lean = Lean("uneven illumination", 24.0, 3, chance, frees=("light_x", "light_y"))
+    looks = iter([missing.Looked([lean], None, {}), missing.Looked([], None, {})])
+    monkeypatch.setattr(missing, "look", lambda *_: next(looks))
+    before = SimpleNamespace(merit=1000.0, value=np.zeros(2), converged=True)
+    after = SimpleNamespace(merit=1000.0 - gained, value=np.zeros(4), converged=True)
+    monkeypatch.setattr(estimate.search, "wider", lambda *_: [after])
+    cautions = []
+    known = SimpleNamespace(known=True)
+    task, ends, looked = estimate._with_what_is_there(Asked(), [before], known, cautions)
+    assert task.free == (("light_x", "light_y") if freed else ())
+    assert ends[0] is looked[0] is (after if freed else before)
+    assert bool(cautions) == freed
