@@ -17,10 +17,8 @@ RNG = np.random.default_rng(17)
 
 
 def sample(case=CASE, *, weight=1.0, noise=0.0, parts=1, orders=(5, 6)):
-    shape = len(case.inverse_depths_per_um), *case.samples
-    field = RNG.normal(size=shape) + 1j * RNG.normal(size=shape)
     moments = RNG.normal(size=orders) + 1j * RNG.normal(size=orders)
-    return Sample(case, weight, field, moments, noise, parts)
+    return Sample(case, weight, moments, noise, parts)
 
 
 def light_on_nodes(moments):
@@ -118,10 +116,28 @@ def test_weights_of_places_rise_to_ten_at_the_edges_of_a_tile():
     assert estimate._edges((3, 1, 4), 1) == pytest.approx([1 + 9 * v**8 for v in (0.75, 0.25, 0.25, 0.75)])
 
 
-def test_intensities_add_over_wavelengths_by_their_weights():
-    one, other = sample(weight=0.7), sample(weight=0.2)
-    want = 0.7 * np.abs(one.field) ** 2 + 0.2 * np.abs(other.field) ** 2
-    assert estimate._intensity([one, other]) == pytest.approx(want.reshape(3, -1))
+def test_light_on_nodes_of_the_lens_needs_no_polynomials():
+    """The same field whether the light is given by its moments or on nodes of its own."""
+    one = sample()
+    (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
+    nodes = ty * 14.5 * 0.37, tx * 20 * 0.37
+    other = replace(one, moments=light_on_nodes(one.moments), nodes_um=nodes)
+    at = (np.array([0, 2]), np.array([1, 3]))
+    assert estimate._direct(other, np.arange(3), at) == pytest.approx(estimate._direct(one, np.arange(3), at), rel=1e-9)
+    assert one.shape == (3, 3, 4)
+
+
+def test_fewer_points_are_looked_at_where_each_takes_a_sum_over_many_nodes():
+    """128 for each of up to four parts at 8 depths; 1e7 nodes times points, 32 points at least, at 4 depths."""
+    few = [[sample()]]
+    assert estimate._effort(few) == (128, 8)
+    assert estimate._effort(3 * few) == (384, 8)
+    assert estimate._effort(6 * few) == (512, 8)
+    for size, points in ((78_000, 128), (80_000, 125), (200_000, 50), (900_000, 32)):
+        many = replace(sample(), moments=np.zeros((size // 100, 100)), nodes_um=(np.zeros(1), np.zeros(1)))
+        want = (points, 8 if size == 78_000 else 4)
+        assert estimate._effort([[many]]) == want
+        assert estimate._effort([[replace(many, nodes_um=None)]]) == (128, 8)
 
 
 def test_differences_are_of_the_drawn_pixels_of_every_part(monkeypatch):
@@ -135,12 +151,11 @@ def test_differences_are_of_the_drawn_pixels_of_every_part(monkeypatch):
         return np.full((len(depths), len(at[0])), 1 + 2j) * (1 + one.weight)
 
     monkeypatch.setattr(estimate, "_direct", direct)
-    light = RNG.uniform(size=(3, 22))
     points = np.array([5, 11, 12, 18, 21])
-    got = estimate._difference(parts, light, np.array([0, 2]), points)
+    got = estimate._direct_light(parts, np.array([0, 2]), points)
     first = 5 * (0.7 * 1.7**2 + 0.4 * 1.4**2)
     last = 5 * 0.9 * 1.9**2
-    assert got == pytest.approx(np.array([first, first, last, last, last]) - light[np.ix_([0, 2], points)])
+    assert got == pytest.approx(np.tile([first, first, last, last, last], (2, 1)))
     assert [v.tolist() for v in asked[0][1]] == [[1, 2], [1, 3]]
     assert [v.tolist() for v in asked[2][1]] == [[0, 1, 1], [0, 1, 4]]
 
@@ -149,14 +164,16 @@ def test_the_error_of_few_pixels_is_the_sum_itself_with_the_noise_of_the_pillars
     """All pixels are looked at: Σ (δ/S - (I/S) Σδ/S)² and 2 w σ² / S of each wavelength, over Σ (I/S)²; 1.7 for all."""
     parts = [[sample(weight=0.7, noise=0.03), sample(weight=0.4, noise=0.05)]]
     off = RNG.normal(size=(3, 12)) * 0.02
-    monkeypatch.setattr(estimate, "_difference", lambda windows, light, depths, points: off[np.ix_(depths, points)])
-    light = sum(s.weight * np.abs(s.field.reshape(3, -1)) ** 2 for s in parts[0])
+    light = RNG.uniform(0.5, 2.0, (3, 12))
+    monkeypatch.setattr(
+        estimate, "_direct_light", lambda windows, depths, points: (light + off)[np.ix_(depths, points)]
+    )
     energy = light.sum(1, keepdims=True)
     share, delta = light / energy, off / energy
     square = ((delta - share * delta.sum(1, keepdims=True)) ** 2).sum()
     noise = 2 * (0.7 * 0.03**2 + 0.4 * 0.05**2) * (1 / energy).sum()
     want = 1.7 * math.sqrt((square + noise) / (share**2).sum())
-    assert estimate.relative_error(parts) == pytest.approx(want, rel=1e-9)
+    assert estimate.relative_error(parts, [light.reshape(3, 3, 4)]) == pytest.approx(want, rel=1e-9)
 
 
 def test_depths_that_are_judged_spread_over_all(monkeypatch):
@@ -164,12 +181,14 @@ def test_depths_that_are_judged_spread_over_all(monkeypatch):
     many = replace(CASE, inverse_depths_per_um=tuple(1 / np.linspace(400, 900, 12)))
     seen = []
 
-    def difference(windows, light, depths, points):
-        seen.append(depths.tolist())
-        return np.zeros((len(depths), len(points)))
+    light = RNG.uniform(0.5, 2.0, (12, 12))
 
-    monkeypatch.setattr(estimate, "_difference", difference)
-    assert estimate.relative_error([[sample(many)]]) == 0
+    def direct(windows, depths, points):
+        seen.append(depths.tolist())
+        return light[np.ix_(depths, points)]
+
+    monkeypatch.setattr(estimate, "_direct_light", direct)
+    assert estimate.relative_error([[sample(many)]], [light.reshape(12, 3, 4)]) == 0
     assert seen == [[0, 2, 3, 5, 6, 8, 9, 11]]
 
 
