@@ -14,6 +14,7 @@ um at most, by which the window is padded. Pillars are handed to the even grid a
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +32,7 @@ from metalens.propagate.operators import depth_basis
 from metalens.propagate.paths import from_source, over_blocks, reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, moments, reduce
 
-BAND_BYTES = 2e7  # of the depths that are mixed at once
+BAND_BYTES = 8e6  # of the depths that are mixed at once
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
 
@@ -86,20 +87,20 @@ def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.de
     fields, coefficients = _depth_fields(case, found, tolerance / 2)
     lens = _lens_phase(case, found)
     given = [torch.tensor(a, dtype=kind, device=device) for a in (coefficients, *_behind(case, found))]
-    table = torch.empty((len(fields), *lens.shape), dtype=kind, device=device)
+    table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind, device=device)
     for one, field in zip(table, fields, strict=True):
         one.copy_(torch.from_numpy(field * lens))
     return WidePlan(case, found, pillars, table, given[0], given[1], given[2])
 
 
-def _depth_fields(case: Case, found: tuple[Axis, Axis], tolerance: float) -> tuple[Any, Array]:
+def _depth_fields(case: Case, found: tuple[Axis, Axis], tolerance: float) -> tuple[Iterator[Array], Array]:
     """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth, b) coefficients."""
     grids = [grid_um(axis) for axis in found]
     counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
     e, x = (legendre.mapped(n, g[0], g[-1]) for n, g in zip(counts, grids, strict=True))
     depths = depth_basis(case, (e, x), tolerance)
     to = [legendre.interpolation(n, g / g[-1]) for n, g in zip(counts, grids, strict=True)]
-    return [to[0] @ one @ to[1].T for one in depths.basis], depths.coefficients
+    return (to[0] @ one @ to[1].T for one in depths.basis), depths.coefficients
 
 
 def _coarse(case: Case, i: int, grid: Array) -> int:
@@ -189,11 +190,13 @@ def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
     parts = []
     out = None if gathered.requires_grad else gathered.new_empty((len(plan.fields), my, mx))
     for start in range(0, len(plan.fields), step):
-        some = plan.fields[start : start + step] * gathered
-        seen = torch.fft.fft(some, n=x.first)[..., : x.size]
-        seen = torch.fft.fft(seen, n=y.first, dim=-2)[..., : y.size, :] * plan.chirp
-        wide = torch.fft.ifft2(_padded(torch.fft.fft2(seen) * plan.transfer, (y.fine, x.fine)), norm="forward")
-        seen = wide[..., : my * y.every : y.every, : mx * x.every : x.every]
+        light = torch.fft.fft(plan.fields[start : start + step] * gathered, n=x.first)[..., : x.size]
+        light = torch.fft.fft(light, n=y.first, dim=-2)[..., : y.size, :]
+        light *= plan.chirp
+        light = torch.fft.fft2(light)
+        light *= plan.transfer
+        light = torch.fft.ifft2(_padded(light, (y.fine, x.fine)), norm="forward")
+        seen = light[..., : my * y.every : y.every, : mx * x.every : x.every]
         if out is None:
             parts.append(seen)
         else:
