@@ -69,7 +69,8 @@ def reach_um(process: Process) -> float:
 def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
     """Pairs of parts that are nearer than the least gap, or than one's backscatter lets the other's doses hold.
 
-    Rectilinear shapes are taken as they are, a lattice of pillars and any other shape as the box around it.
+    Rectilinear shapes are taken as they are, lattices as boxes of some of their pillars (squares of a 64th of the
+    lattice), any other shape as boxes around slices of it (5 um high, or a 64th).
 
     Raises:
         ProcessError: more than 4000 parts on the die.

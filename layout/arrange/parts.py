@@ -1,6 +1,7 @@
 """What is placed: the content of a lens's mask or of a file made elsewhere, its doses, and boxes around its shapes."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,8 @@ from metalens.ground.errors import MaskFileError
 UNIT_NM = 1.0
 PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
 _WHOLE = 1e-6
+_TILES = 64  # squares of a lattice, each way; slices of a polygon at most
+_SLICE = 5000  # units
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,8 +27,9 @@ class Part:
     """A cell with all below it, in nanometres.
 
     name: of the part. top: its cell. cells: by name, as they will be written. doses: relative dose of each layer that
-    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; a
-    lattice of pillars is one box. extent: (4,) around everything, outline included. corrected: whether its doses make
+    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a
+    lattice, of some thousand squares of its pillars. extent: (4,) around everything, outline included. corrected:
+    whether its doses make
     up for the scattered electrons of its own shapes, and of no others. texts: that are left out, as they draw nothing.
     sites: of cells, beside what their content places.
     """
@@ -57,7 +61,7 @@ def of_plan(
     """
     new = {cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells}
     cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
-    boxes = {PILLARS: [_lattice_box(plan, n) for n in range(len(plan.lattices))], APERTURE: []}
+    boxes = {PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)], APERTURE: []}
     every = list(boxes[PILLARS])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
@@ -195,19 +199,40 @@ def compact(cell: CellContent) -> tuple[CellContent, tuple[Copies, ...]]:
     return dataclasses.replace(cell, placed=left), made
 
 
-def _lattice_box(plan: MaskPlan, number: int) -> Array:
-    lattice = plan.lattices[number]
+def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
+    """Boxes around the pillars of squares of sites, at most 64 each way: single pillars where there are few."""
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
-    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
-    return np.array([lattice.x0 - reach, lattice.y0 - bottom - reach, lattice.x0 + right + reach, lattice.y0 + reach])
+    high, wide = -(-lattice.rows // _TILES), -(-lattice.columns // _TILES)
+    found = []
+    for first, block in lattice.blocks(high):
+        for left in range(0, lattice.columns, wide):
+            held = block[:, left : left + wide] != 0
+            if held.any():
+                rows, columns = np.flatnonzero(held.any(1)) + first, np.flatnonzero(held.any(0)) + left
+                x = lattice.x0 + columns[[0, -1]] * lattice.pitch
+                y = lattice.y0 - rows[[-1, 0]] * lattice.down
+                found.append(np.array([x[0] - reach, y[0] - reach, x[1] + reach, y[1] + reach]))
+    return found
 
 
 def _pieces(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon; any other one as the box around it."""
+    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of slices 5 um high or more."""
     step = np.roll(shape, -1, axis=0) - shape
-    if (step != 0).all(1).any():
-        return np.array([[*shape.min(0), *shape.max(0)]], np.int64)
-    return rectilinear.rectangles(shape)
+    if not (step != 0).all(1).any():
+        return rectilinear.rectangles(shape)
+    low, high = int(shape[:, 1].min()), int(shape[:, 1].max())
+    ends = np.linspace(low, high, min(_TILES, max(1, (high - low) // _SLICE)) + 1)
+    start = shape.astype(float)
+    y0, y1 = start[:, 1], start[:, 1] + step[:, 1]
+    steep = np.where(step[:, 1] == 0, 1, step[:, 1])
+    made = []
+    for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
+        along = [np.clip((y - y0) / steep, 0, 1) for y in (bottom, top)]
+        along = [np.where(step[:, 1] == 0, whole, t) for whole, t in zip((0.0, 1.0), along, strict=True)]
+        x = np.concatenate([(start[:, 0] + t * step[:, 0])[inside] for t in along])
+        made.append([math.floor(x.min()), math.floor(bottom), math.ceil(x.max()), math.ceil(top)])
+    return np.array(made, np.int64)
 
 
 def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, Array]:

@@ -1,6 +1,7 @@
 """Parts put together: doses that share no datatype, names that differ, units, room between parts."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,3 +117,18 @@ def test_impossible_places_are_refused():
     many = joined.Placing(part("A", {(1, 0): 1.0}), (At(columns=4001, step_um=(9.0, 9.0)),))
     with pytest.raises(ProcessError, match="4001 copies of A on a die"):
         apart.check([many], PLAIN)
+
+
+def test_a_disc_is_sliced_so_that_its_corners_stay_free():
+    turn = np.linspace(0, 2 * np.pi, 401)[:-1]
+    disc = np.rint(100_000 * np.column_stack([np.cos(turn), np.sin(turn)])).astype(np.int64)
+    shapes = {"D": CellContent("D", {(2, 0): [disc]})}
+    made = parts.of_file(
+        "D", Path("d.gds"), MaskContent("GDSII", 1.0, shapes), PLAIN, cell="", relative_dose=1.0, keep_top=False
+    ).boxes[parts.APERTURE]
+    assert len(made) == 40  # slices of 5 um
+    held = (made[:, 0] <= disc[:, None, 0]) & (disc[:, None, 0] <= made[:, 2])
+    held &= (made[:, 1] <= disc[:, None, 1]) & (disc[:, None, 1] <= made[:, 3])
+    assert held.any(1).all()  # nothing of it sticks out
+    corner = np.hypot(np.abs(made[:, [0, 2]]).max(1), np.abs(made[:, [1, 3]]).min(1))
+    assert corner.max() <= 100_002  # each slice is no wider than the disc at its edge nearer to the middle

@@ -158,6 +158,13 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder,
     two = '[[lens]]\nfile = "a.h5"\nname = "A"\nfurnished = false\nat = [{x_um = 0}, {x_um = 5.5}]\n'
     assert run(folder, two, tmp_path / "m", "--oasis") == 1
     assert "A at (0, 0) um to A at (5.5, 0) um, pillars: 0.000 um apart" in capsys.readouterr().out
+    corner = 'name = "B"\nfurnished = false\nat = [{x_um = 4.58, y_um = 4.58}, {x_um = 4.6, y_um = -4.9}]\n'
+    beside = two.replace("at = [{x_um = 0}, {x_um = 5.5}]", "at = [{x_um = 0}]")
+    assert run(folder, f'{beside}[[lens]]\nfile = "b.h5"\n{corner}', tmp_path / "m", "--oasis") == 1
+    told = capsys.readouterr().out
+    # corner to corner of two squares of pillars: only the one of the upper right is nearer than 70 nm
+    assert "A at (0, 0) um to B at (4.58, 4.58) um, pillars: 0.000 um apart" in told
+    assert "B at (4.6, -4.9) um, pillars" not in told
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
     assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
     assert "FAILS: PADS: design rules broken: 1 feature" in capsys.readouterr().out
