@@ -74,7 +74,7 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
 
 
 def _valley(task: Task, mode: Solution) -> Valley:
-    return Valley(task.problem(), task.data, mode.value, task.prior)
+    return Valley(task.problem(), task.data, mode.value, task.prior, known=(mode.image, mode.slopes))
 
 
 def _profiles(task: Task, valley: Valley, mode: Solution) -> tuple[dict[str, Profile], Array | None]:
@@ -271,17 +271,15 @@ def left_out(task: Task, mode: Solution) -> float:
     for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         seen, hidden = np.sort(seen), np.sort(hidden)
         images = residual.problem(task.model.only(seen), task.names, task.start)
-        valley = Valley(images, task.data.planes(seen), mode.value, task.prior)
+        known = mode.image[seen], mode.slopes[:, seen]
+        valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
         value, _ = valley.descend(mode.value, rounds=6)
         rest = task.data.planes(hidden)
-        image, slopes = residual.problem(task.model.only(hidden), task.names, task.start)(value, True)
+        image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
         keep = rest.usable & ~rest.saturated
-        known = np.einsum("iN,ij,jN->N", _flat(slopes, keep), valley.covariance, _flat(slopes, keep), optimize=True)
-        variance = rest.variance(image)[keep] + known
+        slopes = mode.slopes[:, hidden][:, keep]
+        known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
+        variance = rest.variance(image)[keep] + known_e2
         total += float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum())
         count += int(keep.sum())
     return total / max(count, 1)
-
-
-def _flat(slopes: Array | None, keep: Array) -> Array:
-    return np.asarray(slopes)[:, keep]

@@ -82,6 +82,7 @@ class Settings:
         steps that look final, and those that fail, are checked with an exact one.
     near: sigma that an exact Jacobian still holds for: shorter steps go on with it.
     finish: the Jacobian at the end is exact, or was so within ``near``.
+    miss: share of what a step changes by which images may miss their prediction before the Jacobian is made anew.
     bounded: steps that a bound or ``ball`` stops are the best ones inside (NLopt), not clipped.
     """
 
@@ -90,6 +91,7 @@ class Settings:
     huber: float = 6.0
     secant: bool = False
     near: float = 0.3
+    miss: float = math.inf
     finish: bool = True
     bounded: bool = False
     ball: Ball | None = None
@@ -105,6 +107,7 @@ class Solution:
     chi2_per_dof: of the pixels that count. merit: robust chi-square with priors, to compare starts.
     converged, reason: why it stopped.
     beyond: (p,) sigma from each value to where the parabola has its least: 0 but for bounds that hold it back.
+    slopes: (p, n, y, x) Jacobian that the fit ended with, exact or brought up to date; one close by may begin with it.
     """
 
     value: Array
@@ -118,12 +121,19 @@ class Solution:
     reason: str
     iterations: int
     beyond: Array
+    slopes: Array
 
 
 def fit(
-    model: Model, data: Data, start: Array, *, prior: Prior | None = None, settings: Settings | None = None
+    model: Model,
+    data: Data,
+    start: Array,
+    *,
+    prior: Prior | None = None,
+    settings: Settings | None = None,
+    slopes: Array | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt from one start.
+    """Levenberg-Marquardt from one start, with the Jacobian there or with ``slopes`` (p, n, y, x) from places close by.
 
     Stops when a full step moves every combination of parameters by less than ``step_tolerance`` sigma.
 
@@ -136,7 +146,7 @@ def fit(
     if not data.usable.any():
         raise FitError("no usable pixel in the fit window; check masks and crop")
     damping, converged, reason = 1e-3, False, f"stopped after {settings.iterations} iterations"
-    state = _linearise(model, data, x, prior, settings)
+    state = _linearise(model, data, x, prior, settings, slopes)
     iteration = 0
     while iteration < settings.iterations:
         iteration += 1
@@ -148,7 +158,9 @@ def fit(
             x = state.x + step if accepted else state.x
             state, damping = _linearise(model, data, x, prior, settings), 1e-3
             continue
-        if accepted and settings.secant:
+        if accepted and not done and _missed(state, step, image) > settings.miss:
+            state = _linearise(model, data, state.x + step, prior, settings)
+        elif accepted and settings.secant:
             state = _secant(data, state, step, image, prior, settings, moved=moved)
         elif accepted and state.travel + moved <= settings.near:
             state = _state(data, (state.x + step, image, state.jacobian), prior, settings, travel=state.travel + moved)
@@ -179,11 +191,22 @@ class _State:
     noise: Array
 
 
-def _linearise(model: Model, data: Data, x: Array, prior: Prior, settings: Settings) -> _State:
-    image, jacobian = model(x, True)
+def _linearise(
+    model: Model, data: Data, x: Array, prior: Prior, settings: Settings, slopes: Array | None = None
+) -> _State:
+    image, jacobian = model(x, slopes is None)
+    jacobian = jacobian if slopes is None else slopes
     if jacobian is None or not np.isfinite(image).all():
         raise FitError("the model is not finite at these parameters; bound them or correct the start")
-    return _state(data, (x, image, jacobian), prior, settings)
+    return _state(data, (x, image, jacobian), prior, settings, travel=0.0 if slopes is None else math.inf)
+
+
+def _missed(state: _State, step: Array, image: Array) -> float:
+    """Share of the change by a step, each in sigma of the pixels, that the Jacobian did not foresee."""
+    root = np.sqrt(state.weight) / state.noise
+    change = (image - state.image) * root
+    left = change - np.tensordot(step, state.jacobian, 1) * root
+    return float(np.linalg.norm(left) / max(float(np.linalg.norm(change)), 1e-300))
 
 
 def _secant(
@@ -288,6 +311,7 @@ def _solution(data: Data, state: _State, prior: Prior, settings: Settings, ended
         merit,
         *ended,
         beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
+        slopes=state.jacobian,
     )
 
 

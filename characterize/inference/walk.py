@@ -14,7 +14,7 @@ import numpy as np
 from scipy import interpolate
 
 from characterize.inference import leastsquares
-from characterize.inference.leastsquares import Data, Model, Settings, Solution
+from characterize.inference.leastsquares import Data, Model, Prior, Settings, Solution
 from characterize.inference.search import Task, distinct, few_frames, followed
 from metalens.ground.arrays import Array
 
@@ -23,8 +23,8 @@ REACH = 2.5  # prior sigma to either side of what is thought
 SHOWN = 14.0  # rise of -2 ln L up to which a walk is a profile, a probability of 1e-3; beyond it, it looks for valleys
 _WIDEST = 0.35  # of the prior sigma: a step at most
 _VALLEYS, _AGAIN = 3, 3
-_NEAR = Settings(iterations=5, step_tolerance=0.3, secant=True, near=1.0, finish=False)
-_FAR = Settings(iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False)
+_NEAR = Settings(iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False)
+_FAR = Settings(iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False)
 _FINE, _ON_IT = 1201, 3.0
 _HUBER = Settings().huber
 Part = tuple[Model, Data]
@@ -142,10 +142,9 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
     for _ in range(_AGAIN):
         best, few = kept[0], few_frames(task.model.setting)
         part, step = (task.problem(few), task.data.planes(few)), _WIDEST * _wide(task, best, i)
-        sides = [_side(task, part, best, i, end, step=step, settings=_FAR) for end in _ends(task, best, i)]
-        seen = Walk.of(
-            task, [*sides[0], *sides[1], dataclasses.replace(best, merit=_misfit(task, part, best.value))], i
-        )
+        here = dataclasses.replace(best, merit=_misfit(task, part, best.value), slopes=best.slopes[:, few])
+        sides = [_side(task, part, here, i, end, step=step, settings=_FAR) for end in _ends(task, best, i)]
+        seen = Walk.of(task, [*sides[0], *sides[1], here], i)
         begins = [seen.value[k] for k in seen.minima() if seen.value[k, i] != best.value[i]]
         kept = distinct([*kept, *followed(task, best, begins[:_VALLEYS])])
         if kept[0].merit > best.merit - 1:
@@ -198,12 +197,19 @@ def _side(
     settings: Settings,
     most: float = math.inf,
 ) -> list[Solution]:
-    """Stops from the mode to one end, or to the first that is higher than ``most``."""
+    """Stops from the mode to one end, or to the first that is higher than ``most``.
+
+    Two steps at a time with a Jacobian, then the stop that was left out, with the mean of both of its neighbours'.
+    """
     count = int(np.ceil(abs(end - mode.value[i]) / step - 1e-3))
+    goals = np.linspace(mode.value[i], end, count + 1)[1:].tolist()
     here, out = mode, []
-    for goal in np.linspace(mode.value[i], end, count + 1)[1:]:
-        here = _stop(task, part, here, i, float(goal), settings)
-        out.append(here)
+    for k in range(0, count, 2):
+        there = _stop(task, part, here, i, goals[min(k + 1, count - 1)], settings)
+        if k + 1 < count:
+            out.append(_amid(task, part, (here, there), i, goals[k], settings))
+        out.append(there)
+        here = there
         if here.merit > most:
             break
     return out
@@ -211,14 +217,33 @@ def _side(
 
 def _stop(task: Task, part: Part, here: Solution, i: int, goal: float, settings: Settings) -> Solution:
     """The others fitted with one parameter at ``goal``, from where they are or where the parabola sends them."""
-    low, high = task.prior.low.copy(), task.prior.high.copy()
-    low[i] = high[i] = goal
-    stay = np.clip(here.value, low, high)
+    known = _holding(task.prior, i, goal)
     along = here.covariance[:, i] / here.covariance[i, i]
-    led = np.clip(here.value + along * (goal - here.value[i]), low, high)
-    begin = min((stay, led), key=lambda x: _misfit(task, part, x))
-    known = dataclasses.replace(task.prior, low=low, high=high)
-    found = leastsquares.fit(*part, begin, prior=known, settings=settings)
+    begins = here.value, here.value + along * (goal - here.value[i])
+    begin = min((np.clip(x, known.low, known.high) for x in begins), key=lambda x: _misfit(task, part, x))
+    return _fitted(task, part, begin, known, settings)
+
+
+def _amid(task: Task, part: Part, ends: tuple[Solution, Solution], i: int, goal: float, settings: Settings) -> Solution:
+    """As :func:`_stop`, between two stops, from the straight line between them and with slopes in proportion."""
+    share = (goal - ends[0].value[i]) / (ends[1].value[i] - ends[0].value[i])
+    known = _holding(task.prior, i, goal)
+    begin = ends[0].value + share * (ends[1].value - ends[0].value)
+    slopes = ends[0].slopes + share * (ends[1].slopes - ends[0].slopes)
+    return _fitted(task, part, np.clip(begin, known.low, known.high), known, settings, slopes)
+
+
+def _holding(prior: Prior, i: int, goal: float) -> Prior:
+    """A prior that leaves one parameter at ``goal``."""
+    low, high = prior.low.copy(), prior.high.copy()
+    low[i] = high[i] = goal
+    return dataclasses.replace(prior, low=low, high=high)
+
+
+def _fitted(
+    task: Task, part: Part, begin: Array, known: Prior, settings: Settings, slopes: Array | None = None
+) -> Solution:
+    found = leastsquares.fit(*part, begin, prior=known, settings=settings, slopes=slopes)
     return dataclasses.replace(found, merit=_measured(task, part[1], found.value, found.image))
 
 

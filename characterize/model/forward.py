@@ -43,6 +43,7 @@ _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
+_STAGE = ("stage_zero_um", "stage_scale")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -189,6 +190,9 @@ class ForwardModel:
     def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
         names, s = list(wanted or ()), self.setting
+        scaled = "stage_scale" in names
+        if scaled:  # of one frame as its stage zero's, by how far it is from the middle
+            names = [*(name for name in names if name not in _STAGE), "stage_zero_um"]
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
@@ -202,6 +206,8 @@ class ForwardModel:
             up = x.copy()
             up[PLACE["bandwidth_nm"]] += 0.02
             slopes["bandwidth_nm"] = (self._light(up, None)[0] - light) / 0.02
+        if scaled:
+            slopes["stage_scale"] = slopes["stage_zero_um"] * (s.depth_um - self.stage_centre_um)[:, None, None]
         return light, slopes
 
     def _group_light(
@@ -218,12 +224,13 @@ class ForwardModel:
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
         out: dict[str, Array] = {}
-        growth, conjugate, power = self._growth(x, group), field.conj(), np.vdot(lit, lit)
+        growth, conjugate, power = self._growth(x, group), field.conj(), np.vdot(lit, lit).real
         for name, changed in self._changes(x, group, names, (*lens[1:], phasor, lit)):
             # the part of a change that is the light itself needs no sum, nor loses digits
             same = np.vdot(lit, changed) / power
-            rate = operators.field(changed - same * lit, _SLOPE_TOLERANCE)
-            rate = rate + self._by_window(name, operators, lit)
+            changed = changed - same * lit
+            rate = operators.field(changed, _SLOPE_TOLERANCE)
+            rate = rate + self._by_window(name, operators, lit, float(np.linalg.norm(changed)) / math.sqrt(power))
             out[name] = self.grid.sample(2 * (conjugate * rate).real, transfer) + 2 * same.real * light
             if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
                 disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
@@ -251,12 +258,12 @@ class ForwardModel:
                 changed = (1j * self._phase_slope(x, group, name)).astype(lit.dtype) * lit
                 yield name, changed + by_wave * phasor if name == "wavelength_nm" else changed
 
-    def _by_window(self, name: str, operators: Operators, lit: Array) -> Array | float:
-        """Derivative of the field behind distance and wavelength's own move of the window."""
+    def _by_window(self, name: str, operators: Operators, lit: Array, beside: float) -> Array | float:
+        """Derivative of the field behind distance and wavelength's own move of the window; ``beside`` by the lens."""
         if name not in _WINDOW:
             return 0.0
         rate, um = _WINDOW[name]
-        return um * operators.rates(lit, rate, _SLOPE_TOLERANCE)
+        return um * operators.rates(lit, rate, _SLOPE_TOLERANCE, beside=beside / um)
 
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
@@ -302,7 +309,7 @@ class ForwardModel:
 
     def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
         """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""
-        step = {"stage_scale": 1e-5, "stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
+        step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
         up, down = x.copy(), x.copy()
         up[PLACE[name]] += step
         down[PLACE[name]] -= step
@@ -324,7 +331,6 @@ class ForwardModel:
         return {
             "distance_um": np.full(len(depth), 1 / distance),
             "stage_zero_um": -1 / depth,
-            "stage_scale": (self.stage_centre_um - self.setting.depth_um[group.index]) / depth,
         }
 
     def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[Array, dict[str, Array]]:

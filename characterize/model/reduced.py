@@ -211,7 +211,8 @@ class Reduced:
         shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)
         window = np.einsum("Yj,jir,Xi->YrX", iy, shown, ix, optimize=True) * kernel.window(x, y[:, None])[:, None]
         arrays = [one.astype(self.kind) for one in (across[:some] @ to_p.T, np.tensordot(to_p, amounts, 1), window)]
-        return Terms(arrays[0], arrays[1], arrays[2], remainder, mixed[:some])
+        whole = float(np.linalg.norm(table)) / math.sqrt(table.size)
+        return Terms(arrays[0], arrays[1], arrays[2], remainder, mixed[:some], whole)
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
         """(x, y) on the lens of direction cosines seen from the window's centre."""

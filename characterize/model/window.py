@@ -6,6 +6,7 @@ window's samples by the weights of least error over the band: as in any prolate 
 their number (Slepian and Pollak 1961; Knab 1979).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from metalens.ground.arrays import Array
 MIXED = 0.1  # of the tolerance, for functions of p in the terms
 ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
+_COARSEST = 0.2  # tolerance of a small part of a derivative
 _TAPS = range(6, 42, 2)
 STEP = 1e-3  # of distance and wavelength, for derivatives: paths bend over as much as they are long
 
@@ -40,6 +42,7 @@ class Terms:
     every term on coarse samples (Y, r, X).
 
     remainder, mixed: (r,), (b,) relative size of what is left out before each term, each function of p.
+    size: root mean square of the whole where the lens is seen.
     """
 
     across: Array
@@ -47,6 +50,7 @@ class Terms:
     window: Array
     remainder: Array
     mixed: Array
+    size: float
 
     def some(self, tolerance: float) -> tuple[Array, Array, Array]:
         """Functions, amounts and terms that leave a relative ``tolerance`` out."""
@@ -69,22 +73,28 @@ class Operators:
 
     def field(self, light: Array, tolerance: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or with some left out."""
-        return self._sum(light, ((self.y.to, self.x.to, self.rest),), tolerance)
+        return self._sum(light, ((self.y.to, self.x.to, self.rest, tolerance),))
 
-    def rates(self, light: Array, name: str, tolerance: float = 0.0) -> Array:
+    def rates(self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or ``distance`` per um.
 
-        Less what turns places of the window by themselves, which no intensity sees.
+        Less what turns places of the window by themselves, which no intensity sees. ``tolerance`` is shared among the
+        parts by their size, and by that of what is added to them: ``beside`` times the field.
         """
         y, x = (getattr(way, f"by_{name}") for way in (self.y, self.x))
-        ways = (y, self.x.to, self.rest), (self.y.to, x, self.rest), (self.y.to, self.x.to, self.moved(name))
-        return self._sum(light, ways, tolerance)
+        moved = self.moved(name)
+        pairs = (y, self.y.to), (x, self.x.to)
+        sizes = [*(float(np.linalg.norm(by) / np.linalg.norm(to)) for by, to in pairs), moved.size / self.rest.size]
+        whole = tolerance * math.hypot(*sizes, beside) / math.sqrt(len(sizes))
+        some = [min(whole / max(size, 1e-300), _COARSEST) for size in sizes]
+        ways = (y, self.x.to, self.rest), (self.y.to, x, self.rest), (self.y.to, self.x.to, moved)
+        return self._sum(light, tuple((*way, one) for way, one in zip(ways, some, strict=True)))
 
-    def _sum(self, light: Array, ways: tuple[tuple[Array, Array, Terms], ...], tolerance: float) -> Array:
+    def _sum(self, light: Array, ways: tuple[tuple[Array, Array, Terms, float], ...]) -> Array:
         """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X), for several (Fy, Fx, terms)."""
         ny, nx, kind = len(self.y.to), len(self.x.to), self.y.to.dtype
         products = []
-        for y, x, terms in ways:
+        for y, x, terms, tolerance in ways:
             across, amounts, window = terms.some(tolerance)
             products.append((y, (across[:, None] * x).reshape(len(across) * nx, -1).T, amounts, window))
         light = light.astype(kind, copy=False)

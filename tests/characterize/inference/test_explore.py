@@ -119,7 +119,9 @@ def test_frames_left_out_are_judged_with_what_the_others_know():
     everywhere = np.ones(bright.shape, bool)
     data = Data(frames, everywhere, ~everywhere, np.full(bright.shape, sigma**2), np.full(bright.shape, 1e15))
     model = Straight(bright, pictures)
-    got = explore.left_out(task(model, data), SimpleNamespace(value=np.array([0.4, -0.9, 1.1])))
+    value = np.array([0.4, -0.9, 1.1])
+    image = bright + np.tensordot(value, pictures, 1)
+    got = explore.left_out(task(model, data), SimpleNamespace(value=value, image=image, slopes=pictures))
     order, total = np.argsort(DEPTH), 0.0
     for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         a, b = (pictures[:, part].reshape(3, -1).T for part in (seen, hidden))

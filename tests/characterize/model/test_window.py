@@ -65,7 +65,7 @@ def test_rates_are_the_differences_of_both_factors():
         for by, nodes, band in ((KERNEL.by_y, q, bands[0]), (KERNEL.by_x, p, bands[1]))
     )
     one = np.ones((len(y[0]), 1, len(x[0])), complex)
-    rest = Terms(np.ones((1, 23)), np.ones((19, 1, 1)), one, np.ones(1), np.ones(1))
+    rest = Terms(np.ones((1, 23)), np.ones((19, 1, 1)), one, np.ones(1), np.ones(1), 1.0)
     still = dataclasses.replace(rest, window=0 * one)
     operators = Operators(y[1], x[1], rest, lambda name: still)
 
