@@ -1,4 +1,4 @@
-"""Where a fit's time goes: seconds of each of its phases, found by wrapping the functions that they are."""
+"""Where a fit's time goes: seconds, images and Jacobians of each of its phases, found by wrapping the functions."""
 
 import contextlib
 import time
@@ -24,6 +24,7 @@ PHASES = (  # what it is, the module that calls it, the name that it calls it by
     ("frames left out", _HOME + "explore", "left_out"),
     ("predicted error", _HOME + "explore", "predicted_error"),
 )
+MODEL = "characterize.model.forward", "ForwardModel"
 
 
 @contextlib.contextmanager
@@ -51,3 +52,33 @@ def timed() -> Iterator[dict[str, tuple[float, float]]]:
             module = import_module(home)
             stack.enter_context(mock.patch.object(module, name, wrapped(phase, getattr(module, name))))
         yield spent
+
+
+@contextlib.contextmanager
+def counted() -> Iterator[dict[str, list[int]]]:
+    """{phase: [images, Jacobians]} that the forward model of the fits inside computed; "" is outside all phases."""
+    made: dict[str, list[int]] = {}
+    where = [""]
+    home = import_module(MODEL[0])
+    images = getattr(home, MODEL[1]).images
+
+    def wrapped(phase: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*given: Any, **named: Any) -> Any:
+            where.append(phase)
+            try:
+                return work(*given, **named)
+            finally:
+                where.pop()
+
+        return run
+
+    def one(self: Any, x: Any, wanted: Any = None) -> Any:
+        made.setdefault(where[-1], [0, 0])[int(wanted is not None)] += 1
+        return images(self, x, wanted)
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch.object(getattr(home, MODEL[1]), "images", one))
+        for phase, module, name in PHASES:
+            found = import_module(module)
+            stack.enter_context(mock.patch.object(found, name, wrapped(phase, getattr(found, name))))
+        yield made

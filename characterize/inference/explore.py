@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from metalens.ground.arrays import Array
 
 REACH = posterior.REACH
 _RESTARTS = 2
+_LOST, _LOWER = 3.0, 0.5  # sigma of bend from which on a parameter is walked; misfit below the mode that is followed
 _OF_THE_BENCH = ("log_gain", "background")
 _POINTS = 61  # of the curve of a walk
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
@@ -55,37 +57,66 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     modes = list(ends)
     for name in walk.WALKED:
         modes = walk.valleys(task, modes, name) if name in task.names else modes
-    for _ in range(_RESTARTS):
+    for left in reversed(range(_RESTARTS + 1)):
         valleys = [_valley(task, mode) for mode in modes]
-        profiles, better = _profiles(task, valleys[0], modes[0])
+        walks = _walks(task, modes, valleys[0])
+        profiles, better = _profiles(task, valleys[0], modes[0], walks, followed=bool(left))
         if better is None:
             break
-        again = distinct([*modes, refine(task, better)])
-        if again[0].merit > modes[0].merit - 0.05:
-            break
-        modes = again
-    else:
-        valleys = [_valley(task, mode) for mode in modes]
-        profiles, _ = _profiles(task, valleys[0], modes[0])
-    bent = [name for name in walk.WALKED if name in profiles and (len(modes) > 1 or not profiles[name].parabolic)]
-    widened = max(1.0, modes[0].chi2_per_dof)
-    walks = {name: walk.walk(task, modes, name, widened=widened) for name in bent}
+        modes = distinct([*modes, better])
+    bent = [name for name in walk.WALKED if name in profiles and name not in walks and not profiles[name].parabolic]
+    walks |= {name: _walk(task, modes, name) for name in bent}
     return _joined(task, modes, valleys, profiles, walks)
+
+
+def _walks(task: Task, modes: list[Solution], valley: Valley) -> dict[str, Walk]:
+    """Of what has several valleys, or one so bent that a profile would be lost in it."""
+    names = [name for name in walk.WALKED if name in task.names]
+    bent = [name for name in names if len(modes) > 1 or valley.bend(task.names.index(name)) > _LOST]
+    return {name: _walk(task, modes, name) for name in bent}
+
+
+def _walk(task: Task, modes: list[Solution], name: str) -> Walk:
+    return walk.walk(task, modes, name, widened=max(1.0, modes[0].chi2_per_dof))
 
 
 def _valley(task: Task, mode: Solution) -> Valley:
     return Valley(task.problem(), task.data, mode.value, task.prior, known=(mode.image, mode.slopes))
 
 
-def _profiles(task: Task, valley: Valley, mode: Solution) -> tuple[dict[str, Profile], Array | None]:
-    level = posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
-    found = {}
+def _profiles(
+    task: Task, valley: Valley, mode: Solution, walks: Mapping[str, Walk], *, followed: bool
+) -> tuple[dict[str, Profile], Solution | None]:
+    """Of all named parameters; second: a better mode that one led to, where that is ``followed``.
+
+    By the walk where there is one and what is left is straight with the walked parameter held, else by descents.
+    """
+    level, found = posterior.REACH**2 * max(1.0, mode.chi2_per_dof), {}
+    places = [one.value[np.argmin(one.rise)] for one in walks.values() if one.rise.min() < -_LOWER]
     for i, name in enumerate(task.names):
-        if not name.startswith(_OF_THE_BENCH):
+        if name.startswith(_OF_THE_BENCH):
+            continue
+        by = next((w for w in walks.values() if i == w.index or valley.bend(i, w.index) < posterior.BENT), None)
+        if by is not None:
+            found[name] = _along(by, i, mode, float(valley.sigma[i]), level)
+        else:
             found[name], better = posterior.profile(valley, i, level=level)
-            if better is not None:
-                return found, better
+            places += [] if better is None else [better]
+        if places and followed:
+            other = refine(task, places[0])
+            if other.merit < mode.merit - 0.05:
+                return found, other
+            places, followed = [], False
     return found, None
+
+
+def _along(one: Walk, i: int, mode: Solution, sigma: float, level: float) -> Profile:
+    """Of any parameter by a walk along another, those left over straight."""
+    low, high = (float(end[i]) for end in one.interval(level))
+    value, rise = one.profile() if i == one.index else one.profile_of(i, np.linspace(-1, 1, _POINTS))
+    ratio = np.array([high - mode.value[i], mode.value[i] - low]) / (math.sqrt(level) * sigma)
+    plain = bool(((ratio > posterior.PARABOLIC[0]) & (ratio < posterior.PARABOLIC[1])).all())
+    return Profile(low, high, value, rise, plain)
 
 
 def _joined(

@@ -140,14 +140,12 @@ def fit(
     Raises:
         FitError: the model is not finite at the start, or no pixel is usable.
     """
-    settings = settings or Settings()
-    prior = prior or Prior.none(start)
+    settings, prior = settings or Settings(), prior or Prior.none(start)
     x = np.clip(np.asarray(start, float), prior.low, prior.high)
     if not data.usable.any():
         raise FitError("no usable pixel in the fit window; check masks and crop")
     damping, converged, reason = 1e-3, False, f"stopped after {settings.iterations} iterations"
-    state = _linearise(model, data, x, prior, settings, slopes)
-    iteration = 0
+    state, iteration = _linearise(model, data, x, prior, settings, slopes), 0
     while iteration < settings.iterations:
         iteration += 1
         step, image, damping, accepted = _step(model, data, state, prior, settings, damping)

@@ -96,9 +96,18 @@ class Valley:
         """Within the bounds."""
         return np.asarray(np.clip(x, self.prior.low, self.prior.high))
 
-    def bend(self, i: int) -> float:
-        """Sigma by which images 2 sigma to either side miss the parabola's prediction; inf with a bound between."""
-        places = [self.mode + sign * 2 * self.along(i) for sign in (1, -1)]
+    def bend(self, i: int, held: int | None = None) -> float:
+        """Sigma by which images 2 sigma to either side miss the parabola's prediction; inf with a bound between.
+
+        held: a parameter that stays where it is, the sigma being what is left then.
+        """
+        way = self.along(i)
+        if held is not None:
+            left = self.covariance[:, i] - self.covariance[:, held] * (
+                self.covariance[i, held] / self.covariance[held, held]
+            )
+            way = left / math.sqrt(max(float(left[i]), 1e-300))
+        places = [self.mode + sign * 2 * way for sign in (1, -1)]
         if any((self.inside(x) != x).any() for x in places):
             return math.inf
         ends = [self.residual(x) for x in places]

@@ -20,7 +20,6 @@ _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ALONG_NM = 9.0  # bias by which starts are moved along the valley
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _ROUGH, _AGAIN = 40.0, 2, 5e-3, 3
-_MISS = 0.7  # of a step's change: brought up to date, a Jacobian gains along the step; beyond this, not elsewhere
 _WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 
 
@@ -81,7 +80,7 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
 
     At most ``_MOST`` ends, none that leads to the best itself or to another.
     """
-    settings = Settings(iterations=8, step_tolerance=0.5, secant=True, near=math.inf, miss=_MISS, finish=False)
+    settings = Settings(iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False)
     ends: list[Solution] = []
     for begin in begins:
         if len(ends) == _MOST:
@@ -90,7 +89,7 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
             continue
         one = leastsquares.fit(task.problem(), task.data, begin, prior=task.prior, settings=settings)
         if one.merit < best.merit + MODES_WITHIN + _WORTH and all(_apart(one.value, e) > 2.0 for e in [best, *ends]):
-            ends.append(_long(task, one.value, one.slopes))
+            ends.append(_long(task, one.value))
     return ends
 
 
@@ -153,18 +152,16 @@ def _apart(value: Array, end: Solution) -> float:
 def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     place = [PLACE[name] for name in task.names]
     waves = Ball(np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]), WAVES_RAD)
-    short = Settings(
-        iterations=6, step_tolerance=1.0, secant=True, near=math.inf, miss=_MISS, finish=False, bounded=True, ball=waves
-    )
+    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
     part, seen = task.problem(few), task.data.planes(few)
     opened = [with_values(x, _opened(task, x)) for x in begins]
     tries = [leastsquares.fit(part, seen, x[place], prior=task.prior, settings=short) for x in opened]
     return sorted(tries, key=lambda t: t.merit)
 
 
-def _long(task: Task, value: Array, slopes: Array | None = None) -> Solution:
+def _long(task: Task, value: Array) -> Solution:
     settings = Settings(iterations=80, secant=True)
-    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings, slopes=slopes)
+    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings)
 
 
 def _opened(task: Task, x: Array) -> dict[str, float]:

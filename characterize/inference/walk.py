@@ -70,6 +70,17 @@ class Walk:
         keep = rise < self.shown
         return at[keep], rise[keep]
 
+    def profile_of(self, i: int, share: Array) -> tuple[Array, Array]:
+        """(m,) values of another parameter and (m,) rise, the others straight about the walk.
+
+        share: of the way from the lowest place to where it has risen by ``shown``, -1 to 1.
+        """
+        _, rise, value, spread = self._between()
+        size, middle = np.sqrt(np.maximum(spread[:, i, i], 1e-300)), float(value[np.argmin(rise), i])
+        low, high = (float(end[i]) for end in self.interval(self.shown))
+        at = middle + np.where(share < 0, share * (middle - low), share * (high - middle))
+        return at, np.asarray((rise + ((at[:, None] - value[:, i]) / size) ** 2).min(1))
+
     def interval(self, level: float) -> tuple[Array, Array]:
         """(p,) lowest and highest values at which -2 ln L has risen by ``level`` or less."""
         _, rise, value, spread = self._between()

@@ -43,7 +43,6 @@ _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
-_STAGE = ("stage_zero_um", "stage_scale")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -189,10 +188,8 @@ class ForwardModel:
 
     def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
-        names, s = list(wanted or ()), self.setting
-        scaled = "stage_scale" in names
-        if scaled:  # of one frame as its stage zero's, by how far it is from the middle
-            names = [*(name for name in names if name not in _STAGE), "stage_zero_um"]
+        s, wanted = self.setting, list(wanted or ())
+        names = list(dict.fromkeys("stage_zero_um" if name == "stage_scale" else name for name in wanted))
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
@@ -206,7 +203,7 @@ class ForwardModel:
             up = x.copy()
             up[PLACE["bandwidth_nm"]] += 0.02
             slopes["bandwidth_nm"] = (self._light(up, None)[0] - light) / 0.02
-        if scaled:
+        if "stage_scale" in wanted:  # of one frame as its stage zero's, by how far it is from the middle
             slopes["stage_scale"] = slopes["stage_zero_um"] * (s.depth_um - self.stage_centre_um)[:, None, None]
         return light, slopes
 
@@ -328,10 +325,7 @@ class ForwardModel:
         """(frames,) relative growth of the source's image with the parameters that change its magnification."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         distance = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
-        return {
-            "distance_um": np.full(len(depth), 1 / distance),
-            "stage_zero_um": -1 / depth,
-        }
+        return {"distance_um": np.full(len(depth), 1 / distance), "stage_zero_um": -1 / depth}
 
     def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[Array, dict[str, Array]]:
         """(frames or 1, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
