@@ -20,7 +20,7 @@ PHASES = (  # what it is, the module that calls it, the name that it calls it by
     ("walks along valleys", _HOME + "walk", "walk"),
     ("residual phase", _HOME + "residual", "attempt"),
     ("profiles and draws", _HOME + "explore", "explore"),
-    ("causes that are not fitted", _HOME + "missing", "leans"),
+    ("causes that are not fitted", _HOME + "missing", "look"),
     ("frames left out", _HOME + "explore", "left_out"),
     ("predicted error", _HOME + "explore", "predicted_error"),
 )
