@@ -72,7 +72,7 @@ def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Ite
     light = image - background(x, task.model.setting)
     if len(image) > 2:
         yield from _of_frames(light, slopes)
-    stretched = (_on_pixels(task.model, 1.01).images(x)[0] - image)[None]
+    stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
     held = tuple(name for name in LIGHT if name not in task.names)
     if held:
@@ -192,7 +192,7 @@ def _curvature(light: Array) -> Array:
     return np.stack([ndimage.laplace(frame, mode="nearest") for frame in light])
 
 
-def _on_pixels(model: ForwardModel, share: float) -> ForwardModel:
+def on_pixels(model: ForwardModel, share: float) -> ForwardModel:
     """The model with pixels of another pitch."""
     part = copy.copy(model)
     pixel_um = model.setting.pixel_um * share

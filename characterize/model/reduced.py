@@ -59,7 +59,7 @@ class Reduced:
         self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
-        self._operators: dict[tuple[float, float, tuple[int, int]], Operators] = {}
+        self._operators: dict[tuple[float, ...], Operators] = {}
         self._directions(depths_um)
         self.gathered = self._gather(lens, pillars).astype(self.kind)
         self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
@@ -152,7 +152,7 @@ class Reduced:
         edge_um: width of a rim of the window where a tenfold error is allowed, since only its blur is seen.
         The last few are kept: most steps of a search move neither.
         """
-        key = wavelength_um, distance_um, (len(axes_um[0]), len(axes_um[1]))
+        key = wavelength_um, distance_um, *(float(part) for axis in axes_um for part in (len(axis), axis[0]))
         if key not in self._operators:
             if len(self._operators) >= 6:
                 self._operators.pop(next(iter(self._operators)))

@@ -1,5 +1,6 @@
 """Causes that are not fitted: chance is chance, what is there is found, and what cannot be told apart is said."""
 
+import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -206,3 +207,15 @@ def test_a_clean_bench_is_called_clean_and_glass_is_declared():
     assert wall.chi2 < 16
     glass = next(one for one in untold(found) if "plate of glass" in one)
     assert "distance_um" in glass or "stage_zero_um" in glass
+
+
+def test_pixels_of_another_pitch_see_other_places():
+    """Against a model made for that pitch, whose nodes are its own: fields to 5e-4."""
+    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    model, x = ForwardModel(b.lens(), setting, b.RESPONSE), vector(b.VALUES | {"log_gain": 10.0})
+    here = model.images(x)[0]
+    found = causes.on_pixels(model, 1.03).images(x)[0]
+    want = ForwardModel(b.lens(), dataclasses.replace(setting, pixel_um=1.545), b.RESPONSE).images(x)[0]
+    assert np.abs(found - want).max() < 2e-3 * want.max()
+    assert np.abs(found - here).max() > 2e-2 * want.max()
+    assert np.array_equal(model.images(x)[0], here)
