@@ -30,6 +30,7 @@ BRIGHT = 30.0  # times the light of random phases below which float32 loses what
 MOVING = 1000  # by which the setting is tighter where the geometry carries gradients
 FINEST = 1e-12  # setting below which float64 has nothing left to give
 ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
+TRANSFORMS = {torch.float32: 1e-6, torch.float64: 5e-15}  # rounding of three transforms, above all that was found
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
 KEPT = {
     torch.float32: 1.5e-7,
@@ -165,7 +166,8 @@ def _wide(
         light = light if weight == 1 else light * weight
         total = light if total is None else total + light
         power += weight * given
-    return _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
+    result = _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
+    return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
 
 
 def _judged(
