@@ -128,7 +128,7 @@ def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:
     good = [run for run in runs if "inside" in run and not run["problems"]]
     if not good:
         return []
-    seconds = float(np.mean([run.get("seconds", math.nan) for run in good]))
+    seconds = float(np.mean([run["seconds"] for run in good if "seconds" in run] or [math.nan]))
     head = f"{len(runs)} hidden lenses, {case}"
     names = list(good[0]["inside"])
     every = [run["inside"][name] for run in good for name in names]
