@@ -11,7 +11,7 @@ import numpy as np
 from characterize.inference import posterior, residual, walk
 from characterize.inference.leastsquares import Solution
 from characterize.inference.posterior import Profile, Valley
-from characterize.inference.search import Task, distinct, refine
+from characterize.inference.search import Task, distinct, mirrored, refine
 from characterize.inference.walk import Walk
 from characterize.model import ForwardModel
 from metalens.ground.arrays import Array
@@ -57,6 +57,8 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     modes = list(ends)
     for name in walk.WALKED:
         modes = walk.valleys(task, modes, name) if name in task.names else modes
+    if modes[0] is not ends[0]:  # the search has asked for the mirror images of its own best
+        modes = mirrored(task, modes)
     for left in reversed(range(_RESTARTS + 1)):
         valleys = [_valley(task, mode) for mode in modes]
         walks = _walks(task, modes, valleys[0])

@@ -72,7 +72,21 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
     tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
     floor = min(tries[0].merit, first[0].merit)
     promising = [t for t in tries if t.merit < floor + _PROMISING]
-    return _mirrored(task, distinct([best, *followed(task, best, [t.value for t in promising][: 2 * _MOST])]))
+    return mirrored(task, distinct([best, *followed(task, best, [t.value for t in promising][: 2 * _MOST])]))
+
+
+def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
+    """The ends, and where their biases reversed lead: frames near focus look much alike with a gradient of either sign.
+
+    Again from a new best.
+    """
+    for _ in range(_AGAIN):
+        best = ends[0]
+        begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
+        ends = distinct([*ends, *followed(task, best, begins)])
+        if ends[0].merit > best.merit - 1:
+            break
+    return ends
 
 
 def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
@@ -90,20 +104,6 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
         one = leastsquares.fit(task.problem(), task.data, begin, prior=task.prior, settings=settings)
         if one.merit < best.merit + MODES_WITHIN + _WORTH and all(_apart(one.value, e) > 2.0 for e in [best, *ends]):
             ends.append(_long(task, one.value))
-    return ends
-
-
-def _mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
-    """The ends, and where their biases reversed lead: frames near focus look much alike with a gradient of either sign.
-
-    Again from a new best.
-    """
-    for _ in range(_AGAIN):
-        best = ends[0]
-        begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
-        ends = distinct([*ends, *followed(task, best, begins)])
-        if ends[0].merit > best.merit - 1:
-            break
     return ends
 
 
