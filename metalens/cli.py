@@ -144,6 +144,8 @@ def _guarded(words: list[str], *, debug: bool) -> int:
     except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
         return _refuse(f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}")
     finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0)  # an interrupt that was dropped and came otherwise comes no more
         lock.COMMAND.reset(told)
 
 

@@ -63,7 +63,8 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing(tmp_path):
     child.send_signal(signal.SIGHUP)
     child.wait()
     told = told.read_text()
-    assert child.returncode == 130, told
+    # where the interrupt meets Python at certain places it ends itself by SIGINT when all is done: 130 to a shell, too
+    assert child.returncode in (130, -signal.SIGINT), told
     assert "interrupted; the output is as it was before" in told
     assert os.listdir(tmp_path) == ["study.toml"]
 
