@@ -9,6 +9,7 @@ from numpy.polynomial import polynomial
 
 from metalens import modal
 from metalens.cell import Cell
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.made import Answers, Cause, Solved, designed, of_kind
@@ -49,16 +50,21 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     """One rational curve over the diameter for every amount of every cause, sampled finely."""
     diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / _FINE_UM) + 1)
     changes = _changes()
-    plain = _along(cell, wavelength_um, diameters)
-    columns = []
-    for _, row, amounts in changes:
-        for amount in amounts:
-            if not isinstance(row.acts, Answers) or amount == 0:
-                columns.append(plain)
-                continue
-            changed = row.acts.changed(cell, amount, wavelength_um)
-            columns.append(_along(changed, wavelength_um, diameters))
-    return Solved(wavelength_um, diameters, _powers(np.array(columns).T, changes))
+    cells = [
+        row.acts.changed(cell, amount, wavelength_um) if isinstance(row.acts, Answers) and amount else cell
+        for _, row, amounts in changes
+        for amount in amounts
+    ]
+    apart = list(dict.fromkeys(cells))
+    found: dict[Cell, Array] = {}
+
+    def some(start: int, stop: int) -> None:
+        for one in apart[start:stop]:
+            found[one] = _along(one, wavelength_um, diameters)
+
+    with threads.one_blas_thread():
+        threads.split(len(apart), some)
+    return Solved(wavelength_um, diameters, _powers(np.array([found[one] for one in cells]).T, changes))
 
 
 def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import importlib
 import itertools
 import os
 import sys
@@ -46,4 +47,5 @@ def one_blas_thread() -> contextlib.AbstractContextManager[object]:
 
 @functools.lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
+    importlib.import_module("scipy.linalg")  # its BLAS is another one than numpy's, and must be there to be found
     return ThreadpoolController().select(user_api="blas")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell, index, slope
+from metalens.ground.threads import one_blas_thread
 from metalens.modal.case import Case, case_of, check_tolerance
 from metalens.modal.engine import basis, climb, geometric_mean, geometry
 from metalens.modal.homogeneous import Basis
@@ -154,7 +155,8 @@ def gradient(
     case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
     check_tolerance(tolerance)
     plan = climb(case, tolerance).rung.choice(case.rho).plan
-    (first, d_first), (second, d_second) = (form_rates(case, plan, magnetic=magnetic) for magnetic in (False, True))
+    with one_blas_thread():
+        (first, d_first), (second, d_second) = (form_rates(case, plan, magnetic=magnetic) for magnetic in (False, True))
     by = {name: mean_rate(first, second, d_first[name], d_second[name])[1, 0] for name in d_first}
     t = complex(geometric_mean(first, second)[1, 0])
     half = cell.pitch_um / 2

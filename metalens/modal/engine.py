@@ -10,6 +10,7 @@ import numpy as np
 
 from metalens.cell import Cell, Response
 from metalens.ground.errors import CellError
+from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
 from metalens.modal.case import Case, case_of, check_tolerance, film
 from metalens.modal.few_modes import few_modes
@@ -173,7 +174,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         CellError: a disc so thin or so wide that the matrices of its elements are singular.
     """
     try:
-        with np.errstate(invalid="ignore"):  # of degenerate elements: refused below
+        # matrices of a few hundred rows: on two threads of BLAS a solve takes three to six times as long
+        with one_blas_thread(), np.errstate(invalid="ignore"):  # of degenerate elements: refused below
             first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
     except np.linalg.LinAlgError as singular:
         raise CellError(
