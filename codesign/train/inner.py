@@ -325,7 +325,7 @@ def _laid_out(optimiser: torch.optim.Optimizer) -> None:
     """Moments laid out in memory as their parameters: a fused step walks through both in one order without asking."""
     for parameter, kept in optimiser.state.items():
         for name, value in kept.items():
-            if value.shape == parameter.shape:
+            if name != "step" and value.shape == parameter.shape:  # the count of a scalar is no moment of it
                 kept[name] = torch.empty_like(parameter).copy_(value)
 
 

@@ -213,3 +213,19 @@ def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
     assert record.loss > 1e4
     largest_step = max(float((a - b).abs().max()) for a, b in zip(before, trainer.model.net.parameters(), strict=True))
     assert largest_step < 10 * trainer.inner.weights.rate
+
+
+def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
+    """Of a scalar in float64, whose count has its shape and another dtype; a kernel's moments take its order."""
+    pitch = torch.tensor(2.5, dtype=torch.float64, requires_grad=True)
+    kernel = torch.rand(4, 3, 2, 2).contiguous(memory_format=torch.channels_last).requires_grad_()
+    optimiser = torch.optim.AdamW([pitch, kernel])
+    (pitch**2 + kernel.square().sum()).backward()
+    optimiser.step()
+    before = optimiser.state[pitch]["step"].clone()
+    moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel]["exp_avg"].contiguous()
+    inner._laid_out(optimiser)
+    step, after = optimiser.state[pitch]["step"], optimiser.state[kernel]["exp_avg"]
+    assert (step.dtype, float(step)) == (before.dtype, 1.0)
+    assert after.stride() == kernel.stride()
+    assert torch.equal(after, moment)
