@@ -5,6 +5,10 @@ import numpy as np
 from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
 
+_SIDE = (
+    "light that falls off to one side and a gradient of the bias look alike; "
+    "measure the lamp's profile without the lens"
+)
 _WHY = {
     frozenset({"wavelength_nm", "distance_um"}): "a longer wavelength and a longer distance refocus alike; "
     "measure the wavelength with a spectrometer",
@@ -19,14 +23,8 @@ _WHY = {
     frozenset(
         {"height_nm", "bias_nm"}
     ): "both shift the phase and efficiency of all pillars; measure CDs (SEM) or height (AFM)",
-    frozenset(
-        {"bias_x_nm", "light_x"}
-    ): "light that falls off to one side and a gradient of the bias look alike; measure "
-    "the lamp's profile without the lens",
-    frozenset(
-        {"bias_y_nm", "light_y"}
-    ): "light that falls off to one side and a gradient of the bias look alike; measure "
-    "the lamp's profile without the lens",
+    frozenset({"bias_x_nm", "light_x"}): _SIDE,
+    frozenset({"bias_y_nm", "light_y"}): _SIDE,
     frozenset({"bias_x_nm", "decentre_x_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
     frozenset({"bias_y_nm", "decentre_y_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
     frozenset({"pinhole_um", "crosstalk_px"}): "both blur; measure the pinhole, or take frames at more distant depths",

@@ -29,8 +29,8 @@ class Part:
     name: of the part. top: its cell. cells: by name, as they will be written. doses: relative dose of each layer that
     is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a
     lattice, of some thousand squares of its pillars. extent: (4,) around everything, outline included. corrected:
-    whether its doses make
-    up for the scattered electrons of its own shapes, and of no others. texts: that are left out, as they draw nothing.
+    whether its doses make up for the scattered electrons of its own shapes, and of no others. texts: that are left out,
+    as they draw nothing.
     sites: of cells, beside what their content places.
     """
 

@@ -117,6 +117,7 @@ def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path]
     with work.stages(f"read back {name}"):
         found = readback.differences(made, read(path, standing.MOST_READ, keep=standing.KEPT))
     work.failures += [f"{name} does not read back as planned: {text}" for text in found]
+    work.unlike |= {name} if found else set()
     work.written[name] = path.stat().st_size
 
 

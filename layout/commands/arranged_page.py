@@ -174,10 +174,8 @@ def _doses(work: Work, made: Assembly) -> Section:
 
 
 def _files(work: Work) -> Section:
-    wrong = {
-        name: any(text.startswith(f"{name} does not read back") for text in work.failures) for name in work.written
-    }
-    rows = [[n, f"{s / 1e6:.3f}", "DIFFERENT" if wrong[n] else "as planned"] for n, s in work.written.items()]
+    written = work.written.items()
+    rows = [[n, f"{s / 1e6:.3f}", "DIFFERENT" if n in work.unlike else "as planned"] for n, s in written]
     times = [[stage, seconds] for stage, seconds in work.stages.seconds.items()]
     items = [Table(("file", "MB", "read back"), rows), Table(("stage", "seconds"), times, digits=3)]
     return Section("Files", "Each file was read back: every cell, shape and copy.", items)

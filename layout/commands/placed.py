@@ -29,7 +29,8 @@ class Work:
     """What is known so far of an arrangement.
 
     failures: what keeps the mask from the writer. notes: what a person should know. placed: parts on the die. near:
-    those that stand too near each other. rules: what was found of each part that is checked here.
+    those that stand too near each other. rules: what was found of each part that is checked here. unlike: files that do
+    not read back as planned.
     """
 
     options: Options
@@ -45,6 +46,7 @@ class Work:
     placed: list[joined.Placing] = field(default_factory=list)
     near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
+    unlike: set[str] = field(default_factory=set)
 
     @property
     def verdict(self) -> str:

@@ -105,15 +105,14 @@ def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
     settings = options.settings
     psf_export.check(options.output)
-    given = _read(options.lens)
-    made = given if isinstance(given, lens.Lens) else given.design
+    made, built = _read(options.lens)
     made = made if settings.layers is None else replace(made, layers=settings.layers)
     settings = settings.about(made)
     target, view = options.output, settings.view
     pixels = len(view.depths_um) * len(view.angles_rad) * settings.samples * settings.samples_y
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
-        stack = _make(options, settings, made if isinstance(given, lens.Lens) else given, draft.path)
+        stack = _make(options, settings, made, built, draft.path)
     shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
@@ -132,21 +131,18 @@ class Built(Protocol):
         """PSFs (angle, depth, y, x)."""
 
 
-def _read(path: Path) -> "lens.Lens | Built":
-    """The lens of a file, or what a file of another kind that the command line knows holds."""
+def _read(path: Path) -> tuple[lens.Lens, Built | None]:
+    """The design of a file, and what was made of it where the file is of another kind that the command line knows."""
     kind = store.kind_of(path)
     if kind not in SOURCES:
-        return lens.load(path)
+        return lens.load(path), None
     found: Built = importlib.import_module(SOURCES[kind]).load(path)
-    return found
+    return found.design, found
 
 
-def _make(options: Options, settings: Settings, given: "lens.Lens | Built", path: Path) -> psf.PsfStack:
+def _make(options: Options, settings: Settings, made: lens.Lens, built: Built | None, path: Path) -> psf.PsfStack:
     """Compute, write, draw."""
-    if isinstance(given, lens.Lens):
-        stack = _of_design(options.lens, settings, given)
-    else:
-        stack = _of_made(options.lens, settings, given)
+    stack = _of_design(options.lens, settings, made) if built is None else _of_made(options.lens, settings, built)
     psf_export.write(path, stack)
     pictures = psf_plots.pictures(stack)
     for name, image in pictures.items():
@@ -158,14 +154,15 @@ def _make(options: Options, settings: Settings, given: "lens.Lens | Built", path
 
 def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
     """PSFs of a kind of file that the command line knows a source for."""
-    kind = store.kind_of(path)
     for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
         if getattr(settings, name):
             raise ConfigError(
-                f"{path}: {name} is for a design; this {kind} file has the wavelength and layers that were fitted"
+                f"{path}: {name} is for a design; this {store.kind_of(path)} file has the wavelength and layers that "
+                "were fitted"
             )
     if settings.polarisation == "vector":
-        raise ConfigError(f"{path}: polarisation = 'vector' is for a design; a {kind} file is one scalar")
+        words = f"polarisation = 'vector' is for a design; a {store.kind_of(path)} file is one scalar"
+        raise ConfigError(f"{path}: {words}")
     found = given.psf_stack(settings.view, tolerance=settings.tolerance)
     return replace(found, provenance=_provenance(path, settings))
 

@@ -24,6 +24,7 @@ ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding o
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
 PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
 TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
+NODES = 60  # of a lens along an axis, about, where nothing else is said
 CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 
 
@@ -80,7 +81,7 @@ Kernel = Callable[[Any, Any], Array]
 
 
 def choose(
-    case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int, nodes: int = 60
+    case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int, nodes: int = NODES
 ) -> tuple[Blocks, Blocks]:
     """(rows, columns) blocks that cost least.
 

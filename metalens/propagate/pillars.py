@@ -15,7 +15,7 @@ import torch
 
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
-from metalens.propagate.blocks import CHUNK, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
+from metalens.propagate.blocks import CHUNK, NODES, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
 from metalens.propagate.compiled import gather, spread
 from metalens.propagate.geometry import Case
 
@@ -62,7 +62,7 @@ def moments(
     tolerance: float,
     dtype: torch.dtype,
     device: torch.device | None = None,
-    nodes: int = 60,
+    nodes: int = NODES,
 ) -> Moments:
     """Blocks, and what light at their nodes is worth in each moment.
 

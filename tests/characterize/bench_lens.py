@@ -9,7 +9,10 @@ import numpy as np
 from characterize.bench import bench
 from characterize.bench.bench import Camera, Truth
 from characterize.captures.capture import Capture
+from characterize.inference.leastsquares import Data
+from characterize.model import ForwardModel
 from characterize.model.parameters import Known
+from characterize.model.setting import Setting
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.lens.record import Lens
@@ -95,6 +98,18 @@ def electrons(peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float) 
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
     return bright * (peak_e / bright.max()) + bench.background(truth(**more))
+
+
+def near_focus(depths_um: tuple[float, ...], **values: float) -> tuple[Data, ForwardModel]:
+    """Frames of a lens of these parameters with 6000 electrons at the peak and a floor of 9 e², and their model."""
+    known = tuple(Known(name, value) for name, value in values.items())
+    hidden = Truth(depths_um, peak_e=6000.0, parameter=known, camera=Camera(pixel_um=1.5, pixels=16))
+    electrons = bench.irradiance(lens(), hidden, RESPONSE)
+    electrons = electrons * (6000.0 / electrons.max())
+    electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
+    everywhere, n = np.ones(electrons.shape, bool), len(depths_um)
+    data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
+    return data, ForwardModel(lens(), Setting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16), RESPONSE)
 
 
 def with_a_moved_frame(shots: Capture) -> Capture:

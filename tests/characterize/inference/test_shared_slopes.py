@@ -10,12 +10,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.bench import bench
 from characterize.inference import leastsquares, posterior, search, walk
 from characterize.inference.arrange import Arrangement
-from characterize.inference.leastsquares import Data, Settings
-from characterize.model import NAMES, PLACE, ForwardModel, Known, vector
-from characterize.model.setting import Setting
+from characterize.inference.leastsquares import Settings
+from characterize.model import NAMES, PLACE, Known, vector
 
 DEPTHS = (560.0, 600.0, 640.0)
 FREE = ("bias_nm", "height_nm", "stage_zero_um", "stage_scale", "spherical_rad", "log_gain", "background_e")
@@ -25,20 +23,13 @@ FREE = ("bias_nm", "height_nm", "stage_zero_um", "stage_scale", "spherical_rad",
 def about():
     """A lens near its focus, where bias, height and spherical are bent; its frames, and its fit."""
     values = {"bias_nm": 13.0, "height_nm": -7.0, "stage_zero_um": 4.0, "spherical_rad": 0.11}
-    known = tuple(Known(name, value) for name, value in values.items())
-    hidden = b.Truth(DEPTHS, peak_e=6000.0, parameter=known, camera=b.Camera(pixel_um=1.5, pixels=16))
-    electrons = bench.irradiance(b.lens(), hidden, b.RESPONSE)
-    electrons = electrons * (6000.0 / electrons.max())
-    electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
-    everywhere = np.ones(electrons.shape, bool)
-    data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
-    model = ForwardModel(b.lens(), Setting(np.array(DEPTHS), np.zeros((3, 2)), np.ones(3), 1.5, 16, 16), b.RESPONSE)
+    data, model = b.near_focus(DEPTHS, **values)
     held = {name: Known(name, 0.0) for name in NAMES if name not in FREE}
     laid = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
     task = search.Task(model, data, vector(), held, laid)
     begin = np.zeros(len(task.names))
     light = model.images(vector())[0]
-    begin[task.names.index("log_gain")] = math.log((light * electrons).sum() / (light**2).sum())
+    begin[task.names.index("log_gain")] = math.log((light * data.electrons).sum() / (light**2).sum())
     return task, search.refine(task, begin)
 
 

@@ -12,11 +12,10 @@ from scipy import integrate, optimize, special
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.bench import bench
 from characterize.inference import explore, leastsquares, residual, search, walk
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Data, Prior
-from characterize.model import NAMES, PLACE, ForwardModel, Known, vector
+from characterize.model import NAMES, PLACE, Known, vector
 from characterize.model.setting import Setting
 
 NAMED = ("bias_nm", "height_nm", "background_e")
@@ -165,14 +164,8 @@ def test_the_ends_of_a_lens_s_bent_bias_are_where_another_solver_finds_the_rise(
     """Three depths near focus leave the bias to a third of its prior: scipy fits the rest at both ends."""
     depths = (560.0, 600.0, 640.0)
     values = {"bias_nm": 15.0, "stage_zero_um": 4.0}
-    known = tuple(Known(name, value) for name, value in values.items())
-    hidden = b.Truth(depths, peak_e=6000.0, parameter=known, camera=b.Camera(pixel_um=1.5, pixels=16))
-    bright = bench.irradiance(b.lens(), hidden, b.RESPONSE)
-    electrons = bright * (6000.0 / bright.max())
-    electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
-    everywhere = np.ones(electrons.shape, bool)
-    data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
-    model = ForwardModel(b.lens(), Setting(np.array(depths), np.zeros((3, 2)), np.ones(3), 1.5, 16, 16), b.RESPONSE)
+    data, model = b.near_focus(depths, **values)
+    electrons = data.electrons
     free = {"bias_nm", "stage_zero_um", "log_gain", "background_e", "crosstalk_px"}
     start = vector({"crosstalk_px": 0.2})
     held = {name: Known(name, float(start[PLACE[name]])) for name in NAMES if name not in free}

@@ -9,17 +9,7 @@ from torch import nn
 
 from codesign.network import baselines
 from codesign.network.baselines import DeformableGaze, Eyeball, NVGaze
-
-
-class Told(nn.Module):
-    """A layer that answers what is asked."""
-
-    def __init__(self, answer):
-        super().__init__()
-        self.answer = answer
-
-    def forward(self, _):
-        return self.answer
+from tests.codesign.network.told import Told
 
 
 def test_an_eyeball_s_answers_are_its_place_axis_radius_and_rim():

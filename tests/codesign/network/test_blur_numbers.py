@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from codesign.network import blur
+from tests.codesign.network.told import Told
 
 
 @pytest.mark.parametrize("size", [64, 61, 83])
@@ -36,17 +37,6 @@ def test_the_vergence_of_a_window_is_that_of_its_middle_where_it_is_straight():
     assert blur.window_vergence(depth)[0].numpy() == pytest.approx(want, abs=1e-5)  # float32 weights
     told = torch.tensor([-9.0, 0.5, 0.0, 99.0])
     assert blur.depth_mm(told).tolist() == pytest.approx([1000.0, 1e3 / 49, 1e3 / 45, 5.0])
-
-
-class Told(nn.Module):
-    """Layers that answer what is asked."""
-
-    def __init__(self, answer):
-        super().__init__()
-        self.answer = answer
-
-    def forward(self, _):
-        return self.answer
 
 
 def test_spreads_are_kept_from_e_to_minus_3_to_e_squared_and_windows_count_by_their_variance():

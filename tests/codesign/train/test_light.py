@@ -12,11 +12,7 @@ from codesign.train.light import Light
 from metalens.ground.errors import TrainingError
 from metalens.image import Imager
 
-TRUE = """
-preset = "smoke"
-checkpoint_every = 1
-validation_batches = 1
-test_batches = 1
+FRAMES = """
 [scenes]
 pixels = 32
 margin = 5
@@ -24,6 +20,13 @@ pool = 6
 [inner]
 steps = 4
 batch = 2
+"""
+TRUE = f"""
+preset = "smoke"
+checkpoint_every = 1
+validation_batches = 1
+test_batches = 1
+{FRAMES}
 refresh = 2
 draws = 3
 optics_weight = 0.0
@@ -121,15 +124,9 @@ def test_a_made_lens_known_on_axis_alone_is_no_true_image():
         light.at(0, torch.zeros(0), 160, 16, live=False)
 
 
-STILL = """
+STILL = f"""
 preset = "smoke"
-[scenes]
-pixels = 32
-margin = 5
-pool = 6
-[inner]
-steps = 4
-batch = 2
+{FRAMES}
 [inner.optics]
 rate = 0.0
 [inner.pitch]
