@@ -91,17 +91,18 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
     inside, outer, error = {}, {}, {}
     for i, name in enumerate(found.names):
         if name in hidden_lens.TRUTHS:
-            low, high = found.interval(name)
+            low, high = found.within_model(name)
             inside[name] = bool(low <= values[name] <= high)
-            low, high = found.outer(name)
+            low, high = found.interval(name)
             outer[name] = bool(low <= values[name] <= high)
-            error[name] = float((found.value[i] - values[name]) / math.sqrt(found.covariance[i, i]))
+            error[name] = float((found.value[i] - values[name]) / math.sqrt(found.within_covariance[i, i]))
     words = [
         w
         for w in found.cautions
         if "residuals" in w or "saturated" in w or "left out" in w or "fitted too" in w or "phase of" in w
     ]
-    wider = {n: math.hypot(1, found.unstated[i] / found.sigma[i]) for i, n in enumerate(found.names) if n in inside}
+    own = np.sqrt(np.diag(found.within_covariance))
+    wider = {n: float(found.sigma[i] / own[i]) for i, n in enumerate(found.names) if n in inside}
     return {
         "seed": seed,
         "seconds": seconds,

@@ -166,7 +166,7 @@ def _normalised(found: AsBuilt, values: dict[str, float]) -> tuple[dict[str, flo
     keep = [i for i, name in enumerate(found.names) if name != "log_gain"]
     names = [found.names[i] for i in keep]
     error = np.array([found.value[i] - values.get(found.names[i], 0.0) for i in keep])
-    covariance = found.covariance[np.ix_(keep, keep)]
+    covariance = found.within_covariance[np.ix_(keep, keep)]
     z = dict(zip(names, (error / np.sqrt(np.diag(covariance))).tolist(), strict=True))
     unit = np.array([SPREAD.get(name, 1e3) for name in names])
     share, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))

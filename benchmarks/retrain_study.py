@@ -135,7 +135,7 @@ def quick(template: AsBuilt, case: int) -> AsBuilt:
     """What a fit of this case may say: the truth, off by a draw from the covariance."""
     true = hidden(case)
     rng = np.random.default_rng([case, 7])
-    off = np.linalg.cholesky(template.covariance) @ rng.standard_normal(len(template.names))
+    off = np.linalg.cholesky(template.within_covariance) @ rng.standard_normal(len(template.names))
     middle = np.array([true.get(n, 0.0) for n in template.names])
     return replace(template, value=middle + off, problems=())
 
@@ -170,7 +170,7 @@ def one(on: Ground, case: int, *, model: AsBuilt | None) -> dict[str, Any]:
     start, complete = time.process_time(), model is None
     result = captured(on.work, on.made.design, case) if model is None else quick(model, case)
     config, true = replace(CONFIG, seed=case), on.made.stack(vector(hidden(case)))
-    drawn = tuple(on.made.stack(result.parameters(row)) for row in result.samples(config.draws, seed=case))
+    drawn = tuple(on.made.stack(result.parameters(row)) for row in result.lens_samples(config.draws, seed=case))
     found = Lenses(on.nominal, on.made.stack(result.parameters()), drawn, (true,), True)
     unwarned = retraining.job(on.source, config, found, "nominal")
     unwarned.restore(on.state)
@@ -200,7 +200,7 @@ def z_scores(result: AsBuilt, case: int) -> dict[str, float]:
     true = hidden(case)
     rows = [i for i, name in enumerate(result.names) if name in true]
     return {
-        result.names[i]: float((result.value[i] - true[result.names[i]]) / math.sqrt(result.covariance[i, i]))
+        result.names[i]: float((result.value[i] - true[result.names[i]]) / math.sqrt(result.within_covariance[i, i]))
         for i in rows
     }
 

@@ -80,5 +80,5 @@ print(f"chi² / dof {built.chi2_per_dof:.3f}; {built.reason}")
 
 # %%
 print("\n".join((*built.degeneracies, *built.cautions)))
-lenses = [built.lens(draw) for draw in built.samples(3, seed=0)]
+lenses = [built.lens(draw) for draw in built.lens_samples(3, seed=0)]
 print([f"{each.diameters.diameter_um.max():.4f}" for each in lenses])

@@ -15,6 +15,8 @@ from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
 
+_STATED = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
+
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -106,7 +108,7 @@ def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
     for name, stack in (("dark", shots.dark), ("flat", shots.flat)):
         tifffile.imwrite(folder / f"{name}.tif", stack, photometric="minisblack", metadata=None)
     about = {"pixel_um": truth.camera.pixel_um, "wavelength_um": lens.wavelength_um, "bits": truth.camera.bits}
-    stated = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
-    about |= {k.name: k.value for k in truth.parameter if k.name in stated and k.value}
+    about |= {"pixel_sigma_um": 0.0, **dict.fromkeys(_STATED, 0.0)}  # a bench knows what stands on it
+    about |= {k.name: k.value for k in truth.parameter if k.name in _STATED}
     text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
     (folder / "capture.toml").write_text(text, encoding="utf-8")

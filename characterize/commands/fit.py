@@ -114,7 +114,7 @@ def _lens_values(result: AsBuilt) -> dict[str, object]:
     return {
         "parameters": {name: [float(v), float(s)] for name, v, s in rows},
         "intervals": {name: list(result.interval(name)) for name in result.names},
-        "outer_intervals": {name: list(result.outer(name)) for name in result.names},
+        "intervals_within_model": {name: list(result.within_model(name)) for name in result.names},
         "chi2_per_dof": result.chi2_per_dof,
         "converged": result.converged,
         "reason": result.reason,
@@ -129,17 +129,17 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
     lines += [f"  {words}" for words in result.verdicts]
     for name, v in zip(result.names, result.value, strict=True):
         low, high = result.interval(name)
-        lines.append(f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_outer(result, name)}")
+        lines.append(f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_within(result, name)}")
     for label, words in (("cannot tell", result.degeneracies), ("note", result.cautions), ("PROBLEM", result.problems)):
         lines += [f"  {label}: {text}" for text in words]
     return "\n".join(lines)
 
 
-def _outer(result: AsBuilt, name: str) -> str:
-    """The interval with what the captures cannot tell, and what that mostly is; nothing where it adds little."""
+def _within(result: AsBuilt, name: str) -> str:
+    """The interval that would hold without what the captures cannot tell; nothing where that adds little."""
     causes = result.most(name)
-    low, high = result.outer(name)
-    return f"; {low:.4g} to {high:.4g} with what cannot be told ({', '.join(causes)})" if causes else ""
+    low, high = result.within_model(name)
+    return f"; {low:.4g} to {high:.4g} only without {', '.join(causes)}" if causes else ""
 
 
 def _values(found: PupilFit) -> dict[str, object]:

@@ -61,8 +61,8 @@ def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | 
         "from -5 (blue) to 5 sigma (red): noise alone looks like even speckle, structure is what the model leaves over."
     )
     bars = (
-        "95 % intervals in the typical uncertainty of each parameter, within the model (dark) and with what these "
-        "captures cannot tell (light); grey: what was known beforehand."
+        "95 % intervals in the typical uncertainty of each parameter, with what these captures cannot tell (thin); "
+        "pale: what would be left if all causes that nobody stated were absent; grey: what was known beforehand."
     )
     correlated = report.Figure(
         _correlation(result), "Correlation of the parameters: deep colours cannot be told apart."
@@ -89,7 +89,8 @@ def _curves(pictures: dict[str, bytes], truth: Mapping[str, float] | None) -> li
     if "posterior" not in pictures:
         return []
     caption = (
-        "What the frames and prior knowledge leave open about each parameter, the 95 % interval shaded. Grey bars: "
+        "What the frames and prior knowledge leave open about each parameter, the 95 % interval shaded; dashed: if all "
+        "causes that the frames cannot tell and nobody stated were absent. Grey bars: "
     )
     caption += "draws, where the posterior is bent or double. Grey line: the design."
     caption += " Red line: the hidden truth." if truth is not None else ""
@@ -114,10 +115,11 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         reach = 0.4 * (high - low)
         ends = min([low - reach, *hidden]), max([high + reach, *hidden])
         at = np.linspace(ends[0] - 0.02 * reach, ends[1] + 0.02 * reach, 300)
-        curve = posterior.density(result.curves[name], at)
+        within = result.curves[name]
         axis.set_axis_on()
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
-        axis.plot(at, curve, color="#1f6feb", linewidth=1.2)
+        axis.plot(at, posterior.density(_stretched(result, name, within), at), color="#1f6feb", linewidth=1.2)
+        axis.plot(at, posterior.density(within, at), color="#1f6feb", linewidth=0.6, linestyle=(0, (3, 2)))
         if len(result.draws):
             drawn = result.draws[:, result.names.index(name)]
             axis.hist(drawn, bins=24, range=(at[0], at[-1]), density=True, color="#999", alpha=0.5)
@@ -133,12 +135,20 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
     return report.png(figure)
 
 
+def _stretched(result: AsBuilt, name: str, curve: Array) -> Array:
+    """A profile as wide as the interval with what cannot be told, each side by itself."""
+    value = float(result.value[result.names.index(name)])
+    sides = zip(result.interval(name), result.within_model(name), strict=True)
+    low, high = ((outer - value) / (inner - value) if inner != value else 1.0 for outer, inner in sides)
+    return np.stack([value + np.where(curve[0] < value, low, high) * (curve[0] - value), curve[1]])
+
+
 def _parameters(result: AsBuilt) -> report.Table:
     rows = []
     for name, v, s in zip(result.names, result.value, result.sigma, strict=True):
-        ends = ("{:.4g} to {:.4g}".format(*of(name)) for of in (result.interval, result.outer))
+        ends = ("{:.4g} to {:.4g}".format(*of(name)) for of in (result.interval, result.within_model))
         rows.append((name, float(v), float(s), *ends, ", ".join(result.most(name)), PARAMETERS[PLACE[name]].meaning))
-    heads = "95 % within the model", "95 % with what cannot be told", "mostly"
+    heads = "95 %", "if nothing unstated is there", "widened mostly by"
     return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
 
 
@@ -162,17 +172,18 @@ def _intervals(result: AsBuilt) -> bytes:
     names = [result.names[i] for i in shown]
     unit = np.array([scale(name) for name in names])
     value = result.value[shown] / unit
-    told = np.diag(invert(result.covariance) - result.information)[shown]
+    told = np.diag(invert(result.within_covariance) - result.information)[shown]
     prior = np.maximum(told, 1e-12) ** -0.5 / unit
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()
     rows = np.arange(len(names))[::-1]
     axis.barh(rows, 2 * 1.96 * np.minimum(prior, 1e3), left=-1.96 * np.minimum(prior, 1e3), color="#e4e4e4")
-    ends = np.array([result.interval(name) for name in names]) / unit[:, None]
-    reach = np.abs(ends - value[:, None]).T
-    outer = np.array([result.outer(name) for name in names]) / unit[:, None]
-    axis.errorbar(value, rows, xerr=np.abs(outer - value[:, None]).T, fmt="none", ecolor="#9ec1f7", linewidth=3.5)
-    axis.errorbar(value, rows, xerr=reach, fmt="o", markersize=3, color="#1f6feb", capsize=2, linewidth=1.2)
+    whole, within = (
+        np.abs(np.array([of(name) for name in names]) / unit[:, None] - value[:, None]).T
+        for of in (result.interval, result.within_model)
+    )
+    axis.errorbar(value, rows, xerr=within, fmt="none", ecolor="#9ec1f7", linewidth=3.5)
+    axis.errorbar(value, rows, xerr=whole, fmt="o", markersize=3, color="#1f6feb", capsize=2, linewidth=1.2)
     axis.axvline(0, color="#444", linewidth=0.8)
     axis.set_yticks(rows, [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)], fontsize=7)
     axis.set_xscale("symlog", linthresh=1)

@@ -4,13 +4,15 @@ For those who build on it (retraining, mask correction)::
 
     built = AsBuilt.load("asbuilt.h5")             # built.save(path) writes it
     built.names, built.value, built.covariance     # (p,), (p,), (p, p) of the fitted parameters; built.sigma
+    built.interval("bias_nm")                      # 95 %, with what the captures cannot tell; built.within_model(...)
     built.trusted, built.problems                  # whether the fit passed its own checks
     built.lens()                                   # Lens with the as-built diameters, wavelength and distance
     built.diameters                                # its DiameterMap
     built.pillars()                                # (y, x) complex t of every pillar: process and wave front too
     built.psf()                                    # PsfStack at the depths and angles of the captures
     built.psf_stack(View(depths_um, angles_rad, window_um, samples))   # PsfStack anywhere else
-    draws = built.samples(16, seed=0)              # (16, p) from the posterior
+    draws = built.samples(16, seed=0)              # (16, p) of the parameters, from the posterior
+    draws = built.lens_samples(16, seed=0)         # the same for what the lens does to light: for training and PSFs
     built.psf_stack(view, draws[3])                # ... and the lens, pillars and PSFs of each:
     built.lens(draws[3]), built.pillars(draws[3])
 
@@ -24,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model import PLACE, Setting, made, oversampling, true_depth, vector
+from characterize.model import PARAMETERS, PLACE, Setting, made, oversampling, true_depth, vector
 from metalens import lens as lenses
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -36,11 +38,28 @@ from metalens.psf import PsfStack, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class WithinModel:
+    """What holds where the bench has nothing but what is fitted and stated; all empty where it is not told apart.
+
+    covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by profile over all valleys.
+    draws: (m, p) of the posterior where it is no parabola.
+    """
+
+    covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
+    low: Array = field(default_factory=lambda: np.empty(0))
+    high: Array = field(default_factory=lambda: np.empty(0))
+    draws: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class AsBuilt:
     """Result of :func:`characterize.fit`.
 
+    ``covariance``, ``sigma``, ``interval``, ``draws`` and ``samples`` reckon with what the captures cannot tell and
+    nobody stated (glass, source, side wall ...): they hold on a bench that is not known. ``within`` does not.
+
     design: the lens as designed. response: what height, index and sidewall do to its pillars.
-    names, value, covariance: of the fitted parameters, priors included.
+    names, value, covariance: of the fitted parameters, priors and what cannot be told included.
     held: {name: value} of parameters that were not fitted.
     information: Fisher information of the frames alone.
     depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the sensor.
@@ -50,10 +69,12 @@ class AsBuilt:
     degeneracies: what cannot be told apart, in words. cautions: everything that was put right or assumed.
     trusted: every check passed; problems: those that did not.
     residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty where none was kept.
-    low, high: (p,) 95 % intervals by profile over all valleys; draws: (m, p) of the posterior where it is no parabola.
+    low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no parabola.
+    within: the same within the model, narrower.
     verdicts: how well the PSF is known, and how well the process, in words.
-    causes, by_cause, unstated: what the captures cannot tell apart and nobody stated: names (c,), (c, p) shift of every
-        parameter by each of plausible size, (p,) by all of them together, standard deviations.
+    causes, by_cause: what the captures cannot tell apart and nobody stated: names (c,), (c, p) shift of every parameter
+        by each of plausible size, standard deviations. bench: (p, p) second moment of the shifts by those of the bench
+        alone, which the lens leaves behind.
     curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there with all others fitted.
     """
 
@@ -85,7 +106,8 @@ class AsBuilt:
     verdicts: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     by_cause: Array = field(default_factory=lambda: np.empty((0, 0)))
-    unstated: Array = field(default_factory=lambda: np.empty(0))
+    bench: Array = field(default_factory=lambda: np.empty((0, 0)))
+    within: WithinModel = field(default_factory=WithinModel)
     curves: dict[str, Array] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -96,8 +118,13 @@ class AsBuilt:
 
     @property
     def sigma(self) -> Array:
-        """(p,) standard errors."""
+        """(p,) standard errors, with what the captures cannot tell."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def within_covariance(self) -> Array:
+        """(p, p) within the model; the whole where it is not told apart."""
+        return self.within.covariance if len(self.within.covariance) else self.covariance
 
     @property
     def correlation(self) -> Array:
@@ -106,23 +133,14 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter within the model: by its profile where there is one, else 1.96 sigma each way.
+        """95 % interval on a bench that is not known: the profile and what the captures cannot tell, in quadrature."""
+        return _ends(self.names.index(name), self.value, self.covariance, self.low, self.high)
 
-        It holds where what the model lacks is absent, or stated; see :meth:`outer` for where that is not known.
-        """
-        i = self.names.index(name)
-        if len(self.low):
-            return float(self.low[i]), float(self.high[i])
-        reach = 1.959964 * float(self.sigma[i])
-        return float(self.value[i]) - reach, float(self.value[i]) + reach
-
-    def outer(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter with what the captures cannot tell: :meth:`interval`, and 1.96 ``unstated`` in
-        quadrature."""
-        low, high = self.interval(name)
-        i = self.names.index(name)
-        value, more = float(self.value[i]), 1.959964 * float(self.unstated[i]) if len(self.unstated) else 0.0
-        return value - math.hypot(value - low, more), value + math.hypot(high - value, more)
+    def within_model(self, name: str) -> tuple[float, float]:
+        """95 % interval where what the model lacks is absent, or stated: too narrow where it is not."""
+        if not len(self.within.covariance):
+            return self.interval(name)
+        return _ends(self.names.index(name), self.value, self.within.covariance, self.within.low, self.within.high)
 
     def most(self, name: str) -> tuple[str, ...]:
         """Causes that nobody stated and that widen the interval of a parameter, the most telling first.
@@ -131,7 +149,7 @@ class AsBuilt:
         """
         i = self.names.index(name)
         own = self.by_cause[:, i] if len(self.causes) else np.empty(0)
-        low, high = self.interval(name)
+        low, high = self.within_model(name)
         least = max(0.25 * (high - low) / 3.92, float(own.max(initial=0.0)) / 3)
         return tuple(self.causes[k] for k in np.argsort(-own) if own[k] > least)
 
@@ -141,18 +159,25 @@ class AsBuilt:
         return vector(self.held | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True)))
 
     def samples(self, count: int, seed: int = 0) -> Array:
-        """(count, p) draws of the fitted parameters from their posterior, for training under uncertainty.
+        """(count, p) draws of the fitted parameters from their posterior: of the process, for the next mask.
 
         Those of ``draws`` where the posterior is bent or double (again from the first where more are asked for), else
         Gaussian.
         """
-        random = np.random.default_rng(seed)
-        if len(self.draws):
-            order = [random.permutation(len(self.draws)) for _ in range(-(-count // len(self.draws)))]
-            return np.asarray(self.draws[np.concatenate(order)[:count]])
-        values, vectors = np.linalg.eigh(self.covariance)
-        draws = random.standard_normal((count, len(self.value))) * np.sqrt(np.maximum(values, 0))
-        return np.asarray(self.value + draws @ vectors.T)
+        rng = np.random.default_rng(seed)
+        return _bounded(self.names, _drawn(rng, count, self.value, self.covariance, self.draws))
+
+    def lens_samples(self, count: int, seed: int = 0) -> Array:
+        """(count, p) draws of what the lens does to light, for training and PSFs under uncertainty.
+
+        Narrower than :meth:`samples`: a leaning wall or a shifted write field that was taken for height or trefoil goes
+        with the lens, and does there what it did on the bench. What was the bench's (glass, source, light) does not.
+        """
+        if not len(self.within.covariance):
+            return self.samples(count, seed)
+        rng, one = np.random.default_rng(seed), self.within
+        own = _drawn(rng, count, self.value, one.covariance, one.draws)
+        return _bounded(self.names, own + spread(rng, count, self.bench))
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of :meth:`samples`."""
@@ -205,6 +230,33 @@ class AsBuilt:
         return load(path)
 
 
+def _ends(i: int, value: Array, covariance: Array, low: Array, high: Array) -> tuple[float, float]:
+    """Of a profile where there is one, else 1.96 sigma to either side."""
+    if len(low):
+        return float(low[i]), float(high[i])
+    reach = 1.959964 * math.sqrt(float(covariance[i, i]))
+    return float(value[i]) - reach, float(value[i]) + reach
+
+
+def _drawn(rng: np.random.Generator, count: int, value: Array, covariance: Array, draws: Array) -> Array:
+    """(count, p) of ``draws``, again from the first where more are asked for; Gaussian ones where there are none."""
+    if not len(draws):
+        return np.asarray(value + spread(rng, count, covariance))
+    order = [rng.permutation(len(draws)) for _ in range(-(-count // len(draws)))]
+    return np.asarray(draws[np.concatenate(order)[:count]])
+
+
+def _bounded(names: tuple[str, ...], draws: Array) -> Array:
+    rows = [PARAMETERS[PLACE[name]] for name in names]
+    return np.asarray(np.clip(draws, [row.low for row in rows], [row.high for row in rows]))
+
+
+def spread(rng: np.random.Generator, count: int, covariance: Array) -> Array:
+    """(count, p) Gaussian draws about 0."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(rng.standard_normal((count, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+
+
 _ARRAYS = (
     "value",
     "covariance",
@@ -216,6 +268,7 @@ _ARRAYS = (
     "nominal",
     "residual_sigma",
 )
+_OPTIONAL, _WITHIN = ("low", "high", "draws", "by_cause", "bench"), ("covariance", "low", "high", "draws")
 _WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts", "causes")
 
 
@@ -225,9 +278,8 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
-    for name in ("low", "high", "draws", "by_cause", "unstated"):
-        if len(getattr(result, name)):
-            arrays[name] = getattr(result, name)
+    arrays |= {name: getattr(result, name) for name in _OPTIONAL if len(getattr(result, name))}
+    arrays |= {f"within/{name}": getattr(result.within, name) for name in _WITHIN if len(getattr(result.within, name))}
     if len(result.residual_modes):
         arrays["residual_modes"] = result.residual_modes
     arrays |= {f"curves/{name}": curve for name, curve in result.curves.items()}
@@ -264,7 +316,8 @@ def load(path: str | Path) -> AsBuilt:
     design = lenses.from_parts(a, about, where=str(path), group="design/")
     fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
     fields |= {name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS}
-    fields |= {name: a[name] for name in ("low", "high", "draws", "by_cause", "unstated") if name in a}
+    fields |= {name: a[name] for name in _OPTIONAL if name in a}
+    fields["within"] = WithinModel(**{name: a[f"within/{name}"] for name in _WITHIN if f"within/{name}" in a})
     return AsBuilt(
         design=design,
         response=_response(a, about),

@@ -37,6 +37,7 @@ _OF_MODEL: tuple[tuple[str, str, float], ...] = (  # cause, name and amount that
     ("a tilt of {:g} um of glass about x", "glass_tilt_y_deg", 5),
 )
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
+_OF_MASK = ("bias_a_nm", "bias_o_nm", "sidewall_deg", "index")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,7 +48,8 @@ class Change:
     sigma: of every change, one for all or each its own, how much of it is reckoned with where nobody states it: a
     standard deviation, 0 for none.
     frees: parameters that describe it. sought: whether it is looked for alone. roughly: the change is of the right kind
-    but of an unknown pattern, so that the frames cannot bound it by what they show of it.
+    but of an unknown pattern, so that the frames cannot bound it by what they show of it. of_mask: of the lens
+    itself.
     """
 
     cause: str
@@ -58,6 +60,7 @@ class Change:
     frees: tuple[str, ...] = ()
     sought: bool = True
     roughly: bool = False
+    of_mask: bool = False
 
 
 def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
@@ -68,7 +71,8 @@ def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Ite
         told = "an angle whose square is {:.3g} deg²"
         sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
         words = "a side wall that leans about half height"
-        yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True)  # resonances are left out of it
+        # resonances are left out of it
+        yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True)
     light = image - background(x, task.model.setting)
     if len(image) > 2:
         yield from _of_frames(light, slopes)
@@ -102,7 +106,8 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
             change = (task.model.images(after)[0] - first)[None]
             sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
             words = cause.format(before[PLACE["glass_um"]])
-            yield Change(words, change, amount, name + " {:.3g}", sigma, () if base else (name,))
+            frees = () if base else (name,)
+            yield Change(words, change, amount, name + " {:.3g}", sigma, frees, of_mask=name in _OF_MASK)
 
 
 def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
@@ -133,7 +138,7 @@ def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> I
     every = np.concatenate([bent, np.stack(known)])
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
-    yield Change("write fields out of place", fields, sigma=sigma, sought=False, roughly=True)
+    yield Change("write fields out of place", fields, sigma=sigma, sought=False, roughly=True, of_mask=True)
 
 
 def _size(task: Task, name: str) -> float:

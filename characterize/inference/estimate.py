@@ -9,7 +9,7 @@ import numpy as np
 from characterize.captures import Capture, Gain, clean
 from characterize.inference import explore, knowable, missing, residual, search, verdict
 from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
-from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
 from characterize.inference.missing import Looked, Unstated
@@ -96,9 +96,9 @@ def fit(
             )
     _refuse(_problems(task, ends[0], frames.gain), options)
     posterior = explore.explore(task, ends)
-    if frames.gain.known and (looked is None or posterior.best is not looked[0]):
+    if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
-    result = _result(capture, task, posterior, cautions, frames.gain, looked[1] if looked else None)
+    result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
     _refuse(result.problems, options)
     return result
 
@@ -189,20 +189,19 @@ def _rearranged(data: Data, found: Arrangement) -> Data:
     return Data(part[0], part[1], part[2], part[3], part[4], **common)
 
 
-def _result(
-    capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked | None
-) -> AsBuilt:
+def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
     fitted, unseen = dict(zip(names, solution.value.tolist(), strict=True)), explore.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
-    unstated = looked.reckoned() if looked else Unstated((), np.zeros((0, len(names))), np.zeros(len(names)))
-    counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
+    unstated = looked.reckoned()
+    within = _within(found, covariance, names)
+    more, value = explore.REACH * unstated.sigma, solution.value
     return AsBuilt(
         design=model.lens,
         response=model.response,
         names=names,
-        value=solution.value,
-        covariance=covariance,
+        value=value,
+        covariance=covariance + unstated.covariance,
         information=solution.information,
         held={name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted},
         depth_um=model.setting.depth_um,
@@ -217,18 +216,35 @@ def _result(
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
-        degeneracies=_open(task, found, covariance, looked),
-        cautions=(*cautions, *(_seen(task, solution, looked, unseen) if looked else ())),
+        degeneracies=_open(task, found, covariance, looked if gain.known else None),
+        cautions=(*cautions, *(_seen(task, solution, looked, unseen) if gain.known else ())),
         problems=(*_problems(task, solution, gain), *verdict.held_back(names, solution, task.prior)),
-        low=np.minimum(found.low, solution.value - counted),
-        high=np.maximum(found.high, solution.value + counted),
-        draws=found.draws,
+        low=value - np.hypot(value - within.low, more),
+        high=value + np.hypot(within.high - value, more),
+        draws=_drawn(task, found.draws, unstated),
+        within=within,
         curves={name: np.stack([one.value, one.rise]) for name, one in found.profiles.items()},
         verdicts=_verdicts(task, found, unseen, unstated),
         causes=unstated.causes,
         by_cause=unstated.by_cause,
-        unstated=unstated.sigma,
+        bench=unstated.bench,
     )
+
+
+def _within(found: Posterior, covariance: Array, names: tuple[str, ...]) -> WithinModel:
+    """The posterior with the error of the gain in what is counted in electrons."""
+    value = found.best.value
+    counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
+    low, high = np.minimum(found.low, value - counted), np.maximum(found.high, value + counted)
+    return WithinModel(covariance, low, high, found.draws)
+
+
+def _drawn(task: Task, draws: Array, unstated: Unstated) -> Array:
+    """Draws with what cannot be told; none where there are none."""
+    if not len(draws):
+        return draws
+    moved = draws + spread(np.random.default_rng(2), len(draws), unstated.covariance)
+    return np.asarray(np.clip(moved, task.prior.low, task.prior.high))
 
 
 def _nominal(task: Task, fitted: dict[str, float]) -> Array:

@@ -47,18 +47,20 @@ class Lean:
 class Looked:
     """What was looked for beside the fit: leans, the most telling first, of every cause that can be told apart or is
     taken for something else; the fit, and the causes that are reckoned with as changes (k, pixels) over the noise, of
-    one standard deviation each. roughly: those whose change is known too roughly for the frames to bound them."""
+    one standard deviation each. roughly: those whose change is known too roughly for the frames to bound them.
+    of_mask: those that stay with the lens when it leaves the bench."""
 
     leans: list[Lean]
     fit: "Fitted"
     unstated: dict[str, Array]
     roughly: frozenset[str] = frozenset()
+    of_mask: frozenset[str] = frozenset()
 
     def reckoned(self) -> "Unstated":
         """What the causes may have done to the parameters; see :meth:`Fitted.likely`."""
         names, p = tuple(self.unstated), len(self.fit.names)
         if not names:
-            return Unstated((), np.zeros((0, p)), np.zeros(p))
+            return Unstated.none(p)
         every = np.concatenate([self.unstated[name] for name in names])
         moved, second = self.fit.moved_by(every), np.eye(len(every))
         exact = np.concatenate([np.full(len(part), name not in self.roughly) for name, part in self.unstated.items()])
@@ -67,17 +69,33 @@ class Looked:
         first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
         own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
         by_cause = [np.einsum("pi,ij,pj->p", moved[:, some], second[some, some], moved[:, some]) for some in own]
-        whole = np.einsum("pi,ij,pj->p", moved, second, moved)
-        return Unstated(names, np.sqrt(np.maximum(by_cause, 0)), np.sqrt(np.maximum(whole, 0)))
+        off = np.concatenate([np.full(len(part), name not in self.of_mask) for name, part in self.unstated.items()])
+        bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
+        return Unstated(names, np.sqrt(np.maximum(by_cause, 0)), moved @ second @ moved.T, bench)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Unstated:
-    """What the captures cannot tell: causes, (c, p) root mean square shift of every parameter by each, (p,) by all."""
+    """What the captures cannot tell: causes, (c, p) root mean square shift of every parameter by each.
+
+    covariance: (p, p) second moment of the shifts by all of them. bench: the same by those that the lens leaves behind
+    with the bench; the others act on its light as the parameters do that took them up.
+    """
 
     causes: tuple[str, ...]
     by_cause: Array
-    sigma: Array
+    covariance: Array
+    bench: Array
+
+    @classmethod
+    def none(cls, p: int) -> "Unstated":
+        """Every cause stated."""
+        return cls((), np.zeros((0, p)), np.zeros((p, p)), np.zeros((p, p)))
+
+    @property
+    def sigma(self) -> Array:
+        """(p,) standard deviation of the shifts by all causes."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
 def look(task: Task, mode: Solution) -> Looked:
@@ -90,18 +108,21 @@ def look(task: Task, mode: Solution) -> Looked:
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
     fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread), task.data.shared(image) * root)
-    found, unstated, roughly = [], {}, set()
+    found, unstated = [], {}
+    roughly: set[str] = set()
+    of_mask: set[str] = set()
     for one in causes.changes(task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))):
         change = (one.images * root).reshape(len(one.images), -1)
         if np.any(one.sigma):
             unstated[one.cause] = np.reshape(one.sigma, (-1, 1)) * change
             roughly |= {one.cause} if one.roughly else set()
+            of_mask |= {one.cause} if one.of_mask else set()
         if one.sought:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
             found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees))
     found.append(_ghost(task, x, image, root, fit))
     told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
-    return Looked(told, fit, unstated, frozenset(roughly))
+    return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
 def words(found: list[Lean]) -> list[str]:

@@ -162,5 +162,6 @@ def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array
         without = ", ".join(unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst)
         more = f"; within the model only, that is without {without}: {parts}" + more
     open_ = [i for i in causes if i not in close and told[i] <= 0.7]
-    wide = ", ".join(f"{names[i]} {low[i]:.3g} to {high[i]:.3g}" for i in open_)
+    middle, reach = (low + high) / 2, 1.96 * whole
+    wide = ", ".join(f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}" for i in open_)
     return f"the process is known to {known}" + (f"; loosely: {wide}" if wide else "") + more

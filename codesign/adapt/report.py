@@ -26,7 +26,8 @@ class Story:
     """Everything that the page shows.
 
     apart: PSF errors against the nominal lens of the fitted lens and of the lens that judges. curves: {job: (step,
-    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions: in words.
+    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions: in words. refused: why the
+    correction is not written; empty where it is.
     """
 
     outcome: Outcome
@@ -36,6 +37,7 @@ class Story:
     plan: Correction
     proposals: Sequence[tuple[Proposal, float, float]]
     cautions: Sequence[str] = field(default_factory=tuple)
+    refused: str = ""
 
 
 def write(path: Path, story: Story) -> None:
@@ -150,13 +152,16 @@ def _mask(story: Story) -> Section:
         head, rows, "Simulated with the lens that judges as the truth; Strehl and light against the design.", digits=3
     )
     columns = ("drawn / nm", "present bias / nm", "new bias / nm", "designed / nm", "aimed at / nm")
-    table = Table(columns, table_rows(story.plan), "bias.toml holds the new table for PROCESS.toml.")
+    held = "bias.toml holds the new table for PROCESS.toml."
+    table = Table(columns, table_rows(story.plan), "Written to no file: see above." if story.refused else held)
     text = (
         "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
         "process as it is (height, index, sidewall) makes the designed phase. lens_corrected.h5 also takes off what "
         "varies over the lens; draw it with the new table. The spacer is no matter of the mask: the last row sets it "
         "right as well."
     )
+    if story.refused:
+        text = f"{story.refused[0].upper()}{story.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
     return Section(
         "The next mask", text, [gain, Figure(_table_plot(story.plan), "Bias: made less drawn diameter."), table]
     )

@@ -11,6 +11,24 @@ from metalens.ground.errors import ConfigError
 
 DRAWS = 24
 WIDE_NM = 2.0  # standard deviation of the table's entries beyond which it is no table: the step of drawn diameters
+PROCESS = ("bias_nm", "height_nm", "index", "sidewall_deg", "bias_r_nm")
+_SETTLED = (  # word of a cause, and what states it
+    ("side wall", "the side wall by a cross-section ([[known]] sidewall_deg)"),
+    ("refractive index", "the index by ellipsometry ([[known]] index)"),
+    ("pixel pitch", "the pixel pitch in the light by a target of known period (pixel_sigma_um of capture.toml)"),
+    ("illumination", "the light on the lens by a frame of the lamp alone ([[known]] light_x, light_y, light_r)"),
+    ("glass", "the glass in the beam (glass_um, glass_tilt_x_deg, glass_tilt_y_deg of capture.toml)"),
+    ("write fields", "the overlay of the write fields ([[known]] stitching_nm)"),
+    ("source", "the size of the source (pinhole_um of capture.toml)"),
+    ("spectrum", "the spectrum ([[known]] bandwidth_nm)"),
+    ("tilt of the lens", "the tilt of the lens, by frames at opposite field angles ([[known]] tilt_x_deg, tilt_y_deg)"),
+    ("saddle", "diameters round the rim by micrographs ([[known]] bias_a_nm, bias_o_nm)"),
+)
+_FRAMES = (
+    "frames at source depths on both sides of focus where the spot is several pixels wide (metalens capture lens.h5 "
+    "--plan lists the best), frames at a field angle, diameters from micrographs (metalens measure) or the height "
+    "(AFM) as [[known]]"
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,14 +62,33 @@ def judge(result: AsBuilt, table: Callable[[Array], Array], *, wide_nm: float = 
     sigma = drawn.std(axis=0, ddof=1)
     if sigma.max() <= wide_nm:
         return Sureness(drawn, sigma, "")
-    causes = [name for name in ("bias_nm", "height_nm", "index", "sidewall_deg", "bias_r_nm") if name in result.names]
-    ranges = [(name, *result.interval(name)) for name in causes]
+    ranges = [(name, *result.interval(name)) for name in PROCESS if name in result.names]
     told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
     return Sureness(
         drawn,
         sigma,
         f"no correction: the posterior leaves the bias table open by {sigma.max():.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {told}). Settle it by frames at source depths on both sides of focus where the spot is "
-        "several pixels wide (metalens capture lens.h5 --protocol lists the best), by frames at a field angle, by "
-        "diameters from micrographs (metalens measure) or the height (AFM) as [[known]]",
+        f"{wide_nm:g} allowed; {told}). Settle it by {_settled(result, table, sigma, wide_nm)}",
     )
+
+
+def _settled(result: AsBuilt, table: Callable[[Array], Array], sigma: Array, wide_nm: float) -> str:
+    """What would make the table narrow, the most telling first: causes to state, and frames where these say too little.
+
+    By the table's slopes along every parameter that it follows; a cause moves all of them together, at most by the sum.
+    """
+    best, place = table(result.parameters()), int(np.argmax(sigma))
+    slopes = np.zeros(len(result.names))
+    for i, name in enumerate(result.names):
+        if name in PROCESS:
+            moved = result.value.copy()
+            moved[i] += 0.1 * result.sigma[i]
+            slopes[i] = (table(result.parameters(moved)) - best)[place] / (0.1 * result.sigma[i])
+    own = float(np.sqrt(slopes @ result.within_covariance @ slopes))
+    by_cause = result.by_cause @ np.abs(slopes) if len(result.causes) else np.empty(0)
+    worst = [k for k in np.argsort(-by_cause) if by_cause[k] > max(by_cause.max() / 4, 0.2 * wide_nm)]
+    ways = [way for k in worst for word, way in _SETTLED if word in result.causes[k]]
+    more = (
+        [_FRAMES] if own > 0.7 * wide_nm or not ways else ["the diameters themselves by micrographs (metalens measure)"]
+    )
+    return "; ".join([*dict.fromkeys(ways), *more])

@@ -228,7 +228,7 @@ def _calibration(about: Bench) -> Iterator[Entry]:
         raise LensError("the as-built file is of another lens than the one given; give the lens that was captured")
     best = fitted.parameters()
     made = []
-    for row in fitted.samples(about.given.draws, seed=3):
+    for row in fitted.lens_samples(about.given.draws, seed=3):
         off = fitted.parameters(row) - best
         made.append(Made(state(off), float(off[PLACE["distance_um"]])))
     said = f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"

@@ -13,7 +13,7 @@ from characterize.inference import asbuilt
 from codesign.adapt import Lenses, RetrainConfig, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
-from codesign.adapt.sure import Sureness, judge
+from codesign.adapt.sure import judge
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
 from codesign.train import Record, RunConfig, Trainer, checkpoint
@@ -110,7 +110,7 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
     )
     apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
     story = retrain_report.Story(
-        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found, sure)
+        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found), sure.words
     )
     if sure.usable:
         correction.write(folder, plan)
@@ -184,8 +184,8 @@ def _curves(folder: Path, found: Lenses) -> dict[str, tuple[list[int], list[floa
     }
 
 
-def _cautions(result: asbuilt.AsBuilt, found: Lenses, sure: Sureness) -> list[str]:
-    words = [sure.words] * (not sure.usable) + list(result.problems) + list(result.degeneracies)
+def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
+    words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
     if release != __version__:
         words.append(f"the as-built record was made by release {release}, this is {__version__}")
@@ -222,6 +222,7 @@ def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
         "psf_error": {"fitted": story.apart[0], "judge": story.apart[1]},
         "truth_known": story.lenses.known,
         "next_lens": states,
+        "correction_refused": story.refused,
     }
 
 
@@ -239,4 +240,6 @@ def _text(story: retrain_report.Story, folder: Path) -> str:
         lines.append(
             f"next lens, {p.name:<26} PSF error {error:.3f}, Strehl {p.strehl:.3f}, slippage error {slip:.3f} mm"
         )
+    if story.refused:
+        lines.append(f"next mask: {story.refused}")
     return "\n".join([*lines, f"open {folder / 'report.html'}"])

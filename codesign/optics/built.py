@@ -41,8 +41,8 @@ def of_lens(x: Array) -> Array:
 
 
 def posterior(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
-    """All parameters of ``count`` lenses that the fit holds possible."""
-    for row in built.samples(count, seed=seed):
+    """All parameters of ``count`` lenses that the fit holds possible, as far as their light goes."""
+    for row in built.lens_samples(count, seed=seed):
         yield built.parameters(row)
 
 

@@ -77,15 +77,19 @@ def test_depths_in_millimetres_are_called_so():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_hidden_lens_lies_within_its_intervals(response, seed):
-    """19 intervals of 95 %: three that miss have a probability of 7 % together, four of 1.5 %."""
+    """19 intervals of 95 % within the model: three that miss have a probability of 7 % together, four of 1.5 %.
+
+    The wider ones, which reckon with what this bench does not have, hold all.
+    """
     session = hidden.session(seed)
     seen = bench.shoot(hidden.lens(), session)
     found = characterize.fit(seen.capture, hidden.lens(), USUAL, response=response)
     missed = []
     for name in hidden.TRUTHS:
-        low, high = found.interval(name)
+        low, high = found.within_model(name)
         if not low <= session.of(name) <= high:
             missed.append(name)
+        assert found.interval(name)[0] < session.of(name) < found.interval(name)[1], name
     assert len(missed) < 4, missed
     assert len(found.verdicts) == 2
 
@@ -105,11 +109,11 @@ def test_uneven_light_is_found_fitted_and_the_rest_comes_back(response):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [{"glass_um": 100.0}, {"stitch_nm": 60.0}, {"sidewall_deg": 1.5}])
-def test_what_cannot_be_told_lies_within_the_outer_interval(response, fault):
-    """19 outer intervals: one may miss by chance."""
+def test_what_cannot_be_told_lies_within_the_interval(response, fault):
+    """19 intervals: one may miss by chance."""
     session = bench.with_faults(hidden.session(0), **fault)
     found = characterize.fit(bench.shoot(hidden.lens(), session).capture, hidden.lens(), USUAL, response=response)
-    ends = {name: found.outer(name) for name in hidden.TRUTHS}
+    ends = {name: found.interval(name) for name in hidden.TRUTHS}
     missed = [name for name, (low, high) in ends.items() if not low <= session.of(name) <= high]
     assert len(missed) < 2, missed
 

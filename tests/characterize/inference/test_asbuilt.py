@@ -107,6 +107,8 @@ def test_hidden_lens_is_found_within_its_intervals(fitted):
         (fitted.value[fitted.names.index(n)] - b.VALUES.get(n, 0.0)) / fitted.sigma[fitted.names.index(n)]
         for n in names
     ]
+    z = np.array(z) * fitted.sigma[[fitted.names.index(n) for n in names]]
+    z /= np.sqrt(np.diag(fitted.within_covariance))[[fitted.names.index(n) for n in names]]
     assert np.abs(z).max() < 4
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
@@ -129,16 +131,16 @@ def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fi
 
 
 def test_what_cannot_be_told_is_reckoned_with_beside_the_model(fitted):
-    """A plate of glass moves the stage zero, a source of some size the blur; the outer interval holds the inner one."""
+    """A plate of glass moves the stage zero, a source of some size the blur; the interval holds that of the model."""
     assert "a plate of glass in the beam" in fitted.most("stage_zero_um")
     assert "a source of finite size" in fitted.most("crosstalk_px")
     for name in fitted.names:
-        low, high = fitted.interval(name)
+        low, high = fitted.within_model(name)
         i = fitted.names.index(name)
-        middle = float(fitted.value[i])
-        want = middle + np.hypot(high - middle, 1.959964 * fitted.unstated[i])
-        assert fitted.outer(name)[1] == pytest.approx(want, rel=1e-9)
-        assert fitted.outer(name)[0] <= low
+        middle, more = float(fitted.value[i]), fitted.covariance[i, i] - fitted.within.covariance[i, i]
+        want = middle + np.hypot(high - middle, 1.959964 * np.sqrt(max(more, 0.0)))
+        assert fitted.interval(name)[1] == pytest.approx(want, rel=1e-6)
+        assert fitted.interval(name)[0] <= low
 
 
 def test_saved_result_comes_back(fitted, tmp_path):
@@ -148,7 +150,9 @@ def test_saved_result_comes_back(fitted, tmp_path):
     assert np.array_equal(again.covariance, fitted.covariance)
     assert again.degeneracies == fitted.degeneracies
     assert again.causes == fitted.causes
-    assert again.outer("bias_nm") == fitted.outer("bias_nm")
+    assert again.interval("bias_nm") == fitted.interval("bias_nm")
+    assert again.within_model("bias_nm") == fitted.within_model("bias_nm")
+    assert np.array_equal(again.lens_samples(3, seed=1), fitted.lens_samples(3, seed=1))
     assert np.array_equal(again.diameters.diameter_um, fitted.diameters.diameter_um)
     assert again.samples(3, seed=1).shape == (3, len(fitted.names))
     asbuilt.save(tmp_path / "b.h5", fitted)
@@ -187,7 +191,7 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
     found = stack.intensity[0]
     assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(want.intensity)  # intervals of the fit
     view = View((600.0,), ((0.0, 0.0), (0.05, 0.0)), 24.0, 48)
-    draw = again.psf_stack(view, again.samples(1, seed=2)[0])
+    draw = again.psf_stack(view, again.lens_samples(1, seed=2)[0])
     best = again.psf_stack(view)
     assert draw.intensity.shape == (2, 1, 48, 48)
     assert 1e-4 < np.linalg.norm(draw.intensity - best.intensity) / np.linalg.norm(best.intensity) < 0.05
@@ -196,6 +200,10 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
 def test_samples_have_the_posterior_covariance(fitted):
     draws = fitted.samples(20000, seed=0)
     assert np.abs(np.cov(draws.T) - fitted.covariance).max() < 0.05 * np.diag(fitted.covariance).max()
+    sigma, draws = np.sqrt(np.diag(fitted.covariance)), fitted.lens_samples(20000, seed=3)
+    own = fitted.within_covariance + fitted.bench  # what the mask takes along is not drawn anew
+    assert np.abs((np.cov(draws.T) - own) / np.outer(sigma, sigma)).max() < 0.05
+    assert (np.linalg.eigvalsh((fitted.covariance - own) / np.outer(sigma, sigma)) > -1e-9).mean() > 0.5
 
 
 def test_as_built_lens_goes_through_the_psf_engine(fitted):

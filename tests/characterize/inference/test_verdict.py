@@ -11,7 +11,7 @@ from characterize.inference import verdict
 from characterize.inference.missing import Unstated
 
 RNG = np.random.default_rng(2)
-NOTHING = Unstated((), np.zeros((0, 3)), np.zeros(3))
+NOTHING = Unstated.none(3)
 
 
 def solution(chi2, pixels=800):
@@ -137,7 +137,8 @@ def test_what_others_may_have_moved_is_known_within_the_model_alone():
     sigma = np.array([0.8, 1.0, 0.01])
     low, high = -1.96 * sigma, 1.96 * sigma
     by_cause = np.array([[1.2, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.003]])
-    unstated = Unstated(("a plate of glass", "an oblique saddle", "uneven light"), by_cause, by_cause.sum(0))
+    moved = np.diag(by_cause.sum(0) ** 2)
+    unstated = Unstated(("a plate of glass", "an oblique saddle", "uneven light"), by_cause, moved, np.zeros((3, 3)))
     words = verdict.process_verdict(names, low, high, np.full(3, 0.1), unstated)
     assert words.startswith("the process is known to height_nm +- 1.1, coma_x_rad +- 0.01;")
     assert "within the model only, that is without plate of glass" in words

@@ -12,7 +12,7 @@ from characterize.inference.missing import Unstated
 from characterize.model import PARAMETERS, PLACE
 
 RNG = np.random.default_rng(41)
-NOTHING = Unstated((), np.zeros((0, 4)), np.zeros(4))
+NOTHING = Unstated.none(4)
 
 
 def test_a_cause_is_known_to_its_interval_over_3_92():
@@ -62,7 +62,7 @@ def test_products_of_neighbouring_pixels_are_over_the_root_of_their_number():
 
 def test_an_interval_is_that_of_the_profile_or_1_96_sigma_and_draws_follow_the_covariance():
     covariance = np.array([[0.09, -0.06], [-0.06, 0.25]])
-    names = ("bias_nm", "index")
+    names = ("bias_nm", "distance_um")
     fitted = SimpleNamespace(
         names=names, value=np.array([7.0, 0.4]), covariance=covariance, low=np.array([]), high=np.array([]),
         draws=np.empty((0, 2)), sigma=AsBuilt.sigma.fget(SimpleNamespace(covariance=covariance)),
@@ -70,12 +70,12 @@ def test_an_interval_is_that_of_the_profile_or_1_96_sigma_and_draws_follow_the_c
     assert fitted.sigma == pytest.approx([0.3, 0.5])
     assert AsBuilt.correlation.fget(fitted)[0, 1] == pytest.approx(-0.4)
     reach = stats.norm.ppf(0.975) * 0.5
-    assert AsBuilt.interval(fitted, "index") == pytest.approx((0.4 - reach, 0.4 + reach), rel=1e-6)
+    assert AsBuilt.interval(fitted, "distance_um") == pytest.approx((0.4 - reach, 0.4 + reach), rel=1e-6)
     drawn = AsBuilt.samples(fitted, 40_000, seed=3)
     assert drawn.mean(0) == pytest.approx(fitted.value, abs=0.01)  # four sigma of the mean
     assert np.cov(drawn.T) == pytest.approx(covariance, abs=0.007)  # four sigma: 0.25 sqrt(2 / 40000) x 4
     fitted.low, fitted.high = np.array([6.1, -0.2]), np.array([7.3, 1.9])
-    assert AsBuilt.interval(fitted, "index") == (-0.2, 1.9)
+    assert AsBuilt.interval(fitted, "distance_um") == (-0.2, 1.9)
     fitted.draws = np.arange(14.0).reshape(7, 2)
     again = AsBuilt.samples(fitted, 16, seed=3)
     _, counts = np.unique(again[:, 0], return_counts=True)

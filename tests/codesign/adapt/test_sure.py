@@ -10,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
+from characterize.inference.asbuilt import WithinModel
 from characterize.model import PLACE
 from codesign.adapt import sure
 from metalens.ground.errors import ConfigError
@@ -33,6 +34,25 @@ def test_a_wide_posterior_is_refused_with_what_would_settle_it():
     assert not found.usable
     for words in ("bias_nm", "focus", "micrographs", "AFM"):
         assert words in found.words
+
+
+def test_what_nobody_stated_refuses_and_is_named():
+    """Sharp within the model; a leaning wall and the index move the bias by 3 and 2.6 nm, light by nothing of note."""
+    sharp = m.asbuilt(sigma=0.1)
+    i = sharp.names.index("bias_nm")
+    causes = ("another refractive index", "uneven illumination", "a side wall that leans about half height")
+    by_cause = np.zeros((3, len(sharp.names)))
+    by_cause[:, i] = 2.6, 0.05, 3.0
+    whole = sharp.covariance + by_cause.T @ by_cause
+    open_ = replace(sharp, covariance=whole, within=WithinModel(sharp.covariance), causes=causes, by_cause=by_cause)
+    found = sure.judge(open_, table)
+    assert not found.usable
+    assert found.words.index("cross-section") < found.words.index("ellipsometry")
+    for words in ("lamp", "both sides of focus"):  # the frames have said what they can
+        assert words not in found.words
+    assert found.sigma_nm == pytest.approx(np.hypot(2.6, 3.0) * KNOTS, rel=0.5)
+    kept = replace(open_, bench=np.zeros_like(whole)).lens_samples(400, seed=1)[:, i]
+    assert kept.std() == pytest.approx(0.1, rel=0.15)  # both go with the lens: its light is as sharp as before
 
 
 def test_two_lenses_that_fit_alike_are_wide_however_sharp_each_is():
