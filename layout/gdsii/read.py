@@ -190,6 +190,9 @@ class _Reader:
             if kind == gds.ENDEL:
                 return found
             self.refuse_outside_element()
+            if kind in found and kind not in (gds.PROPATTR, gds.PROPVALUE):
+                more = "; an outline over several records is no GDSII" if kind == gds.XY else ""
+                raise self.fail(f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice{more}")
             found[kind] = data
 
     def numbers(self, found: dict[int, bytes], kind: int, count: int | None) -> Array:
@@ -265,9 +268,12 @@ class _Reader:
         ends = int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
         if len(points) % 2 or len(points) < 4 or (points.reshape(-1, 2) == points[:2]).all():
             raise self.fail(f"path of {len(points) // 2} points, need 2 that differ", start)
-        if width == 0 or ends not in (0, 1, 2, 4):
-            raise self.fail(f"path of width {width} and type {ends}: need a width, and type 0, 1, 2 or 4", start)
-        half = abs(width) / 2
+        if width <= 0 or ends not in (0, 1, 2, 4):
+            absolute = ", which no magnification changes and readers take differently" if width < 0 else ""
+            raise self.fail(
+                f"path of width {width}{absolute}, and type {ends}: need a width above 0, and type 0, 1, 2 or 4", start
+            )
+        half = width / 2
         longer = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (half, half), 4: (float(begin), float(end))}[ends]
         made = paths.outline(points.reshape(-1, 2), half, begin=longer[0], end=longer[1], rounded=ends == 1)
         return (layer & 0xFFFF, datatype & 0xFFFF), made

@@ -49,6 +49,22 @@ def test_paths(tmp_path, suffix, ends):
     assert agrees(path, slack=1)
 
 
+@pytest.mark.parametrize("ends", [(0, 0, False), (31, -2, False), (90, 90, True)])
+def test_paths_of_sharp_bends_and_short_arms(tmp_path, ends):
+    rng, made = np.random.default_rng(7), db.Layout()
+    top = made.create_cell("TOP")
+    for n in range(60):  # arms shorter than the width, and turns up to a way back
+        steps = rng.integers(-1, 2, (5, 2)) * rng.integers(20, (90, 500, 3000)[n % 3], (5, 2))
+        steps[0] += 7
+        line = np.cumsum(np.vstack([[0, 0], steps]), axis=0)
+        shape = db.Path([db.Point(*p) for p in line.tolist()], 180, *ends)
+        top.shapes(made.layer(n + 1, 0)).insert(shape)
+    path = tmp_path / "bent.gds"
+    made.write(str(path))
+    for n in range(60):
+        assert agrees(path, (n + 1, 0), slack=1), n
+
+
 def test_round_paths_of_gdsii(tmp_path):
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(7, 3)
@@ -56,7 +72,9 @@ def test_round_paths_of_gdsii(tmp_path):
     path = tmp_path / "r.gds"
     made.write(str(path))
     area = region_of(layout.read_gdsii(path), (7, 3)).area()
-    assert area == pytest.approx(400 * math.hypot(3000, 1000) + math.pi * 200**2, rel=5e-3)  # 32 corners: 0.6 % of it
+    assert area == pytest.approx(
+        400 * math.hypot(3000, 1000) + math.pi * 200**2, rel=2e-3
+    )  # of 32 corners: 0.06 % of it
 
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])
@@ -98,6 +116,20 @@ def test_arrays_off_the_grid_and_nodes_are_refused_by_name():
     node = gds.record(gds.NODE) + gds.shorts(gds.LAYER, 1) + gds.record(gds.ENDEL)
     with pytest.raises(MaskFileError, match="NODE"):
         gdsii_read.parse(gdsii(node))
+
+
+def test_elements_that_readers_take_differently_are_refused():
+    def path_of(width, *lines):
+        body = gds.record(gds.PATH) + gds.shorts(gds.LAYER, 1) + gds.shorts(gds.DATATYPE, 0)
+        body += gds.record(gds.WIDTH, width.to_bytes(4, "big", signed=True))
+        return gdsii(body + b"".join(gds.points(np.array(line)) for line in lines) + gds.record(gds.ENDEL))
+
+    line = [[0, 0], [300, 400]]
+    assert len(gdsii_read.parse(path_of(60, line)).cells["TOP"].polygons[1, 0]) == 1
+    with pytest.raises(MaskFileError, match="width -60, which no magnification"):
+        gdsii_read.parse(path_of(-60, line))
+    with pytest.raises(MaskFileError, match="XY twice; an outline over several records"):
+        gdsii_read.parse(path_of(60, line, line))
 
 
 def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
