@@ -22,10 +22,12 @@ from metalens import design
 from metalens.design.free_form import search as design_fisher
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.design.free_form.search import Fisher
+from metalens.design.free_form.settings import Asked
 from metalens.design.profiles import Focus
 from metalens.image.pupil import Pupil
 
 PUPIL = Pupil(nodes=160)
+FOCUS = Focus(PUPIL.wavelength_um, PUPIL.sensor_distance_um, 20e3)
 ENERGIES = (0.5, 0.3, 0.7, 0.85)
 BINNINGS = (2, 1, 3)
 PAPER = 1.12  # at 5 degrees, Table 3
@@ -36,15 +38,17 @@ ANGLES = (0.0, 5.0, 10.0)  # of the designs off axis, at the first energy of SPR
 SPREAD = 0.3
 
 
-def settings(binning: int, energy: float, angles_deg: tuple[float, ...] = (0.0,)) -> Fisher:
+def settings(binning: int, energy: float, angles_deg: tuple[float, ...] = (0.0,)) -> Asked:
     """What ``metalens design`` takes by default; one start for several angles."""
     starts = 3 if len(angles_deg) == 1 else 1
-    return Fisher(pixel_um=3.0 * binning, encircled=energy, angles_deg=angles_deg, starts=starts)
+    asked = Fisher(pixel_um=3.0 * binning, encircled=energy, angles_deg=angles_deg, starts=starts)
+    return asked.about(FOCUS, PUPIL.radius_um)
 
 
 def figures(phase: torch.Tensor, focus_um: float) -> dict[str, Any]:
     """Mean information at every binning and least energy, over 11 depths."""
-    found = [design_fisher.score(phase, PUPIL, focus_um=focus_um, settings=Fisher(pixel_um=3.0 * b)) for b in (1, 2, 3)]
+    asked = [Fisher(pixel_um=3.0 * b).about(FOCUS, PUPIL.radius_um) for b in (1, 2, 3)]
+    found = [design_fisher.score(phase, PUPIL, focus_um=focus_um, settings=one) for one in asked]
     return {
         "information": [float(f.information.mean()) for f in found],
         "encircled": float(found[0].encircled.min()),
@@ -75,7 +79,8 @@ def baseline_figures() -> dict[str, Any]:
     """Tuned hyperbolic lens and double helix of every binning."""
     out = {}
     for binning in (1, 2, 3):
-        plain, helix = baselines.tuned_pair(PUPIL, Fisher(pixel_um=3.0 * binning))
+        asked = Fisher(pixel_um=3.0 * binning).about(FOCUS, PUPIL.radius_um)
+        plain, helix = baselines.tuned_pair(PUPIL, asked)
         for kind, found in (("hyperbolic", plain), ("double helix", helix)):
             phase = baselines.baseline_phase(PUPIL, found.zones)
             about = {"focus_um": found.focus_um, "zones": found.zones}

@@ -26,6 +26,7 @@ from codesign.optics import stack as optics
 from metalens import fisher
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.design.free_form.search import Fisher, score
+from metalens.design.profiles import Focus
 from metalens.image import pupil
 from metalens.image.pupil import Pupil
 from metalens.image.scene import Frames
@@ -36,6 +37,7 @@ ROOT = Path(__file__).parents[1]
 STUDY = ROOT / "benchmarks" / "results" / "codesign_study.json"
 DOCS = ROOT / "docs" / "fisher"
 PUPIL = Pupil(nodes=160)
+FOCUS = Focus(PUPIL.wavelength_um, PUPIL.sensor_distance_um, 20e3)
 CASE = CASES["p18"]
 SENSOR = Sensor(CASE.pitch_um, 9.0, CASE.electrons, 0.0, 2 * CASE.electrons, 5.0, 10)
 DEPTHS = torch.linspace(16e3, 26e3, 11, dtype=torch.float64)
@@ -53,7 +55,7 @@ def measures(lens: str, scenes: SceneObjective, frames: Frames) -> dict[str, flo
     found: dict[str, float] = {}
     for kind in ("l2", "sum"):
         for binning in (1, 2, 3):
-            asked = Fisher(pixel_um=3.0 * binning, normalisation=kind)
+            asked = Fisher(pixel_um=3.0 * binning, normalisation=kind).about(FOCUS, PUPIL.radius_um)
             made = score(phase, PUPIL, focus_um=focus_um, settings=asked)
             found[f"I(z) {kind}, {binning} x {binning}"] = float(made.information.mean())
     found["encircled energy, least"] = float(made.encircled.min())
@@ -224,7 +226,7 @@ def main() -> None:
     """Measure all lenses, write JSON and table."""
     torch.set_num_threads(1)
     study = {line["lens"]: line for line in json.loads(STUDY.read_text())["p18"]}
-    scenes = SceneObjective(PUPIL, Fisher(scenes=4, objective="scenes"))
+    scenes = SceneObjective(PUPIL, Fisher(scenes=4, objective="scenes").about(FOCUS, PUPIL.radius_um))
     frames = EyeScenes(SCENES, 9.0, 2000.0, 0, TEST).rendered(0, 4).frames
     found = {}
     for name in (n for n in LENSES if n in study):

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from metalens.design.free_form import STEP_UM, Fisher, score
+from metalens.design import Focus
+from metalens.design.free_form import Fisher, score
 from metalens.image import Pupil, pixel_information
 from metalens.image import pupil as pupils
 
-PIXEL_UM = 3.0
+PIXEL_UM, STEP_UM = 3.0, 200.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,6 +37,8 @@ def coarse_climb(pupil: Pupil, *, iterations: int = 60, looks: int = 4, seed: in
     phase = (2 * grown[0, 0]).requires_grad_(True)
     step = torch.optim.Adam([phase], lr=0.2)
     depths = torch.linspace(16e3, 26e3, 6, dtype=torch.float64)
+    own = Focus(pupil.wavelength_um, pupil.sensor_distance_um, focus_um)
+    asked = Fisher(depths_mm=(16.0, 26.0)).about(own, pupil.radius_um)
     both = torch.cat([depths, depths + STEP_UM])
     history = []
     for i in range(iterations):
@@ -45,7 +48,7 @@ def coarse_climb(pupil: Pupil, *, iterations: int = 60, looks: int = 4, seed: in
             near, far, step_um=STEP_UM, sample_um=PIXEL_UM, pixel_um=PIXEL_UM, normalisation="l2"
         ).mean()
         if i % max(1, iterations // looks) == 0 or i == iterations - 1:
-            honest = score(phase, pupil, focus_um=focus_um, settings=Fisher(), depths=6).information.mean()
+            honest = score(phase, pupil, focus_um=focus_um, settings=asked, depths=6).information.mean()
             history.append(torch.stack([value.detach(), honest]))
         step.zero_grad()
         (-torch.log(value)).backward()  # type: ignore[no-untyped-call]

@@ -87,12 +87,13 @@ def _measure(
         for name, lens in tuned_like(made[0], settings.axial):
             names.append(name)
             made.append(lens)
+    measured = settings.axial.about(made[0])
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
-    axial = {name: evaluate_optics.axial(lens, settings.axial) for name, lens in pairs}
+    axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
     scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
-    text = evaluate_tables.tables(axial, scenes, settings.axial)
-    values = evaluate_tables.values(axial, scenes, settings.axial)
+    text = evaluate_tables.tables(axial, scenes, measured)
+    values = evaluate_tables.values(axial, scenes, measured)
     if options.reader:
         told = judged(dict(zip(names, made, strict=True)), settings.reader)
         found = dict(options.console.track(told, total=len(made), label="reader"))
@@ -102,8 +103,8 @@ def _measure(
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {
-        "axial": evaluate_plots.information(axial, settings.axial),
-        "slices": evaluate_plots.slices(axial, settings.axial),
+        "axial": evaluate_plots.information(axial, measured),
+        "slices": evaluate_plots.slices(axial, measured),
         "scenes": evaluate_plots.scenes(scenes),
     }
     for name, image in pictures.items():
@@ -119,16 +120,16 @@ def _measure(
 
 def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
     """The tuned hyperbolic lens and double helix, of the pillars and aperture of a lens, with their names."""
-    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    radius, measured = lens.diameters.radius_um + lens.diameters.pitch_um / 2, setting.about(lens)
     focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
     wanted = Fisher(
-        depths_mm=setting.depths_mm,
-        pixel_um=setting.pixel_um * min(setting.binnings),
-        radius_um=setting.radius_um,
+        depths_mm=measured.depths_mm,
+        pixel_um=measured.pixel_um * min(setting.binnings),
+        radius_um=measured.radius_um,
         normalisation="sum" if setting.normalisation == "sum" else "l2",
-    )
+    ).about(focus, radius)
     out = []
-    for found in baselines.tuned_pair(design_pupil(focus, radius), wanted):
+    for found in baselines.tuned_pair(design_pupil(focus, radius, wanted), wanted):
         phase, mine = found.phase(focus, radius_um=radius)
         kind = "double-helix" if found.zones else "hyperbolic"
         simple, _ = design.make(

@@ -3,7 +3,7 @@ of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals ov
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -14,43 +14,78 @@ from codesign.eye import Camera, Rendered, Rig, States, Triplets, triplets
 from codesign.optics import formed
 from metalens.ground.errors import ConfigError, SceneError
 from metalens.image import Grid, Imager, Normalisation, axial_information, imager, integrate, scene
-from metalens.lens import Lens
+from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens
 
-STEP_UM = 200.0  # of the difference in Eq. 11
+WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
     """How lenses are measured.
 
-    depths_mm, count: of I(z). angles_deg: field angles. pixel_um, binnings: pixels. normalisation: of Eq. 11.
-    window_um, sample_um: of the PSFs; light outside the window counts as lost. tolerance: of the PSF engine.
+    depths_mm, count: of I(z); left out, the depths over which the first lens goes from 1.75 waves out of focus at the
+        rim to as many on the other side.
+    angles_deg: field angles. pixel_um, binnings: pixels; left out, pixels of 0.88 wavelength / NA of the first lens.
+    normalisation: of Eq. 11.
+    window_um, sample_um: of the PSFs; light outside the window counts as lost. Left out, 56.4 wavelength / NA of the
+        first lens or 8 radii of its blur, and what shows its finest detail.
+    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. tolerance: of the PSF engine.
     """
 
-    depths_mm: tuple[float, float] = (16.0, 26.0)
+    depths_mm: tuple[float, float] | None = None
     count: int = 11
     angles_deg: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0)
-    pixel_um: float = 3.0
+    pixel_um: float | None = None
     binnings: tuple[int, ...] = (1, 2, 3)
     normalisation: Normalisation = "l2"
-    window_um: float = 192.0
-    sample_um: float = 0.75
-    radius_um: float = 18.0
+    window_um: float | None = None
+    sample_um: float | None = None
+    radius_um: float | None = None
     tolerance: float = field(default=1e-3, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        low, high = self.depths_mm
+        low, high = self.depths_mm or (1.0, 1.0)
         if not (0 < low <= high and self.count >= 1 and self.angles_deg and self.binnings and min(self.binnings) >= 1):
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
                 f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
             )
-        if not (self.window_um >= 4 * self.sample_um > 0 and self.pixel_um > 0 and self.radius_um > 0):
+        sample = 1e-6 if self.sample_um is None else self.sample_um
+        wide = self.window_um is None or self.window_um >= 4 * sample
+        lengths = [1.0 if length is None else length for length in (self.pixel_um, self.radius_um)]
+        if not (wide and sample > 0 and min(lengths) > 0):
             raise ConfigError(
                 f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
                 f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
             )
+
+    def about(self, lens: Lens) -> "Filled":
+        """These with what was left to the lens."""
+        near, far = (1e3 * z for z in self.depths_mm) if self.depths_mm else reach.depth_range_um(lens)
+        pixel = self.pixel_um or reach.pixel_um(lens)
+        sample = self.sample_um or reach.sample_um(lens, pixel * min(self.binnings))
+        window = self.window_um or reach.window_um(lens, (near, far), airy=WINDOW)
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        own |= {
+            "pixel_um": pixel,
+            "depths_mm": (near * 1e-3, far * 1e-3),
+            "radius_um": self.radius_um or reach.disc_um(lens),
+        }
+        own |= {"sample_um": sample, "window_um": max(4, round(window / sample)) * sample}
+        return Filled(**own, step_um=reach.depth_step_um(lens, near))
+
+
+@dataclass(frozen=True, slots=True)
+class Filled(Setting):
+    """A :class:`Setting` with nothing left to the lens. step_um: of the difference in Eq. 11."""
+
+    depths_mm: tuple[float, float] = field(kw_only=True)
+    pixel_um: float = field(kw_only=True)
+    window_um: float = field(kw_only=True)
+    sample_um: float = field(kw_only=True)
+    radius_um: float = field(kw_only=True)
+    step_um: float = field(kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +140,17 @@ class Axial:
 
 
 def axial(lens: Lens, setting: Setting | None = None) -> Axial:
-    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the PSF engine."""
-    s = setting or Setting()
+    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the PSF engine.
+
+    What the setting leaves out is that of this lens: to compare lenses, take :meth:`Setting.about` of one.
+    """
+    s = setting if isinstance(setting, Filled) else (setting or Setting()).about(lens)
     depths = np.linspace(1e3 * s.depths_mm[0], 1e3 * s.depths_mm[1], s.count)
-    both = np.sort(np.concatenate([depths, depths + STEP_UM]))
+    both = np.sort(np.concatenate([depths, depths + s.step_um]))
     samples = round(s.window_um / s.sample_um)
     angles = tuple((math.radians(a), 0.0) for a in s.angles_deg)
     stack = from_lens(lens, View(tuple(both), angles, s.window_um, samples), tolerance=s.tolerance)
-    where = [int(np.argmin(np.abs(both - d))) for d in (*depths, *(depths + STEP_UM))]
+    where = [int(np.argmin(np.abs(both - d))) for d in (*depths, *(depths + s.step_um))]
     intensity = torch.as_tensor(stack.intensity)[..., where, :, :].reshape(len(angles), 2, s.count, samples, samples)
     values = []
     for b in s.binnings:
@@ -120,7 +158,7 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
             axial_information(
                 intensity[:, 0],
                 intensity[:, 1],
-                step_um=STEP_UM,
+                step_um=s.step_um,
                 sample_um=s.sample_um,
                 pixel_um=s.pixel_um * b,
                 normalisation=s.normalisation,

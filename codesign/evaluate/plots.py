@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from codesign.evaluate.optics import Axial, SceneEnergy, Setting
+from codesign.evaluate.optics import Axial, Filled, SceneEnergy
 from metalens.ground.report import canvas, png
 from metalens.image import pixel_weights
 
@@ -16,10 +16,10 @@ CAPTIONS = {
     "scenes": "First scene: the sensor image, its squared change with gaze, and the squared difference between gaze "
     "and slip, on one scale for all lenses.",
 }
-HALF_UM = 36.0  # half width of the slices that is shown
+HALF = 0.1875  # half width of the slices that is shown, of the window
 
 
-def information(axial: Mapping[str, Axial], setting: Setting) -> bytes:
+def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
     """I(z) over depth on axis, a panel for each binning."""
     depths = np.linspace(*setting.depths_mm, setting.count)
     count = len(setting.binnings)
@@ -34,22 +34,22 @@ def information(axial: Mapping[str, Axial], setting: Setting) -> bytes:
     return png(figure)
 
 
-def slices(axial: Mapping[str, Axial], setting: Setting) -> bytes:
+def slices(axial: Mapping[str, Axial], setting: Filled) -> bytes:
     """Light along x over depth, lenses down, binnings across."""
     shape = (len(axial), len(setting.binnings))
     figure, panels = canvas(*shape, size=(1 + 2.6 * shape[1], 0.6 + 2.0 * shape[0]), squeeze=False, sharex=True)
-    low, high = setting.depths_mm
+    (low, high), half = setting.depths_mm, HALF * setting.window_um
     for place, (row, (name, found)) in enumerate(zip(panels, axial.items(), strict=True)):
         for panel, binning in zip(row, setting.binnings, strict=True):
             pixel = setting.pixel_um * binning
-            pixels = int(2 * HALF_UM / pixel) // 2 * 2 + 1
+            pixels = int(2 * half / pixel) // 2 * 2 + 1
             weights = pixel_weights(found.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels)
             light = found.slices @ weights.to(found.slices).mT
             shown = (light / light.amax(1, keepdim=True).clamp_min(1e-30)).numpy()
             edge = pixels * pixel / 2
             panel.imshow(shown, extent=(-edge, edge, high, low), aspect="auto", vmin=0, interpolation="nearest")
             panel.grid(False)
-            panel.set_xlim(-HALF_UM, HALF_UM)
+            panel.set_xlim(-half, half)
             if place == 0:
                 panel.set_title(f"{binning} × {binning} of {setting.pixel_um:g} µm")
         row[0].set_ylabel(f"{name}\ndepth / mm", fontsize=8)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from codesign.evaluate.optics import Scenes, scene_views
 from codesign.eye import states_at
-from metalens.design.free_form import SAMPLE_UM, Fisher, Score
+from metalens.design.free_form import Asked, Score
 from metalens.image import OpticsLoss, Pupil, encircled_energy, integrate, optics_loss, scene
 from metalens.image import pupil as pupils
 
@@ -19,7 +19,7 @@ DEPTHS = 14  # of the PSF stack, at equal steps of 1/z over what the scenes hold
 class SceneObjective:
     """Eq. 6 of a phase on the pupil, over a fixed set of scenes."""
 
-    def __init__(self, pupil: Pupil, settings: Fisher, scenes: Scenes | None = None) -> None:
+    def __init__(self, pupil: Pupil, settings: Asked, scenes: Scenes | None = None) -> None:
         """Render the triplets once.
 
         Args:
@@ -58,13 +58,13 @@ class SceneObjective:
 
     def evaluate(self, phase_rad: Tensor, focus_um: float) -> tuple[OpticsLoss, Tensor]:
         """The loss with its parts, and the encircled energy at every depth."""
-        samples = int((self.size + 2) * self.scenes.pitch_um / SAMPLE_UM)
-        samples = min(samples, int(self.pupil.period_um / SAMPLE_UM))
+        sample = self.settings.sample_um
+        samples = min(int((self.size + 2) * self.scenes.pitch_um / sample), int(self.pupil.period_um / sample))
         fine = pupils.psf(
-            phase_rad, self.pupil, depths_um=self.depths_um, focus_um=focus_um, sample_um=SAMPLE_UM, samples=samples
+            phase_rad, self.pupil, depths_um=self.depths_um, focus_um=focus_um, sample_um=sample, samples=samples
         )
-        energy = encircled_energy(fine, SAMPLE_UM, radius_um=self.settings.radius_um)
-        stack = integrate(fine, SAMPLE_UM, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size))
+        energy = encircled_energy(fine, sample, radius_um=self.settings.radius_um)
+        stack = integrate(fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size))
         optics = scene.with_kernels(self.optics, stack / stack.sum((1, 2), keepdim=True))
         size = (self.scenes.pixels, self.scenes.pixels)
         images = [scene.image_spectra(source, optics, size) for source in self.sources]

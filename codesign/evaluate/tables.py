@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.evaluate.optics import Axial, SceneEnergy, Setting
+from codesign.evaluate.optics import Axial, Filled, SceneEnergy
 
 KINDS = ("gaze", "slip", "separability")
 PAPER_SCENES = {"gaze": 1.85, "slip": 1.60, "separability": 1.57}  # proposed lens against hyperbolic, Table 1
@@ -38,7 +38,7 @@ def ratios(scenes: Mapping[str, SceneEnergy]) -> dict[str, dict[str, tuple[float
     }
 
 
-def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Setting) -> dict[str, Any]:
+def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> dict[str, Any]:
     """Every number of the tables, ready for JSON."""
     out: dict[str, Any] = {
         "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
@@ -62,7 +62,7 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
     return out
 
 
-def tables(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Setting) -> str:
+def tables(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> str:
     """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the paper's numbers below each."""
     width = max(14, *(len(name) for name in axial)) + 2
     low, high = setting.depths_mm

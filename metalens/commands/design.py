@@ -29,11 +29,12 @@ from metalens.design import (
     focuses,
     meeting_um,
 )
-from metalens.design.free_form import Fisher
+from metalens.design.free_form import Asked, Fisher
 from metalens.ground import config, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
+from metalens.image import Pupil
 from metalens.lens import Layers, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
@@ -57,7 +58,8 @@ class Design:
     limits: what the process prints.
     layers: [[layers.front]] and [[layers.behind]] with material and thickness_um, in the order that the light meets
         them: films that the phase is corrected for; the gap behind the pillars is filled by the cell's cover.
-    double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` chooses its own source distance.
+    double_helix, cubic, fisher, map: of the profile of that name; ``fisher`` looks for a source distance of its own,
+        about the one that is given.
     along_y: [along_y] with profile, distances and their tables: what light polarised along y is to see, where the
         library is one over two sizes; without it the same as light along x.
     hand: of the circular light that comes, where the library is for circular light: right (x + iy) or left. The phase
@@ -296,8 +298,9 @@ def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[Phas
     from metalens.design.free_form import design_pupil, fisher_profile
     from metalens.design.free_form import report as reports
 
-    console, settings = options.console, wanted.fisher
-    objective = _scene_objective(wanted, radius_um) if settings.objective == "scenes" else None
+    console, settings = options.console, wanted.fisher.about(wanted.focus, radius_um)
+    pupil = design_pupil(wanted.focus, radius_um, settings)
+    objective = _scene_objective(settings, pupil) if settings.objective == "scenes" else None
     console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
     phase, found = fisher_profile(wanted.focus, radius_um=radius_um, settings=settings, objective=objective)
     least, mean = float(found.score.encircled.min()), float(found.score.information.mean())
@@ -307,18 +310,14 @@ def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[Phas
     if objective is not None:
         return phase, focus, None
     console.say("tuning a hyperbolic lens and a double helix for the same pixels, depths and angles")
-    pupil = design_pupil(wanted.focus, radius_um)
     lenses = reports.judged(found, pupil, settings)
     picture = reports.picture(lenses, pupil, settings)
     return phase, focus, _Judged(reports.values(lenses, settings), reports.text(lenses, settings), picture)
 
 
-def _scene_objective(wanted: Design, radius_um: float) -> Any:
+def _scene_objective(settings: Asked, pupil: Pupil) -> Any:
     """Eq. 6 on rendered eyes, of a package above this one: named by the command line, loaded only when asked for."""
-    from metalens.design.free_form import design_pupil
-
-    module = importlib.import_module(OBJECTIVES["scenes"])
-    return module.SceneObjective(design_pupil(wanted.focus, radius_um), wanted.fisher)
+    return importlib.import_module(OBJECTIVES["scenes"]).SceneObjective(pupil, settings)
 
 
 def _pillars(wanted: Design, where: Path, console: Console) -> tuple[PillarLibrary, dict[str, str]]:

@@ -14,7 +14,7 @@ from metalens.lens import Layers, reach
 from metalens.psf import spectrum as spectra
 
 MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
-AIRY, BLURS = 28.0, 8.0  # width of a window in units of wavelength / NA, and of the blur's radius
+AIRY = 28.0  # width of a window in units of wavelength / NA
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +162,7 @@ class Settings:
         if self.window_um is not None:
             return replace(self, depths_mm=depths_mm)
         ends = [z * 1e3 for z in self.sources_mm or depths_mm[:2]]
-        worst = max(reach.blur_um(made, z) for z in ends)
-        width = max(AIRY * reach.diffraction_um(made), BLURS * worst)
-        return replace(self, depths_mm=depths_mm, window_um=float(f"{width:.3g}"))
+        return replace(self, depths_mm=depths_mm, window_um=reach.window_um(made, tuple(ends), airy=AIRY))
 
     @property
     def view(self) -> psf.View:

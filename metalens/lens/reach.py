@@ -1,33 +1,82 @@
 """How far a lens reaches: the range of depths over which its image blurs, and how wide it does, from its own focus."""
 
 import math
+from dataclasses import dataclass, field
 
+from metalens.lens.layers import Layers
 from metalens.lens.record import Lens
 
 DEFOCUS_WAVES = 1.75  # at the rim, at both ends of the range: the blur is then 3.5 wavelength / NA in radius
+STEP_WAVES = 0.115  # at the rim, between two depths whose images are told apart
+ENCIRCLED = 5.3  # radius of the disc that holds a spot whose depth can be told, in wavelength / NA
+SAMPLE = 0.86  # of the coarsest sampling of the intensity
+PIXEL = 0.88  # of a pixel that shows most of what a spot tells, in wavelength / NA
+BLURS = 8.0  # width of a window, in radii of the blur
 
 
-def defocus_per_um(lens: Lens, depth_um: float) -> float:
+@dataclass(frozen=True, slots=True)
+class Aperture:
+    """What of a lens decides how far it reaches: for a lens that is yet to be made."""
+
+    radius_um: float
+    wavelength_um: float
+    sensor_distance_um: float
+    source_distance_um: float = math.inf
+    layers: Layers = field(default_factory=Layers)
+
+
+def defocus_per_um(lens: Lens | Aperture, depth_um: float) -> float:
     """1 / z of a source less that of best focus, 1/um, films in front taken as the air that bends light as much."""
     return 1 / _reduced(lens, depth_um) - 1 / _reduced(lens, lens.source_distance_um)
 
 
-def blur_um(lens: Lens, depth_um: float) -> float:
+def blur_um(lens: Lens | Aperture, depth_um: float) -> float:
     """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z - 1/z0|."""
-    return lens.diameters.radius_um * sensor_reach_um(lens) * abs(defocus_per_um(lens, depth_um))
+    return _aperture(lens).radius_um * sensor_reach_um(lens) * abs(defocus_per_um(lens, depth_um))
 
 
-def sensor_reach_um(lens: Lens) -> float:
+def sensor_reach_um(lens: Lens | Aperture) -> float:
     """Distance in air that bends paraxial light as much as the media between pillars and sensor."""
     return lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).reduced_um
 
 
-def diffraction_um(lens: Lens) -> float:
+def diffraction_um(lens: Lens | Aperture) -> float:
     """Wavelength over the paraxial numerical aperture of the image side, um."""
-    return lens.wavelength_um * sensor_reach_um(lens) / max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    return lens.wavelength_um * sensor_reach_um(lens) / _widest(lens)
 
 
-def depth_range_um(lens: Lens, *, digits: int = 2) -> tuple[float, float]:
+def window_um(lens: Lens | Aperture, depths_um: tuple[float, ...], *, airy: float) -> float:
+    """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst of these depths; 3 digits."""
+    blur = max(blur_um(lens, depth) for depth in depths_um)
+    return _rounded(max(airy * diffraction_um(lens), BLURS * blur), 3)
+
+
+def disc_um(lens: Lens | Aperture) -> float:
+    """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2 digits."""
+    return _rounded(ENCIRCLED * diffraction_um(lens), 2)
+
+
+def pixel_um(lens: Lens | Aperture) -> float:
+    """Pixels that show most of what a spot tells: 0.88 wavelength / NA, 2 digits."""
+    return _rounded(PIXEL * diffraction_um(lens), 2)
+
+
+def depth_step_um(lens: Lens | Aperture, depth_um: float) -> float:
+    """Step of depth that moves the rim by 0.115 waves against the middle: 0.23 wavelength z² / R², 2 digits.
+
+    Short enough that the image's change over it is a derivative; never above a fiftieth of the depth.
+    """
+    step = 2 * STEP_WAVES * lens.wavelength_um * (_reduced(lens, depth_um) / _widest(lens)) ** 2
+    return _rounded(min(step, 0.02 * depth_um), 2)
+
+
+def sample_um(lens: Lens | Aperture, pixel_um: float) -> float:
+    """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a pixel; 2 digits."""
+    sine = math.sin(math.atan(_widest(lens) / sensor_reach_um(lens)))
+    return _rounded(min(SAMPLE * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
+
+
+def depth_range_um(lens: Lens | Aperture, *, digits: int = 2) -> tuple[float, float]:
     """(near, far) depths at which the rim is 1.75 waves out of focus, R² |1/z - 1/z0| / (2 wavelength).
 
     Where no depth is that far out of focus, far is ten times near; near is at least the lens's diameter, or the
@@ -35,7 +84,7 @@ def depth_range_um(lens: Lens, *, digits: int = 2) -> tuple[float, float]:
 
     A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
     """
-    radius = max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    radius = _widest(lens)
     most = 2 * DEFOCUS_WAVES * lens.wavelength_um / radius**2
     focus, films = _reduced(lens, lens.source_distance_um), _thinner(lens)
     near = max(1 / (1 / focus + most), min(2 * radius, focus))
@@ -44,11 +93,23 @@ def depth_range_um(lens: Lens, *, digits: int = 2) -> tuple[float, float]:
     return max(_rounded(near + films, digits), thick), _rounded(far + films, digits)
 
 
-def _reduced(lens: Lens, depth_um: float) -> float:
+def _aperture(lens: Lens | Aperture) -> Aperture:
+    if isinstance(lens, Aperture):
+        return lens
+    distances = lens.sensor_distance_um, lens.source_distance_um
+    return Aperture(lens.diameters.radius_um, lens.wavelength_um, *distances, lens.layers)
+
+
+def _widest(lens: Lens | Aperture) -> float:
+    """Radius, at least one pitch."""
+    return lens.radius_um if isinstance(lens, Aperture) else max(lens.diameters.radius_um, lens.diameters.pitch_um)
+
+
+def _reduced(lens: Lens | Aperture, depth_um: float) -> float:
     return depth_um - _thinner(lens)
 
 
-def _thinner(lens: Lens) -> float:
+def _thinner(lens: Lens | Aperture) -> float:
     """What films in front take off the depth: sum of t (1 - 1/n)."""
     before = lens.layers.before(math.inf, lens.wavelength_um)
     return sum(t * (1 - 1 / n) for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True))

@@ -7,14 +7,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from metalens.design.free_form.settings import SAMPLE_UM, Fisher, Variation
+from metalens.design.free_form.settings import Asked, Variation
 from metalens.ground.paths import path_difference
 from metalens.image import Field, Pupil, axial_information, encircled_energy, pixel_information
 from metalens.image import pupil as pupils
 
-STEP_UM = 200.0  # of the difference in Eq. 11
-WINDOW_UM = 144.0
-CLIMB_WINDOW_UM = 96.0  # while climbing
 CLIMB_IMAGES = 4  # of a step, at least two an angle: more noise, but more steps in the same time
 DIRECTIONS = 4  # of the field, that the steps draw from
 STILL = torch.tensor([[-0.25, 0.25], [0.25, -0.25]])  # positions of the pixels where nothing is drawn
@@ -46,21 +43,21 @@ class Objective(Protocol):
 class AxialObjective:
     """Minus the log of I(z) at random depths, field directions and positions of the pixels; alike for every angle."""
 
-    def __init__(self, pupil: Pupil, settings: Fisher) -> None:
+    def __init__(self, pupil: Pupil, settings: Asked) -> None:
         self.pupil, self.settings = pupil, settings
 
     def loss(self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """See :class:`Objective`."""
         settings = self.settings
         depths, fields, positions = self._drawn(generator)
-        near, far = _stacks(phase_rad, self.pupil, focus_um, depths, CLIMB_WINDOW_UM, fields)
+        near, far = _stacks(phase_rad, self.pupil, focus_um, depths, fields, settings, settings.climb_window_um)
         total = phase_rad.new_zeros(())
         for y, x in (positions * settings.pixel_um).tolist():
             value = pixel_information(near, far, shift_um=(y, x), **_counted(settings))
             value = value.reshape(-1, len(settings.angles_deg))
             spread, mean = torch.log(value + 1e-4).mean(), torch.log(value.mean(0) + 1e-4).mean()
             total = total - (settings.even * spread + (1 - settings.even) * mean) / len(positions)
-        return total, encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)
+        return total, encircled_energy(near, settings.sample_um, radius_um=settings.radius_um)
 
     def _drawn(self, generator: torch.Generator | None) -> tuple[Tensor, list[Field], Tensor]:
         """Depths and fields (angles in turn) of the images, and positions of the pixels."""
@@ -111,7 +108,7 @@ class Robust:
         return phase_rad + sign * self.variation.phase * made + k * moved
 
 
-def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Fisher, depths: int = 11) -> Score:
+def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Asked, depths: int = 11) -> Score:
     """Information and encircled energy of a phase on the pupil's nodes, at ``depths`` depths of the range.
 
     Off axis in the directions of +x and +y: mean information, least energy.
@@ -122,9 +119,10 @@ def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Fisher,
     for angle in settings.angles_deg:
         seen = []
         for turn in (0.0, 0.25) if angle > 0 else (0.0,):
-            near, far = _stacks(phase_rad.detach(), pupil, focus_um, where, WINDOW_UM, [_field(angle, turn)] * depths)
+            fields = [_field(angle, turn)] * depths
+            near, far = _stacks(phase_rad.detach(), pupil, focus_um, where, fields, settings, settings.window_um)
             value = axial_information(near, far, **_counted(settings))
-            seen.append((value, encircled_energy(near, SAMPLE_UM, radius_um=settings.radius_um)))
+            seen.append((value, encircled_energy(near, settings.sample_um, radius_um=settings.radius_um)))
         values.append(torch.stack([value for value, _ in seen]).mean(0))
         energies.append(torch.stack([energy for _, energy in seen]).amin(0))
     if len(values) == 1:
@@ -132,9 +130,9 @@ def score(phase_rad: Tensor, pupil: Pupil, *, focus_um: float, settings: Fisher,
     return Score(torch.stack(values), torch.stack(energies))
 
 
-def _counted(settings: Fisher) -> dict[str, Any]:
+def _counted(settings: Asked) -> dict[str, Any]:
     """How Eq. 11 counts, as arguments."""
-    return {"step_um": STEP_UM, "sample_um": SAMPLE_UM, "pixel_um": settings.pixel_um,
+    return {"step_um": settings.step_um, "sample_um": settings.sample_um, "pixel_um": settings.pixel_um,
             "normalisation": settings.normalisation}  # fmt: skip
 
 
@@ -143,10 +141,17 @@ def _field(angle_deg: float, turn: float) -> Field:
 
 
 def _stacks(
-    phase_rad: Tensor, pupil: Pupil, focus_um: float, depths_um: Tensor, window_um: float, fields: list[Field]
+    phase_rad: Tensor,
+    pupil: Pupil,
+    focus_um: float,
+    depths_um: Tensor,
+    fields: list[Field],
+    settings: Asked,
+    window_um: float,
 ) -> tuple[Tensor, Tensor]:
-    samples = int(min(window_um, pupil.period_um) / SAMPLE_UM)
-    both = torch.cat([depths_um, depths_um + STEP_UM])
-    stack = pupils.psf(phase_rad, pupil, depths_um=both, fields=fields * 2, focus_um=focus_um, sample_um=SAMPLE_UM,
+    sample = settings.sample_um
+    samples = int(min(window_um, pupil.period_um) / sample)
+    both = torch.cat([depths_um, depths_um + settings.step_um])
+    stack = pupils.psf(phase_rad, pupil, depths_um=both, fields=fields * 2, focus_um=focus_um, sample_um=sample,
                        samples=samples)  # fmt: skip
     return stack[: len(depths_um)], stack[len(depths_um) :]

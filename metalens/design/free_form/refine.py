@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from metalens.design.free_form.objective import Objective
-from metalens.design.free_form.settings import Fisher
+from metalens.design.free_form.settings import Asked
 
 REACH_RAD = 0.5  # from the start, for every control
 
 
 def refine(
-    controls: Tensor, build: Callable[[Tensor], Tensor], objective: Objective, settings: Fisher, focus_um: float
+    controls: Tensor, build: Callable[[Tensor], Tensor], objective: Objective, settings: Asked, focus_um: float
 ) -> Tensor:
     """Lower the objective at fixed depths and positions, with the energy of every depth at least what is asked.
 

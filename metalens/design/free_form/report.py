@@ -10,12 +10,12 @@ from torch import Tensor
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.design.free_form.objective import Score, score
 from metalens.design.free_form.search import FisherPhase, phase_on
-from metalens.design.free_form.settings import SAMPLE_UM, Fisher
+from metalens.design.free_form.settings import Asked
 from metalens.ground.report import canvas, png
 from metalens.image import Field, Pupil
 from metalens.image import pupil as pupils
 
-SHOWN_UM = 48.0  # of the PSFs in the picture
+SHOWN = 3  # times as wide as a PSF in the picture is the window
 STRIP = 6  # depths of them
 
 
@@ -29,10 +29,10 @@ class Judged:
     score: Score
 
 
-def judged(made: FisherPhase, pupil: Pupil, settings: Fisher) -> tuple[Judged, ...]:
+def judged(made: FisherPhase, pupil: Pupil, settings: Asked) -> tuple[Judged, ...]:
     """The design, and the best hyperbolic lens and double helix for the same pixels, depths and angles.
 
-    Intensities every 0.75 um, averaged over sub-pixel positions, at 11 depths.
+    Intensities every ``settings.sample_um``, averaged over sub-pixel positions, at 11 depths.
     """
     lenses = [("free form", phase_on(pupil, made), made.focus_um)]
     for simple in baselines.tuned_pair(pupil, settings):
@@ -51,12 +51,14 @@ def times(lenses: tuple[Judged, ...]) -> float:
     return means[0] / max(means[1:])
 
 
-def values(lenses: tuple[Judged, ...], settings: Fisher) -> dict[str, Any]:
+def values(lenses: tuple[Judged, ...], settings: Asked) -> dict[str, Any]:
     """Every figure, ready for JSON."""
     return {
         "depths_mm": _depths(lenses, settings).tolist(),
         "angles_deg": list(settings.angles_deg),
         "pixel_um": settings.pixel_um,
+        "radius_um": settings.radius_um,
+        "step_um": settings.step_um,
         "normalisation": settings.normalisation,
         "times_the_better_baseline": times(lenses),
         "lenses": {
@@ -69,7 +71,7 @@ def values(lenses: tuple[Judged, ...], settings: Fisher) -> dict[str, Any]:
     }
 
 
-def text(lenses: tuple[Judged, ...], settings: Fisher) -> str:
+def text(lenses: tuple[Judged, ...], settings: Asked) -> str:
     """A table: information (mean over the depths) at every angle, and the least energy over the depths."""
     low, high = settings.depths_mm
     lines = [
@@ -87,7 +89,7 @@ def text(lenses: tuple[Judged, ...], settings: Fisher) -> str:
     return "\n".join([*lines, f"  {times(lenses):.2f} x the better baseline; energy of the free form: {energy}"])
 
 
-def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes:
+def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Asked) -> bytes:
     """Information and energy over depth at the first angle, and PSFs of the lenses through the range."""
     figure, _ = canvas(1, 1, size=(10, 7.6))
     figure.clear()
@@ -104,11 +106,11 @@ def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes
     left.legend(fontsize=7)
     planes = torch.linspace(1e3 * settings.depths_mm[0], 1e3 * settings.depths_mm[1], STRIP, dtype=torch.float64)
     fields = [Field(float(np.radians(angle)))] * STRIP
+    samples = max(2, int(settings.window_um / SHOWN / settings.sample_um))
     panels = bottom.subplots(len(lenses), STRIP, squeeze=False)
     for row, lens in enumerate(lenses):
-        samples = int(SHOWN_UM / SAMPLE_UM)
         stack = pupils.psf(lens.phase_rad, pupil, depths_um=planes, fields=fields, focus_um=lens.focus_um,
-                                  sample_um=SAMPLE_UM, samples=samples)  # fmt: skip
+                                  sample_um=settings.sample_um, samples=samples)  # fmt: skip
         for column, image in enumerate(stack):
             panel = panels[row, column]
             panel.imshow(torch.sqrt(image).numpy(), cmap="inferno")
@@ -117,9 +119,12 @@ def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Fisher) -> bytes
                 panel.set_title(f"{planes[column] / 1e3:g} mm", fontsize=8)
             if column == 0:
                 panel.set_ylabel(lens.name.replace(", ", "\n"), fontsize=7)
-    bottom.supxlabel(f"PSFs, {SHOWN_UM:g} µm wide, square root of the intensity, each at its own scale", fontsize=8)
+    bottom.supxlabel(
+        f"PSFs, {samples * settings.sample_um:.3g} µm wide, square root of the intensity, each at its own scale",
+        fontsize=8,
+    )
     return png(figure)
 
 
-def _depths(lenses: tuple[Judged, ...], settings: Fisher) -> Any:
+def _depths(lenses: tuple[Judged, ...], settings: Asked) -> Any:
     return np.linspace(*settings.depths_mm, lenses[0].score.information.shape[1])

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from metalens.design import Focus, PhaseOf, hyperbolic
-from metalens.design.free_form.objective import WINDOW_UM, AxialObjective, Objective, Robust, Score, score
-from metalens.design.free_form.settings import Fisher
+from metalens.design.free_form.objective import AxialObjective, Objective, Robust, Score, score
+from metalens.design.free_form.settings import Asked, Fisher
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import Pupil
@@ -54,11 +54,11 @@ def fisher_profile(
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase (focus and free form) as a function of position, and how it was found.
 
-    ``focus.source_distance_um`` is not used: the settings choose the focus.
+    ``focus.source_distance_um`` is used where the settings leave depths and foci to the lens.
     """
-    settings = settings or Fisher()
-    pupil = design_pupil(focus, radius_um)
-    found = optimise(pupil, settings, objective=objective)
+    asked = (settings or Fisher()).about(focus, radius_um)
+    pupil = design_pupil(focus, radius_um, asked)
+    found = optimise(pupil, asked, objective=objective)
     base = replace(focus, source_distance_um=found.focus_um)
     extra = free_form(found.controls.numpy(), pupil, cells=found.cells)
 
@@ -87,14 +87,14 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
     return stepped if cells else smooth
 
 
-def design_pupil(focus: Focus, radius_um: float) -> Pupil:
+def design_pupil(focus: Focus, radius_um: float, settings: Asked) -> Pupil:
     """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
     edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
-    nodes = max(64, 16 * math.ceil(1.9 * WINDOW_UM * 2 * edge / focus.wavelength_um / 16))
+    nodes = max(64, 16 * math.ceil(1.9 * settings.window_um * 2 * edge / focus.wavelength_um / 16))
     return Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes)
 
 
-def optimise(pupil: Pupil, settings: Fisher, *, objective: Objective | None = None) -> FisherPhase:
+def optimise(pupil: Pupil, settings: Asked, *, objective: Objective | None = None) -> FisherPhase:
     """Best of several starts; deterministic for a seed.
 
     Args:
@@ -154,7 +154,7 @@ def spline(position: Array, count: int) -> Array:
 class _Best:
     """The best iterate seen: first whether it keeps the energy, then its information."""
 
-    def __init__(self, objective: Objective, settings: Fisher, focus_um: float) -> None:
+    def __init__(self, objective: Objective, settings: Asked, focus_um: float) -> None:
         self.objective, self.settings, self.focus_um = objective, settings, focus_um
         self.rank: tuple[bool, float] = (False, -math.inf)
         self.controls: Tensor | None = None
@@ -171,7 +171,7 @@ class _Best:
 
 
 def _climb(
-    pupil: Pupil, settings: Fisher, objective: Objective, focus_um: float, zones: int, generator: torch.Generator
+    pupil: Pupil, settings: Asked, objective: Objective, focus_um: float, zones: int, generator: torch.Generator
 ) -> FisherPhase:
     spread = settings.spread_rad * (0.1 if zones else 1.0)
     controls = spread * torch.randn(settings.grids[0], settings.grids[0], generator=generator, dtype=torch.float64)

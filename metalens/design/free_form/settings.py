@@ -1,11 +1,14 @@
 """What a Fisher-designed lens is asked for: the table [fisher] of DESIGN.toml."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
+from metalens.design.profiles import Focus
 from metalens.ground.errors import ConfigError
+from metalens.lens import reach
 
-SAMPLE_UM = 0.75  # of the intensities that the information is read from
+WINDOW, CLIMB = 42.4, 2 / 3  # width of the PSFs in wavelength / NA; of the window, while climbing
+FOCI = (0.29, 0.71)  # of the range of depths in 1/z, from its near end: where the hyperbolic part is focused
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +34,16 @@ class Fisher:
     """What a Fisher-designed lens is asked for.
 
     objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets of eyes).
-    depths_mm: range of the source. angles_deg: field angles that the lens is made for, each in every direction; the
-        energy is held at all of them, and the information of each counts alike.
-    pixel_um: pixels that the information is read with; give 2 or 3 times the sensor's pitch for 2 x 2 or 3 x 3 binning.
+    depths_mm: range of the source; left out, from 1.75 waves out of focus at the rim on one side of the design's source
+        distance to as many on the other.
+    angles_deg: field angles that the lens is made for, each in every direction; the energy is held at all of them, and
+        the information of each counts alike.
+    pixel_um: pixels that the information is read with: the sensor's pitch, or 2 or 3 times it for 2 x 2 or 3 x 3
+        binning; left out, 0.88 wavelength / NA.
     encircled: least share of the light inside ``radius_um`` of the axis, at every depth; 0 leaves it free.
-    focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread between them.
+    radius_um: left out, 5.3 wavelength / NA.
+    focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread between them. Left out, the
+        middle two fifths of the depths, in 1/z.
     grids: control points across the aperture, stage by stage; 0 as the last for one free value a node of the pupil
         (cells of about 6 um), which sends light away best where the energy allows it.
     iterations: of all stages, shared in proportion to their grids. starts: tried.
@@ -50,12 +58,12 @@ class Fisher:
     """
 
     objective: Literal["axial", "scenes"] = "axial"
-    depths_mm: tuple[float, float] = (16.0, 26.0)
+    depths_mm: tuple[float, float] | None = None
     angles_deg: tuple[float, ...] = (0.0,)
-    pixel_um: float = 3.0
+    pixel_um: float | None = None
     encircled: float = 0.5
-    radius_um: float = 18.0
-    focus_mm: tuple[float, float] = (18.0, 22.0)
+    radius_um: float | None = None
+    focus_mm: tuple[float, float] | None = None
     grids: tuple[int, ...] = (16, 0)
     iterations: int = 800
     starts: int = 3
@@ -70,14 +78,17 @@ class Fisher:
     orthogonality: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.depths_mm[0] < self.depths_mm[1]:
+        if self.depths_mm is not None and not 0 < self.depths_mm[0] < self.depths_mm[1]:
             raise ConfigError(f"depths_mm = {self.depths_mm}: need 0 < least < largest")
+        if self.focus_mm is not None and not 0 < self.focus_mm[0] <= self.focus_mm[1]:
+            raise ConfigError(f"focus_mm = {self.focus_mm}: need 0 < least <= largest")
         if not self.angles_deg or not all(0 <= a <= 40 for a in self.angles_deg):
             raise ConfigError(f"angles_deg = {self.angles_deg}: need at least one field angle of 0 to 40 degrees")
-        if not 0 <= self.encircled < 1 or not self.radius_um > 0 or not self.pixel_um >= 3 * SAMPLE_UM:
+        lengths = [1.0 if length is None else length for length in (self.radius_um, self.pixel_um)]
+        if not 0 <= self.encircled < 1 or not min(lengths) > 0:
             raise ConfigError(
                 f"encircled = {self.encircled}, radius_um = {self.radius_um}, pixel_um = {self.pixel_um}: need a share "
-                f"below 1, a radius above 0, and pixels of at least {3 * SAMPLE_UM} um"
+                "below 1, and a radius and pixels above 0"
             )
         fine = (*self.grids[:-1], self.grids[-1] or 4) if len(self.grids) > 1 else self.grids
         if self.starts < 1 or self.iterations < 1 or not fine or min(fine) < 4:
@@ -90,3 +101,61 @@ class Fisher:
                 f"refine = {self.refine}, scenes = {self.scenes}, orthogonality = {self.orthogonality}, zones = "
                 f"{self.zones}: need 0 or more, 1 or more, 0 or more, and at least one entry"
             )
+
+    def about(self, focus: Focus, radius_um: float) -> "Asked":
+        """These for a lens of this radius, its depths, foci and disc where they were left out.
+
+        Raises:
+            ConfigError: pixels larger than the window of this lens.
+        """
+        lens = reach.Aperture(
+            radius_um, focus.wavelength_um, focus.sensor_distance_um, focus.source_distance_um, focus.layers
+        )
+        near, far = (1e3 * z for z in self.depths_mm) if self.depths_mm else reach.depth_range_um(lens)
+        pixel = self.pixel_um or reach.pixel_um(lens)
+        window = reach.window_um(lens, (near, far), airy=WINDOW)
+        climbed = CLIMB * window
+        if 3 * pixel > climbed:
+            raise ConfigError(
+                f"pixel_um = {pixel}: need at most {climbed / 3:.3g} um for a lens whose spots are seen in a "
+                f"window of {climbed:g} um"
+            )
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        own |= {"depths_mm": (near * 1e-3, far * 1e-3), "radius_um": self.radius_um or reach.disc_um(lens)}
+        own["focus_mm"] = self.focus_mm or between_mm((near, far), *FOCI)
+        own |= {
+            "pixel_um": pixel,
+            "sample_um": reach.sample_um(lens, pixel),
+            "step_um": reach.depth_step_um(lens, near),
+        }
+        return Asked(**own, window_um=window, climb_window_um=climbed)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked(Fisher):
+    """A :class:`Fisher` with nothing left to the lens: what a search climbs, and what its results are judged by.
+
+    window_um, climb_window_um: widths of the PSFs. sample_um: of their intensities. step_um: of the difference in
+    Eq. 11.
+    """
+
+    depths_mm: tuple[float, float] = field(kw_only=True)
+    pixel_um: float = field(kw_only=True)
+    radius_um: float = field(kw_only=True)
+    focus_mm: tuple[float, float] = field(kw_only=True)
+    window_um: float = field(kw_only=True)
+    climb_window_um: float = field(kw_only=True)
+    sample_um: float = field(kw_only=True)
+    step_um: float = field(kw_only=True)
+
+    def about(self, focus: Focus, radius_um: float) -> "Asked":
+        """Itself."""
+        return self
+
+
+def between_mm(depths_um: tuple[float, float], first: float, last: float) -> tuple[float, float]:
+    """Depths at two shares of the range in 1/z, from its near end: 0 is near, 1 far; below 0 nearer. 2 digits."""
+    near, far = (1e3 / z for z in depths_um)
+    ends = (1 / max(near + share * (far - near), 0.1 * far) for share in (first, last))
+    low, high = (float(f"{z:.2g}") for z in ends)
+    return low, high

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from metalens.design import DoubleHelix, Focus, PhaseOf, phase_of
 from metalens.design.free_form.search import score, vortices
-from metalens.design.free_form.settings import Fisher
+from metalens.design.free_form.settings import Asked, between_mm
 from metalens.ground.errors import ConfigError
 from metalens.image import Pupil
 from metalens.image import pupil as pupils
 
-FOCI_MM = (12.0, 50.0)  # searched for the hyperbolic lens
-HELIX_FOCI_MM = (14.0, 30.0)
+FOCI = (-0.87, 1.77)  # searched for the hyperbolic lens: of the range of depths in 1/z, from its near end
+HELIX_FOCI = (-0.37, 1.21)
 ZONES = (1, 2, 3, 4, 5, 6)
 
 
@@ -45,7 +45,7 @@ class Baseline:
         return phase_of(shape, mine, radius_um=radius_um), mine
 
 
-def judged(pupil: Pupil, settings: Fisher, *, zones: int, focus_um: float) -> Baseline:
+def judged(pupil: Pupil, settings: Asked, *, zones: int, focus_um: float) -> Baseline:
     """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``."""
     phase = baseline_phase(pupil, zones)
     found = score(phase, pupil, focus_um=focus_um, settings=settings)
@@ -60,10 +60,10 @@ def baseline_phase(pupil: Pupil, zones: int) -> Tensor:
 
 def tuned(
     pupil: Pupil,
-    settings: Fisher,
+    settings: Asked,
     *,
     zones: Sequence[int] = (0,),
-    foci_mm: tuple[float, float] = FOCI_MM,
+    foci_mm: tuple[float, float],
     count: int = 12,
 ) -> Baseline:
     """Most informative lens over zones and focus: a scan at equal steps of 1/z, then twice a finer one around the best.
@@ -88,7 +88,9 @@ def tuned(
     return max(tried, key=lambda b: b.information)
 
 
-def tuned_pair(pupil: Pupil, settings: Fisher) -> tuple[Baseline, Baseline]:
+def tuned_pair(pupil: Pupil, settings: Asked) -> tuple[Baseline, Baseline]:
     """The best hyperbolic lens and the best double helix."""
-    helix = tuned(pupil, settings, zones=ZONES, foci_mm=HELIX_FOCI_MM, count=6)
-    return tuned(pupil, settings), helix
+    near, far = (1e3 * z for z in settings.depths_mm)
+    plain, wound = (between_mm((near, far), *ends) for ends in (FOCI, HELIX_FOCI))
+    helix = tuned(pupil, settings, zones=ZONES, foci_mm=wound, count=6)
+    return tuned(pupil, settings, foci_mm=plain), helix

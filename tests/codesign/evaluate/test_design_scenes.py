@@ -5,6 +5,7 @@ import torch
 
 from codesign.evaluate.optics import Scenes
 from codesign.evaluate.scenes import SceneObjective
+from metalens.design import Focus
 from metalens.design.free_form.search import optimise
 from metalens.design.free_form.settings import Fisher
 from metalens.ground.errors import ConfigError
@@ -12,7 +13,9 @@ from metalens.image import scene
 from metalens.image.pupil import Pupil
 
 PUPIL = Pupil(nodes=96)
-SETTINGS = Fisher(objective="scenes", scenes=1, grids=(4,), iterations=2, starts=1, zones=(0,), encircled=0.0)
+SETTINGS = Fisher(objective="scenes", scenes=1, grids=(4,), iterations=2, starts=1, zones=(0,), encircled=0.0).about(
+    Focus(0.85, 2000.0, 20e3), PUPIL.radius_um
+)
 SMALL = Scenes(count=1, pitch_um=22.0, pixels=48, window_um=154.0)
 
 

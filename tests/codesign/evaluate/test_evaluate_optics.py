@@ -36,16 +36,17 @@ def _lens(focus_um, zones=0):
 def test_full_lens_agrees_with_the_pupil_model():
     """Same honest information from pillars through the PSF engine as from the smooth pupil: two independent paths."""
     setting = Setting(depths_mm=(1.6, 2.6), count=3, angles_deg=(0.0,), binnings=(1, 2), window_um=96.0)
+    setting = setting.about(_lens(2000.0))
     got = evaluate.axial(_lens(2000.0), setting)
     optics = Pupil(RADIUS_UM, 600.0, nodes=96)
     depths = torch.tensor([1600.0, 2100.0, 2600.0], dtype=torch.float64)
     flat = torch.zeros(96, 96, dtype=torch.float64)
     near, far = (
         pupils.psf(flat, optics, depths_um=d, focus_um=2000.0, sample_um=0.75, samples=128)
-        for d in (depths, depths + 200)
+        for d in (depths, depths + setting.step_um)
     )
     for k, pixel in enumerate((3.0, 6.0)):
-        want = axial_information(near, far, step_um=200.0, sample_um=0.75, pixel_um=pixel)
+        want = axial_information(near, far, step_um=setting.step_um, sample_um=0.75, pixel_um=pixel)
         assert got.information[0, k].numpy() == pytest.approx(want.numpy(), rel=0.05)  # oblique rim, window edge
     assert float(got.encircled.min()) > 0.5
     assert float(got.encircled.max()) <= 1.0

@@ -1,5 +1,6 @@
 """Free-form design: the spline against closed forms, and a short design that beats its start at the energy asked."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -19,7 +20,8 @@ from metalens.image import pupil as pupils
 from metalens.image.pupil import Pupil
 
 SMALL = Pupil(radius_um=400.0, nodes=136)
-QUICK = Fisher(grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0))
+FOCUS = Focus(0.85, 2000.0, 20e3)
+QUICK = Fisher(grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0)).about(FOCUS, 400.0)
 
 
 def test_spline_makes_constants_lines_and_is_smooth():
@@ -50,7 +52,7 @@ def test_a_short_design_gains_information_and_keeps_the_energy():
 
 
 def test_the_same_seed_gives_the_same_phase():
-    brief = Fisher(grids=(5,), iterations=2, starts=1)
+    brief = Fisher(grids=(5,), iterations=2, starts=1).about(FOCUS, 400.0)
     assert torch.equal(free.optimise(SMALL, brief).controls, free.optimise(SMALL, brief).controls)
 
 
@@ -67,7 +69,7 @@ def test_the_lens_phase_is_the_designed_one():
 
 
 def test_the_phase_of_cells_is_that_of_the_nearest_node():
-    brief = Fisher(grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0)
+    brief = Fisher(grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0).about(FOCUS, 400.0)
     found = free.optimise(SMALL, brief)
     assert found.cells
     x, y = (c.numpy() for c in pupils.coordinates(SMALL))
@@ -77,7 +79,7 @@ def test_the_phase_of_cells_is_that_of_the_nearest_node():
 
 
 def test_nlopt_lowers_the_loss_and_holds_the_energy():
-    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12)
+    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12).about(FOCUS, 400.0)
     objective = AxialObjective(SMALL, settings)
     build = free._Phase(SMALL, 6, 0)
     start = 0.3 * torch.randn(6, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -89,7 +91,7 @@ def test_nlopt_lowers_the_loss_and_holds_the_energy():
 
 
 def test_a_design_for_the_process_judges_its_worst_lens():
-    settings = Fisher(encircled=0.0)
+    settings = Fisher(encircled=0.0).about(FOCUS, 400.0)
     plain = AxialObjective(SMALL, settings)
     flat = torch.zeros(136, 136, dtype=torch.float64)
     still = Robust(plain, SMALL, Variation()).judge(flat, 20e3)
@@ -116,6 +118,40 @@ def test_coarse_sampling_at_one_position_claims_what_is_not_there():
 
 
 def test_impossible_wishes_are_refused():
-    for wish in ("encircled = 1.2", "grids = [2]", "depths_mm = [26.0, 16.0]", "pixel_um = 1.0"):
+    wishes = ("encircled = 1.2", "grids = [2]", "depths_mm = [26.0, 16.0]", "pixel_um = 0.0", "focus_mm = [9.0, 8.0]")
+    for wish in wishes:
         with pytest.raises(ConfigError, match=wish.split(" ")[0]):
             config.loads(wish, Fisher)
+
+
+def test_what_is_left_out_follows_the_lens():
+    """The paper's lens as it was; depths scale as the aperture squared, spots as wavelength over NA."""
+    paper = Fisher().about(Focus(0.85, 2000.0, 20e3), 500.0)
+    assert (paper.depths_mm, paper.focus_mm, paper.radius_um) == ((16.0, 26.0), (18.0, 22.0), 18.0)
+    assert paper.pixel_um == 3.0
+    assert (paper.window_um, paper.climb_window_um, paper.sample_um, paper.step_um) == (144.0, 96.0, 0.75, 200.0)
+    half = Fisher(pixel_um=1.3).about(Focus(0.633, 1500.0, 20e3), 250.0)
+    waves = [250.0**2 * abs(1e-3 / z - 1 / 20e3) / (2 * 0.633) for z in half.depths_mm]
+    assert waves == pytest.approx([1.75, 1.75], rel=0.08)  # depths of two digits
+    assert half.depths_mm[0] < half.focus_mm[0] < 20.0 < half.focus_mm[1] < half.depths_mm[1]
+    assert half.radius_um == pytest.approx(5.3 * 0.633 * 1500 / 250, rel=0.03)
+    assert half.sample_um == pytest.approx(1.3 / 4, rel=0.03)
+    own = Fisher(depths_mm=(7.0, 8.0)).about(Focus(0.85, 2000.0, 20e3), 500.0)
+    assert 7.0 < own.focus_mm[0] < own.focus_mm[1] < 8.0
+    assert own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99  # holds the blur of a lens for 20 mm
+
+
+def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
+    """Twice finer samples tell the same: at NA 0.6 samples of 0.75 um, as fit a lens of NA 0.24, lost half of it."""
+    focus, radius = Focus(0.85, 133.0, 2e3), 100.0
+    asked = Fisher(pixel_um=1.1).about(focus, radius)
+    pupil = free.design_pupil(focus, radius, asked)
+    flat = torch.zeros(pupil.nodes, pupil.nodes, dtype=torch.float64)
+    fine = dataclasses.replace(asked, sample_um=asked.sample_um / 2)
+    got, want = (free.score(flat, pupil, focus_um=2e3, settings=s, depths=3).information.mean() for s in (asked, fine))
+    assert float(got) == pytest.approx(float(want), rel=0.02)  # interpolation between samples when pixels are cut
+
+
+def test_pixels_wider_than_a_spot_are_refused():
+    with pytest.raises(ConfigError, match="pixel_um = 40"):
+        Fisher(pixel_um=40.0).about(Focus(0.85, 2000.0, 20e3), 500.0)

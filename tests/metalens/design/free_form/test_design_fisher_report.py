@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from metalens import cli, lens
+from metalens.design import Focus
 from metalens.design.free_form import report as design_fisher_report
 from metalens.design.free_form import search as free
 from metalens.design.free_form import simple_lenses as baselines
@@ -16,6 +17,7 @@ from metalens.ground.errors import ConfigError
 from metalens.image.pupil import Pupil
 
 SMALL = Pupil(radius_um=150.0, nodes=80)
+FOCUS = Focus(0.85, 2000.0, 20e3)
 TOML = """profile = "fisher"
 aperture_mm = 0.2
 [fisher]
@@ -45,7 +47,7 @@ def test_the_command_compares_with_tuned_lenses_and_draws(tmp_path, capsys, monk
 
 
 def test_the_table_names_every_angle_and_the_energy():
-    settings = Fisher(angles_deg=(0.0, 8.0), iterations=4, starts=1, grids=(5,), encircled=0.0)
+    settings = Fisher(angles_deg=(0.0, 8.0), iterations=4, starts=1, grids=(5,), encircled=0.0).about(FOCUS, 150.0)
     made = free.optimise(SMALL, settings)
     assert made.score.information.shape == (2, 11)
     flat = torch.zeros(80, 80, dtype=torch.float64)
@@ -61,7 +63,7 @@ def test_a_design_for_field_angles_gains_at_both():
     """From random noise, 50 steps: more information off axis than a focused lens, the energy kept at all angles."""
     settings = Fisher(
         angles_deg=(0.0, 8.0), iterations=50, starts=1, grids=(6, 0), encircled=0.4, focus_mm=(20.0, 20.0)
-    )
+    ).about(FOCUS, 150.0)
     made = free.optimise(SMALL, settings)
     plain = free.score(torch.zeros(80, 80, dtype=torch.float64), SMALL, focus_um=20e3, settings=settings)
     assert bool((made.score.information.mean(1) > 1.1 * plain.information.mean(1)).all())
