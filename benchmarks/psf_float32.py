@@ -129,7 +129,9 @@ def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, fl
     """(estimate, true relative error, method) in every precision; nothing where the engine refuses the case."""
     found: list[tuple[float, float, str]] = []
     drawing = np.random.default_rng(9)
-    points = chance = want = None
+    points: Any = None
+    chance: Any = None
+    want: Any = None
     for dtype in dtypes:
         maps = [torch.tensor(one, dtype=dtype) for one in (case.phase_rad, case.level)]
         maps[0].requires_grad_(case.kind not in UNPULLED)  # the exact sum, which has no derivatives, is not chosen
