@@ -17,9 +17,9 @@ SPARE = 1.2  # grid of the lens over the least that the kernel's band asks for
 MOST = 20000  # points of a transform along an axis
 FIELDS = 14  # depth fields, about
 SECONDS = 1e-8  # of a transform and what is multiplied to it, on one core, per point and depth field
-# points of the lens that a window asks for, and half-waves in it, from which no other method does as well; below some 35
-# the fading and the grid beyond the lens's rim are as wide as lens and window, and errors miss any setting (on random
-# lenses of 20 to 120 pillars by up to 3e-2; their estimates say so)
+# points of the lens that a window asks for, and half-waves in it, from which no other method does as well; below some
+# 35 the fading and the grid beyond the lens's rim are as wide as lens and window, and errors miss any setting (on
+# random lenses of 20 to 120 pillars by up to 3e-2; their estimates say so)
 WIDE = 120
 STEEPEST = 0.93  # |p| of a ray, fading included, in units of the rarest index
 
