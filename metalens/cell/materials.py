@@ -103,7 +103,9 @@ vacuum=air silicon=Si amorphous-silicon=a-Si crystalline-silicon=c-Si germanium=
 silica=SiO2 fused-silica=SiO2 quartz=SiO2 silicon-dioxide=SiO2 silicon-nitride=Si3N4 gallium-nitride=GaN
 titania=TiO2 titanium-dioxide=TiO2 titanium-nitride=TiN hafnia=HfO2 niobia=Nb2O5 tantala=Ta2O5 alumina=Al2O3
 gallium-arsenide=GaAs gallium-phosphide=GaP aluminium-nitride=AlN aluminum-nitride=AlN
-gold=Au silver=Ag aluminium=Al aluminum=Al chromium=Cr chrome=Cr
+gold=Au silver=Ag aluminium=Al aluminum=Al chromium=Cr chrome=Cr fused-quartz=SiO2 pc=polycarbonate
+su-8-2000=SU-8 ps=polystyrene gan-o=GaN sapphire-o=sapphire al2o3-o=sapphire al2o3-e=sapphire-e mgf2-o=MgF2
+rutile=TiO2-rutile-o zinc-sulfide=ZnS
 """
 SPOKEN = dict(pair.split("=") for pair in _WORDS.split())  # what people type and no spelling leads from: its name
 

@@ -113,6 +113,7 @@ class Options(Common):
         process: PROCESS.toml whose printable pillars and gaps bound the diameters, in place of [limits].
         skip_focus_check: leave out the exact diffraction sum around the focus.
         accept_partial_turn: where the pillars cover less than a turn, take the nearest; the loss is stated.
+        own_cell: solve rows of its own unlike pillars for what they leave of the efficiency (a minute); else rough.
     """
 
     config: tyro.conf.Positional[Path]
@@ -120,6 +121,7 @@ class Options(Common):
     process: Path | None = None
     skip_focus_check: bool = False
     accept_partial_turn: bool = False
+    own_cell: bool = False
 
 
 def run(options: Options) -> int:
@@ -133,8 +135,8 @@ def run(options: Options) -> int:
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
     wanted = made.wanted
-    values = words.values(made.quality, made.check)
-    text = words.text(_head(wanted, target, made.quality), wanted.layers, made.quality, made.check)
+    values = words.values(made.quality, made.check, made.unlike)
+    text = words.text(_head(wanted, target, made.quality), wanted.layers, made.quality, made.check, made.unlike)
     if made.conversion is not None:
         values["circular"] = {"hand": wanted.hand, **asdict(made.conversion)}
         text = f"{text}\n{words.converted(made.conversion, made.quality, wanted.hand)}"
@@ -153,6 +155,8 @@ def _head(wanted: Design, target: Path, quality: Quality) -> str:
 
 def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
     """A lens of pillars of two sizes, for light along x and along y."""
+    if options.own_cell:
+        raise ConfigError("own_cell: rows of pillars of two sizes are not solved; leave --own-cell out")
     with options.claim(options.output, beside=(".png",), inputs=read) as draft:
         path = options.config.parent / (wanted.library or "")
         made_of, inputs = axes.load(path), {file.name: store.sha256(file) for file in (path, options.config)}
@@ -221,12 +225,13 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     quality = replace(
         quality, focuses=wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
     )
+    found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(wanted, quality, check, judged, conversion)
+    return Outcome(wanted, quality, check, judged, conversion, found)
 
 
 def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
@@ -243,13 +248,14 @@ def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; judged: of a free form; conversion: of
-    circular light."""
+    circular light; unlike: what neighbours leave of the efficiency."""
 
     wanted: Design
     quality: Quality
     check: FocusCheck | None
     judged: "_Judged | None"
     conversion: Conversion | None
+    unlike: design.Unlike | None
 
 
 def _filled(layers: Layers, cell: Cell) -> Layers:

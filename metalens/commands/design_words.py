@@ -1,13 +1,32 @@
 """What ``metalens design`` says of a lens: numbers for programs, lines for people."""
 
 import math
+from dataclasses import asdict
 
-from metalens.design import Conversion, FocusCheck, Quality
-from metalens.lens import Layers
+from metalens import design
+from metalens.design import Conversion, FocusCheck, Quality, Unlike
+from metalens.ground.errors import ConfigError
+from metalens.lens import Layers, Lens
 
 
-def values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
-    """Numbers of a lens and of the check of its focus; None for what JSON does not know."""
+def neighbours(
+    made: Lens, quality: Quality, conversion: Conversion | None, radius_um: float, *, solve: bool
+) -> Unlike | None:
+    """What unlike neighbours leave of the light in the focus, solved or rough; None where there is no such number.
+
+    Raises:
+        ConfigError: it is to be solved and cannot be.
+    """
+    if conversion is not None or not quality.focuses:
+        if solve:
+            why = "pillars that are turned" if conversion is not None else "a phase without a focus"
+            raise ConfigError(f"own_cell: {why}: no rows are solved for it; leave --own-cell out")
+        return None
+    return (design.unlike if solve else design.rough_unlike)(made, radius_um=radius_um)
+
+
+def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> dict[str, object]:
+    """Numbers of a lens, of the check of its focus and of its neighbours; None for what JSON does not know."""
     values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
     if quality.focuses:
         values |= {
@@ -30,6 +49,8 @@ def values(quality: Quality, check: FocusCheck | None) -> dict[str, object]:
         along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
         values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": along}
         values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
+    if unlike is not None:
+        values["neighbours"] = asdict(unlike)
     return values
 
 
@@ -54,6 +75,22 @@ def converted(found: Conversion, quality: Quality, hand: str) -> str:
     )
 
 
+def _neighbours(found: Unlike, quality: Quality) -> str:
+    """What neighbours leave of the efficiency, in words."""
+    left = quality.efficiency * found.share
+    if found.pillars:
+        rows = ", ".join(map(str, found.pillars))
+        return (
+            f"  with pillars among unlike neighbours {left:.3f} +- {quality.efficiency * found.error:.2g} "
+            f"(rows of {rows} of its own pillars solved)"
+        )
+    most = min(1.0, 1 - found.share + found.error)
+    return (
+        f"  that is of pillars one by one: unlike neighbours may cost as much as {most:.1%} of it "
+        "(rough, of another cell; --own-cell solves rows of these pillars)"
+    )
+
+
 def _films(layers: Layers) -> list[str]:
     """What the light passes beside the pillars."""
     found = []
@@ -64,7 +101,7 @@ def _films(layers: Layers) -> list[str]:
     return found
 
 
-def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None) -> str:
+def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> str:
     """Lines about a lens below a head; layers: films that its phase is corrected for."""
     lines = [
         head,
@@ -72,6 +109,7 @@ def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None) 
         f"  {'focusing' if quality.focuses else 'wave-front'} efficiency {quality.efficiency:.3f}, "
         f"mean |T|² {quality.transmission:.3f}, "
         f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
+        *([] if unlike is None else [_neighbours(unlike, quality)]),
         *_films(layers),
     ]
     if quality.steepest > quality.sampled_aperture:

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from metalens.design.of_phase import make as make
     from metalens.design.of_phase import phase_of as phase_of
     from metalens.design.of_phase import printable as printable
+    from metalens.design.own_cell import Unlike as Unlike
     from metalens.design.own_cell import left_out as left_out
+    from metalens.design.own_cell import rough_unlike as rough_unlike
+    from metalens.design.own_cell import unlike as unlike
     from metalens.design.paired import Split as Split
     from metalens.design.paired import make_paired as make_paired
     from metalens.design.profiles import Cubic as Cubic
@@ -42,6 +45,7 @@ __getattr__, __dir__, __all__ = attach(
         "PhaseOf": "sites",
         "Quality": "of_phase",
         "Split": "paired",
+        "Unlike": "own_cell",
         "check_focus": "focus_check",
         "field_angle": "of_phase",
         "focuses": "focusing",
@@ -55,5 +59,7 @@ __getattr__, __dir__, __all__ = attach(
         "phase_of": "of_phase",
         "printable": "of_phase",
         "profiles": "",
+        "rough_unlike": "own_cell",
+        "unlike": "own_cell",
     },
 )

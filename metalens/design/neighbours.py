@@ -20,6 +20,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.lens import Lens
 
+LONG = 6  # pillars: of shorter rows several are solved
 GRID = 48  # points across a cell for the normal field; its coefficients are needed to twice the harmonics
 Polarization = Literal["x", "y"]
 
@@ -59,8 +60,10 @@ def solve_row(
         are better by an order of magnitude. Energy holds to rounding.
 
     Raises:
-        CellError: films or tilted walls, no pillar, or pillars that touch.
+        CellError: films or tilted walls, no round pillars on a square lattice, no pillar, or pillars that touch.
     """
+    if not cell.round:
+        raise CellError(f"rows are solved for round pillars on a square lattice, not {cell.described}")
     if cell.under or cell.over or cell.sidewall_rad or cell.height_um <= 0:
         raise CellError("rows are solved for upright pillars without films; leave the films out")
     if not len(diameters_um) or not all(0 < d < cell.pitch_um for d in diameters_um):
@@ -213,6 +216,7 @@ class Neighbours:
 
     a, b: complex. sine, factor: (n,) measured on rows. scatter: (n,) share of the transmitted power that goes
     elsewhere, beyond what pillars one by one would send there. wavelength_um: of the rows.
+    by_polarization: (2, n) the factor of light whose field lies along the row, and across it.
     """
 
     a: complex
@@ -221,37 +225,64 @@ class Neighbours:
     factor: Array
     scatter: Array
     wavelength_um: float
+    by_polarization: Array
 
     def at(self, sine: Array) -> Array:
         """Complex factor where light is turned by this much."""
         s = np.abs(sine)
         return np.asarray(1 + self.a * s + self.b * s**2)
 
+    def without(self, row: int) -> "Neighbours":
+        """The same without a row, a and b as they are."""
+        sine, factor, scatter = (np.delete(part, row) for part in (self.sine, self.factor, self.scatter))
+        both = np.delete(self.by_polarization, row, axis=1)
+        return Neighbours(self.a, self.b, sine, factor, scatter, self.wavelength_um, both)
+
+    def share(self, sine: Array, weight: Array, cover: float) -> float:
+        """Share of the power in the focus of pillars taken one by one that unlike neighbours leave there.
+
+        |∫ (P + S) / 2|² over the lens, P² = c² / cos θ of the light along the slope, S² = c² cos θ of that across it,
+        θ in a cover of this index: tangential fields are c, the power that leaves in a direction is P² and S².
+
+        Args:
+            sine, weight: (m,) turned by, and share of the lens, of sum 1.
+        """
+        powers = np.stack([self.sine, self.sine**2], 1).astype(complex)
+        coefficients = np.linalg.lstsq(powers, self.by_polarization.T - 1, rcond=None)[0]
+        factor = 1 + np.stack([sine, sine**2], 1) @ coefficients
+        cosine = np.sqrt(np.maximum(1 - (sine / cover) ** 2, 0.0))
+        along, across = factor[:, 0] / np.sqrt(np.maximum(cosine, 1e-9)), factor[:, 1] * np.sqrt(cosine)
+        return float(abs(weight @ (along + across) / 2) ** 2)
+
 
 def neighbours(lens: Lens, *, counts: tuple[int, ...] = (6, 5), harmonics: int = 3) -> Neighbours:
     """How far unlike neighbours change the pillars of this lens: blazed rows of its own pillars, both polarisations.
 
     A row of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N pitch), as the lens does where
-    its phase has that slope.
+    its phase has that slope. Of short rows several are solved, whose phases begin elsewhere, and their mean is taken.
 
     Raises:
-        CellError: the cell has films or tilted walls.
+        CellError: the cell has films or tilted walls, or is no round pillar on a square lattice.
     """
     sines, factors, scatter = [], [], []
     for count in counts:
-        wanted = 2 * np.pi * (np.arange(count) + 0.25) / count
-        diameters = lens.proxy.diameter_um(wanted, lens.wavelength_um, within_um=printed(lens))
-        ratio, lost = _blazed(lens, np.asarray(diameters), harmonics)
+        begins = max(1, round(LONG / count))
+        found = []
+        for begin in range(begins):
+            wanted = 2 * np.pi * (np.arange(count) + 0.25 + begin / begins) / count
+            diameters = lens.proxy.diameter_um(wanted, lens.wavelength_um, within_um=printed(lens), gap="nearest")
+            found.append(_blazed(lens, np.asarray(diameters), harmonics))
         sines.append(lens.wavelength_um / (count * lens.cell.pitch_um))
-        factors.append(ratio)
-        scatter.append(lost)
-    s = np.array(sines)
-    a, b = np.linalg.lstsq(np.stack([s, s**2], 1).astype(complex), np.array(factors) - 1, rcond=None)[0]
-    return Neighbours(complex(a), complex(b), np.array(sines), np.array(factors), np.array(scatter), lens.wavelength_um)
+        factors.append(np.mean([ratio for ratio, _ in found], axis=0))
+        scatter.append(float(np.mean([lost for _, lost in found])))
+    s, both = np.array(sines), np.array(factors).T
+    a, b = np.linalg.lstsq(np.stack([s, s**2], 1).astype(complex), both.mean(axis=0) - 1, rcond=None)[0]
+    return Neighbours(complex(a), complex(b), s, both.mean(axis=0), np.array(scatter), lens.wavelength_um, both)
 
 
-def _blazed(lens: Lens, diameters_um: Array, harmonics: int) -> tuple[complex, float]:
-    """Amplitude in the wanted order against pillars one by one, and power that went elsewhere; mean of x and y."""
+def _blazed(lens: Lens, diameters_um: Array, harmonics: int) -> tuple[Array, float]:
+    """Amplitude in the wanted order against pillars one by one, of light along and across the row, and power that went
+    elsewhere, the mean of both."""
     count = len(diameters_um)
     place = np.arange(count) - (count - 1) / 2
     ratios, lost = [], []
@@ -269,7 +300,7 @@ def _blazed(lens: Lens, diameters_um: Array, harmonics: int) -> tuple[complex, f
         travels = np.abs(whole.orders) * lens.wavelength_um < count * lens.cell.pitch_um
         total = float((np.abs(whole.t[travels]) ** 2).sum())
         lost.append(1 - abs(got) ** 2 / total - (1 - abs(want) ** 2 / float((np.abs(alone) ** 2).mean())))
-    return complex(np.mean(ratios)), float(np.mean(lost))
+    return np.array(ratios), float(np.mean(lost))
 
 
 def printed(lens: Lens) -> tuple[float, float]:

@@ -5,17 +5,22 @@ beyond, and some of its diameters at normal incidence and at an angle. Seconds t
 """
 
 import math
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from metalens import rcwa
+from metalens.cell import materials
 from metalens.design.neighbours import neighbours, printed
+from metalens.design.profiles import Focus
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.lens import Lens
 from metalens.psf import LeftOut
 
+LEAST = 2  # pillars in a row; light to both sides is told apart by the rows whose phases begin elsewhere
+RINGS = 48  # of a lens, over which light is summed
 FEWEST, MOST = 4, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
 DIAMETERS = 5
 TOLERANCE = 1e-2  # of t
@@ -40,6 +45,55 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
     found = neighbours(lens, counts=(long, max(FEWEST, round(long / 1.5))))
     angle = angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2 if incidence_rad else 0.0
     return LeftOut((found.a, found.b), angle, "the lens's own cell")
+
+
+@dataclass(frozen=True, slots=True)
+class Unlike:
+    """What unlike neighbours leave of the light that pillars, taken one by one, bring to the focus.
+
+    share: of that power. error: estimate of its error. pillars: in the rows that were solved; none: rough.
+    """
+
+    share: float
+    error: float
+    pillars: tuple[int, ...] = ()
+
+
+def unlike(lens: Lens, *, radius_um: float) -> Unlike:
+    """Rows of the lens's own pillars, with the zones of its rim and longer ones, summed over its aperture.
+
+    Accuracy: the error is what another truncation, and leaving out any one row, change; directions of zones off the
+        lattice axes and the curvature of zones are not solved.
+
+    Raises:
+        CellError: the cell has films or tilted walls, or no round pillars on a square lattice.
+    """
+    sine, weight, cover = _rings(lens, radius_um)
+    rim = max(LEAST, round(lens.wavelength_um / (lens.cell.pitch_um * float(sine.max()))))
+    shortest = min(rim, MOST // 2)
+    counts = shortest, math.ceil(1.5 * shortest), 2 * shortest
+    fine, coarse = (neighbours(lens, counts=counts, harmonics=harmonics) for harmonics in (3, 2))
+    share = fine.share(sine, weight, cover)
+    less = [fine.without(k).share(sine, weight, cover) for k in range(len(counts))]
+    error = abs(coarse.share(sine, weight, cover) - share) + max(abs(one - share) for one in less)
+    return Unlike(share, error, counts)
+
+
+def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
+    """The same with the factor of another cell (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more."""
+    sine, weight, _ = _rings(lens, radius_um)
+    a, b = LeftOut().neighbours
+    share = float(abs(weight @ (1 + a * sine + b * sine**2)) ** 2)
+    return Unlike(share, 1 - share)
+
+
+def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array, float]:
+    """(m,) sines by which rings of a lens turn light, their shares of the area, and the index of the cover."""
+    node, weight = np.polynomial.legendre.leggauss(RINGS)
+    radius = radius_um * np.sqrt((node + 1) / 2)
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    sine = np.array([focus.aperture(r) + r / math.hypot(r, lens.source_distance_um) for r in radius.tolist()])
+    return sine, weight / 2, materials.index(lens.cell.cover, lens.wavelength_um).real
 
 
 def angle_change(lens: Lens, incidence_rad: float) -> float:

@@ -22,6 +22,7 @@ FLOOR_SHARE = 0.1  # of the tolerance: added to every estimate, for what no riva
 DOUBT_SHARE = 0.5  # of the tolerance: disagreement of the fits at which the search ends
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
 SCAN = 1200  # places where the fits are compared
+FIRST = 13  # Chebyshev points that a search begins with
 FINEST_UM = 2e-5  # no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles no better
 
 
@@ -109,8 +110,16 @@ class Curve:
         return np.column_stack([poles.real, np.abs(poles.imag)])
 
 
+def starts(low_um: float, high_um: float, count: int = FIRST) -> list[float]:
+    """Diameters that :func:`explore` solves first: Chebyshev points with both ends."""
+    middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
+    start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
+    start[[0, -1]] = low_um, high_um
+    return [float(v) for v in start]
+
+
 def explore(
-    solve: Solver, low_um: float, high_um: float, *, tolerance: float, first: int = 13, most: int = 80
+    solve: Solver, low_um: float, high_um: float, *, tolerance: float, first: int = FIRST, most: int = 80
 ) -> Nodes:
     """Choose diameters one by one and solve them, until the rational fit predicts what comes.
 
@@ -119,10 +128,8 @@ def explore(
         first: Chebyshev points to begin with.
         most: solves at most; where they do not suffice ``converged`` is False.
     """
-    middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
-    start = middle - half * np.cos(np.pi * np.arange(first) / (first - 1))
-    start[[0, -1]] = low_um, high_um
-    x, made = [float(v) for v in start], [solve(float(v)) for v in start]
+    x = starts(low_um, high_um, first)
+    made = [solve(v) for v in x]
     past: list[Rational] = []
     calm = 0
     while calm < CALM and len(x) < most:

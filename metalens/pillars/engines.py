@@ -5,9 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from metalens.cell import Cell, Response
 from metalens.ground.errors import CellError
+from metalens.pillars.curve import starts
 
+PROBES = [4, 7, -1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
 Engine = Literal["auto", "rcwa", "modal"]
 Polarization = Literal["x", "y", "s", "p"]
 
@@ -45,15 +49,16 @@ def smooth(
 ) -> Callable[[float], Response]:
     """As :func:`precise`, on one discretisation for all diameters of ``span_um``.
 
-    It is the least that meets the tolerance at three probes. Elsewhere the error may exceed the tolerance (it is
+    It is the least that meets the tolerance at three probes, which a curve over the span solves anyhow: answers are
+    remembered. Elsewhere the error may exceed the tolerance (it is
     reported), but it has no jumps that a rational fit would take for resonances.
     """
     as_built = engine == "modal" and (cell.under or cell.over or cell.sidewall_rad)
     if cell.height_um == 0 or as_built:
-        return precise(cell, light, tolerance=tolerance, engine=engine)
+        return functools.cache(precise(cell, light, tolerance=tolerance, engine=engine))
     make = _modal_levels if engine == "modal" else _rcwa_levels
-    levels = make(cell, light, span_um[1], tolerance)
-    probes = [span_um[0] + share * (span_um[1] - span_um[0]) for share in (0.3, 0.62, 1.0)]
+    levels = [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
+    probes = np.array(starts(*span_um))[PROBES].tolist()
     for at in levels[:-1]:
         if all(at(d).converged for d in probes):
             return at

@@ -41,16 +41,9 @@ def work(task: Task) -> Result:
         return _listed(task["diameters_um"], [solve(d) for d in task["diameters_um"]])
     low, high = task["span_um"]
     solve = smooth(cell, light, (low, high), **(about | {"tolerance": SOLVE_SHARE * task["tolerance"]}))
-    made: dict[float, Response] = {}
-
-    def remembered(diameter_um: float) -> Response:
-        if diameter_um not in made:
-            made[diameter_um] = solve(diameter_um)
-        return made[diameter_um]
-
-    nodes = reduced.explore(remembered, low, high, tolerance=FIT_SHARE * task["tolerance"])
+    nodes = reduced.explore(solve, low, high, tolerance=FIT_SHARE * task["tolerance"])
     order = nodes.diameter_um.tolist()
-    return _listed(order, [made[d] for d in order]) | {"converged": nodes.converged, "reason": nodes.reason}
+    return _listed(order, [solve(d) for d in order]) | {"converged": nodes.converged, "reason": nodes.reason}
 
 
 def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) -> Result:

@@ -241,8 +241,11 @@ def test_another_case_is_the_same_material(name, want):
 
 @pytest.mark.parametrize(
     ("name", "want"),
-    [("titania", "TiO2"), ("gold", "Au"), ("silicon", "Si"), ("Titanium dioxide", "TiO2"), ("fused_silica", "SiO2")],
-)
+    [
+        ("titania", "TiO2"), ("gold", "Au"), ("silicon", "Si"), ("Titanium dioxide", "TiO2"), ("fused_silica", "SiO2"),
+        ("GaN-o", "GaN"), ("Al2O3-e", "sapphire-e"), ("PC", "polycarbonate"),
+    ],
+)  # fmt: skip
 def test_a_word_leads_to_the_material(name, want):
     with pytest.raises(MaterialError, match=f"did you mean '{want}'"):
         materials.index(name, 0.6)

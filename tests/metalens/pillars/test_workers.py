@@ -9,10 +9,11 @@ import textwrap
 import pytest
 
 from metalens import rcwa
+from metalens.cell import Response
 from metalens.cell.record import Cell, Index
 from metalens.ground import executor
 from metalens.ground.errors import MaterialError, WorkerError
-from metalens.pillars import workers
+from metalens.pillars import engines, workers
 from metalens.pillars.engines import Light
 
 CELL = Cell(0.30, 0.7, Index(3.6))
@@ -93,3 +94,26 @@ def test_no_cluster_at_the_address_is_told():
     pytest.importorskip("distributed")
     with pytest.raises(WorkerError, match="no dask scheduler at"), executor.on("tcp://127.0.0.1:9"):
         list(executor.run(abs, [1]))
+
+
+def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
+    """A curve pays for its nodes and for the probe that a coarser mesh failed, no more."""
+    asked = []
+
+    def levels(cell, light, largest_um, tolerance):
+        def level(name, met):
+            def at(diameter_um):
+                asked.append((name, diameter_um))
+                return Response(0.9 + 0.2j * diameter_um, 0.1 + 0j, 1e-5, 9, 1.0, "modal", met, name)
+
+            return at
+
+        return [level("coarse", False), level("fine", True), level("finest", True)]
+
+    monkeypatch.setattr(engines, "_modal_levels", levels)
+    found = workers.work(workers.curve_task(CELL, engines.Light(0.85), (0.07, 0.23), tolerance=1e-3, engine="modal"))
+    failed, nodes = [d for name, d in asked if name == "coarse"], [d for name, d in asked if name != "coarse"]
+    assert len(failed) == 1
+    assert len(nodes) == len(set(nodes))
+    assert set(nodes) == set(found["diameter_um"])
+    assert {name for name, _ in asked} == {"coarse", "fine"}
