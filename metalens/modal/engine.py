@@ -182,8 +182,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
             f"a diameter of {case.rho:.3g} pitches: the elements that follow the disc degenerate ({singular}); "
             "use metalens.rcwa for this pillar"
         ) from singular
-    m = min(len(first.q), len(second.q))
-    explained = first.by_q[:m] * (first.q[:m] - second.q[:m])[:, None, None]
+    pairs = nearest_pairs(first.q, second.q)
+    explained = first.by_q[pairs[:, 0]] * (first.q[pairs[:, 0]] - second.q[pairs[:, 1]])[:, None, None]
     rest = first.matrix - second.matrix - explained.sum(0)
     spread = np.abs(explained).sum(0).max() + np.abs(rest).max()
     dense = case.k0**2 * max(case.disc, case.around, key=lambda e: e.real)
@@ -197,6 +197,19 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         grazing=max(first.grazing, second.grazing),
         bloch=case.bloch,
     )
+
+
+def nearest_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(m, 2) places of values that belong together, nearest pairs first, until one side has none left.
+
+    Two layer modes that lie close may come in another order in the other form.
+    """
+    apart, pairs = np.abs(one[:, None] - other), []
+    for _ in range(min(apart.shape)):
+        place = np.unravel_index(int(np.argmin(apart)), apart.shape)
+        pairs.append(place)
+        apart[place[0]], apart[:, place[1]] = np.inf, np.inf
+    return np.array(pairs, int).reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,7 +10,7 @@ from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
 from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
-from metalens.modal.engine import evaluate, geometric_mean
+from metalens.modal.engine import evaluate, geometric_mean, nearest_pairs
 from metalens.modal.homogeneous import modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.mesh import X0, X1, MeshPlan, build
@@ -32,6 +32,17 @@ def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):
     t12 = 2 * np.sqrt(below * n) / (below + n) * 2 * np.sqrt(n * above) / (n + above)
     phase = np.exp(2j * np.pi * n * height / wavelength)
     return t12 * phase / (1 + r1 * r2 * phase**2)
+
+
+# --- both forms -----------------------------------------------------------------------------------------------
+
+
+def test_modes_of_both_forms_are_paired_by_nearness_not_by_order():
+    """Two close modes that change places, and a third that only one form has."""
+    one, other = np.array([9.1, 4.02, 4.0 + 0.3j, 1.5]), np.array([9.0, 4.01 + 0.29j, 4.05])
+    pairs = nearest_pairs(one, other)
+    assert sorted(map(tuple, pairs.tolist())) == [(0, 0), (1, 2), (2, 1)]
+    assert nearest_pairs(one, other[:0]).shape == (0, 2)
 
 
 # --- elements -------------------------------------------------------------------------------------------------
