@@ -21,6 +21,7 @@ from benchmarks.mutation.server import Server
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "benchmarks" / "results" / "mutants.json"
 REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # {"path: was -> became": why no test can tell}
+LONGEST_S = 120.0  # of test files whose usual time is not known
 SEEN = ROOT / "build" / "mutants" / "reach.json"  # which tests run which lines, as seen before the first mutant
 
 
@@ -78,12 +79,14 @@ class Worker:
     server: Server
     graph: Graph
     reach: Reach
+    near: int
 
     @classmethod
-    def begin(cls, trees: list[str], reach: Reach, tests: str) -> None:
+    def begin(cls, trees: list[str], reach: Reach, tests: str, near: int = 0) -> None:
         at = multiprocessing.current_process()._identity[0] - 1
         tree = Path(trees[at % len(trees)])
         cls.bench, cls.server, cls.graph, cls.reach = Bench(tree), Server(tree, (tests,)), Graph(ROOT, tests), reach
+        cls.near = near
 
     @classmethod
     def measure(cls, test: str) -> tuple[str, Seen]:
@@ -97,6 +100,8 @@ class Worker:
         module = mutant.path.removesuffix(".py").replace("/", ".")
         source = mutant.applied((ROOT / mutant.path).read_text(encoding="utf-8"))
         loops = home(ROOT / mutant.path, mutant.line)[0] in compiled(ROOT / mutant.path)
+        if cls.near:
+            return cls._judged_near(mutant, module, source, loops)
         tests = cls.reach.tests(ROOT, mutant.path, mutant.line, budget_s)
         usual = sum(cls.reach.seconds[test] for test in tests)
         answer = None
@@ -111,6 +116,16 @@ class Worker:
         outcome = {"passed": "survived", "failed": "killed", "time": "killed by time"}[outcome]
         files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
         return _row(mutant) | {"outcome": outcome, "seconds": round(spent, 1), "tests": files}
+
+    @classmethod
+    def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
+        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them."""
+        tests = cls.graph.related(module, {}, 10.0 * cls.near)  # files of which no time is known count 10 s each
+        asked = mutant.path, source, tests
+        answer = None if loops else cls.server.outcome(*asked, LONGEST_S)
+        outcome, spent = answer or cls.bench.outcome(*asked, LONGEST_S / 3, fresh=module in cls.graph.compiled)
+        said = "killed" if outcome == "failed" else "survived"
+        return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
 
 
 def _row(mutant: rules.Mutant) -> dict[str, object]:
@@ -127,6 +142,7 @@ def main(words: list[str]) -> int:
     parser.add_argument("--bars", type=float, default=1 / 3, help="share drawn from lines that make error bars")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mutant")
+    parser.add_argument("--near", type=int, default=0, help="ask so many nearest test files, measure nothing first")
     parser.add_argument("--trust", action="store_true", help="take what tests ran at the last measurement")
     parser.add_argument("--tests", default="tests", help="ask the tests of this folder alone")
     parser.add_argument("--result", type=Path, default=RESULT, help="file that keeps the table")
@@ -136,9 +152,13 @@ def main(words: list[str]) -> int:
     load_libraries()
     with contextlib.ExitStack() as stack:
         trees = [str(stack.enter_context(copy_of(ROOT))) for _ in range(asked.jobs)]
-        reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8"))) if asked.trust else _measured(trees, asked.tests)
-        rows = []
-        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, (trees, reach, asked.tests)) as pool:
+        reach = Reach()
+        if asked.trust:
+            reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8")))
+        elif not asked.near:
+            reach = _measured(trees, asked.tests)
+        rows, begun = [], (trees, reach, asked.tests, asked.near)
+        with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, begun) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):
                 rows.append(row)
                 _say(len(rows), len(chosen), row)

@@ -95,7 +95,9 @@ class _Loop:
             wanted = dict.fromkeys(names)
             by_name = {item.nodeid: item for item in session.items}
             items = [by_name[n] for n in wanted if n in by_name]
-            items += [item for item in session.items if item.nodeid.partition("::")[0] in wanted]
+            files = list(wanted)
+            whole = [item for item in session.items if item.nodeid.partition("::")[0] in wanted]
+            items += sorted(whole, key=lambda item: files.index(item.nodeid.partition("::")[0]))
             if change is None:
                 self.pipe.send(self._seen(items, limit_s))
                 continue

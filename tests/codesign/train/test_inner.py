@@ -229,3 +229,9 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
     assert (step.dtype, float(step)) == (before.dtype, 1.0)
     assert after.stride() == kernel.stride()
     assert torch.equal(after, moment)
+
+
+def test_only_the_weights_of_the_network_decay():
+    """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would shrink."""
+    decay = {name: made.param_groups[0]["weight_decay"] for name, made in _trainer().optimisers.items()}
+    assert decay == {"weights": 0.01, "optics": 0.0, "pitch": 0.0}

@@ -1,0 +1,26 @@
+"""What capture.toml says of the bench becomes the fit's priors, in the units of its parameters."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from characterize.inference.prepare import stated
+
+
+def said(**about):
+    capture = SimpleNamespace(wavelength_um=0.8523, pixel_um=0.75, about=about)
+    return {one.name: (one.value, one.sigma) for one in stated(capture, SimpleNamespace(wavelength_um=0.85))}
+
+
+def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
+    found = said(wavelength_sigma_nm=0.3, pixel_sigma_um=0.003, pinhole_um=12.5, glass_um=700)
+    assert found == {
+        "wavelength_nm": (pytest.approx(2.3), 0.3),
+        "pinhole_um": (12.5, 0.0),
+        "glass_um": (700.0, 0.0),
+        "pixel_percent": (0.0, pytest.approx(0.4)),  # 0.003 of 0.75 um
+    }
+
+
+def test_half_a_nanometre_of_wavelength_where_nothing_is_said():
+    assert said() == {"wavelength_nm": (pytest.approx(2.3), 0.5)}

@@ -1,0 +1,39 @@
+"""Bars of lenses of two sizes, and how far apart rays may lie to be said to meet."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from metalens.design import Focus, paired
+from metalens.design.focusing import focuses, meeting_um
+
+K = 2 * np.pi / 1.31
+
+
+def test_the_bar_of_each_polarisation_is_of_its_own_efficiency(monkeypatch):
+    """Amplitudes √η of the peak that are off by the mean bar of the pillars: (√η + b)² - η."""
+    monkeypatch.setattr(paired, "_covered", lambda stock, alike: 0.5)
+    monkeypatch.setattr(paired, "least_period_um", lambda cell: 0.4)
+    quality = [SimpleNamespace(quality=lambda *_, e=e, **__: SimpleNamespace(efficiency=e)) for e in (0.81, 0.36)]
+    stock = SimpleNamespace(error=np.array([0.01, 0.05, 0.3]), leaked=np.array([[0.1, 0.02], [0.3, 0.04], [9.0, 9.0]]))
+    used = np.array([3, 1, 0])
+    made = paired._split(stock, quality, used, (None, None), 100.0, SimpleNamespace(cell=None), alike=False)
+    bar = (3 * 0.01 + 0.05) / 4
+    assert made.efficiency_error == pytest.approx(((0.9 + bar) ** 2 - 0.81, (0.6 + bar) ** 2 - 0.36), rel=1e-12)
+    assert made.leaked == pytest.approx((0.15, 0.025))
+    assert (made.pairs, made.multiplexed, made.covered) == (2, True, 0.5)
+
+
+@pytest.mark.parametrize(("apart", "meets"), [(0.15, True), (0.25, False), (-0.15, True), (-0.25, False)])
+def test_rays_meet_within_a_fifth_of_the_lens(apart, meets):
+    """A lens of focal length f: at the sensor at d its rays have come from radius r to r (1 - d / f)."""
+    sensor_um = 900.0
+    focal_um = sensor_um / (1 - apart)
+
+    def phase(x, y):
+        return -K * np.hypot(np.hypot(x, y[:, None]), focal_um)
+
+    focus, about = Focus(1.31, sensor_um), {"radius_um": 60.0, "pitch_um": 0.6}
+    assert bool(focuses(phase, focus, **about)) is meets
+    assert meeting_um(phase, focus, **about) == pytest.approx(focal_um, rel=1e-5)
