@@ -157,7 +157,8 @@ def main(words: list[str]) -> int:
             reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8")))
         elif not asked.near:
             reach = _measured(trees, asked.tests)
-        rows, begun = [], (trees, reach, asked.tests, asked.near)
+        begun = trees, reach, asked.tests, asked.near
+        rows = []
         with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, begun) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):
                 rows.append(row)

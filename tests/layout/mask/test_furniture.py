@@ -1,4 +1,4 @@
-"""What stands around a lens on the mask: all of it, the opening of the lens alone, or nothing; labels in their place."""
+"""What stands around a lens on the mask: all of it, its opening alone, or nothing; labels where they belong."""
 
 import numpy as np
 import pytest

@@ -7,6 +7,9 @@ import pytest
 
 from metalens.design import Focus, paired
 from metalens.design.focusing import focuses, meeting_um
+from metalens.design.turned import _conversion
+from metalens.pillars.circular import Turned, isolated
+from metalens.rcwa import SAFETY
 
 K = 2 * np.pi / 1.31
 
@@ -37,3 +40,27 @@ def test_rays_meet_within_a_fifth_of_the_lens(apart, meets):
     focus, about = Focus(1.31, sensor_um), {"radius_um": 60.0, "pitch_um": 0.6}
     assert bool(focuses(phase, focus, **about)) is meets
     assert meeting_um(phase, focus, **about) == pytest.approx(focal_um, rel=1e-5)
+
+
+@pytest.mark.parametrize("hand", ["right", "left"])
+def test_bars_of_converted_and_unconverted_light(hand):
+    """Truncations whose t_x was 1 % and t_y 3 % larger: shares |t_x -+ t_y|² / 4 of theirs, SAFETY times as far off.
+
+    One turn is solved 0.04i off on the diagonal: half of it either way round, 0.02 of the amplitude beside the model.
+    """
+    t_x, t_y, angles = 0.93 * np.exp(0.4j), 0.81 * np.exp(-2.0j), np.radians([0, 20, 50, -35])
+    solved = isolated(t_x, t_y, angles)
+    before = np.stack([isolated(1.01 * t_x, 1.03 * t_y, angles), isolated(1.005 * t_x, t_y, angles)], axis=1)
+    plain = _conversion(Turned(0.23, 0.94, angles, solved, np.full(4, 0.01), before), hand)
+    for sign, share, bar in (
+        (-1, plain.converted, plain.converted_error),
+        (1, plain.unconverted, plain.unconverted_error),
+    ):
+        here, there, near = (abs(a * t_x + sign * b * t_y) ** 2 / 4 for a, b in ((1, 1), (1.01, 1.03), (1.005, 1)))
+        assert share == pytest.approx(here, rel=1e-9)
+        assert bar == pytest.approx(SAFETY * max(abs(there - here), abs(near - here)), rel=1e-9)
+    assert plain.isolated_error < 1e-12
+    solved[2, 0, 0] += 0.04j
+    assert _conversion(Turned(0.23, 0.94, angles, solved, np.full(4, 0.01), before), hand).isolated_error == (
+        pytest.approx(0.02, rel=1e-9)
+    )
