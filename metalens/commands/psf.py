@@ -13,7 +13,8 @@ import numpy as np
 import tyro
 
 from metalens import design, lens, psf
-from metalens.commands.common import Common, Output
+from metalens.commands import far_field
+from metalens.commands.common import Common, MaybeOutput
 from metalens.commands.psf_settings import Settings, read
 from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
@@ -42,8 +43,8 @@ class Options(Common):
 
     Attributes:
         lens: lens.h5, or asbuilt.h5 for the lens that was made (its process and wave front included).
-        output: the PSF file to write, .h5 (which all other commands read), .tif, .mat or .fits; plots are written
-            beside it as NAME_xz.png and so on.
+        output: the file to write, psf.h5 if left out: .h5 (which all other commands read), .tif, .mat or .fits;
+            plots are written beside it as NAME_xz.png and so on.
         config: PSF.toml with any of the settings below, own_cell, [[layers.front]] and [[layers.behind]]. What follows
             stands in place of the file's.
         depths_mm: nearest and farthest source, and the largest step between depths; left out: 21 depths about the
@@ -64,11 +65,14 @@ class Options(Common):
         weights: of those wavelengths; left out: equal.
         polarisation: scalar, vector or auto.
         tolerance: relative L2 error.
+        far_field: in place of PSFs, the light far behind the lens over direction cosines, with the share of every beam
+            (deflectors, holograms, axicons): far_field.h5, NAME_far.png. Takes sources_mm (one; left out, a plane
+            wave), angles_deg, angles_y_deg, wavelengths_nm (one) and samples (squares across all directions).
         report: also write NAME.html.
     """
 
     lens: tyro.conf.Positional[Path]
-    output: Output = Path("psf.h5")
+    output: MaybeOutput = None
     config: Path | None = None
     depths_mm: tuple[float, float, float] | None = None
     sources_mm: tuple[float, ...] | None = None
@@ -87,6 +91,7 @@ class Options(Common):
     weights: tuple[float, ...] | None = None
     polarisation: psf.Polarisation | None = None
     tolerance: float | None = None
+    far_field: bool = False
     report: bool = False
 
     @property
@@ -103,12 +108,14 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
-    settings = options.settings
-    psf_export.check(options.output)
+    if options.far_field:
+        return _far(options)
+    target, settings = options.output or Path("psf.h5"), options.settings
+    psf_export.check(target)
     made, built = _read(options.lens)
     made = made if settings.layers is None else replace(made, layers=settings.layers)
     settings = settings.about(made)
-    target, view = options.output, settings.view
+    view = settings.view
     pixels = len(view.depths_um) * len(view.angles_rad) * settings.samples * settings.samples_y
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
@@ -118,6 +125,23 @@ def run(options: Options) -> int:
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
     options.console.result(_summary(stack), text)
     return 0 if stack.converged else 1
+
+
+def _far(options: Options) -> int:
+    """Compute, write, draw the far field of a design."""
+    target = options.output or Path("far_field.h5")
+    if target.suffix.lower() != ".h5":
+        raise ConfigError(f"{target}: a far field is written as .h5")
+    kind = store.kind_of(options.lens)
+    if kind in SOURCES:
+        raise ConfigError(f"{options.lens}: the far field of a design (lens.h5), not of a file of kind {kind}")
+    made = lens.load(options.lens)
+    wanted = far_field.asked(options, made)
+    with options.claim(target, beside=("_far.png", ".html"), room=transaction.ROOM + 4 * wanted.samples**2) as draft:
+        found = far_field.compute(made, wanted, options.console)
+        far_field.save(draft.path, options.lens, wanted, found, page=options.report)
+    options.console.result(far_field.values(wanted, found), far_field.text(target, wanted, found))
+    return 0
 
 
 class Built(Protocol):

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from metalens.psf.budget import Budget as Budget
     from metalens.psf.budget import LeftOut as LeftOut
     from metalens.psf.budget import scalar_error as scalar_error
+    from metalens.psf.directions import FarField as FarField
+    from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
     from metalens.psf.extended import SourceShape as SourceShape
     from metalens.psf.of_lens import Polarisation as Polarisation
@@ -35,6 +37,7 @@ __getattr__, __dir__, __all__ = attach(
     {
         "Budget": "budget",
         "Extent": "extended",
+        "FarField": "directions",
         "LeftOut": "budget",
         "Nodes": "spectrum",
         "Polarisation": "of_lens",
@@ -44,6 +47,7 @@ __getattr__, __dir__, __all__ = attach(
         "View": "of_lens",
         "aperture": "of_lens",
         "export": "",
+        "far_field": "directions",
         "from_lens": "of_lens",
         "unpolarised": "of_lens",
         "load": "record",
