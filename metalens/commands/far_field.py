@@ -175,8 +175,8 @@ def picture(wanted: Asked, found: list[FarField]) -> bytes:
         edge = float(one.sines[-1] + (one.sines[1] - one.sines[0]) / 2)
         top = float(one.share.max())
         panel = panels[0, column]
-        scale = LogNorm(max(1e-6 * top, 1e-300), top)
-        shown = panel.imshow(np.maximum(one.share, scale.vmin), norm=scale, extent=(-edge, edge, edge, -edge))
+        low = max(1e-6 * top, 1e-300)
+        shown = panel.imshow(np.maximum(one.share, low), norm=LogNorm(low, top), extent=(-edge, edge, edge, -edge))
         panel.grid(False)
         panel.set(title=f"from ({x:g}°, {y:g}°)", xlabel="sine along x", ylabel="sine along y")
         figure.colorbar(shown, ax=panel, label="share of the light in a square", shrink=0.85)
