@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks import Row
 from metalens import modal, rcwa
-from metalens.cell import Cell, Index
+from metalens.cell import Cell, Index, Light
 from metalens.ground.errors import CellError
 from metalens.modal import RUNGS
 from metalens.modal.case import Case, case_of
@@ -102,7 +102,7 @@ def judged(kind: str, count: int, tolerance: float, seed: int, *, other_solver: 
             refused += 1
             continue
         seconds += time.perf_counter() - start
-        want, doubt = referee(case_of(cell, diameter, wavelength, angle, 0.0, polarization), got.t_error)
+        want, doubt = referee(case_of(cell, diameter, Light(wavelength, angle, polarization)), got.t_error)
         if doubt > SHARE * got.t_error:
             open_ += 1
         else:

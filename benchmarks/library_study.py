@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
 from metalens.ground.arrays import Array
@@ -22,7 +23,7 @@ from metalens.modal.ladder import RUNGS
 from metalens.pillars import curve as reduced
 from metalens.pillars import workers
 from metalens.pillars.curve import Curve, Nodes
-from metalens.pillars.engines import Light, smooth
+from metalens.pillars.engines import smooth
 from metalens.pillars.record import DEFAULT_CELL
 
 FILE = Path(__file__).parent / "results" / "library_study.json"
@@ -51,7 +52,7 @@ def finer(cell: Cell, light: Light, largest_um: float, mesh: int) -> Any:
     rung = next(rung for rung in RUNGS[max(mesh + 1, good) :] if rung.choice(1.0).plan != used)
 
     def at(diameter_um: float) -> Response:
-        case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
+        case = case_of(cell, diameter_um, light)
         found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
         error = rung.error(found, case.rho)
         t, r = complex(found.matrix[1, 0]), complex(found.matrix[0, 0])

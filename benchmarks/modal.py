@@ -11,6 +11,7 @@ import numpy as np
 
 import metalens
 from benchmarks import Row, fastest
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal import gradient, solve, solve_many
 from metalens.modal.case import case_of
@@ -31,7 +32,7 @@ GOALS = {
 def dense() -> dict[float, complex]:
     """t over 80-320 nm, the dip and the flank with it, on the fine mesh: 6e-6 off the references."""
     rung = next(rung for rung in RUNGS if rung.name == "fine")
-    cases = {float(d): case_of(CELL, float(d), WAVELENGTH_UM, 0.0, 0.0, "x") for d in DIAMETERS}
+    cases = {float(d): case_of(CELL, float(d), Light(WAVELENGTH_UM)) for d in DIAMETERS}
     return {d: complex(evaluate(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0]) for d, c in cases.items()}
 
 
@@ -78,7 +79,7 @@ def mesh(name: str) -> Row:
     rung = next(rung for rung in RUNGS if rung.name == name)
     rough = rung.usual > 5e-5
     wanted = dense() if rough else {d: t for (d, _), t in references(0.0).items()}
-    cases = {d: case_of(CELL, d, WAVELENGTH_UM, 0.0, 0.0, "x") for d in wanted}
+    cases = {d: case_of(CELL, d, Light(WAVELENGTH_UM)) for d in wanted}
 
     def one(d: float) -> complex:
         return complex(evaluate(cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak).matrix[1, 0])

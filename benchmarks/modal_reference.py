@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import metalens
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
@@ -68,7 +69,7 @@ def wanted() -> list[Wanted]:
 
 def entry(name: str, cell: Cell, d: float, wavelength: float, angle: float, p: str, plans: Any) -> dict[str, Any]:
     """Solve one case on both meshes."""
-    case = case_of(cell, d, wavelength, float(np.deg2rad(angle)), 0.0, p)
+    case = case_of(cell, d, Light(wavelength, float(np.deg2rad(angle)), p))
     finer, other = (evaluate(case, plan, weak=WEAK) for plan in plans)
     t, r = finer.matrix[1, 0], finer.matrix[0, 0]
     return {

@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from metalens import modal, rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.cell.response import Response
 
@@ -43,7 +44,7 @@ def truncated_row(cell: Cell, wavelength_um: float, exact: Any, harmonics: int) 
     from metalens.rcwa.solver import truncated
 
     found = rcwa.solve_many(cell, DIAMETERS, wavelength_um, harmonics=harmonics)
-    this = case(cell, wavelength_um, angle_rad=0.0, azimuth_rad=0.0, polarization="x")
+    this = case(cell, Light(wavelength_um))
     seconds = fastest(lambda: truncated(this, DIAMETERS, harmonics), repeats=2) / len(DIAMETERS)
     error = np.abs(np.array([one.t for one in found]) - exact)
     return Row(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from metalens import modal
-from metalens.cell import Cell
+from metalens.cell import Cell, Light
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
@@ -70,7 +70,7 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
 def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     """(diameters,) t of a cell: a few dozen solves on one mesh, and the rational function through them."""
     span = float(diameters[0]), float(diameters[-1])
-    solve = engines.smooth(cell, engines.Light(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal")
+    solve = engines.smooth(cell, Light(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal")
     nodes = curve.explore(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
     return np.asarray(curve.curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(diameters)[:, 0])
 

@@ -21,11 +21,12 @@ from codesign.budget.person import person
 from codesign.budget.prepared import Bench
 from codesign.evaluate import AXIAL
 from codesign.optics import gathered, psf_difference
+from metalens.cell import Light
 from metalens.design import neighbours as supercell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, LensError
 from metalens.made import State, draws, sensitivity, transmission
-from metalens.pillars import Light, PillarLibrary, engines
+from metalens.pillars import PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again
 FINER = 30.0  # how much more precisely

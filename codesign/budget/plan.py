@@ -27,13 +27,13 @@ from codesign.budget.journal import Journal
 from codesign.budget.task import TaskSetting, Views
 from codesign.optics import Aperture, Numerics, Window, kernels
 from metalens import design, library
-from metalens.cell import Cell
+from metalens.cell import Cell, Light
 from metalens.design import Focus
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import PsfBasis
 from metalens.lens import Lens
-from metalens.pillars import Light, Sweep, engines
+from metalens.pillars import Sweep, engines
 
 LEVELS: dict[str, tuple[float, ...]] = {  # coarsest first; the last of each is the finest
     "library_tolerance": (3e-2, 1e-2, 1e-3, 1e-4),

@@ -8,6 +8,9 @@ if TYPE_CHECKING:
     from metalens.cell import materials as materials
     from metalens.cell import shapes as shapes
     from metalens.cell.lattice import Lattice as Lattice
+    from metalens.cell.light import Light as Light
+    from metalens.cell.light import Polarization as Polarization
+    from metalens.cell.light import check_direction as check_direction
     from metalens.cell.materials import index as index
     from metalens.cell.materials import slope as slope
     from metalens.cell.orders import check_subwavelength as check_subwavelength
@@ -28,8 +31,11 @@ __getattr__, __dir__, __all__ = attach(
         "Index": "record",
         "Lattice": "lattice",
         "Layer": "record",
+        "Light": "light",
         "Material": "record",
+        "Polarization": "light",
         "Response": "response",
+        "check_direction": "light",
         "check_subwavelength": "orders",
         "index": "materials",
         "materials": "",

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, index
+from metalens.cell import Cell, Light, index
 from metalens.ground.errors import CellError
 
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
-POLARIZATIONS = ("x", "y", "s", "p")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,22 +44,19 @@ def film(case: Case) -> np.ndarray:
     return np.array([[r, t], [t, -r]], complex)
 
 
-def case_of(
-    cell: Cell, diameter_um: float, wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str
-) -> Case:
+def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
     """Check a case, and put it into half pitches.
 
     Raises:
         CellError: films or a tilted sidewall (``solve`` takes them), a plane of incidence off the lattice axes, an
-            absorbing half-space, an unknown polarisation, or a number out of range.
+            absorbing half-space, or a diameter out of range.
     """
-    diameter_um, wavelength_um = float(diameter_um), float(wavelength_um)
-    angle_rad, azimuth_rad = float(angle_rad), float(azimuth_rad)
+    diameter_um = float(diameter_um)
     check_shape(cell, diameter_um)
-    along = plane_of_incidence(wavelength_um, angle_rad, azimuth_rad, polarization)
-    below, above = half_spaces(cell, wavelength_um, angle_rad)
-    disc, around = (index(m, wavelength_um) for m in (cell.pillar, cell.between))
-    k0, half, sine = 2 * math.pi / wavelength_um, cell.pitch_um / 2, abs(math.sin(angle_rad))
+    along = plane_of_incidence(light)
+    below, above = half_spaces(cell, light)
+    disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.between))
+    k0, half, sine = 2 * math.pi / light.wavelength_um, cell.pitch_um / 2, abs(math.sin(light.angle_rad))
     bloch = k0 * sine * half
     return Case(
         rho=diameter_um / cell.pitch_um,
@@ -71,49 +67,41 @@ def case_of(
         disc=disc**2,
         around=around**2,
         bloch=bloch if bloch > NORMAL_RAD else 0.0,
-        p=polarization in ("p", along),
+        p=light.polarization in ("p", along),
     )
 
 
-def plane_of_incidence(wavelength_um: float, angle_rad: float, azimuth_rad: float, polarization: str) -> str:
+def plane_of_incidence(light: Light) -> str:
     """The lattice axis, "x" or "y", that the plane of incidence contains.
 
     Raises:
-        CellError: a number out of range, an unknown polarisation, a plane off the lattice axes.
+        CellError: a plane off the lattice axes.
     """
-    if not (math.isfinite(wavelength_um) and wavelength_um > 0):
-        raise CellError(f"wavelength_um = {wavelength_um}: need a finite length above 0")
-    if not (abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
+    quarter = light.azimuth_rad / (math.pi / 2)
+    if light.angle_rad and abs(quarter - round(quarter)) > 1e-12:
         raise CellError(
-            f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, the first within +-pi/2"
-        )
-    if polarization not in POLARIZATIONS:
-        raise CellError(f"polarization = {polarization!r}: need one of {', '.join(POLARIZATIONS)}")
-    quarter = azimuth_rad / (math.pi / 2)
-    if angle_rad and abs(quarter - round(quarter)) > 1e-12:
-        raise CellError(
-            f"azimuth_rad = {azimuth_rad}: the modal engine takes planes of incidence along the lattice axes "
+            f"azimuth_rad = {light.azimuth_rad}: the modal engine takes planes of incidence along the lattice axes "
             "(multiples of pi/2); use metalens.rcwa for others"
         )
     return "x" if round(quarter) % 2 == 0 else "y"
 
 
-def half_spaces(cell: Cell, wavelength_um: float, angle_rad: float) -> tuple[complex, complex]:
+def half_spaces(cell: Cell, light: Light) -> tuple[complex, complex]:
     """Indices of substrate and cover, neither absorbing, with a zero order in both.
 
     Raises:
         CellError: says which absorbs, or that the angle is too large.
     """
-    below, above = (index(m, wavelength_um) for m in (cell.substrate, cell.cover))
+    below, above = (index(m, light.wavelength_um) for m in (cell.substrate, cell.cover))
     for name, n in (("substrate", below), ("cover", above)):
         if n.imag:
             raise CellError(
                 f"{name} absorbs (index {n}): the modal engine needs real half-spaces; use metalens.rcwa, "
                 "or take the absorbing part as a film"
             )
-    if abs(math.sin(angle_rad)) >= min(below.real, above.real):
+    if abs(math.sin(light.angle_rad)) >= min(below.real, above.real):
         raise CellError(
-            f"angle_rad = {angle_rad}: no zero order in a half-space of index {min(below.real, above.real)}"
+            f"angle_rad = {light.angle_rad}: no zero order in a half-space of index {min(below.real, above.real)}"
         )
     return below, above
 

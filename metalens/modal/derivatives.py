@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, index, slope
+from metalens.cell import Cell, Light, Polarization, index, slope
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.case import Case, case_of, check_tolerance
 from metalens.modal.engine import basis, climb, geometric_mean, geometry
@@ -144,7 +144,7 @@ def gradient(
     *,
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
-    polarization: str = "x",
+    polarization: Polarization = "x",
     tolerance: float = 1e-3,
 ) -> Gradient:
     """t of ``solve`` and its derivatives; arguments and refusals as there.
@@ -152,7 +152,7 @@ def gradient(
     Accuracy: they are the exact derivatives of the discrete t (1e-8 against finite differences), which differ from
     those of the true t by about the tolerance over the scale on which t varies.
     """
-    case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
+    case = case_of(cell, diameter_um, Light(wavelength_um, angle_rad, polarization, azimuth_rad))
     check_tolerance(tolerance)
     plan = climb(case, tolerance).rung.choice(case.rho).plan
     with one_blas_thread():

@@ -4,11 +4,10 @@ import cmath
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Response
+from metalens.cell import Cell, Light, Polarization, Response
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
@@ -25,7 +24,6 @@ from metalens.rcwa import anchored
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
-Polarization = Literal["x", "y", "s", "p"]
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
 MOST = 8  # and of the others at most so many, the least decaying
@@ -265,10 +263,10 @@ def solve(
         CellError, MaterialError: see ``case_of``.
     """
     check_tolerance(tolerance)
+    light = Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad))
     if cell.round and (cell.sidewall_rad or cell.under or cell.over):
-        light = anchored.Light(float(wavelength_um), float(angle_rad), float(azimuth_rad), polarization)
         return _as_built(cell, float(diameter_um), light, tolerance)
-    case = case_of(cell, diameter_um, wavelength_um, angle_rad, azimuth_rad, polarization)
+    case = case_of(cell, diameter_um, light)
     if case.height == 0:
         matrix = film(case)
         energy = float((np.abs(matrix[:, 0]) ** 2).sum())
@@ -279,7 +277,7 @@ def solve(
     return Response(t, r, end.error, unknowns, energy, "modal", end.converged, end.reason)
 
 
-def _as_built(cell: Cell, diameter_um: float, light: anchored.Light, tolerance: float) -> Response:
+def _as_built(cell: Cell, diameter_um: float, light: Light, tolerance: float) -> Response:
     """A pillar with a tilted wall or films, from upright ones without."""
     plain = anchored.plain(cell)
     upright = [

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell
-from metalens.modal.engine import Polarization, solve
+from metalens.cell import Cell, Polarization
+from metalens.modal.engine import solve
 
 
 @dataclass(frozen=True, eq=False, slots=True)

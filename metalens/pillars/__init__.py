@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from metalens.pillars import study as study
     from metalens.pillars import study_plots as study_plots
     from metalens.pillars import workers as workers
-    from metalens.pillars.engines import Light as Light
     from metalens.pillars.fit import ProxyFit as ProxyFit
     from metalens.pillars.fit import Wanted as Wanted
     from metalens.pillars.proxy import Proxy as Proxy
@@ -32,7 +31,6 @@ __getattr__, __dir__, __all__ = attach(
         "study_plots": "",
         "DEFAULT_CELL": "record",
         "Journal": "sweep",
-        "Light": "engines",
         "PillarLibrary": "record",
         "Proxy": "proxy",
         "ProxyFit": "fit",

@@ -2,27 +2,16 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Response
+from metalens.cell import Cell, Light, Response
 from metalens.ground.errors import CellError
 from metalens.pillars.curve import starts
 
 PROBES = [4, 7, -1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
 Engine = Literal["auto", "rcwa", "modal"]
-Polarization = Literal["x", "y", "s", "p"]
-
-
-@dataclass(frozen=True, slots=True)
-class Light:
-    """One plane wave: vacuum wavelength, angle of incidence in air, and polarisation (x at normal incidence, s, p)."""
-
-    wavelength_um: float
-    angle_rad: float = 0.0
-    polarization: Polarization = "x"
 
 
 def choose(cell: Cell, engine: Engine = "auto") -> str:
@@ -73,7 +62,7 @@ def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float)
         mesh = rung.choice(largest_um / cell.pitch_um)
 
         def at(diameter_um: float) -> Response:
-            case = case_of(cell, diameter_um, light.wavelength_um, light.angle_rad, 0.0, light.polarization)
+            case = case_of(cell, diameter_um, light)
             made = evaluate(case, mesh.plan, weak=rung.weak)
             shared = max(rung.choice(case.rho).thin, mesh.thin) - mesh.thin + mesh.shared(case.rho, case.bloch)
             error = rung.bound(shared, made, case.rho)
@@ -90,7 +79,7 @@ def _rcwa_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) 
     if not cell.round:
         from metalens.rcwa import most_harmonics
 
-        most = most_harmonics(cell, largest_um, angle_rad=light.angle_rad)
+        most = most_harmonics(cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad)
         reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
     return [functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches]
 
@@ -103,6 +92,7 @@ def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Re
         diameter_um,
         light.wavelength_um,
         angle_rad=light.angle_rad,
+        azimuth_rad=light.azimuth_rad,
         polarization=light.polarization,
         tolerance=tolerance,
     )
@@ -116,6 +106,7 @@ def _rcwa(cell: Cell, light: Light, tolerance: float, harmonics: int | None, dia
         diameter_um,
         light.wavelength_um,
         angle_rad=light.angle_rad,
+        azimuth_rad=light.azimuth_rad,
         polarization=light.polarization,
         tolerance=tolerance,
         harmonics=harmonics,

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from metalens.cell import Light, Polarization
 from metalens.ground.arrays import Array
-from metalens.pillars.engines import Light, Polarization
 from metalens.pillars.record import Sweep
 
 Normal = dict[str, Polarization]

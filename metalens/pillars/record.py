@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Index, check_subwavelength, index
+from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, ConfigError, DomainError
@@ -16,7 +16,6 @@ from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.pillars.circular import Turned
 from metalens.pillars.circular import check as check_turned
-from metalens.pillars.engines import Polarization
 from metalens.pillars.proxy import Proxy
 
 # Hydrogenated amorphous silicon deposited for near-infrared optics: n of 3.5-3.7 and hardly any loss. The evaporated

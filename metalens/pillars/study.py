@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from metalens.cell import Blend, Cell, Material, check_subwavelength, index
+from metalens.cell import Blend, Cell, Light, Material, check_subwavelength, index
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError
 from metalens.pillars import curve as reduced
 from metalens.pillars import engines, workers
 from metalens.pillars.curve import Curve, Nodes
-from metalens.pillars.engines import Light
 from metalens.pillars.record import PLAIN
 from metalens.pillars.stretch import REACH
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from metalens import __version__
-from metalens.cell import Cell
+from metalens.cell import Cell, Light
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
@@ -17,7 +17,6 @@ from metalens.ground.store import Provenance
 from metalens.pillars import curve as reduced
 from metalens.pillars import engines, few_nodes, workers
 from metalens.pillars.curve import Curve, Nodes
-from metalens.pillars.engines import Light
 from metalens.pillars.few_nodes import Rows
 from metalens.pillars.record import PillarLibrary, Sweep, check
 from metalens.pillars.workers import Result, Task

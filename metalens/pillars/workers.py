@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from metalens.cell import Cell, Response
+from metalens.cell import Cell, Light, Response
 from metalens.ground import config, executor
 from metalens.pillars import curve as reduced
-from metalens.pillars.engines import Light, precise, smooth
+from metalens.pillars.engines import precise, smooth
 
 SOLVE_SHARE, FIT_SHARE = 0.5, 0.4  # of an entry's tolerance: for the solver, and for the rational fit
 Task = dict[str, Any]
@@ -66,7 +66,7 @@ def run(tasks: list[Task], *, processes: int | None = None) -> Iterator[tuple[in
 
 
 def _task(kind: str, cell: Cell, light: Light, tolerance: float, engine: str) -> Task:
-    wave = [light.wavelength_um, light.angle_rad, light.polarization]
+    wave = [light.wavelength_um, light.angle_rad, light.polarization, light.azimuth_rad]
     return {"kind": kind, "cell": config.dumps(cell), "light": wave, "tolerance": tolerance, "engine": engine}
 
 

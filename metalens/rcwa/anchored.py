@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Response
+from metalens.cell import Cell, Light, Response
 from metalens.ground.arrays import Array
-from metalens.rcwa.conditions import Case, Polarization, case, check_diameter
+from metalens.rcwa.conditions import Case, case, check_diameter
 from metalens.rcwa.solver import truncated, wall_stages
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
@@ -31,16 +31,6 @@ STEP_UM = 1e-4
 MOST_UM = 0.01  # of a shift: a truncation that wants more knows nothing of this pillar
 UNEXPLAINED = 0.5
 SHARE = 0.2  # of the tolerance, for the modal solves
-
-
-@dataclass(frozen=True, slots=True)
-class Light:
-    """A plane wave, as :func:`metalens.modal.solve` takes it."""
-
-    wavelength_um: float
-    angle_rad: float
-    azimuth_rad: float
-    polarization: Polarization
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,7 +71,7 @@ def solve_anchored(
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
     """
-    this, bare = (_case(made, light) for made in (cell, plain(cell)))
+    this, bare = (case(made, light) for made in (cell, plain(cell)))
     nodes = node_diameters(cell, diameter_um)
     anchors = Anchors(
         np.array(nodes), np.array([(found.t, found.r) for found in upright]), max(found.t_error for found in upright)
@@ -143,13 +133,3 @@ def shifted(bare: Case, anchors: Anchors, reach: int) -> Shift:
 def _amplitudes(bare: Case, diameter_um: Array, reach: int) -> Array:
     found = truncated(bare, diameter_um, reach)
     return np.stack([found.t, found.r], axis=1)
-
-
-def _case(cell: Cell, light: Light) -> Case:
-    return case(
-        cell,
-        light.wavelength_um,
-        angle_rad=light.angle_rad,
-        azimuth_rad=light.azimuth_rad,
-        polarization=light.polarization,
-    )

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from metalens.cell import Cell, Film, Response, materials
+from metalens.cell import Cell, Film, Light, Response, check_direction, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, mirrors, pattern, wall
-from metalens.rcwa.conditions import Polarization, check_direction, direction
+from metalens.rcwa.conditions import direction
 from metalens.rcwa.made import check_size
 from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
 from metalens.rcwa.solver import safety
@@ -54,7 +54,7 @@ class Jones:
 
 
 @dataclass(frozen=True, slots=True)
-class _Light:
+class _Tangent:
     """Tangential wave vector over k0, azimuth (0 at normal incidence) and wavelength."""
 
     kx: float
@@ -73,7 +73,7 @@ class _Problem:
 
     cell: Cell
     size_um: float
-    light: _Light
+    light: _Tangent
     media: Media
     classes: tuple[tuple[Operation, ...], ...]
 
@@ -104,7 +104,7 @@ def jones(
     """
     if not (math.isfinite(tolerance) and tolerance > 0):
         raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
-    light = _light(wavelength_um, angle_rad, azimuth_rad)
+    light = _tangent(wavelength_um, angle_rad, azimuth_rad)
     media = _media(cell, light)
     check_size(cell, size_um)
     classes = _classes(cell, size_um, light)
@@ -128,13 +128,13 @@ def jones(
     return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
 
 
-def _light(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> _Light:
+def _tangent(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> _Tangent:
     """The tangential wave vector, its components 0 where they are 0 but for rounding."""
     check_direction(angle_rad, azimuth_rad)
     sine = math.sin(angle_rad)
     flat = 0.0 if sine == 0 else azimuth_rad
     kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(flat), sine * math.sin(flat)))
-    return _Light(kx, ky, flat, wavelength_um)
+    return _Tangent(kx, ky, flat, wavelength_um)
 
 
 def _moved(history: list[Array], reach: int) -> float:
@@ -144,21 +144,11 @@ def _moved(history: list[Array], reach: int) -> float:
     return safety(reach) * farthest + _ROUNDING
 
 
-@dataclass(frozen=True, slots=True)
-class Incident:
-    """A plane wave, as :func:`metalens.rcwa.solve` takes it."""
-
-    wavelength_um: float
-    angle_rad: float
-    azimuth_rad: float
-    polarization: Polarization
-
-
-def co_polarised(cell: Cell, size_um: float, light: Incident, *, tolerance: float, harmonics: int | None) -> Response:
+def co_polarised(cell: Cell, size_um: float, light: Light, *, tolerance: float, harmonics: int | None) -> Response:
     """One diagonal element of :func:`jones`; the same arguments and refusals."""
     place = ("x", "y").index(light.polarization) if light.polarization in ("x", "y") else None
     if light.angle_rad:
-        place = ("s", "p").index(direction(light.angle_rad, light.azimuth_rad, light.polarization)[-1])
+        place = ("s", "p").index(direction(light)[-1])
     elif place is None:  # p lies in the plane of incidence that the azimuth names
         turned = round(light.azimuth_rad / (math.pi / 2)) % 2
         place = turned if light.polarization == "p" else 1 - turned
@@ -172,10 +162,10 @@ def most_harmonics(cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimut
     """Largest truncation that :func:`jones` takes by itself: less for a cell without mirrors."""
     sine = math.sin(angle_rad)
     kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad)))
-    return _LAST[min(len(found) for found in _classes(cell, size_um, _Light(kx, ky, azimuth_rad, 1.0)))]
+    return _LAST[min(len(found) for found in _classes(cell, size_um, _Tangent(kx, ky, azimuth_rad, 1.0)))]
 
 
-def _media(cell: Cell, light: _Light) -> Media:
+def _media(cell: Cell, light: _Tangent) -> Media:
     k0 = 2 * math.pi / light.wavelength_um
 
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
@@ -190,7 +180,7 @@ def _media(cell: Cell, light: _Light) -> Media:
     return Media(below, above, films(cell.under), films(cell.over))
 
 
-def _classes(cell: Cell, size_um: float, light: _Light) -> tuple[tuple[Operation, ...], ...]:
+def _classes(cell: Cell, size_um: float, light: _Tangent) -> tuple[tuple[Operation, ...], ...]:
     """Sets of operations whose fields together make every polarisation: one set, or one for each polarisation."""
     outline = cell.outline(size_um)
     flip_x = outline.keeps(-1, 1) and light.kx == 0
@@ -236,7 +226,7 @@ def _operators(space: mirrors.Orders, ways: Waves, cell: Cell, this: pattern.Sla
     return pattern.operators(space, ways, this, cell)
 
 
-def _waves(space: mirrors.Orders, cell: Cell, light: _Light) -> tuple[Waves, dict[int, tuple[int, float]]]:
+def _waves(space: mirrors.Orders, cell: Cell, light: _Tangent) -> tuple[Waves, dict[int, tuple[int, float]]]:
     """The waves, and for each polarisation of the basis that this class holds: its place, and its sign there.
 
     At normal incidence the zero order has no Ez or Hz of its own: it is put in front where its set lacks it.

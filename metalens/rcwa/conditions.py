@@ -4,13 +4,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from metalens.cell import Cell, Film, materials
+from metalens.cell import Cell, Film, Light, materials
 from metalens.ground.errors import CellError
 from metalens.rcwa import basis as fourier
 from metalens.rcwa.stack import Media
 from metalens.rcwa.waves import Waves, waves
 
-Polarization = Literal["x", "y", "s", "p"]
 _STRAIGHT = 1e-15  # cos or sin of an azimuth that lies in a mirror plane, to rounding
 
 
@@ -43,33 +42,33 @@ class Case:
         return not any(n.imag for n in (self.pillar, self.between, self.media.substrate, self.media.cover, *films))
 
 
-def case(cell: Cell, wavelength_um: float, *, angle_rad: float, azimuth_rad: float, polarization: Polarization) -> Case:
-    """The case of a cell; angles are those of the light outside, in vacuum: k = k0 sin(angle_rad).
+def case(cell: Cell, light: Light) -> Case:
+    """The case of a cell and a plane wave.
 
     Raises:
-        CellError: an impossible angle or polarisation, or a zero order that does not propagate in the substrate.
+        CellError: a polarisation that is ambiguous in this direction, or a zero order that does not propagate in
+            the substrate.
         MaterialError: a wavelength outside the range of a material.
     """
     if not cell.round:
         raise CellError(f"this solver takes round pillars on a square lattice, not {cell.described}")
-    wavelength_um, angle_rad, azimuth_rad = float(wavelength_um), float(angle_rad), float(azimuth_rad)
-    k0 = 2 * math.pi / wavelength_um if wavelength_um else math.nan
+    k0 = 2 * math.pi / light.wavelength_um
 
     def index(material: object) -> complex:
-        return materials.index(material, wavelength_um)  # type: ignore[arg-type]
+        return materials.index(material, light.wavelength_um)  # type: ignore[arg-type]
 
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
         return tuple((index(film.material), film.thickness_um * k0) for film in stack)
 
     media = Media(index(cell.substrate), index(cell.cover), films(cell.under), films(cell.over), (cell.height_um * k0,))
-    kx, ky, azimuth_rad, symmetry, wave = direction(angle_rad, azimuth_rad, polarization)
+    kx, ky, azimuth_rad, symmetry, wave = direction(light)
     if media.substrate.real <= math.hypot(kx, ky):
         raise CellError(
             f"sin(angle_rad) = {math.hypot(kx, ky):.6g} in a substrate of n = {media.substrate.real:.6g}: the light "
             "cannot come from there; need a smaller angle_rad or another substrate"
         )
     pillar, between = index(cell.pillar), index(cell.between)
-    return Case(cell, wavelength_um, k0, kx, ky, azimuth_rad, symmetry, wave, pillar, between, media)
+    return Case(cell, light.wavelength_um, k0, kx, ky, azimuth_rad, symmetry, wave, pillar, between, media)
 
 
 def case_waves(this: Case, harmonics: int) -> tuple[Waves, int]:
@@ -109,27 +108,13 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
             )
 
 
-def check_direction(angle_rad: float, azimuth_rad: float) -> None:
-    """Refuse what is no direction of light.
-
-    Raises:
-        CellError: an angle that is not finite, or not below a right angle.
-    """
-    if not (math.isfinite(angle_rad) and abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
-        raise CellError(f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, |angle| < pi/2")
-
-
-def direction(
-    angle_rad: float, azimuth_rad: float, polarization: Polarization
-) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
+def direction(light: Light) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
     """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into the plane y = 0 where it may be.
 
     Raises:
-        CellError: an impossible angle or polarisation.
+        CellError: a polarisation along x or y, in a plane of incidence off both.
     """
-    if polarization not in ("x", "y", "s", "p"):
-        raise CellError(f"polarization = {polarization!r}: need 'x', 'y', 's' or 'p'")
-    check_direction(angle_rad, azimuth_rad)
+    angle_rad, azimuth_rad, polarization = light.angle_rad, light.azimuth_rad, light.polarization
     if angle_rad == 0:
         return 0.0, 0.0, 0.0, "x", "p"  # the disc and the lattice look alike from x and y: one solution serves all
     sine, c, s = math.sin(angle_rad), math.cos(azimuth_rad), math.sin(azimuth_rad)

@@ -10,10 +10,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from metalens.cell import Cell, Response
+from metalens.cell import Cell, Light, Polarization, Response
 from metalens.ground.errors import CellError
-from metalens.rcwa.any_shape import Incident, co_polarised
-from metalens.rcwa.conditions import Polarization, case, check_diameter
+from metalens.rcwa.any_shape import co_polarised
+from metalens.rcwa.conditions import case, check_diameter
 from metalens.rcwa.derivative import Derivatives, differentiate
 from metalens.rcwa.solver import solve_case
 
@@ -79,10 +79,10 @@ def solve_many(
     diameters = np.array([float(diameter) for diameter in diameter_um])
     for diameter in diameters if cell.round else ():
         check_diameter(cell, float(diameter))
+    light = Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad))
     if not cell.round:
-        light = Incident(float(wavelength_um), float(angle_rad), float(azimuth_rad), polarization)
         return [co_polarised(cell, float(d), light, tolerance=tolerance, harmonics=harmonics) for d in diameters]
-    this = case(cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
+    this = case(cell, light)
     return solve_case(this, diameters, tolerance=tolerance, harmonics=harmonics)
 
 
@@ -109,6 +109,6 @@ def derivatives(
     check_diameter(cell, float(diameter_um))
     if harmonics < 1:
         raise CellError(f"harmonics = {harmonics}: need at least 1")
-    this = case(cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
+    this = case(cell, Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)))
     steps = 8 if cell.sidewall_rad else 0
     return differentiate(this, float(diameter_um), harmonics=harmonics, steps=steps, angle_rad=float(angle_rad))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from metalens import modal
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
@@ -33,7 +34,7 @@ def slope(function, reach, points=11):
 
 def value(cell=CELL, diameter=0.15, wavelength=0.85, angle_rad=0.0, polarization="x"):
     """t of the coarse mesh to all digits; ``solve`` stops at a thousandth of what the mesh is worth."""
-    case = case_of(cell, diameter, wavelength, angle_rad, 0.0, polarization)
+    case = case_of(cell, diameter, Light(wavelength, angle_rad, polarization))
     return evaluate(case, RUNGS[0].choice(case.rho).plan).matrix[1, 0]
 
 
@@ -121,7 +122,7 @@ def test_degenerate_modes_need_no_care():
 
 
 def test_lossless_derivatives_keep_the_matrix_unitary():
-    case = case_of(replace(CELL, pillar=Index(3.6)), 0.15, 0.85, 0.3, 0.0, "p")
+    case = case_of(replace(CELL, pillar=Index(3.6)), 0.15, Light(0.85, 0.3, "p"))
     for magnetic in (False, True):
         s, rates = form_rates(case, COARSE, magnetic=magnetic)
         for rate in rates.values():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
 from metalens.modal.assembly import assemble
@@ -154,7 +155,7 @@ def test_oblique_homogeneous_layer_is_fresnel(polarization):
 
 @pytest.mark.parametrize("diameter", [0.01, 0.1, 0.1937, 0.302, 0.39])
 def test_lossless_energy_and_reciprocity(diameter):
-    case = case_of(cell(), diameter, WAVELENGTH, 0.0, 0.0, "x")
+    case = case_of(cell(), diameter, Light(WAVELENGTH))
     solution = evaluate(case, COARSE)
     s = solution.matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
@@ -164,21 +165,21 @@ def test_lossless_energy_and_reciprocity(diameter):
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_lossless_energy_and_reciprocity_oblique(polarization):
-    solution = evaluate(case_of(cell(), 0.272, WAVELENGTH, math.radians(5), 0.0, polarization), COARSE)
+    solution = evaluate(case_of(cell(), 0.272, Light(WAVELENGTH, math.radians(5), polarization)), COARSE)
     s = solution.matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
     assert abs(s[0, 1] - s[1, 0]) < 1e-12
 
 
 def test_reciprocity_with_absorption():
-    s = evaluate(case_of(cell(k=0.1), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    s = evaluate(case_of(cell(k=0.1), 0.2, Light(WAVELENGTH)), COARSE).matrix
     assert abs(s[0, 1] - s[1, 0]) < 1e-12
     assert np.linalg.norm(s, 2) < 1
 
 
 def test_swap_of_sides_turns_the_scattering_matrix_round():
-    there = evaluate(case_of(cell(), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
-    back = evaluate(case_of(cell(substrate=1.0, cover=1.4525), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    there = evaluate(case_of(cell(), 0.2, Light(WAVELENGTH)), COARSE).matrix
+    back = evaluate(case_of(cell(substrate=1.0, cover=1.4525), 0.2, Light(WAVELENGTH)), COARSE).matrix
     assert np.abs(back - there[::-1, ::-1]).max() < 1e-11
 
 
@@ -210,7 +211,7 @@ def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
 
 @pytest.mark.parametrize("height", [50.0, 1000.0])
 def test_hard_tall_pillars_stay_unitary(height):
-    s = evaluate(case_of(cell(height), 0.2, WAVELENGTH, 0.0, 0.0, "x"), COARSE).matrix
+    s = evaluate(case_of(cell(height), 0.2, Light(WAVELENGTH)), COARSE).matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-10
 
 
@@ -221,7 +222,7 @@ def test_hard_touching_pillars_on_a_mesh_of_their_own():
     """
     touching = rcwa.solve(cell(), 0.4, WAVELENGTH, harmonics=11)
     plan = MeshPlan(3, 4, 3, (0.7, 1.45), sectors=(0.15, 1.0))
-    near, nearer = (evaluate(case_of(cell(), 0.4 * (1 - gap), WAVELENGTH, 0.0, 0.0, "x"), plan) for gap in (1e-4, 1e-5))
+    near, nearer = (evaluate(case_of(cell(), 0.4 * (1 - gap), Light(WAVELENGTH)), plan) for gap in (1e-4, 1e-5))
     for solution in (near, nearer):
         s = solution.matrix
         assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
@@ -245,7 +246,7 @@ def test_hard_pitch_equals_wavelength():
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_hard_tiny_angles_join_normal_incidence(polarization):
-    case = [case_of(cell(), 0.2, WAVELENGTH, a, 0.0, polarization) for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)]
+    case = [case_of(cell(), 0.2, Light(WAVELENGTH, a, polarization)) for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)]
     t = [evaluate(c, COARSE).matrix[1, 0] for c in case]
     assert t[1] == t[0] == t[2]
     assert abs(t[3] - t[0]) < 1e-7
@@ -254,7 +255,7 @@ def test_hard_tiny_angles_join_normal_incidence(polarization):
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_hard_grazing(polarization):
-    case = case_of(cell(), 0.2, WAVELENGTH, math.radians(89), 0.0, polarization)
+    case = case_of(cell(), 0.2, Light(WAVELENGTH, math.radians(89), polarization))
     solution = evaluate(case, COARSE)
     assert np.isfinite(solution.matrix).all()
     assert abs(solution.energy - 1) < 1e-12
@@ -325,7 +326,7 @@ def test_bad_numbers_are_refused(change, word):
 )
 def test_elements_refuse_films_and_tilted_walls_by_name(shape):
     with pytest.raises(CellError, match="upright pillar without films"):
-        case_of(Cell(0.4, **shape), 0.2, 0.85, 0.0, 0.0, "x")
+        case_of(Cell(0.4, **shape), 0.2, Light(0.85))
 
 
 def test_absorbing_half_space_is_refused():

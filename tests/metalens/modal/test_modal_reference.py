@@ -9,6 +9,7 @@ import pytest
 
 import metalens
 from metalens import modal, rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.ground.errors import CellError
 from metalens.modal import RUNGS
@@ -74,7 +75,8 @@ def test_error_estimate_holds_oblique(entry):
 
 def held_against(rung, where, **light):
     """Bar and error of t: the finer mesh is known by its own estimate, which counts against the bar."""
-    case = case_of(*where, light.get("angle_rad", 0.0), 0.0, light.get("polarization", "x"))
+    cell, diameter, wavelength = where
+    case = case_of(cell, diameter, Light(wavelength, **light))
     solution = evaluate(case, rung.choice(case.rho).plan)
     return complex(solution.matrix[1, 0]), rung.error(solution, case.rho)
 
@@ -92,9 +94,9 @@ def test_one_guided_wave_that_both_forms_place_alike(size, media, where):
 
     Half the difference of the forms is 2 to 8 times below the error.
     """
-    where = Cell(*size, *map(Index, media)), *where
-    case = case_of(*where, 0.0, 0.0, "x")
-    want, doubt = held_against(RUNGS[3], where)
+    cell, (diameter, wavelength) = Cell(*size, *map(Index, media)), where
+    case = case_of(cell, diameter, Light(wavelength))
+    want, doubt = held_against(RUNGS[3], (cell, diameter, wavelength))
     for rung in RUNGS[:2]:
         got = evaluate(case, rung.choice(case.rho).plan)
         error = abs(got.matrix[1, 0] - want)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from metalens import library, modal
+from metalens.cell import Light
 from metalens.pillars import few_nodes
-from metalens.pillars.few_nodes import Light
 from metalens.pillars.record import DEFAULT_CELL, Sweep
 
 WAVES = tuple(round(0.84 + 0.002 * i, 3) for i in range(11))

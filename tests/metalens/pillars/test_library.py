@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from metalens import library, modal, rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.cell.shapes import Square
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError, DomainError, MaterialError, StoreError
 from metalens.pillars import engines
-from metalens.pillars.engines import Light
 from metalens.pillars.record import DEFAULT_CELL, PillarLibrary, Sweep
 
 COARSE = Sweep(wavelengths_um=(0.84, 0.86), samples=40, tolerance=2e-2)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from metalens.cell import Light
 from metalens.ground.errors import DomainError
 from metalens.pillars import few_nodes, stretch, sweep
-from metalens.pillars.engines import Light
 from metalens.pillars.record import DEFAULT_CELL, Sweep
 
 

@@ -9,12 +9,11 @@ import textwrap
 import pytest
 
 from metalens import rcwa
-from metalens.cell import Response
+from metalens.cell import Light, Response
 from metalens.cell.record import Cell, Index
 from metalens.ground import executor
 from metalens.ground.errors import MaterialError, WorkerError
 from metalens.pillars import engines, workers
-from metalens.pillars.engines import Light
 
 CELL = Cell(0.30, 0.7, Index(3.6))
 TASK = workers.points_task(CELL, Light(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa")

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError, MaterialError
 from metalens.rcwa.conditions import case, case_waves
@@ -310,7 +311,7 @@ def test_many_diameters_are_what_each_one_is_alone():
 
 def plain_slices(cell, diameter_um, harmonics, slices):
     """t of a staircase of upright layers, the plain way."""
-    this = case(cell, WAVELENGTH, angle_rad=0, azimuth_rad=0, polarization="x")
+    this = case(cell, Light(WAVELENGTH))
     ways, zero = case_waves(this, harmonics)
     step = cell.height_um * math.tan(cell.sidewall_rad) / slices
     widths = diameter_um - step * (2 * np.arange(slices) + 1 - slices)
@@ -322,7 +323,7 @@ def plain_slices(cell, diameter_um, harmonics, slices):
 @pytest.mark.parametrize("tilt_deg", [2, -2])
 def test_tilted_wall_is_the_limit_of_plain_slices(tilt_deg):
     cell = replace(CELL, sidewall_rad=math.radians(tilt_deg))
-    this = case(cell, WAVELENGTH, angle_rad=0, azimuth_rad=0, polarization="x")
+    this = case(cell, Light(WAVELENGTH))
     coarse, fine = (plain_slices(cell, 0.15, 3, slices) for slices in (32, 64))
     limit = fine + (fine - coarse) / 3  # second order, Richardson: 1e-6 left
     t = {stages: truncated(this, np.array([0.15]), 3, stages).t[0] for stages in (4, 5, 6)}

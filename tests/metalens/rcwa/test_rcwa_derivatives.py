@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
+from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
 from metalens.rcwa.conditions import case, case_waves
@@ -40,7 +41,7 @@ def slope(value, at, step):
 
 def transmission(cell, diameter_um, wavelength_um, direction, steps):
     """At three orders; a tilted wall in the layers that are differentiated."""
-    this = case(cell, wavelength_um, **direction)
+    this = case(cell, Light(wavelength_um, **direction))
     if not steps:
         return truncated(this, np.array([diameter_um]), 3).t[0]
     ways, zero = case_waves(this, 3)
@@ -54,7 +55,7 @@ def test_layers_of_the_derivatives_meet_the_collocated_wall(tilt):
     """Fourth order: sixteen times less with twice the steps, towards what ``solve`` takes."""
     cell = replace(PLAIN, sidewall_rad=tilt)
     direction = {"angle_rad": 0.0, "azimuth_rad": 0.0, "polarization": "x"}
-    want = truncated(case(cell, 0.85, **direction), np.array([0.21]), 3, 8).t[0]
+    want = truncated(case(cell, Light(0.85, **direction)), np.array([0.21]), 3, 8).t[0]
     errors = [abs(transmission(cell, 0.21, 0.85, direction, steps) - want) for steps in (4, 8)]
     assert errors[1] < 2e-3
     assert errors[1] < 0.2 * errors[0]
@@ -73,7 +74,9 @@ def test_layers_of_the_derivatives_meet_the_collocated_wall(tilt):
 def test_every_derivative_against_differences(cell, steps, angle_rad, azimuth_rad, polarization):
     diameter, wavelength = 0.21, 0.85
     direction = {"angle_rad": angle_rad, "azimuth_rad": azimuth_rad, "polarization": polarization}
-    got = differentiate(case(cell, wavelength, **direction), diameter, harmonics=3, steps=steps, angle_rad=angle_rad)
+    got = differentiate(
+        case(cell, Light(wavelength, **direction)), diameter, harmonics=3, steps=steps, angle_rad=angle_rad
+    )
 
     def t(cell=cell, diameter=diameter, wavelength=wavelength, **turned):
         return transmission(cell, diameter, wavelength, direction | turned, steps)
