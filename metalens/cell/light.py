@@ -31,7 +31,7 @@ class Light:
         if not (math.isfinite(self.wavelength_um) and self.wavelength_um > 0):
             raise CellError(f"wavelength_um = {self.wavelength_um}: need a finite length above 0")
         if self.polarization not in get_args(Polarization):
-            raise CellError(f"polarization = {self.polarization!r}: need one of {', '.join(get_args(Polarization))}")
+            raise CellError(f"polarization = {self.polarization!r}: need 'x', 'y', 's' or 'p'")
         check_direction(self.angle_rad, self.azimuth_rad)
 
 

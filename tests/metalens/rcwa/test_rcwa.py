@@ -69,11 +69,7 @@ def test_hard_homogeneous_layer_is_the_film_of_the_closed_form(direction, n):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_hard_pillar_of_air_goes_through_the_modes_and_gives_the_film(direction):
-    this = case(
-        replace(CELL, pillar="air"),
-        WAVELENGTH,
-        **{"angle_rad": 0.0, "azimuth_rad": 0.0, "polarization": "x"} | direction,
-    )
+    this = case(replace(CELL, pillar="air"), Light(WAVELENGTH, **direction))
     got = truncated(this, np.array([0.0, 0.01, 0.2, 0.4]), 4)
     sine = math.sin(direction.get("angle_rad", 0.0))
     t, r = fresnel_stack([1.4525, 1.0, 1.0], [0.7], sine=sine, polarization=direction.get("polarization", "s"))
@@ -185,7 +181,7 @@ def test_swap_of_sides_with_a_tilted_wall():
 
 @pytest.mark.parametrize(("symmetry", "direction"), [("x", DIRECTIONS[0]), ("p", DIRECTIONS[1]), ("s", DIRECTIONS[2])])
 def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
-    this = case(CELL, WAVELENGTH, **{"angle_rad": 0.0, "azimuth_rad": 0.0, "polarization": "x"} | direction)
+    this = case(CELL, Light(WAVELENGTH, **direction))
     assert this.symmetry == symmetry
     reduced, whole = (truncated(some, np.array([0.12, 0.25]), 4) for some in (this, replace(this, symmetry="none")))
     assert np.abs(reduced.t - whole.t).max() < ROUNDING
@@ -193,7 +189,7 @@ def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
 
 
 def test_hard_x_and_y_are_degenerate_without_the_help_of_symmetry():
-    this = replace(case(CELL, WAVELENGTH, angle_rad=0, azimuth_rad=0, polarization="x"), symmetry="none")
+    this = replace(case(CELL, Light(WAVELENGTH)), symmetry="none")
     x, y = (truncated(replace(this, wave=wave), np.array([0.2]), 4).t[0] for wave in "ps")
     assert abs(x - y) < ROUNDING
 
@@ -374,7 +370,9 @@ def test_total_reflection_at_a_cover_of_low_index():
     assert abs(abs(got.r) - 1) < ROUNDING
 
 
-@pytest.mark.parametrize("wavelength_um", [0.0, -1.0, math.nan, 5.0])
-def test_bad_wavelengths_are_refused(wavelength_um):
-    with pytest.raises(MaterialError):
+@pytest.mark.parametrize(
+    ("wavelength_um", "error"), [(0.0, CellError), (-1.0, CellError), (math.nan, CellError), (5.0, MaterialError)]
+)
+def test_bad_wavelengths_are_refused(wavelength_um, error):
+    with pytest.raises(error, match="wavelength|um"):
         rcwa.solve(Cell(0.4), 0.2, wavelength_um)
