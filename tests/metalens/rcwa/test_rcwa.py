@@ -374,5 +374,5 @@ def test_total_reflection_at_a_cover_of_low_index():
     ("wavelength_um", "error"), [(0.0, CellError), (-1.0, CellError), (math.nan, CellError), (5.0, MaterialError)]
 )
 def test_bad_wavelengths_are_refused(wavelength_um, error):
-    with pytest.raises(error, match="wavelength|um"):
+    with pytest.raises(error, match=r"wavelength| um"):
         rcwa.solve(Cell(0.4), 0.2, wavelength_um)
