@@ -64,6 +64,13 @@ def _shaped(low: float, high: float, heights: tuple[float, float], k: float) -> 
     return draw
 
 
+def _many_waves(rng: np.random.Generator) -> Drawn:
+    """High index and a wide pitch: more than two waves of the pillar's index across the cell, several orders."""
+    pitch = rng.uniform(0.45, 0.6)
+    cell = Cell(pitch, rng.uniform(0.2, 2.0), **_any(rng, n=(3.2, 3.8)))
+    return cell, pitch * rng.uniform(0.25, 0.85), pitch / rng.uniform(0.58, 0.78), 0.0, "x"
+
+
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "at a cutoff": _cutoff,
     "at a resonance": _resonant,
@@ -71,6 +78,7 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "thin": _shaped(0.05, 0.2, (0.3, 0.9), 0.0),
     "tall": _shaped(0.3, 0.8, (1.2, 2.5), 0.0),
     "absorbing": _shaped(0.2, 0.8, (0.3, 0.9), 1.0),
+    "of many waves in a pitch": _many_waves,
 }
 
 

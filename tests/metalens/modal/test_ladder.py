@@ -18,8 +18,8 @@ RUNG = Rung(
 )  # fmt: skip
 
 
-def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0):
-    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch)
+def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0, size=1.3):
+    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch, size=size)
 
 
 @pytest.mark.parametrize(
@@ -45,6 +45,20 @@ def test_near_a_cutoff_the_difference_counts_more_and_exact_cutoffs_in_part():
     assert RUNG.error(found(grazing=0.04), 0.2) == pytest.approx(thin, rel=1e-9)
     gap = 4.2 * 0.02 + 1.5 * (1e-4 + 4e-3 * 0.95**4) * 1.7 + 0.15 * 0.04 + 2e-4  # 3 x 1.4 is above 3.1
     assert RUNG.error(found(grazing=0.04), 0.95) == pytest.approx(gap, rel=1e-9)
+
+
+def test_in_a_pitch_of_many_waves_the_shared_error_rises_as_their_sixth_power():
+    shared = 2e-4 + 7e-3 * 0.5**4 + 5e-4
+    for size, more in ((2.0, 1.0), (2.5, 1.25**6)):
+        want = 1.4 * 0.02 + more * shared * 1.7 + 2e-4
+        assert RUNG.error(found(size=size), 0.5) == pytest.approx(want, rel=1e-9)
+
+
+def test_a_mesh_may_have_factors_of_its_own_in_place_of_those_of_the_rung():
+    own = Rung("own", (Choice(NARROW_PLAN, 0.6, 2e-4, safety=0.7, at_cutoff=1.1), *RUNG.choices[1:]), 1.4, 1e-2, 3.1)
+    assert own.error(found(), 0.5) == pytest.approx(0.7 * 0.02 + 2e-4 * 1.7 + 2e-4, rel=1e-9)
+    assert own.error(found(grazing=0.04), 0.5) == pytest.approx(1.1 * 0.02 + 2e-4 * 1.7 + 0.15 * 0.04 + 2e-4, rel=1e-9)
+    assert own.error(found(grazing=0.04), 0.8) == RUNG.error(found(grazing=0.04), 0.8)
 
 
 def test_modes_far_below_the_error_are_left_out():
