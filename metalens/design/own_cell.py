@@ -19,9 +19,9 @@ from metalens.ground.errors import CellError
 from metalens.lens import Lens
 from metalens.psf import LeftOut
 
-LEAST = 2  # pillars in a row; light to both sides is told apart by the rows whose phases begin elsewhere
 RINGS = 48  # of a lens, over which light is summed
-FEWEST, MOST = 4, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
+FEWEST, MOST = 2, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
+# (with two, light to both sides is told apart by rows whose phases begin elsewhere)
 DIAMETERS = 5
 TOLERANCE = 1e-2  # of t
 
@@ -69,7 +69,7 @@ def unlike(lens: Lens, *, radius_um: float) -> Unlike:
         CellError: the cell has films or tilted walls, or no round pillars on a square lattice.
     """
     sine, weight, cover = _rings(lens, radius_um)
-    rim = max(LEAST, round(lens.wavelength_um / (lens.cell.pitch_um * float(sine.max()))))
+    rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * float(sine.max()))))
     shortest = min(rim, MOST // 2)
     counts = shortest, math.ceil(1.5 * shortest), 2 * shortest
     fine, coarse = (neighbours(lens, counts=counts, harmonics=harmonics) for harmonics in (3, 2))
