@@ -196,7 +196,7 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(steep, m
     r = 10.0 * np.sqrt((np.arange(4000) + 0.5) / 4000)
     shares = {h: rows.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000), 1.0) for h, rows in solved.items()}
     assert found.share == pytest.approx(shares[3], rel=1e-3)
-    assert found.error > abs(shares[3] - shares[2])
+    assert found.error > abs(shares[3] - shares[2]) + 0.2 * (1 - shares[3])
     assert found.error < 0.3
     rough = design.rough_unlike(steep, radius_um=10.0)
     assert abs(rough.share - found.share) < rough.error  # what is said without a solve covers it
