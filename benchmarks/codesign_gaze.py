@@ -51,7 +51,7 @@ def gaze_of(work: Path, line: dict[str, Any], test: People, frames: Rendered) ->
     """Gaze errors of one run of the study."""
     trainer = restored(work, line, frames)
     seen = assess.frames(trainer, frames, len(frames.batches))
-    architecture = architecture_of(CASES[line["run"].split("/")[0]].width)
+    architecture = architecture_of(CASES[line["run"].split("/")[0]])
     answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
     return {"run": line["run"], **asdict(gaze_test.gaze_errors(test, answers.centre, answers.slip_mm))}
 

@@ -6,7 +6,7 @@
     python -m benchmarks.codesign_report --work DIR                # JSON, table and figures from the lines there are
 
 Every run draws the same number of frames from one pool, with the same network, noise and schedule; the lens alone
-differs. One JSON line a run, errors of every test frame beside it; a stopped study goes on where it was.
+differs. One JSON line a run, errors of every test frame beside it; a stopped study goes on at its last 100 steps.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from codesign.network.architecture import Architecture, Space
 from codesign.network.baselines import Name
 from codesign.network.supernet import recalibrate
 from codesign.optics.stack import OpticsConfig, added_phase
-from codesign.train import ambiguity, assess, inner
+from codesign.train import ambiguity, assess, checkpoint, inner
 from codesign.train.depth_test import depth_response
 from codesign.train.formation import network_macs
 from codesign.train.inner import Batch, InnerConfig, Scenes, Schedule, Trainer
@@ -54,21 +54,26 @@ SPACE = Space(widths=(0.25, 0.5), depths=(2, 3), expansions=(3, 4), kernels=(3, 
 class Case:
     """Conditions that all lenses of a comparison share.
 
-    pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of 32 frames.
-    width: of the elastic network. network: it, or a baseline in its place. angle_deg: field angle of the frames.
+    pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of ``batch`` frames.
+    width, depth: of the elastic network, and blocks of each of its stages. network: it, or a baseline in its place.
+    angle_deg: field angle of the frames.
     """
 
     pitch_um: float
     electrons: float = 2000.0
     steps: int = 800
     width: float = 0.5
+    depth: int = 2
     network: Name = "supernet"
     angle_deg: float = 0.0
+    batch: int = 32
 
 
 CASES = {
     "p9": Case(9.0),
     "p18": Case(18.0),
+    "p18blur": Case(18.0, steps=1600, width=0.25, depth=3, batch=16),
+    "p18blurlong": Case(18.0, steps=4800, width=0.25, depth=3, batch=16),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
     "p9dim": Case(9.0, electrons=400.0),
@@ -130,9 +135,9 @@ def oblique(settings: OpticsConfig) -> torch.Tensor:
     return torch.linalg.lstsq(modes, wanted[inside][:, None]).solution[:-1, 0]
 
 
-def architecture_of(width: float) -> Architecture:
-    """The network of all runs: two blocks a stage, kernels of 5, expansion 3."""
-    return Architecture((2,) * 5, (5,) * SPACE.slots, (3,) * SPACE.slots, width, 1.0)
+def architecture_of(case: Case) -> Architecture:
+    """The network of all runs of a case: kernels of 5, expansion 3."""
+    return Architecture((case.depth,) * 5, (5,) * SPACE.slots, (3,) * SPACE.slots, case.width, 1.0)
 
 
 def scenes_of(stream: int) -> EyeScenes:
@@ -182,21 +187,24 @@ def _natural(scenes: EyeScenes, count: int) -> States:
     return replace(states, scale=torch.ones_like(states.scale))
 
 
-def train_one(work: Path, case: Case, lens: str, seed: int) -> Trainer:
-    """The trainer at the end of its run, with the batch statistics of the final lens."""
+def train_one(work: Path, case: Case, lens: str, seed: int, *, kept_at: Path) -> Trainer:
+    """The trainer at the end of its run, with the batch statistics of the final lens; goes on from ``kept_at``."""
     optics, moving = optics_of(lens, angle_deg=case.angle_deg)
-    settings = InnerConfig(steps=case.steps, batch=32, seed=seed, optics=moving, optics_weight=0.0)
+    settings = InnerConfig(steps=case.steps, batch=case.batch, seed=seed, optics=moving, optics_weight=0.0)
     scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
     made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE, network=case.network)
     if "oblique" in lens:
         with torch.no_grad():
             made.coefficients_rad.copy_(oblique(optics))
-    trainer = Trainer(settings, optics, sensor_of(case), scenes, made, architecture=architecture_of(case.width))
+    trainer = Trainer(settings, optics, sensor_of(case), scenes, made, architecture=architecture_of(case))
+    if kept_at.is_file():
+        trainer.restore(checkpoint.load(kept_at, settings=settings))
     for record in trainer.run():
         if record.step % 100 == 0:
             print(f"{lens}/{seed} step {record.step}: task {record.task:.3f}, {record.skipped} skipped", flush=True)
-    seen = assess.frames(trainer, scenes, 8)
-    recalibrate(made.net, architecture_of(case.width), [seen.frames[i : i + 32] for i in range(0, 256, 32)])
+            checkpoint.save(kept_at, trainer.state(), settings=settings)
+    seen = assess.frames(trainer, scenes, 256 // case.batch)
+    recalibrate(made.net, architecture_of(case), [seen.frames[i : i + 32] for i in range(0, 256, 32)])
     return trainer
 
 
@@ -205,19 +213,21 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     case_name, lens, seed = name.split("/")
     case = CASES[case_name]
     start = time.perf_counter()
-    trainer = train_one(work, case, lens, int(seed))
+    kept_at = stem(work, name).with_suffix(".checkpoint")
+    trainer = train_one(work, case, lens, int(seed), kept_at=kept_at)
     seconds = time.perf_counter() - start
-    net, architecture = trainer.model.net, architecture_of(case.width)
+    net, architecture = trainer.model.net, architecture_of(case)
     frames = case.steps * trainer.inner.batch
     window_um = SCENES.pixels * trainer.optics.sample_um
     macs = float(network_macs(net, architecture, window_um, torch.tensor(case.pitch_um)))
     line: dict[str, Any] = {"run": name, "frames": frames, "mmacs": macs / 1e6, "seconds": seconds}
     line |= tested(work, name, trainer, architecture, count=TESTED)
-    response = depth_response(trainer, kept(work, "ambiguous", TESTED), net, architecture, batches=8)
+    response = depth_response(trainer, kept(work, "ambiguous", TESTED), net, architecture, batches=256 // case.batch)
     line["depth_response"] = {"mm_per_mm": response.mean, "standard_error": response.standard_error}
     line["skipped_steps"] = trainer.skipped
     line["coefficients_rad"] = [round(float(v), 4) for v in trainer.model.coefficients_rad.detach()]
     save_file({k: v.contiguous() for k, v in net.state_dict().items()}, stem(work, name).with_suffix(".safetensors"))
+    kept_at.unlink(missing_ok=True)
     return line
 
 
@@ -245,7 +255,7 @@ def restored(work: Path, line: dict[str, Any], scenes: Scenes) -> Trainer:
     made.net.load_state_dict(load_file(stem(work, line["run"]).with_suffix(".safetensors")))
     with torch.no_grad():
         made.coefficients_rad.copy_(torch.tensor(line["coefficients_rad"], dtype=torch.float64))
-    return Trainer(InnerConfig(batch=32), optics, sensor_of(case), scenes, made)
+    return Trainer(InnerConfig(batch=case.batch), optics, sensor_of(case), scenes, made)
 
 
 def sensor_of(case: Case) -> Sensor:
@@ -261,7 +271,7 @@ def retest(work: Path, only: list[str] | None) -> None:
         wanted = line["run"] in only if only else stem(work, line["run"]).with_suffix(".safetensors").is_file()
         if wanted and name not in done(work):
             trainer = restored(work, line, kept(work, "natural", WIDE))
-            found = tested(work, name, trainer, architecture_of(CASES[case].width), count=WIDE)
+            found = tested(work, name, trainer, architecture_of(CASES[case]), count=WIDE)
             keep_line(work / LINES, line | {"run": name} | found)
             print(json.dumps({"run": name} | found), flush=True)
 

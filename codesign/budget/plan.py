@@ -4,16 +4,17 @@ What no setting changes (the person, fixation, noise, the reader of a run) is th
 above it leaves the rest of the squares to the settings.
 
 A pilot measures, for every setting of every knob alone, the gaze error it makes for each eye and the time it takes: an
-estimator that believes in these optics reads images through those of the knob's finest setting. Errors of several knobs
-add as vectors to first order; where they happen to cancel, that is not relied on. Times add by the structure of the
-run. All combinations are compared, and the cheapest that meets the goal is taken. Everything is judged against the
-finest setting of every knob.
+estimator that believes in these optics reads images through those of the knob's finest setting. Images are true, over
+field, depth and spectrum, or of one PSF a depth where PLAN.toml says so (:mod:`codesign.budget.chain`). Errors of
+several knobs add as vectors to first order; where they happen to cancel, that is not relied on. Times add by the
+structure of the run. All combinations are compared, and the cheapest that meets the goal is taken. Everything is judged
+against the finest setting of every knob.
 """
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,79 +22,28 @@ import numpy as np
 import torch
 
 from codesign.budget import task
+from codesign.budget.chain import (
+    LEVELS,
+    PILOT,
+    TRUE_LEVELS,
+    Chain,
+    Choice,
+    Imaging,
+    Optics,
+    PlanConfig,
+    TrueChoice,
+    choice_of,
+)
 from codesign.budget.entry import NONE, Entry, total
 from codesign.budget.floor import allowance_rad
 from codesign.budget.journal import Journal
-from codesign.budget.task import TaskSetting, Views
-from codesign.optics import Aperture, Numerics, Window, kernels
-from metalens import design, library
-from metalens.cell import Cell, Light
-from metalens.design import Focus
+from metalens.cell import Light
 from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
-from metalens.image import PsfBasis
-from metalens.lens import Lens
-from metalens.pillars import Sweep, engines
+from metalens.image import Imager
+from metalens.pillars import engines
 
-LEVELS: dict[str, tuple[float, ...]] = {  # coarsest first; the last of each is the finest
-    "library_tolerance": (3e-2, 1e-2, 1e-3, 1e-4),
-    "depth_count": (4, 6, 8, 12, 16, 24, 32, 48),
-    "wavelength_count": (1, 2, 3, 4, 6, 8),
-    "psf_tolerance": (3e-2, 1e-2, 1e-3, 1e-4, 1e-5),
-    "kernel_tolerance": (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4),
-    "diameter_step_nm": (20, 10, 5, 2, 1),
-}
-PILOT = Numerics(12, 1, 1e-4, 1e-4)  # of the other knobs while one is looked at
 REFERENCE_DIAMETERS = 12
-SETTLE_STEPS = 2  # of the estimator, which starts at the true state
 CLASS_SECONDS = 0.003  # a class of pillars on a mask: polygons, exposure at its edges, one cell
-
-
-@dataclass(frozen=True, slots=True)
-class PlanConfig:
-    """PLAN.toml: the lens and the run that is planned.
-
-    stacks: PSF stacks that the run computes. frames: images that it forms.
-    """
-
-    aperture_mm: float = 1.0
-    wavelength_nm: float = field(default=850.0, metadata={"above": 0})
-    sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
-    source_distance_mm: float = field(default=20.0, metadata={"above": 0})
-    led_fwhm_nm: float = 0.0
-    stacks: int = 200
-    frames: int = 10_000
-    cell: Cell = library.DEFAULT_CELL
-    task: TaskSetting = field(default_factory=TaskSetting)
-
-    def __post_init__(self) -> None:
-        if not (0.02 <= self.aperture_mm <= 4 and self.stacks >= 1 and self.frames >= 1 and self.led_fwhm_nm >= 0):
-            raise ConfigError(
-                f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}: need 0.02 to 4 mm, "
-                "and 1 or more of both"
-            )
-
-    @property
-    def focus(self) -> Focus:
-        """What the lens images onto what."""
-        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """A setting of every knob."""
-
-    library_tolerance: float
-    depth_count: int
-    wavelength_count: int
-    psf_tolerance: float
-    kernel_tolerance: float
-    diameter_step_nm: float
-
-    @property
-    def numerics(self) -> Numerics:
-        """Of the optics."""
-        return Numerics(self.depth_count, self.wavelength_count, self.psf_tolerance, self.kernel_tolerance)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,6 +51,7 @@ class Pilot:
     """What was measured for every knob: errors (levels, scenes, 2) in rad, and seconds (levels,) that depend on it.
 
     floor: links that no setting changes: the person, fixation, noise, and the reader where a run was given.
+    nodes: of every tolerance of the true image: rows and columns of the field, depths, wavelengths.
     """
 
     levels: dict[str, tuple[float, ...]]
@@ -109,6 +60,7 @@ class Pilot:
     noise_rad: float
     spent_seconds: float
     floor: tuple[Entry, ...] = ()
+    nodes: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,66 +68,11 @@ class Plan:
     """The cheapest choice: its predicted gaze error and seconds, and those of everything at its finest."""
 
     goal_rad: float
-    choice: Choice
+    choice: Choice | TrueChoice
     predicted_rad: float
     seconds: float
     finest_seconds: float
     met: bool
-
-
-class Chain:
-    """The run to plan: its lens, eyes, and pillars at every library tolerance, computed when first asked for."""
-
-    def __init__(self, config: PlanConfig, say: Callable[[str], None] = lambda text: None) -> None:
-        config = replace(config, task=replace(config.task, sensor_distance_um=config.focus.sensor_distance_um))
-        self.config, self.say = config, say
-        self.levels = dict(LEVELS) if config.led_fwhm_nm else LEVELS | {"wavelength_count": (1.0,)}
-        self.finest = Choice(*(row[-1] for row in self.levels.values()))  # type: ignore[arg-type]
-        self._libraries: dict[float, tuple[library.PillarLibrary, float]] = {}
-        self.states = config.task.states
-        self.eyes: Views = task.views(config.task, self.states)
-        self.window = Window(*self.eyes.depths_um, config.task.pitch_um)
-        self.lens = self._design()
-        self.aperture = Aperture(self.lens)
-
-    def library(self, tolerance: float) -> tuple[library.PillarLibrary, float]:
-        """The library at a tolerance, and the processor seconds it took."""
-        if tolerance not in self._libraries:
-            start = time.perf_counter()
-            waves = (self.config.wavelength_nm * 1e-3,)
-            made = library.sweep(self.config.cell, Sweep(waves, tolerance=tolerance))
-            self._libraries[tolerance] = made, time.perf_counter() - start
-            self.say(f"library at {tolerance:g}: {made.solves} solves")
-        return self._libraries[tolerance]
-
-    def table(self, tolerance: float) -> Array:
-        """t of the aperture's diameters in the library of this tolerance."""
-        made, _ = self.library(tolerance)
-        t = made.t[:, 0, 0].mean(0)
-        d = self.aperture.diameter_um
-        phase, level = np.unwrap(np.angle(t)), np.abs(t)
-        return np.asarray(np.interp(d, made.diameter_um, level) * np.exp(1j * np.interp(d, made.diameter_um, phase)))
-
-    def optics(self, table: Array, numerics: Numerics) -> PsfBasis:
-        """Kernels of the lens with these pillars."""
-        maps = self.aperture.maps(table)
-        return kernels(self.lens, maps, numerics, self.window, fwhm_nm=self.config.led_fwhm_nm)
-
-    def electrons(self, optics: PsfBasis) -> torch.Tensor:
-        """Images of the eyes."""
-        return task.electrons(self.eyes.anchor, optics, self.config.task)
-
-    def read(self, images: torch.Tensor, believed: PsfBasis) -> torch.Tensor:
-        """(scenes, unknowns) where the estimate of the eyes' states comes to rest, less the true ones."""
-        return task.settle(images, believed, self.states, self.config.task, seen=self.eyes, steps=SETTLE_STEPS)
-
-    def _design(self) -> Lens:
-        made, _ = self.library(self.levels["library_tolerance"][0])
-        focus, aperture_um = self.config.focus, self.config.aperture_mm * 1e3
-        wanted = design.phase_of(None, focus, radius_um=aperture_um / 2)
-        return design.make(
-            wanted, focus, aperture_um=aperture_um, cell=made.cell, proxy=library.proxy_of(made), profile="hyperbolic"
-        )[0]
 
 
 def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, ...] = ()) -> Pilot:
@@ -187,8 +84,8 @@ def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, .
     start, journal = time.perf_counter(), journal or Journal()
     real, imaginary, solving = journal.part("exact", lambda: _listed(chain))
     exact = np.array(real) + 1j * np.array(imaginary)
-    base = chain.optics(exact, PILOT)
-    errors, seconds = {}, {}
+    base = chain.optics(exact, chain.around)
+    errors, seconds, nodes = {}, {}, ()
     for knob, levels in chain.levels.items():
 
         def measure(knob: str = knob) -> list[Any]:
@@ -196,17 +93,21 @@ def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, .
                 found = _library_knob(chain, base, solving)
             elif knob == "diameter_step_nm":
                 found = _mask_knob(chain, base, exact)
+            elif knob == "image_tolerance":
+                found = _image_knob(chain, exact)
             else:
                 found = _optics_knob(chain, exact, knob)
             return [part.tolist() for part in found]
 
-        errors[knob], seconds[knob] = map(np.array, journal.part(knob, measure))
+        parts = journal.part(knob, measure)
+        errors[knob], seconds[knob] = map(np.array, parts[:2])
+        nodes = tuple(map(tuple, parts[2])) if parts[2:] else nodes
         chain.say(f"{knob}: {', '.join(f'{v:g}' for v in levels)}")
     noise = task.linear(chain.eyes, base, chain.config.task).noise_rad
     if floor and not any(entry.link == "sensor noise" for entry in floor):
         mean = noise * math.sqrt(math.pi) / 2  # rms to mean of a Gaussian in the plane
         floor = (*floor, Entry("sensor noise", NONE, NONE, mean, "one frame: Cramér-Rao bound"))
-    return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start, floor)
+    return Pilot(chain.levels, errors, seconds, noise, time.perf_counter() - start, floor, nodes)
 
 
 def _listed(chain: Chain) -> list[Any]:
@@ -235,20 +136,20 @@ def _exact(chain: Chain) -> tuple[Array, float]:
     return coarse * np.exp(change[0] + 1j * change[1]), each * 1.5 * made.solves
 
 
-def _library_knob(chain: Chain, truth: PsfBasis, finest_seconds: float) -> tuple[Array, Array]:
+def _library_knob(chain: Chain, truth: Optics, finest_seconds: float) -> tuple[Array, Array]:
     """Whole sweeps at all but the finest tolerance."""
     coarse = chain.levels["library_tolerance"][:-1]
-    errors = [_misread(chain, truth, chain.optics(chain.table(tolerance), PILOT)) for tolerance in coarse]
+    errors = [_misread(chain, truth, chain.optics(chain.table(tolerance), chain.around)) for tolerance in coarse]
     seconds = [*(chain.library(tolerance)[1] for tolerance in coarse), finest_seconds]
     return np.stack([*errors, np.zeros_like(errors[0])]), np.maximum.accumulate(np.array(seconds))
 
 
-def _mask_knob(chain: Chain, believed: PsfBasis, exact: Array) -> tuple[Array, Array]:
+def _mask_knob(chain: Chain, believed: Optics, exact: Array) -> tuple[Array, Array]:
     """Rounding of the diameters; the cost is that of the classes on the mask."""
     errors, seconds = [], []
     span = float(np.ptp(chain.aperture.diameter_um[np.flatnonzero(chain.aperture.share)]))
     for step in chain.levels["diameter_step_nm"]:
-        truth = chain.optics(chain.aperture.rounded(exact, step * 1e-3), PILOT)
+        truth = chain.optics(chain.aperture.rounded(exact, step * 1e-3), chain.around)
         errors.append(_misread(chain, truth, believed))
         seconds.append(CLASS_SECONDS * (span * 1e3 / step + 1))
     return np.stack(errors), np.array(seconds)
@@ -274,6 +175,29 @@ def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
     return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
+def _image_knob(chain: Chain, table: Array) -> tuple[Array, Array, Array]:
+    """Tolerances of the true image, against the finest; seconds of all PSFs and images of the run, and the nodes."""
+    made: list[Optics] = []
+    seconds, nodes = [], []
+    for level in chain.levels["image_tolerance"]:
+        made.append(chain.optics(table, level))  # plans the field, which a run does once
+        stack = _fastest(partial(chain.optics, table, level))
+        image = _fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes
+        seconds.append(chain.config.stacks * stack + chain.config.frames * image)
+        nodes.append(nodes_of(made[-1]))
+    errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
+    none = np.zeros((chain.config.task.scenes, 2))
+    return np.stack([*errors, none]), np.maximum.accumulate(np.array(seconds)), np.array(nodes)
+
+
+def nodes_of(optics: Optics) -> tuple[int, ...]:
+    """Rows and columns of the field's nodes, depths, wavelengths of a true image."""
+    if not isinstance(optics, Imager):
+        raise TypeError("only a true image has nodes over the field")
+    plan = optics.plan
+    return len(plan.y_um), len(plan.x_um), len(plan.depths_um), len(plan.waves.weights)
+
+
 def _fastest(work: Callable[[], object]) -> float:
     """Seconds of the faster of two calls."""
     spent = []
@@ -284,7 +208,7 @@ def _fastest(work: Callable[[], object]) -> float:
     return min(spent)
 
 
-def _misread(chain: Chain, truth: PsfBasis, believed: PsfBasis) -> Array:
+def _misread(chain: Chain, truth: Optics, believed: Optics) -> Array:
     """(scenes, 2) error of the gaze that an estimator reads from images through optics other than it believes in."""
     return np.asarray(chain.read(chain.electrons(truth), believed)[:, :2].numpy())
 
@@ -306,15 +230,16 @@ def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
     cost = _cost(measured, places, names, config)
     good = np.flatnonzero(error <= allowed)
     best = int(good[cost[good].argmin()]) if len(good) else len(places) - 1
-    values: list[Any] = [measured.levels[n][k] for n, k in zip(names, places[best], strict=True)]
-    values = [int(v) if n.endswith("count") else v for n, v in zip(names, values, strict=True)]
+    choice = choice_of(names, [measured.levels[n][k] for n, k in zip(names, places[best], strict=True)])
     predicted = math.hypot(float(error[best]), total(list(measured.floor)).gaze_rad)
-    return Plan(goal_rad, Choice(*values), predicted, float(cost[best]), float(cost[-1]), bool(len(good)))
+    return Plan(goal_rad, choice, predicted, float(cost[best]), float(cost[-1]), bool(len(good)))
 
 
 def _cost(measured: Pilot, places: Array, names: list[str], config: PlanConfig) -> Array:
     """Seconds of the run: a library, the stacks (times of the knobs multiply), the images, the mask."""
     column = {n: measured.seconds[n][places[:, i]] for i, n in enumerate(names)}
+    if "image_tolerance" in column:
+        return np.sum([*column.values()], axis=0)
     pilot_stack = {
         n: measured.seconds[n][_place(measured, n)] for n in ("depth_count", "wavelength_count", "psf_tolerance")
     }
@@ -333,18 +258,24 @@ def _place(measured: Pilot, knob: str) -> int:
     return measured.levels[knob].index(getattr(PILOT, knob))
 
 
-def achieved(chain: Chain, choice: Choice, truth: torch.Tensor) -> float:
+def achieved(chain: Chain, choice: Choice | TrueChoice, truth: torch.Tensor) -> float:
     """Gaze error, rad, of the estimator that believes in the optics of ``choice``.
 
     Args:
         truth: images (scenes, pixels) of the eyes through the finest optics with the mask of ``choice``; see
             :func:`reality`.
     """
-    optics = chain.optics(chain.table(choice.library_tolerance), choice.numerics)
+    optics = chain.optics(chain.table(choice.library_tolerance), choice.imaging)
     return task.gaze_rms(chain.read(truth, optics))
 
 
 def reality(chain: Chain, diameter_step_nm: float) -> torch.Tensor:
     """Images of the eyes through the finest optics, pillars as the mask has them."""
     exact = chain.table(chain.finest.library_tolerance)
-    return chain.electrons(chain.optics(chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.numerics))
+    return chain.electrons(chain.optics(chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.imaging))
+
+
+__all__ = [
+    "LEVELS", "PILOT", "TRUE_LEVELS", "Chain", "Choice", "Imaging", "Pilot", "Plan", "PlanConfig", "TrueChoice",
+    "achieved", "choose", "nodes_of", "pilot", "reality",
+]  # fmt: skip

@@ -196,7 +196,9 @@ def gaze_mean(shift: Tensor) -> float:
     return float(shift[..., :2].pow(2).sum(-1).sqrt().mean())
 
 
-def settle(image: Tensor, optics: PsfBasis, states: States, setting: TaskSetting, *, seen: Views, steps: int) -> Tensor:
+def settle(
+    image: Tensor, optics: PsfBasis | Imager, states: States, setting: TaskSetting, *, seen: Views, steps: int
+) -> Tensor:
     """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels), starting from the true states.
 
     Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen`` are those of the true states.

@@ -30,7 +30,7 @@ class Options(Common):
         gaze_error: the goal, with its unit: 1deg, 50arcmin, 20mrad; of the whole error, from pillar to answered gaze.
         run: RUN_DIR of a co-design run: its reader is part of the floor; without one the floor is that of the person.
         frames: that the floor is measured on: subjects, stimuli, calibration, as those of the experiment.
-        config: PLAN.toml of the lens and the run; left out: a 1 mm lens, 200 PSF stacks, 10 000 images.
+        config: PLAN.toml of the lens and the run; left out: a 1 mm lens, 200 sets of PSFs, 10 000 true images.
         output: folder for cell.toml, psf.toml, run.toml, process.toml, plan.json and report.html.
     """
 
@@ -89,7 +89,9 @@ def values(best: Plan, measured: Pilot) -> dict[str, object]:
         "goal_deg": math.degrees(best.goal_rad),
         "met": best.met,
         "predicted_deg": math.degrees(best.predicted_rad),
+        "image": "true" if isinstance(best.choice, plan.TrueChoice) else "uniform",
         "choice": asdict(best.choice),
+        "nodes": chosen_nodes(best, measured),
         "seconds": best.seconds,
         "finest_seconds": best.finest_seconds,
         "pilot_seconds": measured.spent_seconds,
@@ -107,21 +109,54 @@ def write(folder: Path, best: Plan, measured: Pilot, chain: Chain) -> None:
     tables = [line.replace("[", "[cell.", 1) if line.startswith("[") else line for line in lines[split:]]
     sweep = [f"wavelengths_um = [{wanted.wavelength_nm * 1e-3}]", f"tolerance = {choice.library_tolerance}"]
     store.write_text(folder / "cell.toml", "\n".join(["[cell]", *lines[:split], *tables, "", "[sweep]", *sweep]) + "\n")
-    near, far = (1e-3 * d for d in chain.eyes.depths_um)
-    step = (far - near) / (choice.depth_count - 1)
-    store.write_text(
-        folder / "psf.toml",
-        f"depths_mm = [{near:.3f}, {far:.3f}, {step:.4f}]\nangles_deg = [0.0]\nled_fwhm_nm = {wanted.led_fwhm_nm}\n"
-        f"tolerance = {choice.psf_tolerance}\n",
-    )
-    store.write_text(
-        folder / "run.toml",
-        f"[optics]\naperture_mm = {wanted.aperture_mm}\ndepth_count = {choice.depth_count}\n"
-        f"depths_mm = [{near:.3f}, {far:.3f}]\ntolerance = {choice.kernel_tolerance}\n",
-    )
+    store.write_text(folder / "psf.toml", psf_text(best, measured, chain))
+    store.write_text(folder / "run.toml", run_text(best, chain))
     store.write_text(folder / "process.toml", f"[rules]\ndiameter_step_nm = {int(choice.diameter_step_nm)}\n")
     store.write_text(folder / "plan.json", json.dumps(values(best, measured), indent=1) + "\n")
     _page(folder / "report.html", best, measured)
+
+
+def chosen_nodes(best: Plan, measured: Pilot) -> dict[str, int]:
+    """What the chosen tolerance of the true image needs: nodes of the field, depths, wavelengths; none of one PSF."""
+    if not isinstance(best.choice, plan.TrueChoice):
+        return {}
+    found = measured.nodes[measured.levels["image_tolerance"].index(best.choice.image_tolerance)]
+    return dict(zip(("rows", "columns", "depths", "wavelengths"), found, strict=True))
+
+
+def psf_text(best: Plan, measured: Pilot, chain: Chain) -> str:
+    """PSF.toml: the depths, and for the true image the angles from the axis to the edge of the field."""
+    choice, near, far = best.choice, *(1e-3 * d for d in chain.eyes.depths_um)
+    if isinstance(choice, plan.TrueChoice):
+        nodes = chosen_nodes(best, measured)
+        half = chain.config.task.size / 2 * chain.config.task.pitch_um
+        edge = math.degrees(math.atan(half / chain.lens.sensor_distance_um))
+        count = nodes["columns"] // 2 + 1
+        depths, tolerance = nodes["depths"], round(choice.image_tolerance / 3, 4)  # adds a twentieth in quadrature
+        angles = [round(edge * k / (count - 1), 3) for k in range(count)]
+    else:
+        depths, tolerance, angles = choice.depth_count, choice.psf_tolerance, [0.0]
+    step = (far - near) / max(depths - 1, 1)
+    return (
+        f"depths_mm = [{near:.3f}, {far:.3f}, {step:.4f}]\nangles_deg = {angles}\n"
+        f"led_fwhm_nm = {chain.config.led_fwhm_nm}\ntolerance = {tolerance}\n"
+    )
+
+
+def run_text(best: Plan, chain: Chain) -> str:
+    """RUN.toml's table of the optics."""
+    choice, wanted = best.choice, chain.config
+    near, far = (1e-3 * d for d in chain.eyes.depths_um)
+    lens = (
+        f"aperture_mm = {wanted.aperture_mm}\nsensor_distance_mm = {wanted.sensor_distance_mm}\n"
+        f"wavelength_nm = {wanted.wavelength_nm}\nfocus_mm = {wanted.source_distance_mm}\n"
+        f"depths_mm = [{near:.3f}, {far:.3f}]\n"
+    )
+    if isinstance(choice, plan.TrueChoice):
+        how = f"fwhm_nm = {wanted.led_fwhm_nm}\nimage_tolerance = {choice.image_tolerance}\n"
+        return f'[optics]\nimage = "true"\n{lens}{how}'
+    how = f"depth_count = {choice.depth_count}\ntolerance = {choice.kernel_tolerance}\n"
+    return f'[optics]\nimage = "uniform"\n{lens}{how}'
 
 
 def _page(path: Path, best: Plan, measured: Pilot) -> None:
@@ -148,7 +183,7 @@ def _page(path: Path, best: Plan, measured: Pilot) -> None:
     table = report.Table(
         ("knob", "setting", "gaze error / deg", "seconds", ""),
         rows,
-        "Seconds: of a library, a stack, an image, a mask.",
+        "Seconds: of a library, a stack, an image, a mask; of the true image, all its PSFs and images.",
     )
     words = (
         "Every setting was measured alone in a pilot; errors add as vectors over the eyes. What no setting changes is "
@@ -161,11 +196,13 @@ def text(best: Plan, measured: Pilot, folder: Path) -> str:
     """The plan for a terminal."""
     rows = [f"  {name.replace('_', ' '):<20} {value:g}" for name, value in asdict(best.choice).items()]
     verdict = "" if best.met else "  THE GOAL IS NOT MET by the finest settings on offer\n"
+    nodes = chosen_nodes(best, measured)
+    field_of = f"  {'of the true image':<20} {', '.join(f'{v} {k}' for k, v in nodes.items())}\n" if nodes else ""
     return (
         f"{folder}: gaze error {math.degrees(best.predicted_rad):.2g} deg predicted, "
         f"{math.degrees(best.goal_rad):.2g} allowed\n"
         + "\n".join(rows)
-        + f"\n{verdict}  run {best.seconds:.0f} s, everything at its finest {best.finest_seconds:.0f} s; "
+        + f"\n{field_of}{verdict}  run {best.seconds:.0f} s, everything at its finest {best.finest_seconds:.0f} s; "
         f"the pilot took {measured.spent_seconds:.0f} s\n"
         f"  floor, whatever the settings: {floor_words(measured)}"
     )

@@ -1,4 +1,4 @@
-"""What real frames have and the model of the eye has not: spectacles, make-up, uneven light, movement, another view.
+"""What real frames have and the model of the eye has not: spectacles, make-up, uneven light, movement, other cameras.
 
 Every cause is a record of :data:`CAUSES` and changes rendered frames, their depth and their pupil masks, in the image.
 It is on in a share of the frames that grows with the ``variety`` of the scenes: none at 1, the record's share at 2.
@@ -41,8 +41,12 @@ CAUSES: Mapping[str, Cause] = {
     "gradient": Cause(0.6, 0.1, 0.7, "of the mean light", "light that falls off from one side to the other"),
     "shade": Cause(0.25, 0.2, 0.7, "of the light", "shadow with a soft edge, of brow, nose or frame"),
     "movement": Cause(0.3, 0.008, 0.04, "frame widths", "the eye or the camera moves during the exposure"),
+    "vignette": Cause(0.4, 0.1, 0.8, "of the light", "another camera's corners are darker than its middle"),
+    "saturation": Cause(0.25, 0.01, 0.15, "of the pixels", "the brightest part of the frame is at the camera's white"),
+    "tone": Cause(0.5, -0.6, 0.6, "logarithm of gamma", "another camera's curve: dark parts lifted or crushed"),
 }
 RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
+WHITE, BLACK = 0.99, 1e-3  # of a tone curve: share of the pixels below its white, and the least level of it
 TAPS = 15  # of the kernel of a movement, at most its length
 
 
@@ -73,7 +77,7 @@ def dressed(made: Rendered, worn: Worn) -> Rendered:
         return made
     light, cover, depth = (getattr(made.frames, name).clone() for name in Frames.__slots__)
     pupil, grid = made.pupil.clone(), _grid(int(light.shape[-1]))
-    for steps in ((_made_up, _glints), (_lit,), (_spectacles,), (_moved,)):
+    for steps in ((_made_up, _glints), (_lit,), (_spectacles,), (_moved,), (_recorded,)):
         for step in steps:
             step(light, cover, depth, pupil, grid, worn, made.labels)
     return Rendered(Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil))
@@ -186,6 +190,25 @@ def _moved(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: obj
         padded = F.pad(stack[:, None], (reach,) * 4, mode="replicate")
         seen = F.conv2d(padded, kernel[None, None])[:, 0]
         light[i], cover[i], depth[i], pupil[i] = seen[:2], seen[2:4], seen[4:6] / seen[6:8], seen[8]
+
+
+def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
+              of: Labels) -> None:  # fmt: skip
+    """As another camera gives it: darker corners, white from some level on, a curve between black and its white.
+
+    A factor on both sheets alike. Curves are of the light before the lens, where frames are dressed: blur and curve
+    change places only at edges.
+    """
+    x, y = grid
+    for i, dark, _ in _on(worn, "vignette"):
+        light[i] *= 1 - dark * 2 * (x**2 + y**2)
+    for i, share, _ in _on(worn, "saturation"):
+        level = light[i].sum(0)
+        light[i] *= (torch.quantile(level, 1 - share) / level.clamp_min(1e-9)).clamp(max=1.0)
+    for i, log_gamma, _ in _on(worn, "tone"):
+        level = light[i].sum(0)
+        white = torch.quantile(level, WHITE).clamp_min(1e-9)
+        light[i] *= (level / white).clamp_min(BLACK) ** (np.exp(log_gamma) - 1)
 
 
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:

@@ -401,7 +401,8 @@ def chain(**more):
         "optics": lambda table, numerics: (table, numerics),
         "table": lambda tolerance: ("table", tolerance),
         "electrons": lambda optics: ("seen", optics),
-        "config": SimpleNamespace(task=SimpleNamespace(scenes=3)),
+        "config": SimpleNamespace(task=SimpleNamespace(scenes=3), stacks=7, frames=500),
+        "around": plan.PILOT,
     }
     return SimpleNamespace(**known | more)
 
@@ -449,6 +450,22 @@ def test_settings_of_the_optics_are_judged_by_the_finest_of_them(monkeypatch, kn
     made = [("exact", replace(around, **{name: v})) for v in levels[knob]]
     assert asked == [(made[2], made[0]), (made[2], made[1])]
     assert errors[2].tolist() == np.zeros((3, 2)).tolist()
+
+
+def test_tolerances_of_the_true_image_cost_all_psfs_and_all_images_of_the_run(monkeypatch):
+    """7 sets of PSFs, 500 images of which three scenes are timed at once; a finer tolerance is not taken as cheaper."""
+    asked, times = [], iter([2.0, 0.3, 1.0, 0.6, 5.0, 0.9])
+    monkeypatch.setattr(
+        plan, "_misread", lambda chain, truth, believed: asked.append((truth, believed)) or np.full((3, 2), 0.1)
+    )
+    monkeypatch.setattr(plan, "_fastest", lambda work: next(times))
+    monkeypatch.setattr(plan, "nodes_of", lambda optics: (optics[1] * 10, 5.0, 4.0, 1.0))
+    errors, seconds, nodes = plan._image_knob(chain(levels={"image_tolerance": (0.3, 0.2, 0.1)}), "exact")
+    assert seconds == pytest.approx([7 * 2.0 + 500 * 0.1, 7 * 1.0 + 500 * 0.2, 7 * 5.0 + 500 * 0.3])
+    assert asked == [(("exact", 0.1), ("exact", 0.3)), (("exact", 0.1), ("exact", 0.2))]
+    assert errors[0].tolist() == np.full((3, 2), 0.1).tolist()
+    assert not errors[2].any()
+    assert nodes.tolist() == [[3, 5, 4, 1], [2, 5, 4, 1], [1, 5, 4, 1]]
 
 
 def test_the_pilot_s_truth_is_the_coarse_table_put_right_at_twelve_diameters(monkeypatch):
@@ -503,3 +520,6 @@ def test_knobs_run_from_coarse_to_fine():
     assert plan.LEVELS["depth_count"] == (4, 6, 8, 12, 16, 24, 32, 48)
     for knob in ("depth_count", "wavelength_count", "psf_tolerance"):
         assert getattr(plan.PILOT, knob) in plan.LEVELS[knob]  # its seconds stand for a stack
+    true = plan.TRUE_LEVELS
+    assert {k: true[k] for k in ("library_tolerance", "diameter_step_nm")}.items() <= plan.LEVELS.items()
+    assert all(np.diff(true["image_tolerance"]) < 0)

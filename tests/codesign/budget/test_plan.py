@@ -1,6 +1,8 @@
 """The planner on a pilot whose optimum is known, and its words and files."""
 
+import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,9 @@ from codesign.budget import plan
 from codesign.budget.plan import Pilot, PlanConfig
 from codesign.budget.task import TaskSetting
 from codesign.commands import plan as command_plan
+from codesign.train import run as runs
+from metalens.commands.psf import Settings
+from metalens.ground import config as config_file
 from metalens.ground.errors import ConfigError
 
 CONFIG = PlanConfig(stacks=10, frames=100)
@@ -101,7 +106,8 @@ def test_the_words_say_what_was_chosen(tmp_path):
 
 def test_a_run_at_one_wavelength_is_planned():
     """The pilot of a lens of 0.1 mm with few settings; one knob has a single one."""
-    config = PlanConfig(aperture_mm=0.1, stacks=2, frames=10, task=TaskSetting(scenes=1, pixels=32, margin=4))
+    small = TaskSetting(scenes=1, pixels=32, margin=4)
+    config = PlanConfig(aperture_mm=0.1, stacks=2, frames=10, image="uniform", task=small)
     chain = plan.Chain(config)
     chain.levels |= {"library_tolerance": (3e-2, 1e-2), "depth_count": (4, 12), "psf_tolerance": (1e-2, 1e-4)}
     chain.levels |= {"kernel_tolerance": (1e-1, 1e-4), "diameter_step_nm": (20, 1)}
@@ -110,6 +116,76 @@ def test_a_run_at_one_wavelength_is_planned():
     assert best.met
     assert best.choice.wavelength_count == 1
     assert 0 < best.predicted_rad < math.radians(0.1)
+
+
+@pytest.mark.slow
+def test_a_run_of_true_images_is_planned():
+    """A lens of 0.1 mm, tolerances of 0.3 and 0.2: off the axis its image differs from that of the axial PSF."""
+    small = TaskSetting(scenes=1, pixels=32, margin=4)
+    config = PlanConfig(aperture_mm=0.1, stacks=2, frames=10, led_fwhm_nm=30.0, task=small)
+    chain = plan.Chain(config)
+    assert chain.true
+    chain.levels |= {"library_tolerance": (3e-2, 1e-2), "image_tolerance": (0.3, 0.2), "diameter_step_nm": (20, 1)}
+    measured = plan.pilot(chain)
+    best = plan.choose(measured, math.radians(1.0), config)
+    assert set(measured.levels) == {"library_tolerance", "image_tolerance", "diameter_step_nm"}
+    assert best.met
+    assert 0 < best.predicted_rad < math.radians(1.0)
+    table = chain.table(3e-2)
+    optics = chain.optics(table, 0.2)
+    assert plan.nodes_of(optics) == measured.nodes[1]
+    assert chain.device(0.2) is chain.device(0.2)  # all pillars share its nodes
+    one = chain.electrons(chain.device(0.2).one_psf())
+    assert float((chain.electrons(optics) - one).norm() / one.norm()) > 1e-4
+
+
+def test_files_of_a_plan_of_true_images(tmp_path):
+    """Seven columns of nodes: axis, two between, edge of 20 pixels of 18 um beside the middle."""
+    config = PlanConfig(
+        aperture_mm=0.3, led_fwhm_nm=30.0, source_distance_mm=33.0, task=TaskSetting(pixels=32, margin=4)
+    )
+    eyes, lens = SimpleNamespace(depths_um=(15e3, 27e3)), SimpleNamespace(sensor_distance_um=2000.0)
+    chain = SimpleNamespace(config=config, eyes=eyes, lens=lens)
+    levels = {"library_tolerance": (3e-2,), "image_tolerance": (0.3, 0.12), "diameter_step_nm": (20,)}
+    nothing = {name: np.zeros((len(row), 3, 2)) for name, row in levels.items()}
+    nodes = ((3, 3, 5, 1), (7, 7, 9, 5))
+    measured = Pilot(levels, nothing, {n: np.ones(len(row)) for n, row in levels.items()}, 1e-3, 5.0, nodes=nodes)
+    best = plan.Plan(0.01, plan.TrueChoice(3e-2, 0.12, 20), 0.008, 3.0, 9.0, True)
+    command_plan.write(tmp_path, best, measured, chain)
+    made = runs.load(tmp_path / "run.toml").optics
+    assert (made.image, made.image_tolerance, made.fwhm_nm) == ("true", 0.12, 30.0)
+    assert (made.aperture_mm, made.focus_mm, made.depths_mm) == (0.3, 33.0, (15.0, 27.0))
+    seen = config_file.load(tmp_path / "psf.toml", Settings)
+    edge = math.degrees(math.atan(20 * 18.0 / 2000))
+    assert seen.angles_deg == pytest.approx([0, edge / 3, 2 * edge / 3, edge], abs=1e-3)
+    assert (seen.tolerance, seen.led_fwhm_nm) == (0.04, 30.0)
+    assert seen.depths_mm == pytest.approx((15.0, 27.0, 1.5))
+    assert "7 rows, 7 columns, 9 depths, 5 wavelengths" in command_plan.text(best, measured, tmp_path)
+    assert json.loads((tmp_path / "plan.json").read_text())["nodes"]["wavelengths"] == 5
+
+
+def test_a_plan_of_one_psf_a_depth_says_so(tmp_path):
+    """Its run would otherwise be one of true images, whose settings nobody chose."""
+    config = PlanConfig(image="uniform", led_fwhm_nm=30.0)
+    eyes = SimpleNamespace(depths_um=(15e3, 27e3))
+    best = plan.choose(_pilot(), 1.0, config)
+    (tmp_path / "run.toml").write_text(command_plan.run_text(best, SimpleNamespace(config=config, eyes=eyes)))
+    made = runs.load(tmp_path / "run.toml").optics
+    assert (made.image, made.depth_count, made.tolerance) == ("uniform", 4, 0.1)
+    assert command_plan.values(best, _pilot())["nodes"] == {}
+
+
+def test_seconds_of_a_run_of_true_images_add():
+    levels = {"library_tolerance": (3e-2, 1e-2), "image_tolerance": (0.3, 0.1), "diameter_step_nm": (20, 1)}
+    seconds = {"library_tolerance": np.array([1.0, 3.0]), "image_tolerance": np.array([70.0, 500.0]),
+               "diameter_step_nm": np.array([0.2, 0.9])}  # fmt: skip
+    errors = {name: np.array([[[3e-3, 0.0]], [[0.0, 0.0]]]) for name in levels}
+    measured = Pilot(levels, errors, seconds, 1e-3, 5.0, nodes=((3, 3, 5, 1), (9, 9, 9, 1)))
+    best = plan.choose(measured, 6.1e-3, CONFIG)  # two of the three may stay coarse: the images are the dear ones
+    assert best.choice == plan.TrueChoice(3e-2, 0.3, 1)
+    assert best.seconds == pytest.approx(1.0 + 70.0 + 0.9)
+    assert best.finest_seconds == pytest.approx(503.9)
+    assert command_plan.chosen_nodes(best, measured) == {"rows": 3, "columns": 3, "depths": 5, "wavelengths": 1}
 
 
 def test_the_cost_of_a_run_is_a_library_its_stacks_its_images_and_its_mask():

@@ -60,6 +60,9 @@ def test_amounts_of_what_may_be_worn():
         "gradient": (0.6, 0.1, 0.7),
         "shade": (0.25, 0.2, 0.7),
         "movement": (0.3, 0.008, 0.04),
+        "vignette": (0.4, 0.1, 0.8),
+        "saturation": (0.25, 0.01, 0.15),
+        "tone": (0.5, -0.6, 0.6),
     }
 
 
@@ -219,3 +222,33 @@ def test_labels_follow_the_mask():
     assert got.centroid_px[1].tolist() == [7.0, 6.0]  # nothing is left: where the pupil is
     grown = wear._labels(labels, after, was)
     assert grown.visible.tolist() == [1.0, 0.6]  # not above 1; of nothing before, as it was
+
+
+def test_corners_of_another_camera_are_darker_by_the_square_of_their_distance():
+    """Corners lose the whole share but for half a pixel, the middle nothing."""
+    light, cover, depth, pupil = put_on(vignette=0.6)
+    plain, *rest = put_on()
+    line = (np.arange(plain.shape[-1]) + 0.5) / plain.shape[-1] - 0.5
+    assert light == pytest.approx(plain * (1 - 0.6 * 2 * (line[None] ** 2 + line[:, None] ** 2)), rel=1e-5, abs=1e-7)
+    for now, was in zip((cover, depth, pupil), rest, strict=True):
+        assert np.array_equal(now, was)
+
+
+def test_the_brightest_pixels_are_at_one_white():
+    plain, seen = put_on()[0], put_on(saturation=0.15)[0]
+    level = plain.sum(0)
+    white = np.quantile(level, 0.85)
+    assert seen.sum(0) == pytest.approx(np.minimum(level, white), rel=1e-4)
+    bright = level > white
+    assert bright.any()
+    assert seen[:, bright] / seen.sum(0)[bright] == pytest.approx(plain[:, bright] / level[bright], rel=1e-4)
+
+
+@pytest.mark.parametrize("log_gamma", [-0.5, 0.4])
+def test_a_tone_curve_is_a_power_between_black_and_white(log_gamma):
+    plain, seen = put_on()[0], put_on(tone=log_gamma)[0]
+    level = plain.sum(0)
+    white, gamma = np.quantile(level, 0.99), math.exp(log_gamma)
+    inside = level > 1e-3 * white
+    assert inside.any()
+    assert seen.sum(0)[inside] == pytest.approx(white * (level[inside] / white) ** gamma, rel=1e-4)

@@ -63,7 +63,7 @@ def test_the_count_is_that_of_a_counted_pass(size):
     assert features.shape == (1, blur.SLIP_FEATURES)
 
 
-def test_the_depth_of_a_window_is_read_from_it_and_the_two_windows_around_it():
+def test_the_depth_of_a_window_is_read_from_it_and_two_more_around_it_a_block():
     branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
     frames = _frames(2, 64)
     changed = frames.clone()
@@ -71,8 +71,26 @@ def test_the_depth_of_a_window_is_read_from_it_and_the_two_windows_around_it():
     with torch.no_grad():
         moved = (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > 0
     wanted = torch.zeros(blur.GRID, blur.GRID, dtype=torch.bool)
-    wanted[:3, -3:] = True
+    reach = 1 + blur.BLOCKS * (blur.REACH // 2)
+    wanted[:reach, -reach:] = True
+    assert reach < blur.GRID
     assert torch.equal(moved, wanted)
+
+
+def test_a_block_adds_to_a_window_what_its_mixed_neighbours_tell():
+    """A gatherer of ones and a mixer of -0.5: x - hardswish(sum of the 5 x 5 windows around + 0.3) / 2."""
+    block = blur.Around(3)
+    with torch.no_grad():
+        block.gather.weight.fill_(1.0)
+        block.gather.bias.fill_(0.3)
+        block.mix.weight.copy_(-0.5 * torch.eye(3)[..., None, None])
+        block.mix.bias.zero_()
+        x = torch.zeros(1, 3, blur.GRID, blur.GRID)
+        x[0, 1, 2, 3] = 0.7
+        got = block(x)
+    around = torch.full_like(x, 0.3)
+    around[0, 1, 0:5, 1:6] += 0.7
+    torch.testing.assert_close(got, x - 0.5 * around * (around + 3) / 6, rtol=1e-6, atol=1e-7)
 
 
 def test_windows_hold_the_vergence_under_them():

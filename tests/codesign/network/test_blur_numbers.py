@@ -41,7 +41,7 @@ def test_the_vergence_of_a_window_is_that_of_its_middle_where_it_is_straight():
 
 def test_spreads_are_kept_from_e_to_minus_3_to_e_squared_and_windows_count_by_their_variance():
     random = torch.Generator().manual_seed(3)
-    answer = torch.randn(2, 2, 7, 7, generator=random)
+    answer = torch.randn(2, 2 + blur.BESIDE, 7, 7, generator=random)
     answer[:, 1, 0, :3] = torch.tensor([-3.4, 2.6, 1.9])
     branch = blur.BlurBranch(nn.Identity())
     branch.depth = Told(answer)
@@ -54,6 +54,7 @@ def test_spreads_are_kept_from_e_to_minus_3_to_e_squared_and_windows_count_by_th
     trust = np.exp(-2 * spread)
     mean = (trust * answer[:, 0].numpy()).sum((1, 2)) / trust.sum((1, 2))
     assert features.shape == (2, blur.SLIP_FEATURES)
-    assert features[:, -2].numpy() == pytest.approx(mean, rel=1e-5)
-    assert features[:, -1].numpy() == pytest.approx(spread.mean((1, 2)), rel=1e-5)
+    assert features[:, 3 * 49].numpy() == pytest.approx(mean, rel=1e-5)
+    assert features[:, 3 * 49 + 1].numpy() == pytest.approx(spread.mean((1, 2)), rel=1e-5)
+    assert torch.equal(features[:, 3 * 49 + 2 :], answer[:, 2:].flatten(1))
     assert features[:, : 2 * 49].numpy() == pytest.approx(depth.flatten(1).numpy())
