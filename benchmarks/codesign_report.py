@@ -1,6 +1,7 @@
 """Tables and figures of the co-design study: paired bootstrap over test scenes and over runs.
 
-python -m benchmarks.codesign_report --work DIR        # writes benchmarks/results and docs/codesign
+python -m benchmarks.codesign_report --work DIR                  # writes benchmarks/results and docs/codesign
+python -m benchmarks.codesign_report --work DIR --only p18blur   # writes benchmarks/results/codesign_study_p18blur.json
 """
 
 import argparse
@@ -18,6 +19,7 @@ from metalens.ground import report, store
 from metalens.ground.arrays import Array
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 HEAD = """# Results of the study
 
 Mean absolute error of the axial slippage on 512 test frames in 256 pairs that share a pupil position. The depth of
@@ -31,7 +33,8 @@ scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
 - `p9`, `p18`: pixels of 9 and 18 um, 2000 electrons from white in 9 um. `p18long`: three times the frames. `p18dim`:
   100 electrons. `p9dim`: 400 electrons. `p9field`: 10 degrees off axis. `p18small`: `p18long` with half the width.
   `p18nvgaze`, `p18popovic`, `p18de2gaze`: `p18long` with the networks of those papers in place of ours. `p9wide`:
-  networks of `p9` tested on four times as many frames.
+  networks of `p9` tested on four times as many frames. `p18blur`, `p18blurlong`: `p18` and `p18long` with the
+  branch that reads blur and half the backbone's width, in steps of 16 frames; other cases: networks without it.
 
 Ratios with 95 % intervals of a paired bootstrap over pairs of frames and over runs; with one seed, over frames alone.
 The best focus is the fixed lens of one focus (`hyperF`, `obliqueF`) of least error on natural frames. Made by
@@ -246,8 +249,15 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=None, help="cases; their JSON alone is written")
     options = parser.parse_args()
     runs = load(options.work)
+    if options.only:
+        for case in options.only:
+            rows = summaries(runs[case])
+            store.write_text(RESULTS / f"codesign_study_{case}.json", json.dumps(rows, indent=1) + "\n")
+            print(table({case: rows}, runs))
+        return
     found = {case: summaries(mine) for case, mine in runs.items() if len(mine) > 1}
     folder = ROOT / "docs" / "codesign"
     folder.mkdir(parents=True, exist_ok=True)
@@ -258,7 +268,7 @@ def main() -> None:
     if any(f"p18{name}" in runs for name in BASELINES):
         kept["networks"] = networks(runs)
         content += "\n" + networks_text(kept["networks"])
-    store.write_text(ROOT / "benchmarks" / "results" / "codesign_study.json", json.dumps(kept, indent=1) + "\n")
+    store.write_text(RESULTS / "codesign_study.json", json.dumps(kept, indent=1) + "\n")
     store.write_text(folder / "results.md", HEAD + content)
     store.write_bytes(folder / "study.png", figure(found))
     print(content)

@@ -4,6 +4,7 @@
     python -m benchmarks.codesign_study run --work DIR --only p18/hyper33/0
     python -m benchmarks.codesign_study retest --work DIR --only p9/hyper33/0     # as p9wide: on four times the frames
     python -m benchmarks.codesign_report --work DIR                # JSON, table and figures from the lines there are
+    python -m benchmarks.codesign_report --work DIR --only p18blur # the JSON of some cases, beside that of the study
 
 Every run draws the same number of frames from one pool, with the same network, noise and schedule; the lens alone
 differs. One JSON line a run, errors of every test frame beside it; a stopped study goes on at its last 100 steps.
@@ -310,6 +311,12 @@ PLAN += [f"p18long/{lens}/0" for lens in ("joint33", "rush33", "hyper28")]
 PLAN += [f"p9/{lens}/{seed}" for seed in range(5) for lens in LENSES]
 PLAN += [f"{case}/{lens}/0" for case in ("p9", "p18") for lens in SCAN]
 PLAN += [f"p18/{lens}/{seed}" for seed in range(5) for lens in LENSES]
+PLAN += [
+    f"{case}/{lens}/{seed}"
+    for case in ("p18blur", "p18blurlong")
+    for seed in range(5)
+    for lens in ("hyper40", "hyper33")
+]
 PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
 PLAN += [f"p9field/{lens}/{seed}" for seed in range(2) for lens in (*MAIN, "oblique33", "swiftoblique33")]

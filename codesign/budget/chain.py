@@ -36,7 +36,7 @@ LEVELS: dict[str, tuple[float, ...]] = {  # of one PSF a depth; coarsest first, 
     "kernel_tolerance": (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4),
     **MASK,
 }
-TRUE_LEVELS: dict[str, tuple[float, ...]] = {**PILLARS, "image_tolerance": (0.3, 0.2, 0.1, 0.05, 0.03), **MASK}
+TRUE_LEVELS: dict[str, tuple[float, ...]] = {**PILLARS, "image_tolerance": (0.2, 0.1, 0.05, 0.03, 0.02), **MASK}
 PILOT = Numerics(12, 1, 1e-4, 1e-4)  # of the other knobs while one is looked at
 TRUE_PILOT = 0.1  # the same: tolerance of the true image
 SETTLE_STEPS = 2  # of the estimator, which starts at the true state

@@ -85,10 +85,12 @@ def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, .
     real, imaginary, solving = journal.part("exact", lambda: _listed(chain))
     exact = np.array(real) + 1j * np.array(imaginary)
     base = chain.optics(exact, chain.around)
-    errors, seconds, nodes = {}, {}, ()
+    errors, seconds = {}, {}
+    nodes: tuple[tuple[int, ...], ...] = ()
     for knob, levels in chain.levels.items():
 
         def measure(knob: str = knob) -> list[Any]:
+            found: tuple[Array, ...]
             if knob == "library_tolerance":
                 found = _library_knob(chain, base, solving)
             elif knob == "diameter_step_nm":
@@ -239,7 +241,7 @@ def _cost(measured: Pilot, places: Array, names: list[str], config: PlanConfig) 
     """Seconds of the run: a library, the stacks (times of the knobs multiply), the images, the mask."""
     column = {n: measured.seconds[n][places[:, i]] for i, n in enumerate(names)}
     if "image_tolerance" in column:
-        return np.sum([*column.values()], axis=0)
+        return np.asarray(np.sum([*column.values()], axis=0))
     pilot_stack = {
         n: measured.seconds[n][_place(measured, n)] for n in ("depth_count", "wavelength_count", "psf_tolerance")
     }

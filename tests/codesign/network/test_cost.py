@@ -65,6 +65,6 @@ def test_cost_falls_with_pitch_and_impossible_pitch_is_refused():
     space = Space()
     sizes = [cost.input_size(1200.0, pitch, 1.0) for pitch in (3.0, 6.0, 12.0)]
     counts = [float(cost.macs_of_size(space, smallest(space), s)) for s in sizes]
-    assert counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.9
+    assert counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85  # heads and windows of the blur are no pixels
     with pytest.raises(ConfigError, match=r"leaves 12\.0 pixels"):
         cost.input_size(1200.0, 100.0, 1.0)
