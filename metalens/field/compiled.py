@@ -1,5 +1,5 @@
-"""Compiled loops: sources of one patch weighted for every kernel (``forming.at_depth`` times the frames in one pass),
-and the light on the nodes of a pupil."""
+"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth`` times the frames in one pass), and
+the light on the nodes of a pupil."""
 
 import numba
 import numpy as np
@@ -9,63 +9,54 @@ from metalens.ground.threads import split
 from metalens.propagate import turns32
 
 
-def weighted(
-    frames: tuple[Array, Array, Array], tables: tuple[Array, Array], shape: tuple[int, int], few: int
-) -> tuple[Array, Array]:
-    """(rank, frames, sheets, Y, X) light and (few, frames, sheets, Y, X) coverage, float32, zero beyond the patch.
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-untyped-def]
+    """Sheets weighted for kernels: ``patches.lagrange`` between the depths, row by row.
 
     Args:
-        frames: (frames, sheets, y, x) radiance, coverage, and depth in units of the depth nodes, float32.
-        tables: (y * x, depths, rank) weights and (y * x, depths) illumination, float32.
+        content, place: (frames, sheets, y, x) light or coverage, and depth in units of the depth nodes, float32.
+        held: (few, 2) frame and sheet that are wanted. lit: whether the relative illumination weighs too.
+        tables: (y * x, depths, rank) weights and (y * x, depths) illumination, float32. first: of the kernels.
+        out: (y, kernels, few, x).
     """
-    count, sheets = frames[0].shape[:2]
-    light = np.zeros((tables[0].shape[2], count, sheets, *shape), np.float32)
-    cover = np.zeros((few, count, sheets, *shape), np.float32)
-    _weigh(*frames, *tables, light, cover)
-    return light, cover
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _weigh(radiance, coverage, place, table, energy, light, cover):  # type: ignore[no-untyped-def]
-    """The 4-point interpolation of ``patches.lagrange`` between the depths, row by row."""
-    count, sheets, high, wide = radiance.shape
-    depths, rank = table.shape[1:]
-    few = cover.shape[0]
+    few, wide = out.shape[1], out.shape[3]
+    weights, energy = tables[0][:, :, first : first + few], tables[1]
+    depths = weights.shape[1]
     n = min(4, depths)
-    taps = np.empty(n, np.float32)
-    lines = np.empty((wide, rank), np.float32)
-    bright = np.empty(wide, np.float32)
-    for f in range(count):
-        for s in range(sheets):
-            for y in range(high):
-                for x in range(wide):
-                    bright[x] = 0
-                    if coverage[f, s, y, x] == 0 and radiance[f, s, y, x] == 0:
-                        lines[x] = 0
-                        continue
-                    p = place[f, s, y, x]
-                    first = min(max(int(p) - (n // 2 - 1), 0), depths - n)
-                    for i in range(n):
-                        w = np.float32(1)
-                        for j in range(n):
-                            if j != i:
-                                w *= (p - first - j) / (i - j)
-                        taps[i] = w
-                    pixel, level = y * wide + x, np.float32(0)
-                    for r in range(rank):
-                        lines[x, r] = taps[0] * table[pixel, first, r]
-                    for i in range(n):
-                        level += taps[i] * energy[pixel, first + i]
-                        if i > 0:
-                            for r in range(rank):
-                                lines[x, r] += taps[i] * table[pixel, first + i, r]
-                    bright[x] = level * radiance[f, s, y, x]
-                for r in range(rank):
-                    for x in range(wide):
-                        light[r, f, s, y, x] = lines[x, r] * bright[x]
+    last = n - 1
+    for y in range(out.shape[0]):
+        for job in range(len(held)):
+            f, s = held[job]
+            for x in range(wide):
+                value = content[f, s, y, x]
+                if value == 0:
+                    out[y, :, job, x] = 0
+                    continue
+                p, pixel = place[f, s, y, x], y * wide + x
+                i = min(max(int(p) - (n // 2 - 1), 0), depths - n)
+                j, k, m = i + min(1, last), i + min(2, last), i + last
+                a, b, c, d = _taps(p - np.float32(i), n)
+                if lit:
+                    value *= a * energy[pixel, i] + b * energy[pixel, j] + c * energy[pixel, k] + d * energy[pixel, m]
+                a, b, c, d = a * value, b * value, c * value, d * value
+                at = weights[pixel]
                 for r in range(few):
-                    for x in range(wide):
-                        cover[r, f, s, y, x] = lines[x, r] * coverage[f, s, y, x]
+                    out[y, r, job, x] = a * at[i, r] + b * at[j, r] + c * at[k, r] + d * at[m, r]
+
+
+@numba.njit(inline="always")
+def _taps(t, n):  # type: ignore[no-untyped-def]
+    """Weights of ``patches.lagrange`` at t from the first of n nodes; nodes that are not there have 0."""
+    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    u, v, w = t - one, t - np.float32(2), t - np.float32(3)
+    if n == 4:
+        sixth = np.float32(1 / 6)
+        return -u * v * w * sixth, t * v * w * half, -t * u * w * half, t * u * v * sixth
+    if n == 3:
+        return u * v * half, -t * v, t * u * half, none
+    if n == 2:
+        return -u, t, none, none
+    return one, none, none, none
 
 
 def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from metalens.field import compiled
+from metalens.field import products
 from metalens.field.patches import Patch, dense, lagrange
 from metalens.field.plan import Grid, Plan
 from metalens.field.stray import Stray, add_stray
@@ -64,8 +64,8 @@ class Imager:
         return image(frames, self)
 
 
-def image(frames: Frames, optics: Imager, *, chunk: int = 4) -> Tensor:
-    """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time stay in a processor's cache."""
+def image(frames: Frames, optics: Imager, *, chunk: int = 8) -> Tensor:
+    """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time share the reading of a patch's tables."""
     grid = optics.grid
     size = tuple(n + 2 * grid.margin for n in grid.samples)
     if tuple(frames.radiance.shape[-2:]) != size:
@@ -99,37 +99,40 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
     reach = size // 2
     whole = grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach
     out = light.new_zeros(len(light), kinds, light.shape[1], *whole)
-    position = vergence(depth_um, optics.plan.depths_um)
-    for patch, transfer in zip(optics.patches, optics.transfer, strict=True):
-        high, wide = patch.rows[1] - patch.rows[0] + 2 * reach, patch.columns[1] - patch.columns[0] + 2 * reach
-        shape = _size(patch, size)
-        given = light, cover, position
-        for kind, source in enumerate(_sources(patch, given, len(optics.plan.depths_um), shape, kinds)):
-            mixed = _mixed(torch.fft.rfft2(source, s=shape), transfer)
-            seen = torch.fft.irfft2(mixed, s=shape)[..., :high, :wide]
-            place = out[:, kind, :, patch.rows[0] : patch.rows[0] + high, patch.columns[0] : patch.columns[0] + wide]
-            place += seen
+    given = light, cover, vergence(depth_um, optics.plan.depths_um)
+    shapes = [_size(patch, size) for patch in optics.patches]
+    if all(_plain(a) for a in (*given, *optics.transfer, *(p.energy for p in optics.patches))):
+        seen, kernels = (a.numpy() for a in given), [t.contiguous().numpy() for t in optics.transfer]
+        products.through((*seen,), optics.patches, kernels, shapes, out.numpy())
+    else:
+        for patch, transfer, shape in zip(optics.patches, optics.transfer, shapes, strict=True):
+            _add(patch, transfer, shape, given, out)
     return out[..., reach : reach + grid.frame[0], reach : reach + grid.frame[1]]
 
 
-def _sources(
-    patch: Patch, given: tuple[Tensor, Tensor, Tensor], depths: int, shape: tuple[int, int], kinds: int
-) -> list[Tensor]:
-    """(rank, frames, sheets, …) light, and with two kinds coverage, of a patch, weighted for its kernels.
+def _add(
+    patch: Patch, transfer: Tensor, shape: tuple[int, int], given: tuple[Tensor, Tensor, Tensor], out: Tensor
+) -> None:
+    """What a patch adds to :func:`_through`, by FFT; ``given`` as :func:`_sources` takes it."""
+    beyond = out.shape[-1] - given[0].shape[-1]
+    rows = slice(patch.rows[0], patch.rows[1] + beyond)
+    columns = slice(patch.columns[0], patch.columns[1] + beyond)
+    for kind, source in enumerate(_sources(patch, given, out.shape[1])):
+        mixed = _mixed(torch.fft.rfft2(source, s=shape), transfer)
+        place = out[:, kind, :, rows, columns]
+        place += torch.fft.irfft2(mixed, s=shape)[..., : place.shape[-2], : place.shape[-1]]
+
+
+def _sources(patch: Patch, given: tuple[Tensor, Tensor, Tensor], kinds: int) -> list[Tensor]:
+    """(rank, frames, sheets, y, x) light, and with two kinds coverage, of a patch, weighted for its kernels.
 
     Args:
         given: light, coverage and :func:`vergence` of the whole frame.
     """
     rows, columns = slice(*patch.rows), slice(*patch.columns)
     light, cover, place = (a[..., rows, columns] for a in given)
-    tables = patch.weights, patch.energy
-    few = patch.coverage if kinds > 1 else 0
-    if all(_plain(a) for a in (light, cover, place, *tables)):
-        seen = light.numpy(), cover.numpy(), place.numpy()
-        made = compiled.weighted(seen, (tables[0].numpy(), tables[1].numpy()), shape, few)
-        return [torch.from_numpy(part) for part in made[:kinds]]
-    weights, level = at_depth(patch, place, depths)
-    return [weights * (light * level), weights[:few] * cover][:kinds]
+    weights, level = at_depth(patch, place, patch.weights.shape[1])
+    return [weights * (light * level), weights[: patch.coverage] * cover][:kinds]
 
 
 def _mixed(spectrum: Tensor, transfer: Tensor) -> Tensor:
@@ -142,7 +145,7 @@ def _mixed(spectrum: Tensor, transfer: Tensor) -> Tensor:
 
 def _plain(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
-    if a.dtype != torch.float32 or a.device.type != "cpu" or a.requires_grad:
+    if a.dtype not in (torch.float32, torch.complex64) or a.device.type != "cpu" or a.requires_grad:
         return False
     return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 

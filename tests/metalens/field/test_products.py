@@ -1,0 +1,95 @@
+"""Patches by matrix products: transforms against numpy's FFT, whole images against the ones that torch forms."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.field import Grid, forming, patches, products
+from metalens.image import Frames
+
+
+@pytest.mark.parametrize("size", [9, 10, 45])
+def test_products_transform_and_lead_back(size):
+    """Seven samples in 9, 10 and 45 points, one of the three with more frequencies than a block holds."""
+    given = np.random.default_rng(3).normal(size=(7, 5)).astype(np.float32)
+    y, x = products.bases(7, size), products.bases(5, 12)
+    whole = y.across @ (given @ x.along)
+    want = np.fft.rfft2(given, s=(size, 12))
+    real, imaginary = (_unblocked(whole, which)[:, : want.shape[1]] for which in (0, 1))
+    frequencies = size // 2 + 1
+    plus = real[:frequencies] + imaginary[frequencies:] + 1j * (imaginary[:frequencies] - real[frequencies:])
+    assert np.abs(plus - want[:frequencies]).max() < 1e-5  # float32 of values up to 12
+    back = y.back_across @ np.concatenate([2 * whole[:frequencies], 2 * whole[frequencies:]]) @ x.back_along
+    assert np.abs(back[:7, :5] - given).max() < 1e-6
+    assert np.abs(back[7:]).max() < 1e-6
+
+
+def _unblocked(rows, which):
+    return rows.reshape(len(rows), -1, 2, products.LANES)[:, :, which].reshape(len(rows), -1)
+
+
+@pytest.fixture(scope="module", params=[(5, 1), (7, 3), (9, 6)])
+def optics(request):
+    """Random PSFs over a field: windows of 5 to 9, and 1, 3 or 6 depths; patches of unlike sizes."""
+    window, depths = request.param
+    draw = np.random.default_rng(window)
+    stack = torch.from_numpy(draw.random((5, 4, depths, window, window))).float()
+    stack /= stack.sum((-1, -2), keepdim=True)
+    grid = Grid((23, 18), 2.0, (3e3, 3e3 if depths == 1 else 9e3), margin=3, window=window)
+    rows, columns = grid.frame
+    y, x = (torch.linspace(-n, n, k, dtype=torch.float64) for n, k in ((rows, 5), (columns, 4)))
+    deep = 1 / torch.linspace(1 / 3e3, 1 / grid.depths_um[1], depths, dtype=torch.float64)
+    plan = SimpleNamespace(y_um=y, x_um=x, depths_um=deep)
+    energy = torch.from_numpy(0.5 + draw.random((5, 4, depths))).float()
+    cut = patches.cut(stack, energy, forming.between_nodes(grid, plan), patches=3, overlap=2, tolerance=1e-3)
+    return forming.with_psfs(forming.Imager(grid, plan, stack, energy, cut, [], {}), stack, energy)
+
+
+def _frames(optics, count):
+    """A near sheet over the upper part, softly ended; the far one has a dark hole, and the last frame no near sheet."""
+    draw = torch.Generator().manual_seed(8)
+    size = tuple(n + 2 * optics.grid.margin for n in optics.grid.samples)
+    y = torch.arange(size[0], dtype=torch.float32)[:, None].expand(size)
+    near = torch.sigmoid((8 - y) * 3).repeat(count, 1, 1)
+    near[-1] = 0
+    cover = torch.stack([near, 1 - near], 1)
+    light = cover * torch.rand(count, 2, *size, generator=draw)
+    light[:, 1, 14:19, 3:11] = 0
+    depth = 3e3 + (optics.grid.depths_um[1] - 3e3) * torch.rand(count, 2, *size, generator=draw)
+    return Frames(light, cover.contiguous(), depth)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_products_form_the_image_that_torch_forms(optics, count):
+    frames = _frames(optics, count)
+    by_fft = Frames(frames.radiance.clone().requires_grad_(), frames.coverage, frames.depth_um)
+    want, got = optics(by_fft).detach(), optics(frames)
+    assert float((got - want).norm() / want.norm()) < 2e-6  # float32
+
+
+def test_images_do_not_depend_on_the_number_of_threads(optics):
+    frames, before = _frames(optics, 5), torch.get_num_threads()
+    images = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            images.append(optics(frames))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*images)
+
+
+def test_sheets_that_hold_nothing_in_a_patch_are_left_out(optics, monkeypatch):
+    """The near sheet ends softly, 1e-7 of 1 at ln(1e7) / 3 = 5.4 rows below its edge; the second frame has none."""
+    held = []
+    monkeypatch.setattr(products, "_convolved", lambda content, place, some, *_: held.append(some.tolist()))
+    optics(_frames(optics, 2))
+    last = 8 + math.log(1e7) / 3 + optics.grid.spare
+    upper = sum(patch.rows[0] <= last for patch in optics.patches)
+    assert upper < len(optics.patches)
+    assert sum([0, 0] in some for some in held) == 2 * upper  # light and coverage
+    assert sum([1, 0] in some for some in held) == 0
+    assert sum([1, 1] in some for some in held) == 2 * len(optics.patches)
