@@ -102,8 +102,9 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
     given = light, cover, vergence(depth_um, optics.plan.depths_um)
     shapes = [_size(patch, size) for patch in optics.patches]
     if all(_plain(a) for a in (*given, *optics.transfer, *(p.energy for p in optics.patches))):
-        seen, kernels = (a.numpy() for a in given), [t.contiguous().numpy() for t in optics.transfer]
-        products.through((*seen,), optics.patches, kernels, shapes, out.numpy())
+        seen = given[0].numpy(), given[1].numpy(), given[2].numpy()
+        kernels = [t.contiguous().numpy() for t in optics.transfer]
+        products.through(seen, optics.patches, kernels, shapes, out.numpy())
     else:
         for patch, transfer, shape in zip(optics.patches, optics.transfer, shapes, strict=True):
             _add(patch, transfer, shape, given, out)
