@@ -38,6 +38,20 @@ class Profile:
     parabolic: bool
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Spot:
+    """A place with its residual, and the slopes that are believed there."""
+
+    x: Array
+    rest: Array
+    slopes: Array
+
+    @property
+    def misfit(self) -> float:
+        """Sum of squares of the residual."""
+        return float(self.rest @ self.rest)
+
+
 class Valley:
     """The misfit about a mode: -2 ln posterior less a constant, with the noise held.
 
@@ -64,6 +78,7 @@ class Valley:
         self.covariance = (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(size, size)
         self._sigmas = (vectors * np.sqrt(np.maximum(values, 0))).T * size
         self._met: list[tuple[Array, Array]] = []
+        self._beside: dict[int, list[Spot] | None] = {}
 
     @property
     def sigma(self) -> Array:
@@ -101,17 +116,28 @@ class Valley:
 
         held: a parameter that stays where it is, the sigma being what is left then.
         """
-        way = self.along(i)
-        if held is not None:
+        if held is None:
+            ends = self.beside(i)
+        else:
             left = self.covariance[:, i] - self.covariance[:, held] * (
                 self.covariance[i, held] / self.covariance[held, held]
             )
-            way = left / math.sqrt(max(float(left[i]), 1e-300))
+            ends = self._both_ways(left / math.sqrt(max(float(left[i]), 1e-300)))
+        if ends is None:
+            return math.inf
+        return float(np.linalg.norm((ends[0].rest + ends[1].rest) / 2 - self.bottom))
+
+    def beside(self, i: int) -> list[Spot] | None:
+        """Where the parabola goes 2 sigma up and down one parameter; None with a bound between."""
+        if i not in self._beside:
+            self._beside[i] = self._both_ways(self.along(i))
+        return self._beside[i]
+
+    def _both_ways(self, way: Array) -> list[Spot] | None:
         places = [self.mode + sign * 2 * way for sign in (1, -1)]
         if any((self.inside(x) != x).any() for x in places):
-            return math.inf
-        ends = [self.residual(x) for x in places]
-        return float(np.linalg.norm((ends[0] + ends[1]) / 2 - self.bottom))
+            return None
+        return [Spot(x, self.residual(x), self.slopes) for x in places]
 
     def descend(
         self,
@@ -127,9 +153,22 @@ class Valley:
 
         slopes: those to begin with, of :meth:`slopes_at`, where those of the mode do not hold.
         """
+        begin = Spot(x, self.residual(x) + shift, self.slopes if slopes is None else slopes)
+        found = self.lowered(begin, held=held, shift=shift, rounds=rounds, least=least)
+        return found.x, found.misfit
+
+    def lowered(
+        self,
+        begin: Spot,
+        *,
+        held: int | None = None,
+        shift: Array | float = 0.0,
+        rounds: int = _SOLVES,
+        least: float = 0.02,
+    ) -> Spot:
+        """The least misfit from a spot on, its slopes brought up to date; see :meth:`descend`."""
+        x, rest, slopes, value, damping = begin.x, begin.rest, begin.slopes, begin.misfit, 1e-6
         free = np.array([j for j in range(len(x)) if j != held])
-        slopes, rest = self.slopes if slopes is None else slopes, self.residual(x) + shift
-        value, damping = float(rest @ rest), 1e-6
         for _ in range(rounds):
             part = slopes[:, free]
             curvature, gradient = part.T @ part, part.T @ rest
@@ -151,13 +190,13 @@ class Valley:
                 x, rest, value = there, after, lower
             else:
                 damping = max(damping * 30, 1e-2)
-        return x, value
+        return Spot(x, rest, slopes)
 
-    def slopes_at(self, x: Array) -> Array:
+    def slopes_at(self, x: Array, rest: Array | None = None) -> Array:
         """(pixels + p, p) derivatives of :meth:`residual`: by how they change towards places met before, or computed.
 
         Along each of those as far as ``x`` lies that way. They hold where half their sum with those of the mode gives
-        the residual at ``x`` to ``_HOLDS`` sigma (trapezium rule).
+        the residual at ``x`` (``rest``, where it is known) to ``_HOLDS`` sigma (trapezium rule).
         """
         slopes, way = self.slopes, x - self.mode
         for place, change in self._met:
@@ -165,7 +204,8 @@ class Valley:
             share = float(np.clip(along @ reach / max(float(along @ along), 1e-300), 0.0, 1.5))
             slopes, way = slopes + share * change, way - share * place
         step = x - self.mode
-        missed = self.residual(x) - self.bottom - (self.slopes + slopes) @ (step / 2)
+        rest = self.residual(x) if rest is None else rest
+        missed = rest - self.bottom - (self.slopes + slopes) @ (step / 2)
         if float(np.linalg.norm(missed)) < _HOLDS:
             return slopes
         image, jacobian = self._model(x, True)
@@ -225,31 +265,54 @@ def density(curve: Array, at: Array) -> Array:
 
 def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tuple[float, float]], Array | None]:
     """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
-    mode, sigma, along = valley.mode, float(valley.sigma[i]), sign * valley.along(i)
+    mode, sigma = valley.mode, float(valley.sigma[i])
     bound = valley.prior.low[i] if sign < 0 else valley.prior.high[i]
-    reach, direction = goal, along
-    slopes: Array | None = None  # those that hold at the end, once it is near
+    beside = valley.beside(i)
+    here = _spot(valley, mode + sign * goal * valley.along(i)) if beside is None else beside[0 if sign > 0 else 1]
+    held = False  # the slopes are those that hold at the end, once it is near
     seen: list[tuple[float, float]] = []
     for turn in range(_ROUNDS + _CHECKS):
-        x, misfit = valley.descend(valley.inside(mode + reach * direction), held=i, slopes=slopes)
-        rise = misfit - valley.least
+        here = valley.lowered(here, held=i)
+        x, rise = here.x, here.misfit - valley.least
         seen.append((float(x[i]), max(rise, 0.0)))
         if rise < -0.5:
             return float(x[i]), seen, x
         root = math.sqrt(max(rise, 1e-6))
         done = abs(root - goal) < _CLOSE or (x[i] == bound and root < goal)
-        direction = (x - mode) / reach
-        if slopes is not None and done:
+        if held and done:
             break
-        if slopes is None and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
-            slopes, seen = valley.slopes_at(x), []
+        if not held and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
+            here, seen, held = Spot(x, here.rest, valley.slopes_at(x, here.rest)), [], True
         else:
-            reach *= float(np.clip(goal / root, 0.35, 2.0))
+            here = _spot(valley, x + _onwards(here, i, float(x[i] - mode[i]), (root, goal)), here.slopes)
     place, roots = np.array([p for p, _ in seen]), np.sqrt([r for _, r in seen])
     nearest = int(np.argmin(np.abs(roots - goal)))
     gained = goal / max(float(roots[nearest]), 1e-3)
     end = mode[i] + (place[nearest] - mode[i]) * float(np.clip(gained, 0.8, 1.25))
     return float(end if np.isfinite(end) else mode[i] + sign * goal * sigma), seen, None
+
+
+def _spot(valley: Valley, x: Array, slopes: Array | None = None) -> Spot:
+    """Inside the bounds."""
+    x = valley.inside(x)
+    return Spot(x, valley.residual(x), valley.slopes if slopes is None else slopes)
+
+
+def _onwards(here: Spot, i: int, gone: float, roots: tuple[float, float]) -> Array:
+    """(p,) step along the profile's tangent, from where the root of the rise is the first to where it is the second.
+
+    By Newton's rule, or in proportion to the way ``gone`` where the root falls outwards; between 0.35 and 2 times that
+    way in all.
+    """
+    root, goal = roots
+    free = np.array([j for j in range(len(here.x)) if j != i])
+    part = here.slopes[:, free]
+    way = np.zeros(len(here.x))
+    way[i] = 1.0
+    way[free] = -np.linalg.lstsq(part.T @ part, part.T @ here.slopes[:, i], rcond=1e-14)[0]
+    slope = float(here.rest @ (here.slopes @ way)) / root
+    share = 1 + (goal - root) / (slope * gone) if slope * gone > 0.2 * root else goal / root
+    return np.asarray(way * gone * (float(np.clip(share, 0.35, 2.0)) - 1))
 
 
 def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Array:

@@ -89,8 +89,13 @@ def test_a_bent_valley_is_followed_to_its_ends():
     def back(f):
         return -2 + 2 * np.sqrt(1 + f)
 
-    mode = np.array([back(amplitude[0]), amplitude[1]])
-    found, better = profile(Valley(bent, seen, mode, Prior.none(mode)), 0)
+    mode, asked = np.array([back(amplitude[0]), amplitude[1]]), []
+
+    def counted(x, jacobian):
+        asked.append(jacobian)
+        return bent(x, jacobian)
+
+    found, better = profile(Valley(counted, seen, mode, Prior.none(mode)), 0)
     reach = REACH * np.sqrt(covariance[0, 0])
     ends = back(amplitude[0] - reach), back(amplitude[0] + reach)
     assert better is None
@@ -98,6 +103,7 @@ def test_a_bent_valley_is_followed_to_its_ends():
     assert found.high == pytest.approx(ends[1], abs=0.06 * (ends[1] - ends[0]))
     rise = np.interp(mode[0], found.value, found.rise)
     assert rise < 0.3
+    assert asked.count(False) <= 12  # two on the way out, and five an end
 
 
 def test_draws_of_a_bent_valley_have_the_data_s_spread():
