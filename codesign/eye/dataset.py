@@ -1,6 +1,5 @@
 """Sets of states: triplets for the Fisher matrix, pairs that share a pupil position, and shards of frames on disk."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -186,18 +185,6 @@ def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
     labels = {name[7:]: torch.from_numpy(a) for name, a in arrays.items() if name.startswith("labels/")}
     frames = Frames(radiance, torch.stack([1 - eye_share, eye_share], 1), depth)
     return frames, torch.from_numpy(arrays["pupil"]).float() / 255, labels
-
-
-def shards(
-    folder: str | Path, *, count: int, seed: int, per_shard: int = 512, motion: Motion | None = None,
-    rig: Rig | None = None, camera: Camera | None = None,
-) -> Iterator[Path]:  # fmt: skip
-    """Write ``count`` frames as shards named by their first frame, one after another; yields each finished file."""
-    for start in range(0, count, per_shard):
-        indices = torch.arange(start, min(start + per_shard, count))
-        path = Path(folder) / f"scene-{start:07d}.h5"
-        write_shard(path, render(states_at(indices, seed, motion=motion), rig=rig, camera=camera), seed=seed)
-        yield path
 
 
 def _bytes(values: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from layout.certify.certificate import certify as certify
     from layout.certify.certificate import survey as survey
     from layout.certify.made_lens import MadeRows as MadeRows
-    from layout.certify.made_lens import as_made as as_made
     from layout.certify.verdict import Edges as Edges
     from layout.certify.verdict import Survey as Survey
 
@@ -20,7 +19,6 @@ __getattr__, __dir__, __all__ = attach(
         "Edges": "verdict",
         "MadeRows": "made_lens",
         "Survey": "verdict",
-        "as_made": "made_lens",
         "certify": "certificate",
         "survey": "certificate",
     },

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from layout.certify.certificate import Certificate
 from layout.certify.exposed import Band
 from layout.mask import MaskPlan
 from layout.process import compiled
@@ -54,20 +53,6 @@ class MadeRows:
         if made.max() >= pitch:
             raise ProcessError(f"a pillar is predicted {made.max():.3f} um wide, as wide as the pitch; check the doses")
         return dataclasses.replace(designed, diameters=DiameterMap(made, pitch), profile="as-written")
-
-
-def as_made(designed: Lens, plan: MaskPlan, found: Certificate) -> Lens:
-    """``designed`` with the diameters at half height that the written mask makes; profile ``as-written``.
-
-    Args:
-        plan: that was written; its first lattice is the lens, on the layer numbers of its pillars.
-
-    Raises:
-        ProcessError: a predicted pillar off the lattice, or as wide as the pitch.
-    """
-    rows = MadeRows(plan)
-    rows.place(found.x_um, found.y_um, found.made_nm, found.layer)
-    return rows.lens(designed)
 
 
 @compiled

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.certify import as_made, certify, exposed, outlines, places, survey
+from layout.certify import MadeRows, certify, exposed, outlines, places, survey
 from layout.certify.gathered import Polygons
 from layout.dose import exposure
 from layout.files import doses
@@ -20,6 +20,7 @@ from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.made import Bias
 from metalens.pillars import Proxy
+from tests.referees import rims
 
 BEAM = {"alpha_um": 0.013, "beta_um": 24.0, "eta": 0.7}
 
@@ -53,7 +54,7 @@ def test_exposures_are_those_of_the_direct_sum(third):
     which = np.linspace(0, len(centres) - 1, 12).astype(int)
     point = exposure.point_exposure(process.exposure)
     wide, dose = found.drawn_nm * 1e-3, np.full(len(centres), table[1, 0])
-    exact = exposure.at_edges(centres, wide, dose, point, which=which)
+    exact = rims.at_edges(centres, wide, dose, point, which=which)
     assert found.exposure[which] * 0.5 == pytest.approx(exact, rel=2e-3)  # neighbours as Gaussians of their moment
 
 
@@ -202,7 +203,9 @@ def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
     plan, content, table = written(process)
     proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
     designed = Lens(lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
-    made = as_made(designed, plan, certify(content, table, process))
+    found, rows = certify(content, table, process), MadeRows(plan)
+    rows.place(found.x_um, found.y_um, found.made_nm, found.layer)
+    made = rows.lens(designed)
     d, want = made.diameters.diameter_um, designed.diameters.diameter_um
     assert np.array_equal(d > 0, want > 0)
     assert np.abs(d - want)[want > 0].max() < 2.1e-3  # 1 nm of the step, 1 nm of the exposure

@@ -7,10 +7,11 @@ import pytest
 
 from layout.dose import correct as dose
 from layout.dose.bodies import NONE
-from layout.dose.exposure import PointExposure, at_edges, point_exposure, rim_of_own_disc
+from layout.dose.exposure import PointExposure, point_exposure, rim_of_own_disc
 from layout.process.process import Exposure, Process
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap
+from tests.referees.rims import at_edges
 
 PITCH = 0.4
 

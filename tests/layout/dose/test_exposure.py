@@ -6,7 +6,6 @@ import pytest
 from layout.dose.exposure import (
     PointExposure,
     _fit_error,
-    at_edges,
     disc,
     fit,
     point_exposure,
@@ -15,6 +14,7 @@ from layout.dose.exposure import (
 )
 from layout.process.process import Exposure
 from metalens.ground.errors import ProcessError
+from tests.referees.rims import at_edges
 
 GOLD = np.pi * (3 - np.sqrt(5))
 

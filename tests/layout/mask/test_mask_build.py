@@ -16,6 +16,7 @@ from layout.shapes import polygon
 from metalens.ground.errors import LensError, ProcessError
 from metalens.lens.record import DiameterMap
 from metalens.made import Bias
+from tests.referees import rims
 
 PLAIN = Process(exposure=Exposure(correct=False))
 
@@ -184,7 +185,7 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
     which = np.linspace(0, len(wide) - 1, 24).astype(int)
     beside = [f.polygons.items() for f in plan.figures if f.name in ("MARKS", "LABEL")]
     shapes = [(p, plan.doses[layer]) for items in beside for layer, ps in items for p in ps]
-    edges = exposure.at_edges(centres, wide, dose, point, which=which, rim_points=8)
+    edges = rims.at_edges(centres, wide, dose, point, which=which, rim_points=8)
     box = np.array([[*p.min(0), *p.max(0)] for p, _ in shapes]) * 1e-3
     level = np.array([dose for _, dose in shapes])
     area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
