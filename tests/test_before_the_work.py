@@ -188,7 +188,8 @@ def test_the_room_asked_for_is_that_of_the_result(inputs, monkeypatch, capsys, w
     ("words", "needed"),
     [
         ("design design.toml -o o.h5", 20_000),  # 4 bytes for every site of a disc 0.023 mm wide at 0.288 um: 20 039
-        ("layout lens.h5 -o o", 36),
+        ("layout lens.h5 --oasis -o o", 36),
+        ("layout lens.h5 -o o", 36 + 28 * 36),  # a reference of GDSII for each pillar
         ("export lens.h5 -o o.npz", 144),
         ("export lens.h5 -o o.dat --samples 70", 12 * 70**2),
     ],

@@ -7,6 +7,7 @@ import numpy as np
 from layout.arrange import apart, joined, seen
 from layout.commands.placed import Work
 from layout.files import Assembly
+from layout.rules import told
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, KeyFigure, Section, Table
@@ -132,13 +133,13 @@ def _checks(work: Work) -> Section:
     rows = [_lens_row(name, values) for name, values in work.lenses.items()]
     for name, found in work.rules.items():
         broken = sum(found.counts.values())
-        sizes = [f"{found.pillars:,}", found.minimum_gap_nm, found.minimum_feature_nm, broken]
+        sizes = [f"{found.pillars:,}", told(found.minimum_gap_nm), told(found.minimum_feature_nm), broken]
         rows.append([name, *sizes, "", "", "FAILS" if broken else "passes"])
     head = (
         "part",
         "shapes",
-        "least gap / nm",
-        "least feature / nm",
+        "least gap",
+        "least feature",
         "broken rules",
         "exposure",
         "read back",
@@ -158,9 +159,9 @@ def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
         f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm" for e in values["exposure"].values()
     ]
     same = "DIFFERENT" if any(values["differences"].values()) else "as planned"
-    sizes = [f"{values['pillars']:,}", values["minimum_gap_nm"], values["minimum_feature_nm"]]
-    told = [sum(values["violations"].values()), exposed[0] if exposed else "not certified", same]
-    return [name, *sizes, *told, "passes" if values["ok"] else "FAILS"]
+    sizes = [f"{values['pillars']:,}", told(values["minimum_gap_nm"]), told(values["minimum_feature_nm"])]
+    found = [sum(values["violations"].values()), exposed[0] if exposed else "not certified", same]
+    return [name, *sizes, *found, "passes" if values["ok"] else "FAILS"]
 
 
 def _doses(work: Work, made: Assembly) -> Section:

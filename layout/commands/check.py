@@ -13,7 +13,7 @@ from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis_bytes
 from layout.oasis import read as oasis_read
 from layout.process import process as processes
-from layout.rules import DrcReport, foreign, markers
+from layout.rules import DrcReport, foreign, markers, told
 from metalens.commands import Common, MaybeOutput
 from metalens.ground.errors import MaskFileError
 
@@ -79,8 +79,7 @@ def _values(found: DrcReport) -> dict[str, Any]:
     return {
         "ok": found.ok,
         "shapes": found.pillars,
-        "minimum_gap_nm": found.minimum_gap_nm,
-        "minimum_feature_nm": found.minimum_feature_nm,
+        **{name: size for name, size in found.sizes.items() if name != "minimum_foot_gap_nm"},
         "violations": found.counts,
     }
 
@@ -92,7 +91,7 @@ def _text(path: Path, found: DrcReport, form: list[Finding]) -> str:
     lines = [
         f"{path}: {verdict}",
         f"  {found.pillars:,} shapes; smallest gap below the rule's reach "
-        f"{found.minimum_gap_nm:.1f} nm, thinnest {found.minimum_feature_nm:.1f} nm",
+        f"{told(found.minimum_gap_nm)}, thinnest {told(found.minimum_feature_nm)}",
     ]
     lines += [
         f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.value:.4g} nm, need {v.limit:.4g}; {v.text}"

@@ -57,7 +57,7 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
         _refuse_beyond_plain(options, source)
-        transaction.check_room(options.output, math.prod(source.diameters.diameter_um.shape))  # a byte each, or more
+        transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, furniture=furniture, with_doses=options.dose)
     with stages("write fields"):
@@ -66,6 +66,12 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
     with stages("check"):
         found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
     return Job(options, source, rules, made, split, plan, found, stages)
+
+
+def _room(options: Options, source: Lens) -> int:
+    """Bytes that the mask files need: a reference of GDSII for each pillar, of OASIS a byte for each site at most."""
+    small = math.prod(source.diameters.diameter_um.shape)
+    return gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small if options.writes_gds else small
 
 
 def _refuse_beyond_plain(options: Options, source: Lens) -> None:
@@ -90,13 +96,12 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
 
 def _write_masks(job: Job, target: Path) -> None:
     options, plan = job.options, job.plan
-    neither = not (options.oasis or options.gds)
-    if options.oasis or neither:
+    if options.writes_oasis:
         path = target / "mask.oas"
         with job.stages("write OASIS"):
             oasis_write.write(plan, path, form=options.form, circles=options.circles)
         _read_back(job, path, oasis_read.read)
-    if options.gds or neither:
+    if options.writes_gds:
         path = target / "mask.gds"
         with job.stages("write GDSII"):
             gdsii_write.write(plan, path)
@@ -179,9 +184,7 @@ def values_of(job: Job) -> dict[str, Any]:
         "pillars": found.pillars,
         "classes": len(job.plan.classes),
         "diameters": len(job.made.cells.diameters_nm),
-        "minimum_gap_nm": found.minimum_gap_nm,
-        "minimum_foot_gap_nm": found.minimum_foot_gap_nm,
-        "minimum_feature_nm": found.minimum_feature_nm,
+        **found.sizes,
         "maximum_density": found.maximum_density,
         "violations": found.counts,
         "files": job.written,

@@ -8,7 +8,7 @@ from layout.commands import pictures
 from layout.commands.job import Job
 from layout.files import Window, handover
 from layout.mask import MaskPlan
-from layout.rules import DrcReport
+from layout.rules import DrcReport, told
 from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.report import Figure, KeyFigure, Section, Table
@@ -68,8 +68,8 @@ def _key_figures(job: Job) -> list[KeyFigure]:
     same = all(outcome.ok for outcome in job.compared.values())
     return [
         KeyFigure("pillars", f"{found.pillars:,}"),
-        KeyFigure("smallest gap", f"{found.minimum_gap_nm:.1f} nm", found.counts["gap"] + found.counts["overlap"] == 0),
-        KeyFigure("thinnest pillar", f"{found.minimum_feature_nm:.1f} nm", found.counts["feature"] == 0),
+        KeyFigure("smallest gap", told(found.minimum_gap_nm), found.counts["gap"] + found.counts["overlap"] == 0),
+        KeyFigure("thinnest pillar", told(found.minimum_feature_nm), found.counts["feature"] == 0),
         KeyFigure("violations", f"{broken:,}", broken == 0),
         KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
     ]

@@ -21,6 +21,7 @@ from metalens.ground.errors import ProcessError
 
 _BLOCK = 1 << 19  # bytes of references made before they are written: within the processor's cache
 _FLUSHED = 16  # pieces after which the disk is given what was written
+REFERENCE_BYTES = 28  # of each pillar at least: a reference to a cell of a name of four characters
 MOST_LAYERS = 32767  # layer numbers are signed 16-bit
 
 

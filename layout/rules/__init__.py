@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from layout.rules import markers as markers
     from layout.rules.report import DrcReport as DrcReport
     from layout.rules.report import Violation as Violation
+    from layout.rules.report import told as told
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -19,5 +20,6 @@ __getattr__, __dir__, __all__ = attach(
         "check": "",
         "foreign": "",
         "markers": "",
+        "told": "report",
     },
 )

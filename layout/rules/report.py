@@ -41,6 +41,11 @@ class Violation:
         return (self.box[0] + self.box[2]) / 2, (self.box[1] + self.box[3]) / 2
 
 
+def told(size_nm: float | None) -> str:
+    """A size that was found, with its unit; "none" where there was nothing to measure."""
+    return "none" if size_nm is None or not math.isfinite(size_nm) else f"{size_nm:.1f} nm"
+
+
 @dataclass(eq=False, slots=True)
 class DrcReport:
     """Result of the check.
@@ -82,6 +87,13 @@ class DrcReport:
         """Whether no rule is broken."""
         return not any(self.counts.values())
 
+    @property
+    def sizes(self) -> dict[str, float | None]:
+        """The smallest gap and feature that were found; None where there was nothing to measure."""
+        found = {"minimum_gap_nm": self.minimum_gap_nm, "minimum_feature_nm": self.minimum_feature_nm}
+        found |= {"minimum_foot_gap_nm": self.minimum_foot_gap_nm}
+        return {name: value if math.isfinite(value) else None for name, value in found.items()}
+
     def add(self, rule: str, count: int, violation: Violation | None) -> None:
         """Count violations; list one."""
         self.counts[rule] += count
@@ -93,7 +105,7 @@ class DrcReport:
         """One line for a person."""
         found = ", ".join(f"{count} {rule}" for rule, count in self.counts.items() if count)
         return (
-            f"{self.pillars} pillars: smallest gap {self.minimum_gap_nm:.1f} nm, "
-            f"thinnest {self.minimum_feature_nm:.1f} nm, density up to {self.maximum_density:.1%}; "
+            f"{self.pillars} pillars: smallest gap {told(self.minimum_gap_nm)}, "
+            f"thinnest {told(self.minimum_feature_nm)}, density up to {self.maximum_density:.1%}; "
             + (f"violations: {found}" if found else "no violation")
         )

@@ -8,6 +8,7 @@ import numpy as np
 from metalens.cell import Lattice
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
+from metalens.lens.rows import RowsOnDisk
 
 _BLOCK_ROWS = 256
 
@@ -75,6 +76,12 @@ class DiameterMap:
             for row in range(min(2, len(d))):
                 if np.asarray(d[row::2])[:, 1 - row :: 2].any():
                     raise LensError("a pillar between the sites of the hexagonal lattice: row + column is odd there")
+
+    @property
+    def pillars(self) -> int:
+        """How many sites hold a pillar."""
+        held: object = self.diameter_um
+        return held.count if isinstance(held, RowsOnDisk) else int(np.count_nonzero(self.diameter_um))
 
     @property
     def lattice_row_um(self) -> float:

@@ -25,7 +25,7 @@ class RowsOnDisk:
         self.dtype, self.ndim, self.nbytes = self._data.dtype, self._data.ndim, self._data.nbytes
         self._height = int(self._data.chunks[0]) if self._data.chunks else _BAND
         self._first, self._kept = 0, np.empty((0, self.shape[1]), self.dtype)
-        self._ends: tuple[float, float] | None = None
+        self._ends: tuple[float, float, int] | None = None
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -50,13 +50,20 @@ class RowsOnDisk:
         """Least value; NaN where one is not a number."""
         return float(np.minimum(self._extremes()[0], initial))
 
-    def _extremes(self) -> tuple[float, float]:
+    @property
+    def count(self) -> int:
+        """Values that are not 0."""
+        return self._extremes()[2]
+
+    def _extremes(self) -> tuple[float, float, int]:
+        """Least and largest value, and how many are not 0."""
         if self._ends is None:
-            low, high = np.inf, -np.inf
+            low, high, count = np.inf, -np.inf, 0
             for first in range(0, len(self), self._height):
                 band = self[first : first + self._height]
                 low, high = np.minimum(low, band.min()), np.maximum(high, band.max())
-            self._ends = float(low), float(high)
+                count += int(np.count_nonzero(band))
+            self._ends = float(low), float(high), count
         return self._ends
 
     def _rows(self, first: int, end: int) -> Array:

@@ -118,3 +118,15 @@ def test_sound_marks_pass_and_a_missing_file_is_refused(tmp_path, capsys):
     assert "keeps the design rules" in capsys.readouterr().out
     assert cli.main(["check", str(tmp_path / "none.oas")]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
+    made = db.Layout()
+    made.create_cell("TOP").shapes(made.layer(1, 0)).insert(db.Box(0, 0, 310, 170))
+    made.write(str(tmp_path / "one.gds"))
+    assert cli.main(["check", str(tmp_path / "one.gds")]) == 0
+    told = capsys.readouterr().out
+    assert "smallest gap below the rule's reach none, thinnest 170.0 nm" in told
+    assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
+    values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)  # no Infinity, which JSON does not know
+    assert (values["minimum_gap_nm"], values["minimum_feature_nm"]) == (None, 170.0)

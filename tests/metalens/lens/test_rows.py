@@ -36,6 +36,7 @@ def test_ends_and_all_of_it(stored):
     rows, values = stored
     assert (rows.max(), rows.min(initial=0)) == (float(values.max()), 0.0)
     assert rows.min(initial=9.0) == float(values.min())
+    assert rows.count == values.size
     assert np.array_equal(np.asarray(rows), values)
     assert (len(rows), rows.shape, rows.dtype) == (53, values.shape, values.dtype)
 
