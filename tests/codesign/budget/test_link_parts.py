@@ -167,7 +167,7 @@ def test_draws_of_a_fit_count_from_its_best_estimate(monkeypatch):
     fitted = SimpleNamespace(
         design=SimpleNamespace(diameters=diameters),
         parameters=lambda row=None: best if row is None else row,
-        samples=lambda count, *, seed: seeds.append(seed) or drawn[:count],
+        lens_samples=lambda count, *, seed: seeds.append(seed) or drawn[:count],
     )
     made = []
     monkeypatch.setattr(links, "state", lambda off: off)
