@@ -70,8 +70,8 @@ def _table() -> Row:
     waves = tuple(round(0.84 + 0.002 * i, 3) for i in range(11))
     sweep = Sweep(waves, (0.0, 5.0, 10.0, 15.0, 20.0), (0.06, 0.205))
     row, _ = _sweep("200 x 11 x 5 x 2 entries", sweep)
-    met = "met" if row.seconds <= 120 and row.error <= 1e-3 else "missed"
-    return Row(row.case, row.method, row.seconds, row.error, row.against, row.threads, goal=f"120 s at 1e-3: {met}")
+    met = "met" if row.seconds <= 60 and row.error <= 1e-3 else "missed"
+    return Row(row.case, row.method, row.seconds, row.error, row.against, row.threads, goal=f"60 s at 1e-3: {met}")
 
 
 def _proxy(fitted: proxy_fit.ProxyFit, seconds: float) -> list[Row]:
