@@ -70,3 +70,16 @@ def test_a_foreign_folder_is_not_overwritten_by_force(folder, capsys):
     assert _retrain(folder, "--force", out="thesis") == 2
     assert "not made by metalens" in capsys.readouterr().err
     assert (folder / "thesis" / "chapter.txt").exists()
+
+
+@pytest.mark.slow
+def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(folder, capsys):
+    asbuilt.save(folder / "wide.h5", m.asbuilt(sigma=5.0))
+    assert _retrain(folder, "--json", "--truth", str(folder / "truth.toml"), record="wide.h5", out="open") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "no correction" in told["correction_refused"]
+    assert not (folder / "open" / "bias.toml").exists()
+    assert not (folder / "open" / "lens_corrected.h5").exists()
+    page = (folder / "open" / "report.html").read_text()
+    assert "No correction" in page
+    assert "Written to no file" in page
