@@ -27,7 +27,7 @@ TAKES = (
 )
 SAMPLES = 401
 PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are told
-HEAD = ("incidence / deg", "sine x", "sine y", "angle / deg", "azimuth / deg", "share of the light")
+HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y")
 Directions = list[tuple[float, float]]
 
 
@@ -188,7 +188,7 @@ def picture(wanted: Asked, found: list[FarField]) -> bytes:
 
 def _report(path: Path, wanted: Asked, found: list[FarField], image: bytes) -> None:
     rows = [
-        [f"({x:g}, {y:g})", b.sine_x, b.sine_y, b.angle_deg, b.azimuth_deg, b.share]
+        [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
         for (x, y), one in zip(wanted.angles_deg, found, strict=True)
         for b in one.beams
     ]

@@ -120,7 +120,8 @@ def run(options: Options) -> int:
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(target, beside=ends, room=transaction.ROOM + 4 * pixels) as draft:
         stack = _make(options, settings, made, built, draft.path)
-    shape = f"{len(stack.angles_rad)} angles x {len(stack.depths_um)} depths x {len(stack.weights)} wavelengths"
+    counts = (("angle", stack.angles_rad), ("depth", stack.depths_um), ("wavelength", stack.weights))
+    shape = " x ".join(f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts)
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
     options.console.result(_summary(stack), text)

@@ -58,8 +58,10 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
         text = content.decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; need a TOML config ({record.__name__})") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file ({error})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(
+            f"{path}: not a text file; need settings in TOML ({record.__name__}), in which files of data are named"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); need a TOML config") from None
     except ValueError as error:

@@ -82,8 +82,8 @@ class Budget:
     @property
     def text(self) -> str:
         """One line for a person."""
-        parts = [f"{f.name} {getattr(self, f.name):.1e}" for f in fields(self) if f.name != "outside"]
-        known = [part for part in parts if not part.endswith("nan")]
+        terms = [(f.name, getattr(self, f.name)) for f in fields(self) if f.name != "outside"]
+        known = [f"{name} {value:.1e}" if value else f"{name} 0" for name, value in terms if not math.isnan(value)]
         lost = "" if math.isnan(self.outside) else f"; {self.outside:.1%} of the light falls beside the window"
         return f"error by cause: {', '.join(known)}; of the device {self.total:.1e}{lost}"
 

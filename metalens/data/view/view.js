@@ -97,6 +97,13 @@ function plot(parent, title, xName, yName, log) {
   };
 }
 
+// colours with what they mean at both ends; the answer tells (low, high, words behind)
+function bar(parent, table) {
+  const box = element("p", parent, { class: "bar" }), low = element("span", box), strip = `linear-gradient(to right,${table.filter((_, i) => i % 15 === 0).map((c) => `rgb(${c.map(Math.round).join()})`).join()})`;
+  element("span", box, { class: "strip", style: `background:${strip}`, "aria-hidden": "true" });
+  const high = element("span", box);
+  return (a, b, words) => { low.textContent = text(a); high.textContent = `${text(b)} ${words}`; };
+}
 async function images(panel, section) {
   const { values, shape } = await unpacked(panel.values), [ny, nx] = shape.slice(-2), size = ny * nx;
   const controls = element("div", section, { class: "controls" }), views = element("div", section, { class: "views" });
@@ -106,7 +113,7 @@ async function images(panel, section) {
   const right = element("div", views, { class: "plot" }), profile = plot(right, "Along the cross", "x / µm", panel.unit, false);
   const optics = panel.optics ? { mtf: plot(right, "MTF", "cycles / mm", "contrast", false), energy: plot(right, "Encircled energy", "radius / µm", "share", false) } : null;
   let cross = [Math.floor(ny / 2), Math.floor(nx / 2)], log = false, own = true;
-  const table = panel.signed ? TABLE(SIGNED) : TABLE(CIVIDIS);
+  const table = panel.signed ? TABLE(SIGNED) : TABLE(CIVIDIS), ends = bar(figure, table);
   let all = 0;
   for (const v of values) if (Math.abs(v) > all) all = Math.abs(v);
   const place = sliders(panel, controls, () => draw());
@@ -128,6 +135,7 @@ async function images(panel, section) {
       out.data.set([c[0], c[1], c[2], 255], 4 * i);
     }
     context.putImageData(out, 0, 0);
+    ends(panel.signed ? -top : log ? 1e-4 * top : 0, top, `${panel.unit}; ${text(nx * panel.step)} × ${text(ny * panel.step)} µm`);
     context.fillStyle = "#ffffff50";
     context.fillRect(0, cross[0], nx, 0.5); context.fillRect(cross[1], 0, 0.5, ny);
     const x = Array.from({ length: nx }, (_, k) => um(k, nx));
@@ -296,6 +304,7 @@ async function classes(panel, section) {
     return `row ${i}, column ${k} (x ${text(x)}, y ${text(y)} µm): ` + (one ? `${text(sizes[one - 1])} ${panel.unit}${more}` : "nothing here") + (mark ? `. ${mark[2]}` : "");
   }
   board(panel, section, { w: nx, h: ny }, panel.pitch, 80, paint, tell);
+  bar(section, table)(low, high, panel.unit);
   tableOf(section, [`size / ${panel.unit}`, "sites", ...Object.keys(panel.columns)], () => { const n = new Float64Array(sizes.length + 1); for (const v of index) n[v]++; return sizes.map((v, i) => [v, n[i + 1], ...Object.values(panel.columns).map((c) => c[i])]).filter((row) => row[1]); }, "Sizes and how many sites have them");
 }
 

@@ -31,7 +31,7 @@ def test_the_worst_budget_takes_the_largest_of_every_term():
 
 def test_the_line_for_a_person_names_what_is_known():
     words = Budget(0.02, outside=0.123).text
-    assert words.startswith("error by cause: numerical 2.0e-02, sampling 0.0e+00, spectrum 0.0e+00, source 0.0e+00; of")
+    assert words.startswith("error by cause: numerical 2.0e-02, sampling 0, spectrum 0, source 0; of")
     assert words.endswith("; 12.3% of the light falls beside the window")
     assert "glass" not in words
 

@@ -111,3 +111,11 @@ def test_ticks_tell_neighbours_apart(tmp_path):
     script = f"return JSON.stringify({splits}.map((s) => ticks(null, s)));"
     wanted = '[["0.9999985","0.999999","0.9999995","1"],["0","0.25","0.5"],["-40","0","40"],["0","2e-9","4e-9"]]'
     assert _told(tmp_path, _everything(), script) == wanted
+
+
+def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):
+    values = np.random.default_rng(9).uniform(0, 3.25, (7, 11))
+    values[2, 3] = 3.25
+    panel = Images("psf", values, [], 0.5, unit="electrons")
+    words = _told(tmp_path, [panel], "return document.querySelector('.bar').innerText;")
+    assert words.split() == ["0", "3.25", "electrons;", "5.5", "×", "3.5", "µm"]
