@@ -184,3 +184,21 @@ def _read_through(file: Any) -> None:
 
     visit("/", file)
     file.visititems(visit)
+
+
+_FOREIGN = {  # first bytes of what is often given in place of an artefact, in words
+    b"\x93NUMPY": "an array of NumPy",
+    b"PK\x03\x04": "an archive (.npz or .zip)",
+    b"II*\0": "a TIFF picture",
+    b"MM\0*": "a TIFF picture",
+    b"\x89PNG": "a PNG picture",
+    b"MATLAB 5": "a MATLAB file",
+}
+
+
+def foreign(path: str | Path) -> str:
+    """What a file is that begins as another program's, in words; empty for any other."""
+    start = b""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        start = file.read(8)
+    return next((words for first, words in _FOREIGN.items() if start.startswith(first)), "")

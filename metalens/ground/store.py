@@ -26,14 +26,6 @@ _UNITS = "um, rad"
 _MOST_BYTES = 1 << 36  # of all arrays of a file
 _DENSEST = 1040  # values' bytes for a byte in the file: what deflate can do at best
 _SMALL = 4096  # bytes of an array that is kept in its header, under the checksum of the header
-FOREIGN = {  # first bytes of what is often given in place of an artefact, in words
-    b"\x93NUMPY": "an array of NumPy",
-    b"PK\x03\x04": "an archive (.npz or .zip)",
-    b"II*\0": "a TIFF picture",
-    b"MM\0*": "a TIFF picture",
-    b"\x89PNG": "a PNG picture",
-    b"MATLAB 5": "a MATLAB file",
-}
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 
@@ -203,17 +195,9 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1, without
     except StoreError:
         raise
     except DAMAGE as error:
-        foreign = next((words for start, words in FOREIGN.items() if _start(Path(path)).startswith(start)), "")
-        if foreign:
-            raise StoreError(f"{path}: {foreign}, need an HDF5 file of this toolchain") from error
+        if found := reading.foreign(path):
+            raise StoreError(f"{path}: {found}, need an HDF5 file of this toolchain") from error
         raise StoreError(f"{path}: truncated or not an HDF5 file of this toolchain ({error})") from error
-
-
-def _start(path: Path) -> bytes:
-    """First bytes of a file, none where it cannot be read."""
-    with contextlib.suppress(OSError), open(path, "rb") as file:
-        return file.read(max(map(len, FOREIGN)))
-    return b""
 
 
 def kind_of(path: str | Path) -> str:

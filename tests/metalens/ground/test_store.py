@@ -186,5 +186,5 @@ def test_a_journal_s_last_line_counts_where_it_is_whole(tmp_path):
 
 def test_what_is_no_artefact_is_named_as_what_it_is(tmp_path):
     np.save(tmp_path / "phase.npy", np.eye(3))
-    with pytest.raises(StoreError, match="phase.npy: an array of NumPy, need an HDF5 file"):
+    with pytest.raises(StoreError, match=r"phase\.npy: an array of NumPy, need an HDF5 file"):
         store.load(tmp_path / "phase.npy")
