@@ -73,16 +73,21 @@ def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
-    """Row by row, so that the sum of a depth stays in the nearest cache."""
+    """Row by row, so that the sum of a depth stays in the nearest cache; of a row what the aperture lets through."""
     depths, few = mix.shape
     line = np.empty(turns.shape[1])
     for y in range(turns.shape[0]):
+        open_ = np.nonzero(weight[y])[0]
+        start, stop = (open_[0], open_[-1] + 1) if len(open_) else (0, 0)
+        out[:, y, :start] = 0
+        out[:, y, stop:] = 0
         for d in range(depths):
-            line[:] = turns[y]
+            for x in range(start, stop):
+                line[x] = turns[y, x]
             for v in range(few):
                 share = mix[d, v]
-                for x in range(line.size):
+                for x in range(start, stop):
                     line[x] += share * paths[v, y, x]
-            for x in range(line.size):
+            for x in range(start, stop):
                 c, s = turns32(line[x] - np.rint(line[x]))
                 out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s
