@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,44 @@ def measured(target: Path) -> list[Row]:
     return [*_gdstk_rows(target), *_klayout_rows(target)]
 
 
+def gdstk_library(mask: MaskPlan) -> Any:
+    """The pillars of the bench in gdstk: a list of offsets for each diameter."""
+    import gdstk
+
+    grid, size = mask.lattices[0].whole(), PITCH * 1e-3
+    library = gdstk.Library("TOP", unit=1e-6, precision=1e-9)
+    top = library.new_cell("TOP")
+    for k, made in enumerate(mask.classes, 1):
+        cell = library.new_cell(made.name)
+        cell.add(gdstk.Polygon(made.outline * 1e-3, layer=1))
+        row, column = np.nonzero(grid == k)
+        place = np.column_stack([(column - 1250) * size, (1250 - row) * size])
+        reference = gdstk.Reference(cell, tuple(place[0]))
+        reference.repetition = gdstk.Repetition(offsets=(place - place[0])[1:])
+        top.add(reference)
+    return library
+
+
+def klayout_layout(mask: MaskPlan) -> Any:
+    """The pillars of the bench in KLayout: an instance for each."""
+    import klayout.db as db
+
+    grid = mask.lattices[0].whole()
+    made = db.Layout()
+    made.dbu = 0.001
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    cells = []
+    for kind in mask.classes:
+        cell = made.create_cell(kind.name)
+        cell.shapes(layer).insert(db.Polygon([db.Point(*p) for p in kind.outline.tolist()]))
+        cells.append(cell.cell_index())
+    rows, columns = np.nonzero(grid)
+    x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
+    for k, px, py in zip(grid[rows, columns].tolist(), x, y, strict=True):
+        top.insert(db.CellInstArray(cells[k - 1], db.Vector(px, py)))
+    return made
+
+
 def _gdstk_rows(target: Path) -> list[Row]:
     try:
         import gdstk
@@ -25,23 +64,10 @@ def _gdstk_rows(target: Path) -> list[Row]:
     mask = plan()
     grid = mask.lattices[0].whole()
 
-    def build(size: float) -> "gdstk.Library":
-        library = gdstk.Library("TOP", unit=1e-6, precision=1e-9)
-        top = library.new_cell("TOP")
-        for k, made in enumerate(mask.classes, 1):
-            cell = library.new_cell(made.name)
-            cell.add(gdstk.Polygon(made.outline * 1e-3, layer=1))
-            row, column = np.nonzero(grid == k)
-            place = np.column_stack([(column - 1250) * size, (1250 - row) * size])
-            reference = gdstk.Reference(cell, tuple(place[0]))
-            reference.repetition = gdstk.Repetition(offsets=(place - place[0])[1:])
-            top.add(reference)
-        return library
-
     made = []
     for name, write in (
-        ("GDSII", lambda: build(0.4).write_gds(target / "g.gds")),
-        ("OASIS level 6", lambda: build(0.4).write_oas(target / "g.oas", compression_level=6)),
+        ("GDSII", lambda: gdstk_library(mask).write_gds(target / "g.gds")),
+        ("OASIS level 6", lambda: gdstk_library(mask).write_oas(target / "g.oas", compression_level=6)),
     ):
         seconds = fastest(write, repeats=1)
         size = (target / ("g.gds" if name == "GDSII" else "g.oas")).stat().st_size / 1e6
@@ -66,23 +92,8 @@ def _klayout_rows(target: Path) -> list[Row]:
     mask = plan()
     grid = mask.lattices[0].whole()
 
-    def build() -> "db.Layout":
-        made = db.Layout()
-        made.dbu = 0.001
-        top, layer = made.create_cell("TOP"), made.layer(1, 0)
-        cells = []
-        for kind in mask.classes:
-            cell = made.create_cell(kind.name)
-            cell.shapes(layer).insert(db.Polygon([db.Point(*p) for p in kind.outline.tolist()]))
-            cells.append(cell.cell_index())
-        rows, columns = np.nonzero(grid)
-        x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
-        for k, px, py in zip(grid[rows, columns].tolist(), x, y, strict=True):
-            top.insert(db.CellInstArray(cells[k - 1], db.Vector(px, py)))
-        return made
-
     start = time.perf_counter()
-    build().write(str(target / "k.gds"))
+    klayout_layout(mask).write(str(target / "k.gds"))
     made = [Row("free-form", "KLayout build + write GDSII", time.perf_counter() - start, NAN, "no comparison")]
     for name, write in (("m.gds", layout.write_gdsii), ("m.oas", layout.write_oasis)):
         write(mask, target / name)

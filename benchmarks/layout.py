@@ -111,13 +111,18 @@ def measured(work: Callable[[], object], *, repeats: int = 3) -> tuple[float, fl
     return seconds, grown[0]
 
 
-def rows() -> list[Row]:
-    """All rows of this toolchain alone."""
+def rows() -> Iterator[Row]:
+    """All rows, one by one; build and write beside gdstk and KLayout where these are installed."""
+    from benchmarks import _layout_fresh
+
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder)
-        files = [*_file_rows(target), *_check_rows(), *_polygon_rows(), *_streaming_rows(target)]
-        files += [*_certificate_rows(target), *_foreign_check_rows(target), *_command_rows(target)]
-        return [*files, *_large_command_rows(target)]
+        yield from _layout_fresh.rows(target)
+        for some in (_file_rows, _streaming_rows, _certificate_rows, _foreign_check_rows, _command_rows):
+            yield from some(target)
+        yield from _check_rows()
+        yield from _polygon_rows()
+        yield from _large_command_rows(target)
 
 
 def _file_rows(target: Path) -> list[Row]:
@@ -284,19 +289,18 @@ def _foreign_check_rows(target: Path) -> list[Row]:
     return [Row("1 mm lens", "metalens check, OASIS", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")]
 
 
-def _large_command_rows(target: Path) -> list[Row]:
+def _large_command_rows(target: Path) -> Iterator[Row]:
     """The whole command in a process of its own, with the peak of all its memory."""
     from metalens import lens as lenses
 
-    made = []
-    for diameter_mm, goal in ((2.0, ""), (4.0, "<= 60 s"), (10.0, "<= 300 s, <= 1000 MB")):
+    goals = ((1.0, "<= 8 s"), (2.0, ""), (4.0, "<= 60 s"), (10.0, "<= 300 s, <= 1000 MB"))
+    for diameter_mm, goal in goals:
         lenses.save(target / "large.h5", _lens(diameter_mm, 0.4))
         words = [sys.executable, "-c", _COMMAND, str(target / "large.h5"), str(target / "large")]
         done = subprocess.run(words, capture_output=True, text=True, check=True)
         code, seconds, peak = map(float, done.stdout.split()[-3:])
         case = f"{diameter_mm:g} mm lens"
-        made.append(Row(case, "metalens layout, OASIS", seconds, code, "exit status; all memory", 2, peak, goal))
-    return made
+        yield Row(case, "metalens layout, OASIS", seconds, code, "exit status; all memory", 2, peak, goal)
 
 
 def peer_rows() -> list[Row]:
