@@ -82,11 +82,11 @@ class Worker:
     near: int
 
     @classmethod
-    def begin(cls, trees: list[str], reach: Reach, tests: str, near: int = 0) -> None:
+    def begin(cls, trees: list[str], reach: Reach, tests: str, near: int = 0, files: tuple[str, ...] = ()) -> None:
         at = multiprocessing.current_process()._identity[0] - 1
         tree = Path(trees[at % len(trees)])
-        cls.bench, cls.server, cls.graph, cls.reach = Bench(tree), Server(tree, (tests,)), Graph(ROOT, tests), reach
-        cls.near = near
+        cls.bench, cls.server = Bench(tree), Server(tree, files or (tests,))
+        cls.graph, cls.reach, cls.near = Graph(ROOT, tests), reach, near
 
     @classmethod
     def measure(cls, test: str) -> tuple[str, Seen]:
@@ -120,12 +120,17 @@ class Worker:
     @classmethod
     def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
         """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them."""
-        tests = cls.graph.related(module, {}, 10.0 * cls.near)  # files of which no time is known count 10 s each
+        tests = _near(cls.graph, module, cls.near)
         asked = mutant.path, source, tests
         answer = None if loops else cls.server.outcome(*asked, LONGEST_S)
         outcome, spent = answer or cls.bench.outcome(*asked, LONGEST_S / 3, fresh=module in cls.graph.compiled)
         said = "killed" if outcome == "failed" else "survived"
         return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
+
+
+def _near(graph: Graph, module: str, count: int) -> list[str]:
+    """So many test files nearest to a module: where no time is known, the graph counts 10 s for each."""
+    return graph.related(module, {}, 10.0 * count)
 
 
 def _row(mutant: rules.Mutant) -> dict[str, object]:
@@ -157,7 +162,8 @@ def main(words: list[str]) -> int:
             reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8")))
         elif not asked.near:
             reach = _measured(trees, asked.tests)
-        begun = trees, reach, asked.tests, asked.near
+        files = _files(chosen, asked.tests, asked.near) if asked.near else ()
+        begun = trees, reach, asked.tests, asked.near, files
         rows = []
         with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, begun) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):
@@ -165,6 +171,13 @@ def main(words: list[str]) -> int:
                 _say(len(rows), len(chosen), row)
     rows.sort(key=lambda row: (row["path"], row["line"], row["became"]))
     return _keep(rows, asked, " ".join(words))
+
+
+def _files(chosen: list[rules.Mutant], tests: str, near: int) -> tuple[str, ...]:
+    """All test files that will be asked."""
+    graph = Graph(ROOT, tests)
+    modules = {mutant.path.removesuffix(".py").replace("/", ".") for mutant in chosen}
+    return tuple(sorted({test for module in modules for test in _near(graph, module, near)}))
 
 
 def _survivors(result: Path) -> list[rules.Mutant]:
