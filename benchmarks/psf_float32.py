@@ -63,7 +63,7 @@ def drawn(rng: np.random.Generator) -> Drawn:
     if kind == "large aperture":
         distance = half * rng.uniform(0.3, 2)
     if kind.startswith("wide"):
-        distance = half * rng.uniform(2.5, 6)  # no rays too steep for the transforms
+        distance = half * rng.uniform(2.5, 4.5)  # no rays too steep for the transforms
     depths = np.sort(source * 10 ** rng.uniform(-0.3, 0.3, rng.integers(1, 4)))
     if rng.random() < 0.1:
         depths[-1] = np.inf
@@ -118,8 +118,8 @@ def _window(rng: np.random.Generator, kind: str, half: float, wavelength: float)
     if kind.startswith("lens"):
         width, samples = half * rng.uniform(0.1, 1), int(rng.integers(24, 80))
     if kind.startswith("wide"):
-        width = wavelength * rng.uniform(150, 300)
-        samples = int(width / (wavelength * rng.uniform(0.8, 2)))
+        width = wavelength * rng.uniform(200, 300)
+        samples = int(width / (wavelength * rng.uniform(1, 2)))
     if kind.endswith("beside the light"):
         away = rng.uniform(-1, 1, 2) * half * rng.uniform(0.5, 1.5 if kind.startswith("wide") else 3)
     return {"window_um": width, "samples": samples, "offset_um": tuple(away)}

@@ -67,30 +67,36 @@ def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
     count, total_depths = _effort(windows), len(seen[0])
     edges = np.concatenate([_edges(samples[0].shape, samples[0].parts) for samples in windows])
     depths = np.unique(np.linspace(0, total_depths - 1, min(total_depths, count[1])).round().astype(int))
-    normalised = np.concatenate([part.reshape(total_depths, -1)[depths].astype(float) for part in seen], axis=1)
-    energy = normalised.sum(1)
-    normalised /= energy[:, None]
+    parts = [part.reshape(total_depths, -1)[depths] for part in seen]
+    normalised = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+    energy = normalised.sum(1, dtype=float)
+    normalised /= energy[:, None].astype(normalised.dtype)
     order = _orders([samples[0].shape for samples in windows])
-    points, chance = draw(normalised.mean(0, keepdims=True), order, count[0], edges)
+    points, chance = draw(normalised.mean(0, dtype=float, keepdims=True), order, count[0], edges)
     points, chance = np.tile(points, (len(depths), 1)), np.tile(chance, (len(depths), 1))
     direct = _direct_light(windows, depths, points[0]) / energy[:, None]
     difference = direct - np.take_along_axis(normalised, points, 1)
     noise = sum(2 * s.weight * s.noise**2 * (1 / energy).sum() for s in windows[0])
     total = square_error(normalised, points, chance, difference) + float(noise)
-    return float(SAFETY * np.sqrt(total / (normalised**2).sum()))
+    return float(SAFETY * np.sqrt(total / _squares(normalised).sum()))
 
 
 def square_error(normalised: Array, points: Array, chance: Array, difference: Array) -> float:
     """Unbiased estimate of Σ (δ/S - (I/S)·Σδ/S)² from samples of ``difference`` = δ/S (depth, n) at drawn pixels."""
-    value = np.take_along_axis(normalised, points, 1)
+    value = np.take_along_axis(normalised, points, 1).astype(float)
     a, b, d = difference**2 / chance, value * difference / chance, difference / chance
-    n, power = points.shape[1], (normalised**2).sum(1)
+    n, power = points.shape[1], _squares(normalised)
     if n == normalised.shape[1]:
         return float((a.sum(1) - 2 * b.sum(1) * d.sum(1) + d.sum(1) ** 2 * power).sum())
     pairs = n * (n - 1)
     cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
     common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
     return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.03 * float(a.mean(1).sum()))
+
+
+def _squares(normalised: Array) -> Array:
+    """(depth,) sums of squares, without an array of squares."""
+    return np.asarray(np.einsum("ij,ij->i", normalised, normalised, dtype=float))
 
 
 def _effort(windows: list[list[Sample]]) -> tuple[int, int]:

@@ -8,7 +8,7 @@ its tiles.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,8 @@ def layout(case: Case, tolerance: float) -> Layout | None:
         if parts > max(case.samples):
             break
         rows = tiles(case, parts)[1]
-        found = _largest([sizes(tile, tolerance) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])])
+        corners = {_alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])}
+        found = _largest([sizes(tile, tolerance) for tile in corners])
         passed_on = nodes[0] * nodes[1] * (1e-8 + 2e-10 * found.nodes[0])
         each = _seconds(rows[0][0], found, len(case.inverse_depths_per_um)) + passed_on
         seconds = 1e-3 + each * sum(map(len, rows))
@@ -77,6 +78,12 @@ def layout(case: Case, tolerance: float) -> Layout | None:
         elif best is not None:
             break
     return best
+
+
+def _alike(tile: Case) -> Case:
+    """The tile, or its mirror image, which needs the same counts, where the source is straight ahead along an axis."""
+    x, y = (abs(c) if slope == 0 else c for c, slope in zip(tile.centre_um, tile.tangents, strict=True))
+    return replace(tile, centre_um=(x, y))
 
 
 def _largest(found: list[Sizes]) -> Sizes:

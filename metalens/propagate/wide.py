@@ -145,11 +145,11 @@ def _behind(case: Case, found: tuple[Axis, Axis]) -> tuple[Array, Array]:
         period = axis.fine * case.step_um / axis.every
         n, width = np.arange(axis.size) - axis.size // 2, period / axis.size
         place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
-        chirps.append(np.exp(1j * k * (n * width) ** 2 / (2 * axis.stretch_um) - 2j * np.pi * n * place / axis.first))
-        order = np.fft.fftfreq(axis.size) * axis.size
-        u = order * case.wavelength_um / period
+        turns = n * (axis.size // 2 / axis.size - place / axis.first)  # the lowest order of the next transform is first
+        chirps.append(np.exp(1j * k * (n * width) ** 2 / (2 * axis.stretch_um) + 2j * np.pi * turns))
+        u = n * case.wavelength_um / period
         first = -(samples - 1) / 2 * case.step_um / width + axis.size // 2
-        ramps.append(np.exp(2j * np.pi * order * first / axis.size) * _fade(axis, np.abs(u) - axis.most) / axis.size)
+        ramps.append(np.exp(2j * np.pi * n * first / axis.size) * _fade(axis, np.abs(u) - axis.most) / axis.size)
         squares.append((axis.middle + u) ** 2)
         paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
     w = squares[0][:, None] + squares[1]
@@ -195,25 +195,13 @@ def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
         light *= plan.chirp
         light = torch.fft.fft2(light)
         light *= plan.transfer
-        light = torch.fft.ifft2(_padded(light, (y.fine, x.fine)), norm="forward")
-        seen = light[..., : my * y.every : y.every, : mx * x.every : x.every]
+        light = torch.fft.ifft(light, n=y.fine, dim=-2, norm="forward")[..., : my * y.every : y.every, :]
+        seen = torch.fft.ifft(light, n=x.fine, norm="forward")[..., : mx * x.every : x.every]
         if out is None:
             parts.append(seen)
         else:
             out[start : start + step] = seen
     return torch.cat(parts) if out is None else out
-
-
-def _padded(spectrum: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """A spectrum in more points, zero where it had none."""
-    if tuple(spectrum.shape[-2:]) == size:
-        return spectrum
-    out = spectrum.new_zeros((*spectrum.shape[:-2], *size))
-    parts = [(slice(0, (n + 1) // 2), slice(-(n // 2), None)) for n in spectrum.shape[-2:]]
-    for rows in parts[0]:
-        for columns in parts[1]:
-            out[..., rows, columns] = spectrum[..., rows, columns]
-    return out
 
 
 def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:

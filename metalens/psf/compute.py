@@ -31,7 +31,8 @@ MOVING = 1000  # by which the setting is tighter where the geometry carries grad
 FINEST = 1e-12  # setting below which float64 has nothing left to give
 ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
 TRANSFORMS = {torch.float32: 1e-6, torch.float64: 5e-15}  # rounding of three transforms, above all that was found
-MISSED = 0.01  # of the setting of a wide window: what rare errors the few points of its estimate may miss
+MISSED = 0.02  # of the setting of a wide window: what rare errors the few points of its estimate may miss
+SCATTER = 1.5  # times the estimate of a wide window, whose errors are where it is dim: few of its points see them
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
 KEPT = {
     torch.float32: 1.5e-7,
@@ -168,7 +169,7 @@ def _wide(
         total = light if total is None else total + light
         power += weight * given
     result = _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
-    return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype], MISSED * tolerance))
+    return replace(result, error=math.hypot(SCATTER * result.error, TRANSFORMS[dtype], MISSED * tolerance))
 
 
 def _judged(

@@ -113,8 +113,9 @@ def _record(
 ) -> PsfStack:
     """The stack for intensities (…, depth, y, x), a case for each angle; axes are depths, wavelengths, weights."""
     energy = light.sum((-1, -2))
+    divided = torch.div if light.requires_grad else torch.Tensor.div_  # in place where nothing else looks at it
     return PsfStack(
-        light / energy[..., None, None],
+        divided(light, energy[..., None, None]),
         energy * cases[0].step_um ** 2,
         depths_um=axes[0],
         angles_rad=np.arctan([c.tangents for c in cases]),
