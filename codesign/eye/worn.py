@@ -164,7 +164,8 @@ def _spectacles(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid
         away = torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
         band = torch.sigmoid((width / 2 - (away - width / 2).abs()) * light.shape[-1] * 2)
         shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(away / width * 6.0))
-        far = depth[i, 1].median() * RIM_DEPTH
+        eye = depth[i, 1][depth[i, 1] > 0]  # 0 behind skin, which is most of many frames
+        far = (eye if len(eye) else depth[i, 0]).median() * RIM_DEPTH
         _hidden(light, cover, depth, pupil, i, band, band * shine, far)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.batches.flat import flattened
 from codesign.batches.scenes import EyeScenes, SceneConfig, tilted
 from codesign.eye import renderer
 from codesign.eye import worn as wear
@@ -103,6 +104,23 @@ def test_a_rim_hides_what_is_behind_it_and_stands_nearer():
     assert 0.4 < share < 0.6  # columns 54 (half hidden) to 59 of 50 to 59
     assert float(out.labels.visible) == pytest.approx(0.9 * share, rel=1e-5)
     assert 49.5 < float(out.labels.centroid_px[0, 0]) < 54.5 - 1
+
+
+def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
+    """The renderer leaves the depth of the eye at 0 where skin hides it: most of the frame here."""
+    made = scene(opening=(28, 34))
+    made.frames.depth_um[:, 1, :28] = 0
+    made.frames.depth_um[:, 1, 34:] = 0
+    out = put_on(made, rim=0.1)
+    there = out.frames.depth_um[0, 0] != made.frames.depth_um[0, 0]
+    assert bool(there.any())
+    assert out.frames.depth_um[0, 0][there].unique().tolist() == pytest.approx([0.7 * 20e3])
+
+
+def test_dressed_frames_have_a_depth_wherever_they_are_seen():
+    made = SCENES.rendered(3, 8)
+    flat = flattened(made.frames, torch.ones(8))
+    assert flat.depth_um.min() > 4000  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
 
 
 def test_mirrored_windows_add_light_and_hide_nothing():
