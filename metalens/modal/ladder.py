@@ -133,7 +133,7 @@ RUNGS = (
         "coarse",
         (
             Choice(MeshPlan(3, 3, 2, STEEPER, core=0.45), 0.7, 6e-6, 3e-5, oblique=1e-5, middle=3.5e-5),
-            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 1e-5, 7e-5, oblique=2.5e-5),
+            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 4e-5, 7e-5, oblique=2.5e-5),
         ),
         1.2,
         2e-3,
