@@ -267,6 +267,11 @@ def test_layout_never_loads_torch_nor_the_solid_kernels():
     assert not _loaded("import layout, metalens.lens") & {"torch", "build123d", "manifold3d", "matplotlib", "scipy"}
 
 
+def test_the_commands_of_the_base_install_do_without_torch():
+    names = ("library", "study", "design", "export", "view", "info")
+    assert "torch" not in _loaded("\n".join(f"import metalens.commands.{name}" for name in names))
+
+
 def test_help_loads_neither_numpy_nor_torch():
     code = (
         "import contextlib, io\nfrom metalens.cli import main\n"

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -34,10 +34,12 @@ from metalens.ground import config, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
-from metalens.image import Pupil
 from metalens.lens import Layers, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
+
+if TYPE_CHECKING:
+    from metalens.image import Pupil
 
 MOST_SUMMED = 60_000_000  # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
@@ -321,7 +323,7 @@ def _free_form(wanted: Design, options: Options, radius_um: float) -> tuple[Phas
     return phase, focus, _Judged(reports.values(lenses, settings), reports.text(lenses, settings), picture)
 
 
-def _scene_objective(settings: Asked, pupil: Pupil) -> Any:
+def _scene_objective(settings: Asked, pupil: "Pupil") -> Any:
     """Eq. 6 on rendered eyes, of a package above this one: named by the command line, loaded only when asked for."""
     return importlib.import_module(OBJECTIVES["scenes"]).SceneObjective(pupil, settings)
 
