@@ -118,7 +118,7 @@ def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
 
 
 def test_dressed_frames_have_a_depth_wherever_they_are_seen():
-    made = SCENES.rendered(3, 8)
+    made = SCENES.rendered(4, 8)  # a rim is among them
     flat = flattened(made.frames, torch.ones(8))
     assert flat.depth_um.min() > 4000  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
 
