@@ -3,10 +3,20 @@ the light on the nodes of a pupil."""
 
 import numba
 import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
 
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
 from metalens.propagate import turns32
+
+
+def plain(a: Tensor) -> bool:
+    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
+    if a.dtype not in (torch.float32, torch.complex64) or a.device.type != "cpu" or a.requires_grad:
+        return False
+    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
@@ -91,3 +101,16 @@ def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
             for x in range(start, stop):
                 c, s = turns32(line[x] - np.rint(line[x]))
                 out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s
+
+
+def power(field: Array) -> Array:
+    """|U|² of complex64."""
+    out = np.empty(field.shape, np.float32)
+    _power(np.ascontiguousarray(field).reshape(-1), out.reshape(-1))
+    return out
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _power(field, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
+        out[i] = field[i].real * field[i].real + field[i].imag * field[i].imag

@@ -16,9 +16,8 @@ from dataclasses import dataclass, field, replace
 import scipy.fft
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from metalens.field import products
+from metalens.field import compiled, products
 from metalens.field.patches import Patch, dense, lagrange
 from metalens.field.plan import Grid, Plan
 from metalens.field.stray import Stray, add_stray
@@ -101,7 +100,7 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
     out = light.new_zeros(len(light), kinds, light.shape[1], *whole)
     given = light, cover, vergence(depth_um, optics.plan.depths_um)
     shapes = [_size(patch, size) for patch in optics.patches]
-    if all(_plain(a) for a in (*given, *optics.transfer, *(p.energy for p in optics.patches))):
+    if all(compiled.plain(a) for a in (*given, *optics.transfer, *(p.energy for p in optics.patches))):
         seen = given[0].numpy(), given[1].numpy(), given[2].numpy()
         kernels = [t.contiguous().numpy() for t in optics.transfer]
         products.through(seen, optics.patches, kernels, shapes, out.numpy())
@@ -142,13 +141,6 @@ def _mixed(spectrum: Tensor, transfer: Tensor) -> Tensor:
     for part, kernel in zip(spectrum[1:], transfer[1:], strict=False):
         total = torch.addcmul(total, part, kernel)
     return total
-
-
-def _plain(a: Tensor) -> bool:
-    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
-    if a.dtype not in (torch.float32, torch.complex64) or a.device.type != "cpu" or a.requires_grad:
-        return False
-    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 def vergence(depth_um: Tensor, depths_um: Tensor) -> Tensor:
@@ -207,7 +199,7 @@ def blurred(frames: Frames, optics: Imager) -> Tensor:
 def _far_alone(frames: Frames) -> bool:
     """Whether the far sheet covers everything, so that nothing is hidden; never where coverage has derivatives."""
     cover, light = frames.coverage, frames.radiance
-    if not (_plain(cover) and _plain(light)):
+    if not (compiled.plain(cover) and compiled.plain(light)):
         return False
     return not bool(cover[:, 0].any()) and not bool(light[:, 0].any()) and bool((cover[:, 1] == 1).all())
 

@@ -167,21 +167,25 @@ def _one(
     light = light if factor is None else light * factor.to(torch.complex64)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
-    return torch.cat([_shown(part, found, grid, ends) for part in torch.split(light, few)]) / total
+    moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
+    return torch.cat([_shown(part, found, grid, ends, moves) for part in torch.split(light, few)]) / total
 
 
-def _shown(light: Tensor, found: Rays, grid: Sampling, ends: tuple[Samples, ...]) -> Tensor:
+def _shown(light: Tensor, found: Rays, grid: Sampling, ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:
     """(depths, h, w) transform of the light on the nodes, squared and moved to second order, on the samples."""
     spectrum = torch.fft.fft2(light, s=(grid.size, grid.size))
-    power = torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
-    plain, change = _moved(power, ends, found.slope)
+    if compiled.plain(spectrum):
+        power = torch.from_numpy(compiled.power(spectrum.numpy()))
+    else:
+        power = torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
+    plain, change = _moved(power, ends, moves[0])
     shown = plain + change
     if not grid.curved:
         return shown
     for j, aside in enumerate((found.aside, found.aside[:, None])):
         other = torch.fft.fft2(light * aside.to(light.real), s=(grid.size, grid.size))
         flux = torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)
-        shown = shown + _moved(flux, ends, found.curvature[:, j])[1]
+        shown = shown + _moved(flux, ends, moves[1 + j])[1]
     return shown
 
 
@@ -200,14 +204,19 @@ def _around(ends: tuple[Samples, ...]) -> Tensor:
     return torch.stack([x, y])
 
 
-def _moved(power: Tensor, ends: tuple[Samples, ...], slope: Tensor) -> tuple[Tensor, Tensor]:
-    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and ∇·(s P): how it changes where it is
-    moved by s(δ)_j = δᵀ slope_j δ / 2."""
-    plain, across, down = _on_samples(power, ends)
+def _move(slope: Tensor, ends: tuple[Samples, ...]) -> Tensor:
+    """([x, y, divergence], h, w) of the shift s(δ)_j = δᵀ slope_j δ / 2."""
     at = _around(ends)
     turned = torch.einsum("jab,byx->jayx", slope.to(at), at)
     s = torch.einsum("jayx,ayx->jyx", turned, at) / 2
-    return plain, plain * (turned[0, 0] + turned[1, 1]) + s[0] * across + s[1] * down
+    return torch.cat([s, (turned[0, 0] + turned[1, 1])[None]])
+
+
+def _moved(power: Tensor, ends: tuple[Samples, ...], move: Tensor) -> tuple[Tensor, Tensor]:
+    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and ∇·(s P): how it changes where it is
+    moved by s (see :func:`_move`)."""
+    plain, across, down = _on_samples(power, ends)
+    return plain, plain * move[2] + move[0] * across + move[1] * down
 
 
 def seen(
