@@ -8,7 +8,8 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import Layers, Optics, SmoothWave, Window, compiled, psfs
+from metalens.field import Layers, Optics, SmoothWave, Window, compiled, points, psfs
+from metalens.field.patches import relative
 from metalens.field.plan import spectral
 from metalens.field.rays import rays, source_paths
 from metalens.psf import Nodes
@@ -61,3 +62,16 @@ def test_wavelengths_that_share_their_rays_are_those_alone():
     )
     assert got.shape == (2, 3, 15, 15)
     assert float((got - want).norm() / want.norm()) < 2e-3
+
+
+def test_what_wraps_round_in_a_transform_is_nothing_of_the_sharpest_image(monkeypatch):
+    """In focus on the axis the pupil's rims interfere most; against a transform in which nothing wraps."""
+    optics, window = Optics(SmoothWave(Focus(0.85, 240.0, 6e3), 50.0), Layers(), 240.0), Window(15, 9.0)
+    at, depth = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([6e3], dtype=torch.float64)
+    sizes, found = [], []
+    for clear in (points.CLEAR, 1.0):
+        monkeypatch.setattr(points, "CLEAR", clear)
+        sizes.append(points.sampling(optics, window, 0.85).size)
+        found.append(psfs(optics, at, depths_um=depth, wavelength_um=0.85, window=window)[0, 0])
+    assert sizes[0] < sizes[1]
+    assert 0 < float(relative(*found)) < 3e-4
