@@ -31,7 +31,7 @@ def test_a_longer_table_holds_the_shorter_one_in_its_middle():
 def test_without_loss_the_operator_is_hermitian(angle_rad):
     """Q is eps less kappa² in orders: real permittivities make it its own adjoint, however complex its entries."""
     space = mirrors.orders(3, pattern.frame(CELL, (IDENTITY,)))
-    light = any_shape._light(0.633, angle_rad, 0.4)
+    light = any_shape._tangent(0.633, angle_rad, 0.4)
     ways, _ = any_shape._waves(space, CELL, light)
     slab = pattern.Slab((CELL.outline(0.24),), (2.6**2,), 1.1**2)
     Q = pattern.operators(space, ways, slab, CELL)[1]
