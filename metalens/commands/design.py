@@ -224,9 +224,8 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     else:
         partial = options.accept_partial_turn
         made, quality = design.make(phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about)
-    quality = replace(
-        quality, focuses=wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
-    )
+    meets = wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
+    quality = replace(quality, focuses=meets)
     found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(path, made)
