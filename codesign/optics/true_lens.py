@@ -165,7 +165,7 @@ def device(
     """A device whose image is prepared.
 
     Raises:
-        SceneError: the tolerance cannot be met; PropagationError: films thicker than the gap.
+        SceneError, PropagationError: as :func:`metalens.field.imager`.
     """
     with torch.no_grad():
         whole = field_imager(

@@ -47,9 +47,11 @@ def imager(
         distance_um: lens to sensor, by default the design's.
 
     Raises:
-        SceneError: the tolerance cannot be met; PropagationError: films thicker than the gap.
+        SceneError: wavelengths, depths or field points that no number of meets the tolerance; PropagationError: films
+            thicker than the gap.
 
-    Accuracy: ``error`` of the result, by cause in ``parts``.
+    Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may leave it above the
+        tolerance (``edge``: light that a small aperture's rim bends beyond the window).
     """
     wave = wave_of(lens)
     focus = wave.focus  # type: ignore[attr-defined]

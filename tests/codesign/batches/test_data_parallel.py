@@ -30,7 +30,7 @@ optics = OpticsConfig(
     aperture_mm=0.4, depth_count=4, sample_um=24.0, window_samples=9, polynomials=6, image="uniform"
 )
 space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
-config = InnerConfig(steps=3, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
+config = InnerConfig(steps=2, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
 member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)
 made = inner.model(optics, pitch_um=24.0, seed=1, space=space)
 trainer = Trainer(config, optics, Sensor(24.0), PoolScenes(fill(scenes, 12), 8, 0.2, 1), made, architecture=member)
@@ -77,10 +77,10 @@ def _run(script, target, count, text=WORKER):
 def test_two_processes_equal_one_to_rounding(tmp_path):
     one = _run(tmp_path / "worker.py", tmp_path / "one.pt", 1)
     two = _run(tmp_path / "worker.py", tmp_path / "two.pt", 2)
-    assert float(one[0].abs().max()) > 0.01
-    assert one[2] == pytest.approx(two[2], rel=1e-3)
-    # Adam divides by the gradient's own size, so rounding of small gradients shows: 1 % of a step of 0.02
-    torch.testing.assert_close(two[0], one[0], rtol=0.0, atol=5e-4)
+    assert float(one[0].abs().max()) > 0.005
+    # two steps: Adam divides by a gradient's own size, so that rounding of small ones grows a hundredfold a step
+    assert one[2] == pytest.approx(two[2], rel=1e-5)
+    torch.testing.assert_close(two[0], one[0], rtol=0.0, atol=5e-5)  # of steps of 0.01; 4e-7 on one processor
     assert float((two[1] - one[1]).norm() / one[1].norm()) < 2e-3
 
 
