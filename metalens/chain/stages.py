@@ -9,7 +9,7 @@ from typing import Any
 from metalens.ground import config, store
 from metalens.ground.errors import ConfigError
 
-SHIPPED = ("cell", "design", "process", "run", "bench_truth")
+SHIPPED = ("cell", "design", "process", "run", "bench_truth", "bench_metrology")
 
 
 @dataclass(frozen=True, slots=True)
