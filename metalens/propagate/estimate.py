@@ -3,16 +3,18 @@
 The moments of the lens are taken to a few orders more than the method uses. From those, the field at sampled points is
 summed directly over lens nodes in float64, without depth basis, directions or correction terms; the difference in
 intensity is the error of everything but rounding at the pillars and the interpolation inside blocks of pillars, which
-are modelled as noise of the pillars. Points are drawn by intensity and by its root, more at the
-edges of tiles.
+are modelled as noise of the pillars. Points are drawn by intensity, by its root, more at the
+edges of tiles, and by the light around them.
 """
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
@@ -24,8 +26,9 @@ from metalens.propagate.paths import reference_depth
 from metalens.propagate.sincos import turns64
 
 MORE = 8
-POINTS = 128  # that an estimate looks at
+POINTS, EVERY = 128, 32  # that an estimate looks at, and more than one in so many where a window has many
 DEPTHS = 8
+NEAR = 9  # samples on a side of the neighbourhood whose light draws points to a sample
 WORK, FEWEST = 1e7, 32  # nodes times points above which fewer points are looked at, and the fewest
 SAFETY = 1.7
 
@@ -72,7 +75,9 @@ def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
     energy = normalised.sum(1, dtype=float)
     normalised /= energy[:, None].astype(normalised.dtype)
     order = _orders([samples[0].shape for samples in windows])
-    points, chance = draw(normalised.mean(0, dtype=float, keepdims=True), order, count[0], edges)
+    mean = normalised.mean(0, dtype=float, keepdims=True)
+    near = _near(mean[0], [samples[0].shape[-2:] for samples in windows])
+    points, chance = draw(mean, order, count[0], edges, near)
     points, chance = np.tile(points, (len(depths), 1)), np.tile(chance, (len(depths), 1))
     direct = _direct_light(windows, depths, points[0]) / energy[:, None]
     difference = direct - np.take_along_axis(normalised, points, 1)
@@ -102,7 +107,10 @@ def _squares(normalised: Array) -> Array:
 def _effort(windows: list[list[Sample]]) -> tuple[int, int]:
     """(points, depths) that are looked at: fewer where a point takes the sum over very many nodes."""
     nodes = max(samples[0].moments.size for samples in windows)
-    if windows[0][0].nodes_um is None or nodes * POINTS <= WORK:
+    if windows[0][0].nodes_um is None:
+        pixels = sum(math.prod(samples[0].shape[-2:]) for samples in windows)
+        return max(POINTS * min(4, len(windows)), pixels // EVERY), DEPTHS
+    if nodes * POINTS <= WORK:
         return POINTS * min(4, len(windows)), DEPTHS
     return max(FEWEST, int(WORK / nodes)), DEPTHS // 2
 
@@ -134,11 +142,20 @@ def _orders(shapes: list[tuple[int, ...]]) -> Array:
     return np.concatenate([first + scan(shape) for first, shape in zip(firsts[:-1], shapes, strict=True)])
 
 
-def draw(normalised: Array, order: Array, count: int, edges: Array | float = 1.0) -> tuple[Array, Array]:
+def _near(mean: Array, shapes: list[tuple[int, ...]]) -> Array:
+    """(pixel,) light of a pixel's neighbourhood: beside a sharp spot it is dim, and errors are those of the spot."""
+    ends = np.cumsum([rows * columns for rows, columns in shapes])[:-1]
+    parts = zip(np.split(mean, ends), shapes, strict=True)
+    return np.concatenate([uniform_filter(part.reshape(shape), NEAR).ravel() for part, shape in parts])
+
+
+def draw(
+    normalised: Array, order: Array, count: int, edges: Array | float = 1.0, near: Array | None = None
+) -> tuple[Array, Array]:
     """(depth, n) pixel indices and their chances: a systematic sample along ``order``, or every pixel of few.
 
     Args:
-        normalised: (depth, pixel) of sum 1; the chance follows it and its root times ``edges``.
+        normalised: (depth, pixel) of sum 1; the chance follows it, its root times ``edges``, and ``near`` if given.
         order: (pixel,) as :func:`scan`, so that the sample is even over the window.
         count: of points in all depths together.
     """
@@ -147,7 +164,8 @@ def draw(normalised: Array, order: Array, count: int, edges: Array | float = 1.0
     if pixels <= n:
         return np.tile(np.arange(pixels), (depths, 1)), np.ones((depths, pixels))
     root = np.sqrt(normalised) * edges
-    density = (normalised + root / root.sum(1, keepdims=True)) / 2
+    parts = [normalised, root, *(np.broadcast_to(part, root.shape) for part in (near,) if part is not None)]
+    density = np.sum([part / part.sum(1, keepdims=True) for part in parts], axis=0) / len(parts)
     sums = np.cumsum(density[:, order], axis=1)
     picks = (np.arange(n) + 0.5) / n
     points = np.stack([order[np.searchsorted(row / row[-1], picks)] for row in sums])

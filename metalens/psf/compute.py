@@ -31,8 +31,10 @@ MOVING = 1000  # by which the setting is tighter where the geometry carries grad
 FINEST = 1e-12  # setting below which float64 has nothing left to give
 ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
 TRANSFORMS = {torch.float32: 1e-6, torch.float64: 5e-15}  # rounding of three transforms, above all that was found
-MISSED = 0.02  # of the setting of a wide window: what rare errors the few points of its estimate may miss
-SCATTER = 1.5  # times the estimate of a wide window, whose errors are where it is dim: few of its points see them
+MANY = 8192  # samples of a window from which an estimate looks at few of them
+MISSED = 0.02  # of the setting of such a window: what rare errors those few may miss
+SCATTER = 1.5  # times its estimate: errors beside a spot and where the window is dim are seen by few of the few
+EXACT = {torch.float32: 1e-7, torch.float64: 4e-12}  # rounding of exact sums and of what they are kept in
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
 KEPT = {
     torch.float32: 1.5e-7,
@@ -106,9 +108,8 @@ def intensity(
 def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights: list[float], reason: str) -> Result:
     arrays = [np.abs(field_exact(p.numpy(), t.numpy(), c)) ** 2 for p, t, c in zip(phase, level, cases, strict=True)]
     total = sum(w * a for w, a in zip(weights, arrays, strict=True))
-    error = 1e-12 if phase.dtype == torch.float64 else 1e-7
     power = sum(w * float((t.double() ** 2).sum()) for w, t in zip(weights, level, strict=True))
-    return Result(torch.as_tensor(total).to(phase.dtype), error, reason, power)
+    return Result(torch.as_tensor(total).to(phase.dtype), EXACT[phase.dtype], reason, power)
 
 
 def _windowed(
@@ -145,7 +146,8 @@ def _windowed(
             rows.append(torch.cat(parts, -1))
         light += weight * power
         total = total + torch.cat(rows, -2)
-    return _judged(total, samples, seen, (cases, weights, light), choice)
+    result = _judged(total, samples, seen, (cases, weights, light), choice)
+    return _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
 
 
 def _wide(
@@ -169,7 +171,13 @@ def _wide(
         total = light if total is None else total + light
         power += weight * given
     result = _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
-    return replace(result, error=math.hypot(SCATTER * result.error, TRANSFORMS[dtype], MISSED * tolerance))
+    result = _few_seen(result, tolerance)
+    return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
+
+
+def _few_seen(result: Result, tolerance: float) -> Result:
+    """With what an estimate from few of many samples may miss."""
+    return replace(result, error=math.hypot(SCATTER * result.error, MISSED * tolerance))
 
 
 def _judged(
