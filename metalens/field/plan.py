@@ -9,9 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.field import compiled
 from metalens.field.patches import dense, relative
 from metalens.field.points import Optics, Window, psfs
 from metalens.ground.errors import SceneError
+from metalens.ground.threads import apart
 from metalens.psf import Nodes, Source
 from metalens.psf import spectrum as spectra
 
@@ -128,12 +130,24 @@ def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, win
     """(points, depths, h, w) PSFs summed over the spectrum; light of each wavelength with its weight."""
     pairs = list(zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True))
     about = {"depths_um": depths_um, "window": window, "finest_um": min(wave for wave, _ in pairs)}
-    found = []
-    for place in at_um.unsqueeze(1):  # all wavelengths of a point share its rays
+
+    def of(place: Tensor) -> Tensor:  # all wavelengths of a point share its rays
         total = torch.zeros(())
         for wave, weight in pairs:
             total = total + weight * psfs(optics, place, wavelength_um=wave, **about)
-        found.append(total)
+        return total
+
+    first, *others = at_um.unsqueeze(1)
+    found = [of(first)] + [torch.empty(0)] * len(others)
+
+    def some(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            found[i + 1] = of(others[i])
+
+    if compiled.plain(found[0]):
+        apart(len(others), torch.no_grad()(some))
+    else:  # derivatives, or another device
+        some(0, len(others))
     return torch.cat(found)
 
 

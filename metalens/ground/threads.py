@@ -14,7 +14,30 @@ from threadpoolctl import ThreadpoolController
 
 def split(count: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads (see :func:`threads`)."""
-    parts = min(threads(), count)
+    _shared(count, min(threads(), count), work)
+
+
+def apart(count: int, work: Callable[[int, int], object]) -> None:
+    """As :func:`split`, for work of many small calls of torch: each part has one of its threads to itself.
+
+    Together they would wait for each other at every call. ``work`` may carry no derivatives: what torch knows of them
+    is of the calling thread.
+    """
+    torch = sys.modules["torch"]
+    own = int(torch.get_num_threads())
+
+    def alone(start: int, stop: int) -> None:
+        torch.set_num_threads(1)
+        work(start, stop)
+
+    try:
+        _shared(count, min(own, count), alone)
+    finally:
+        torch.set_num_threads(own)
+
+
+def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
+    """``work`` in so many parts, the first in this thread."""
     if parts <= 1:
         work(0, count)
         return

@@ -64,6 +64,28 @@ def test_wavelengths_that_share_their_rays_are_those_alone():
     assert float((got - want).norm() / want.norm()) < 2e-3
 
 
+def test_field_points_are_the_same_on_any_number_of_threads():
+    """Whatever thread forms a point, in the order asked for; 1e-5: transforms in single precision, and compiled."""
+    optics, window = Optics(SmoothWave(Focus(0.85, 240.0, 6e3), 50.0), Layers(), 240.0), Window(9, 4.8)
+    at, depths = (
+        torch.tensor([[20.0, -31.0], [3.0, 8.0], [-40.0, 5.0], [9.0, 44.0]]).double(),
+        torch.tensor([5e3]).double(),
+    )
+    waves = Nodes(np.array([0.84, 0.85]), np.array([0.4, 0.6]), 0.0)
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            found.append(spectral(optics, at, depths, waves, window))
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(before)
+    alone = torch.cat([spectral(optics, place, depths, waves, window) for place in at.unsqueeze(1)])
+    for got in found:
+        assert float((got - alone).norm() / alone.norm()) < 1e-5
+    assert float((alone[0] - alone[3]).norm() / alone.norm()) > 0.05
+
+
 def test_what_wraps_round_in_a_transform_is_nothing_of_the_sharpest_image(monkeypatch):
     """In focus on the axis the pupil's rims interfere most; against a transform in which nothing wraps."""
     optics, window = Optics(SmoothWave(Focus(0.85, 240.0, 6e3), 50.0), Layers(), 240.0), Window(15, 9.0)

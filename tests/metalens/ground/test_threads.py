@@ -52,3 +52,25 @@ def test_every_part_is_done_once_by_torchs_threads():
     finally:
         torch.set_num_threads(before)
     assert seen.tolist() == [1] * 11
+
+
+def test_parts_that_stay_apart_have_one_thread_of_torch_each_and_give_them_back():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    seen, inside = np.zeros(11, int), []
+
+    def work(start, stop):
+        seen[start:stop] += 1
+        inside.append(torch.get_num_threads())
+
+    def broken(start, stop):
+        raise ArithmeticError("of a part")
+
+    try:
+        threads.apart(11, work)
+        assert (torch.get_num_threads(), inside, seen.tolist()) == (3, [1] * 3, [1] * 11)
+        with pytest.raises(ArithmeticError, match="of a part"):
+            threads.apart(11, broken)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
