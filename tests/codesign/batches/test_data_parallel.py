@@ -30,13 +30,13 @@ optics = OpticsConfig(
     aperture_mm=0.4, depth_count=4, sample_um=24.0, window_samples=9, polynomials=6, image="uniform"
 )
 space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
-config = InnerConfig(steps=2, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
+config = InnerConfig(steps=1, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
 member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)
 made = inner.model(optics, pitch_um=24.0, seed=1, space=space)
 trainer = Trainer(config, optics, Sensor(24.0), PoolScenes(fill(scenes, 12), 8, 0.2, 1), made, architecture=member)
 records = list(trainer.run())
 if parallel.rank() == 0:
-    torch.save([made.coefficients_rad.detach(), made.net.stem.weight.detach(), records[-1].loss], sys.argv[1])
+    torch.save([made.coefficients_rad.grad, made.net.stem.weight.detach(), records[-1].loss], sys.argv[1])
 parallel.leave()
 """
 
@@ -77,10 +77,10 @@ def _run(script, target, count, text=WORKER):
 def test_two_processes_equal_one_to_rounding(tmp_path):
     one = _run(tmp_path / "worker.py", tmp_path / "one.pt", 1)
     two = _run(tmp_path / "worker.py", tmp_path / "two.pt", 2)
-    assert float(one[0].abs().max()) > 0.005
-    # two steps: Adam divides by a gradient's own size, so that rounding of small ones grows a hundredfold a step
+    assert float(one[0].norm()) > 1e-3
+    # one step: Adam divides by a gradient's own size, so that in the next rounding of the smallest ones is all there is
     assert one[2] == pytest.approx(two[2], rel=1e-5)
-    torch.testing.assert_close(two[0], one[0], rtol=0.0, atol=5e-5)  # of steps of 0.01; 4e-7 on one processor
+    assert float((two[0] - one[0]).norm() / one[0].norm()) < 2e-4  # single precision through lens and net; 7e-6 here
     assert float((two[1] - one[1]).norm() / one[1].norm()) < 2e-3
 
 
