@@ -160,9 +160,7 @@ def co_polarised(cell: Cell, size_um: float, light: Light, *, tolerance: float, 
 
 def most_harmonics(cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimuth_rad: float = 0.0) -> int:
     """Largest truncation that :func:`jones` takes by itself: less for a cell without mirrors."""
-    sine = math.sin(angle_rad)
-    kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad)))
-    return _LAST[min(len(found) for found in _classes(cell, size_um, _Tangent(kx, ky, azimuth_rad, 1.0)))]
+    return _LAST[min(len(found) for found in _classes(cell, size_um, _tangent(1.0, angle_rad, azimuth_rad)))]
 
 
 def _media(cell: Cell, light: _Tangent) -> Media:
