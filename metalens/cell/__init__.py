@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from metalens.cell.light import Light as Light
     from metalens.cell.light import Polarization as Polarization
     from metalens.cell.light import check_direction as check_direction
+    from metalens.cell.light import check_tolerance as check_tolerance
     from metalens.cell.materials import index as index
     from metalens.cell.materials import slope as slope
     from metalens.cell.orders import check_subwavelength as check_subwavelength
@@ -37,6 +38,7 @@ __getattr__, __dir__, __all__ = attach(
         "Response": "response",
         "check_direction": "light",
         "check_subwavelength": "orders",
+        "check_tolerance": "light",
         "index": "materials",
         "materials": "",
         "shapes": "",

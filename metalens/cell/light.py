@@ -43,3 +43,13 @@ def check_direction(angle_rad: float, azimuth_rad: float) -> None:
     """
     if not (math.isfinite(angle_rad) and abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
         raise CellError(f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, |angle| < pi/2")
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse what is not a finite number above 0.
+
+    Raises:
+        CellError: says which tolerance.
+    """
+    if not (math.isfinite(tolerance) and tolerance > 0):
+        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")

@@ -30,12 +30,6 @@ class Case:
     p: bool
 
 
-def check_tolerance(tolerance: float) -> None:
-    """Refuse what is not a finite number above 0."""
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
-
-
 def film(case: Case) -> np.ndarray:
     """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
     kz1, kz2 = (math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above))

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Polarization, index, slope
+from metalens.cell import Cell, Light, Polarization, check_tolerance, index, slope
 from metalens.ground.threads import one_blas_thread
-from metalens.modal.case import Case, case_of, check_tolerance
+from metalens.modal.case import Case, case_of
 from metalens.modal.engine import basis, climb, geometric_mean, geometry
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes

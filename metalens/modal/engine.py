@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Polarization, Response
+from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
-from metalens.modal.case import Case, case_of, check_tolerance, film
+from metalens.modal.case import Case, case_of, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import RUNGS, Rung, first_rung

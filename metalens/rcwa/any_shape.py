@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from metalens.cell import Cell, Film, Light, Response, check_direction, materials
+from metalens.cell import Cell, Film, Light, Response, check_direction, check_tolerance, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import layer as modes
@@ -102,8 +102,7 @@ def jones(
         CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order.
         MaterialError: a wavelength outside the range of a material.
     """
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    check_tolerance(tolerance)
     light = _tangent(wavelength_um, angle_rad, azimuth_rad)
     media = _media(cell, light)
     check_size(cell, size_um)

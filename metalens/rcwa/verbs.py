@@ -5,12 +5,11 @@ diameters. Light comes from the substrate, phases run from the foot of the pilla
 it) to its top, time factor exp(-iwt).
 """
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Polarization, Response
+from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.rcwa.any_shape import co_polarised
 from metalens.rcwa.conditions import case, check_diameter
@@ -72,8 +71,7 @@ def solve_many(
     harmonics: int | None = None,
 ) -> list[Response]:
     """As :func:`solve`, for several diameters at once; each stops at its own truncation."""
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise CellError(f"tolerance = {tolerance}: need a finite number above 0")
+    check_tolerance(tolerance)
     if harmonics is not None and harmonics < 1:
         raise CellError(f"harmonics = {harmonics}: need at least 1")
     diameters = np.array([float(diameter) for diameter in diameter_um])
