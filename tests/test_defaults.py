@@ -1,0 +1,77 @@
+"""A default is a promise: who leaves a key or an argument out gets tomorrow what he gets today.
+
+``tests/defaults.txt`` is the list that was promised; whoever changes a default changes its line there too, and says so
+in the change log. What is new need not stand in it; a name that goes takes its line along.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROMISED = dict(line.split(" = ", 1) for line in (Path(__file__).parent / "defaults.txt").read_text().splitlines())
+
+
+def number(node: ast.expr | None) -> bool:
+    """Whether an expression is a number, or a tuple that holds one."""
+    if isinstance(node, ast.Tuple):
+        return any(number(part) for part in node.elts)
+    node = node.operand if isinstance(node, ast.UnaryOp) else node
+    return isinstance(node, ast.Constant) and type(node.value) in (int, float)
+
+
+def given(node: ast.AST, where: str) -> Iterator[tuple[str, ast.expr]]:
+    """(name, default) of the fields of a public class and of the arguments of a public function, and inside them."""
+    name = getattr(node, "name", "_")
+    if isinstance(node, ast.ClassDef) and name[0] != "_":
+        for part in node.body:
+            yield from given(part, f"{where}.{name}")
+    elif isinstance(node, ast.FunctionDef) and (name[0] != "_" or name == "__init__"):
+        about = node.args
+        own = (*about.posonlyargs, *about.args)
+        pairs = [*zip(own[len(own) - len(about.defaults) :], about.defaults, strict=True)]
+        pairs += [(a, d) for a, d in zip(about.kwonlyargs, about.kw_defaults, strict=True) if d is not None]
+        yield from ((f"{where}.{name}({argument.arg})", default) for argument, default in pairs)
+    elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
+        value = node.value
+        if isinstance(value, ast.Call) and getattr(value.func, "id", "") == "field":
+            value = next((k.value for k in value.keywords if k.arg == "default"), value)
+        yield f"{where}.{node.target.id}", value
+
+
+def found(package: str) -> dict[str, str]:
+    """{name: default} of all numbers that a package gives where nothing is said."""
+    out = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if not isinstance(node, ast.AnnAssign):  # a constant of the module is no default
+                out |= {name: ast.unparse(value) for name, value in given(node, module) if number(value)}
+    return out
+
+
+@pytest.mark.parametrize("package", ["metalens", "layout", "characterize", "codesign"])
+def test_defaults_are_the_promised_ones(package):
+    here = found(package)
+    known = {name: value for name, value in PROMISED.items() if name.startswith(f"{package}.")}
+    assert {name: here[name] for name in known if name in here} == {n: v for n, v in known.items() if n in here}
+    assert len(known.keys() - here.keys()) < 0.05 * len(known)  # lines of names that are gone: strike them out
+    assert len(known) > 0.8 * len(here)
+
+
+def test_defaults_are_read_from_fields_arguments_and_methods():
+    source = (
+        "class Lens:\n    pitch_um: float = 0.37\n    name: str = 'a'\n    shift_um: tuple = field(default=(1.5, -2))\n"
+        "    def at(self, z, y=3, *, x: float = -0.5): ...\ndef _own(a=1): ...\nclass _Own:\n    b: int = 2\n"
+    )
+    read = {
+        name: ast.unparse(value) for node in ast.parse(source).body for name, value in given(node, "m") if number(value)
+    }
+    assert read == {
+        "m.Lens.pitch_um": "0.37",
+        "m.Lens.shift_um": "(1.5, -2)",
+        "m.Lens.at(y)": "3",
+        "m.Lens.at(x)": "-0.5",
+    }
