@@ -1,4 +1,4 @@
-"""Numbers of the paper's tables from stacks and images that are typed in: what belongs to which depth, angle and scene."""
+"""Numbers of the paper's tables from typed stacks and images: what belongs to which depth, angle and scene."""
 
 import math
 from types import SimpleNamespace
