@@ -161,3 +161,11 @@ def test_levels_are_less_row_medians_and_a_shade_over_their_percentiles():
     rest = rest - ndimage.gaussian_filter(rest, 12.0)
     low, high = np.percentile(rest, [10, 90])
     assert sem.level(image, sem.Micrograph(5.0, 40.0)) == pytest.approx((rest - low) / (high - low))
+
+
+def test_uniformity_is_three_standard_deviations_of_the_good_pillars():
+    found = object.__new__(sem.Diameters)
+    object.__setattr__(found, "diameter_nm", np.array([151.0, math.nan, 163.0, 148.0, 155.5]))
+    good = np.array([151.0, 163.0, 148.0, 155.5])
+    assert found.three_sigma_nm == pytest.approx(3 * math.sqrt(((good - good.mean()) ** 2).mean()), rel=1e-12)
+    assert found.mean_nm == pytest.approx(good.mean(), rel=1e-12)
