@@ -1,0 +1,167 @@
+"""How a tolerance is met: the settings that are tried, and every part of the error that is told, with typed results."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.propagate import SHARE, Case
+from metalens.psf import compute
+from metalens.psf.compute import Result
+
+CASE = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400, 1 / 900), (14.0, -8.5), 0.6, (9, 11))
+OTHER = Case((30, 41), 0.37, 0.79, 62.0, (0.21, -0.13), (1 / 400, 1 / 900), (14.0, -8.5), 0.6, (9, 11))
+
+
+def maps(dtype, count=1):
+    rng = np.random.default_rng(3)
+    return tuple(torch.from_numpy(rng.uniform(0.1, 1, (count, 30, 41))).to(dtype) for _ in range(2))
+
+
+def scripted(monkeypatch, *results):
+    """``_windowed`` gives these (error, brightness) in turn; what it was asked for: (dtype, setting)."""
+    asked, left = [], list(results)
+
+    def windowed(maps, dtype, cases, weights, tolerance, moving):
+        asked.append((dtype, tolerance))
+        error, bright = left.pop(0)
+        return Result(torch.ones(2, 9, 11, dtype=torch.float64), error, "typed", 7.0, brightness=bright)
+
+    monkeypatch.setattr(compute, "_windowed", windowed)
+    monkeypatch.setattr(compute, "choose", lambda *given, **more: SimpleNamespace(method="windowed"))
+    return asked
+
+
+SINGLE, DOUBLE = torch.float32, torch.float64
+
+
+def run(dtype=SINGLE, tolerance=1e-3, case=CASE, **more):
+    return compute.intensity(*maps(dtype), [case], [1.0], tolerance=tolerance, **more)
+
+
+def test_one_try_at_half_the_tolerance_adds_what_sums_and_results_round(monkeypatch):
+    asked = scripted(monkeypatch, (6e-4, 500.0))
+    found = run()
+    assert asked == [(SINGLE, 5e-4)]
+    assert found.error == pytest.approx(math.hypot(6e-4, 4e-7, 1.5e-7), rel=1e-12)
+    assert (found.intensity.dtype, found.power) == (SINGLE, 7.0)
+    tight = scripted(monkeypatch, (1e-7, 500.0))
+    assert run(tolerance=9e-7).error == pytest.approx(math.hypot(1e-7, 4e-7, 1.5e-7), rel=1e-9)
+    assert tight == [(SINGLE, 4.5e-7)]
+    double = scripted(monkeypatch, (1e-14, 500.0))
+    assert run(DOUBLE, 1e-9).error == pytest.approx(math.hypot(1e-14, 2e-15), rel=1e-9)
+    assert double == [(DOUBLE, 5e-10)]
+
+
+def test_what_single_precision_cannot_hold_is_summed_in_double(monkeypatch):
+    asked = scripted(monkeypatch, (1e-7, 500.0))
+    assert run(tolerance=7e-7).error == pytest.approx(math.hypot(1e-7, 2e-15, 1.5e-7), rel=1e-9)
+    assert asked == [(DOUBLE, 3.5e-7)]
+    few = scripted(monkeypatch, (1e-4, 500.0))  # 7 x 9 samples have no mean rounding, 8 x 8 have
+    run(case=Case((30, 41), 0.37, 0.85, 62.0, (0.2, 0.1), (0.002, 0.001), (14.0, -8.5), 0.6, (7, 9)))
+    assert few == [(DOUBLE, 5e-4)]
+    enough = scripted(monkeypatch, (1e-4, 500.0))
+    run(case=Case((30, 41), 0.37, 0.85, 62.0, (0.2, 0.1), (0.002, 0.001), (14.0, -8.5), 0.6, (8, 8)))
+    assert enough == [(SINGLE, 5e-4)]
+
+
+def test_tries_get_tighter_until_the_estimate_is_met_and_the_last_is_told_in_any_case(monkeypatch):
+    asked = scripted(monkeypatch, (2e-3, 500.0), (1.1e-3, 500.0), (1.05e-3, 500.0))
+    assert run().error == pytest.approx(1.05e-3, rel=1e-6)
+    assert asked == [(SINGLE, 5e-4), (SINGLE, pytest.approx(1.25e-4)), (DOUBLE, pytest.approx(1e-5))]
+    asked = scripted(monkeypatch, (2e-3, 500.0), (0.9e-3, 500.0))
+    assert run().error == pytest.approx(0.9e-3, rel=1e-6)
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize(("bright", "tries"), [(31.0, 1), (29.0, 2)])
+def test_dim_windows_are_summed_again_in_double(monkeypatch, bright, tries):
+    asked = scripted(monkeypatch, (1e-4, bright), (1e-4, bright))
+    run()
+    assert [dtype for dtype, _ in asked] == [SINGLE, DOUBLE][:tries]
+
+
+def test_gradients_ask_for_tighter_settings(monkeypatch):
+    """A thirty-second of the tolerance or 1e-6, not above an eighth; a moving geometry a thousandth, in double."""
+    for tolerance, want in ((1e-3, 1e-3 / 32), (2e-5, 1e-6), (4e-6, 5e-7)):
+        asked = scripted(monkeypatch, (0.0, 500.0))
+        phase, level = maps(SINGLE)
+        compute.intensity(phase.requires_grad_(), level, [CASE], [1.0], tolerance=tolerance)
+        assert asked == [(SINGLE, pytest.approx(want))]
+    asked = scripted(monkeypatch, (0.0, 500.0))
+    run(moving=object())
+    assert asked == [(DOUBLE, pytest.approx(1e-6))]
+
+
+def test_exact_sums_add_wavelengths_by_their_weights(monkeypatch):
+    field = {0.85: 2.0 + 1.0j, 0.79: 1.0 - 3.0j}
+    monkeypatch.setattr(compute, "choose", lambda *given, **more: SimpleNamespace(method="exact", reason="few"))
+    monkeypatch.setattr(compute, "field_exact", lambda p, t, case: np.full((2, 9, 11), field[case.wavelength_um]))
+    phase, level = maps(SINGLE, 2)
+    found = compute.intensity(phase, level, [CASE, OTHER], [0.7, 0.4], tolerance=1e-3)
+    assert found.intensity.numpy() == pytest.approx(np.full((2, 9, 11), 0.7 * 5 + 0.4 * 10))
+    squares = (level.double() ** 2).sum((1, 2))
+    assert found.power == pytest.approx(float(0.7 * squares[0] + 0.4 * squares[1]))
+    assert (found.error, found.reason) == (1e-7, "few")
+    double = compute.intensity(phase.double(), level.double(), [CASE, OTHER], [0.7, 0.4], tolerance=1e-3)
+    assert double.error == 4e-12
+
+
+def test_pillars_of_random_phases_add_by_power_at_the_middle_of_the_window():
+    """|area d / (2π r²) (1/r - ik)| of the kernel from the lens's middle to that of the window, to (1 / kr)² / 2; root of the power."""
+    r = math.hypot(62.0, 14.0, 8.5)
+    k = 2 * math.pi / 0.85
+    kernel = 0.37**2 * 62.0 / (2 * math.pi * r**2) * abs(1 / r - 1j * k)
+    assert compute._incoherent(5.3, CASE) == pytest.approx(math.sqrt(5.3) * kernel, rel=1e-5)
+
+
+def test_few_of_many_samples_may_miss_half_as_much_again_and_a_part_of_the_setting():
+    found = compute._few_seen(Result(torch.ones(1), 3e-4, "typed", 1.0), 8e-3)
+    assert found.error == pytest.approx(math.hypot(1.5 * 3e-4, 0.02 * 8e-3), rel=1e-12)
+
+
+def test_a_wide_window_tells_noise_brightness_and_transforms(monkeypatch):
+    """Two wavelengths: light and power by weight, noise of each from its own power, error of few samples and FFTs."""
+    kept = []
+    light = {0.85: 3.0, 0.79: 5.0}
+    power = {0.85: 900.0, 0.79: 700.0}
+    bright = torch.ones(2, 9, 11, dtype=SINGLE)
+    bright[:, 3, 4] = 21.0
+    monkeypatch.setattr(compute, "plan_wide", lambda case, *_: SimpleNamespace(nodes_um=None, case=case))
+    monkeypatch.setattr(
+        compute,
+        "light_wide",
+        lambda p, t, made: (
+            bright * light[made.case.wavelength_um],
+            torch.ones(5, 6, dtype=torch.complex64),
+            power[made.case.wavelength_um],
+        ),
+    )
+    monkeypatch.setattr(compute, "relative_error", lambda samples, seen: kept.append((samples, seen)) or 4e-4)
+    choice = SimpleNamespace(method="wide", reason="typed")
+    found = compute._wide(maps(SINGLE, 2), SINGLE, [CASE, OTHER], [0.7, 0.4], 8e-3, choice)
+    own = math.hypot(math.hypot(1.5 * 4e-4, 0.02 * 8e-3), 1e-6)
+    assert found.error == pytest.approx(own, rel=1e-12)
+    total = 0.7 * 3 + 0.4 * 5
+    assert found.intensity[1, 3, 4].item() == pytest.approx(21 * total, rel=1e-6)
+    assert found.power == pytest.approx(0.7 * 900 + 0.4 * 700)
+    (samples,), (seen,) = kept[0]
+    assert seen == pytest.approx(bright.numpy() * total)
+    for sample, case, weight in zip(samples, (CASE, OTHER), (0.7, 0.4), strict=True):
+        phasor = math.hypot(8e-7, 8e-3 / SHARE)
+        assert sample.noise == pytest.approx(phasor * compute._incoherent(power[case.wavelength_um], case), rel=1e-9)
+        assert (sample.weight, sample.case, sample.parts) == (weight, case, 1)
+    lit = (98 * 1 + 21**2) / (98 + 21) * total  # of the light itself: Σ I² / Σ I
+    alone = 0.7 * compute._incoherent(1.0, CASE) ** 2 + 0.4 * compute._incoherent(1.0, OTHER) ** 2
+    assert found.brightness == pytest.approx(lit / alone / found.power, rel=1e-5)
+    plain = compute._judged(
+        bright * total,
+        [samples],
+        [seen],
+        ([CASE, OTHER], [0.7, 0.4], found.power),
+        SimpleNamespace(method="windowed", reason=""),
+    )
+    assert plain.brightness == pytest.approx((98 + 21) / 99 * total / alone / found.power, rel=1e-5)
+    assert plain.error == 4e-4
