@@ -110,7 +110,7 @@ def test_exact_sums_add_wavelengths_by_their_weights(monkeypatch):
 
 
 def test_pillars_of_random_phases_add_by_power_at_the_middle_of_the_window():
-    """|area d / (2π r²) (1/r - ik)| of the kernel from the lens's middle to that of the window, to (1 / kr)² / 2; root of the power."""
+    """|area d / (2π r²) (1/r - ik)| of the kernel from the lens's middle to that of the window, root of the power."""
     r = math.hypot(62.0, 14.0, 8.5)
     k = 2 * math.pi / 0.85
     kernel = 0.37**2 * 62.0 / (2 * math.pi * r**2) * abs(1 / r - 1j * k)
