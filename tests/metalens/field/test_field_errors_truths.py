@@ -1,0 +1,176 @@
+"""What an imager says of its own error, cause by cause, from PSFs that are typed in."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.field import Grid, engine, plan
+from metalens.field.forming import Imager
+from metalens.field.plan import Plan
+from metalens.field.points import Window
+from metalens.lens import Layers
+from metalens.psf import Nodes
+
+RNG = np.random.default_rng(31)
+Y, X = torch.tensor([-300.0, 40.0, 260.0]).double(), torch.tensor([-500.0, -90.0, 420.0, 700.0]).double()
+WAVES = Nodes(np.array([0.82, 0.88]), np.array([0.25, 0.75]), 0.004)
+PLAN = Plan(Y, X, torch.tensor([3e3, 4e3, 9e3]).double(), WAVES, Window(7, 2.0), folds=False)
+OPTICS = SimpleNamespace(distance_um=900.0, layers=Layers())
+
+
+def psf_of(scale, shape=()):
+    light = torch.from_numpy(RNG.uniform(0.2, 1.0, (*shape, 7, 7)))
+    return scale * light / light.sum((-1, -2), keepdim=True)
+
+
+def test_the_error_of_an_image_adds_its_causes_and_not_the_light_outside():
+    made = Imager(None, None, None, None, [], [], {"kernels": 0.03, "nodes": 0.04, "spectrum": 0.12, "outside": 0.5})
+    assert made.error == pytest.approx(0.13, rel=1e-12)
+
+
+def test_illumination_falls_with_the_fourth_power_of_the_cosine_of_its_own_place():
+    light = psf_of(1.0, (3, 4, 3)) * torch.from_numpy(RNG.uniform(0.5, 2.0, (3, 4, 3)))[..., None, None]
+    unit, energy = engine.normalised(light, OPTICS, PLAN)
+    for i, y in enumerate(Y.tolist()):
+        for j, x in enumerate(X.tolist()):
+            cosine = 900 / math.hypot(x, y, 900)
+            for k in range(3):
+                total = float(light[i, j, k].sum())
+                assert float(energy[i, j, k]) == pytest.approx(total * cosine**4, rel=1e-12)
+                assert unit[i, j, k].numpy() == pytest.approx(light[i, j, k].numpy() / total, rel=1e-12)
+
+
+def test_the_width_of_light_is_its_root_mean_square_distance_from_its_middle():
+    light = psf_of(3.0, (2, 2)) * torch.tensor([[1.0, 0.4], [2.5, 0.7]])[..., None, None]
+    light[0, 1] = 0.0
+    light[0, 1, 2, 5] = 1.0  # a point is as wide as half a sample
+    want = []
+    for psf in light.reshape(-1, 7, 7).numpy():
+        y, x = np.mgrid[:7, :7]
+        cy, cx = (psf * y).sum() / psf.sum(), (psf * x).sum() / psf.sum()
+        want.append(math.sqrt(max((psf * ((y - cy) ** 2 + (x - cx) ** 2)).sum() / psf.sum(), 0.25)))
+    assert plan.width(light) == pytest.approx(np.mean(want), rel=1e-9)
+
+
+def test_the_transform_is_judged_by_rays_seen_from_a_width_aside(monkeypatch):
+    """By 0.6 and 0.8 of the width along x and y, at the first wavelength; root of the mean square over all PSFs."""
+    plain, other, asked = psf_of(1.0, (2, 3)), psf_of(1.0, (2, 3)), []
+
+    def psfs(optics, at, *, depths_um, wavelength_um, window, shift_um):
+        asked.append((at, depths_um, wavelength_um, shift_um))
+        return 0.8 * plain if shift_um == (0.0, 0.0) else other
+
+    monkeypatch.setattr(plan, "psfs", psfs)
+    at, depths = torch.zeros(2, 2), torch.ones(3)
+    found = plan.neglected(OPTICS, WAVES, PLAN.window, (at, depths))
+    wide = plan.width(plain) * 2.0
+    assert [wave for _, _, wave, _ in asked] == [0.82, 0.82]
+    assert asked[1][3] == pytest.approx((0.6 * wide, 0.8 * wide))
+    errors = [float(plan.relative(o, 0.8 * p)) for o, p in zip(other.flatten(0, 1), plain.flatten(0, 1), strict=True)]
+    assert found == pytest.approx(math.sqrt(np.mean(np.square(errors))), rel=1e-9)
+
+
+def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monkeypatch):
+    def psfs(optics, at, *, depths_um, wavelength_um, window, finest_um):
+        assert finest_um == 0.82
+        return (at.sum() + 10 * wavelength_um) * torch.ones(1, len(depths_um), 7, 7)
+
+    monkeypatch.setattr(plan, "psfs", psfs)
+    at = torch.tensor([[1.0, 2.0], [5.0, -3.0], [0.5, 0.25]])
+    found = plan.spectral(OPTICS, at, torch.ones(2), WAVES, PLAN.window)
+    middle = 10 * (0.25 * 0.82 + 0.75 * 0.88)
+    assert found.shape == (3, 2, 7, 7)
+    assert found[:, 1, 4, 2].numpy() == pytest.approx([3 + middle, 2 + middle, 0.75 + middle], rel=1e-6)
+
+
+def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
+    """Places of the pixels between the outermost nodes, depths at 13 and 58 % of the range of 1/z; light that the true
+    PSFs lose is outside; the transform is judged at five of the places; half of what lies beyond a window is edge."""
+    seen = {}
+    true, used = psf_of(1.0, (16, 2)), psf_of(1.0, (16, 2))
+    passed = torch.from_numpy(RNG.uniform(0.8, 0.95, (16, 2)))
+
+    def spectral(optics, at, depths, waves, window):
+        seen.update(at=at, depths=depths)
+        return true * passed[..., None, None]
+
+    def psfs_used(made, pixels, depths):
+        seen.update(pixels=pixels)
+        return used.float()
+
+    def neglected(optics, waves, window, at):
+        seen.update(few=at)
+        return 0.017
+
+    monkeypatch.setattr(engine, "spectral", spectral)
+    monkeypatch.setattr(engine, "psfs_used", psfs_used)
+    monkeypatch.setattr(engine, "neglected", neglected)
+    monkeypatch.setattr(engine, "sampling", lambda optics, window, wave: SimpleNamespace(beyond=0.05 * wave))
+    grid = Grid((31, 44), 2.0, (3e3, 9e3), window=7)
+    parts = engine._held_out(OPTICS, SimpleNamespace(plan=PLAN, grid=grid))
+    rows, columns = grid.frame
+    pixels = seen["pixels"].numpy()
+    assert pixels.shape == (16, 2)
+    assert pixels[:, 0].max() < rows
+    assert rows <= pixels[:, 1].max() < columns  # rows and columns are not exchanged
+    y = -300 + 560 * pixels[:, 0] / (rows - 1)
+    x = -500 + 1200 * pixels[:, 1] / (columns - 1)
+    assert seen["at"].numpy() == pytest.approx(np.stack([x, y], 1))
+    assert seen["depths"].tolist() == pytest.approx([1 / (1 / 3e3 + s * (1 / 9e3 - 1 / 3e3)) for s in (0.13, 0.58)])
+    errors = [float(plan.relative(u.double(), t)) for u, t in zip(used.flatten(0, 1), true.flatten(0, 1), strict=True)]
+    assert parts["nodes"] == pytest.approx(math.sqrt(np.mean(np.square(errors))), rel=1e-5)
+    assert parts["outside"] == pytest.approx(1 - float(passed.mean()), rel=1e-9)
+    assert parts["spectrum"] == 0.004
+    assert parts["transform"] == 0.017
+    assert parts["edge"] == pytest.approx(0.05 * 0.82 / 2)
+    few, depths = seen["few"]
+    assert few.numpy() == pytest.approx(seen["at"].numpy()[:5])
+    assert depths is seen["depths"]
+
+
+def test_kernels_are_thinned_to_what_a_texture_shows_and_the_error_is_that_of_the_texture(monkeypatch):
+    """Trimmed at 8, 6 and 4.5 times their share the texture is off by 1.3, 0.98 and 0.96 of it: the last is taken."""
+    share = 0.02 * 0.6
+    off = {8.0: 1.3, 6.0: 0.98, 4.5: 0.96}
+    image = torch.from_numpy(RNG.uniform(0.5, 1.5, (1, 9, 8)))
+    grid = Grid((9, 8), 2.0, (3e3, 9e3), window=3)
+    whole = Imager(grid, PLAN, None, None, [], [], {"kernels": 0.005})
+    asked = []
+
+    def trimmed(optics, tolerance):
+        asked.append(tolerance / share)
+        return Imager(grid, PLAN, None, None, [], [], {"looser": tolerance / share})
+
+    def blurred(frames, optics):
+        looser = optics.parts.get("looser")
+        return image if looser is None else image * (1 + share * off[round(looser, 6)])
+
+    monkeypatch.setattr(engine, "trimmed", trimmed)
+    monkeypatch.setattr(engine, "blurred", blurred)
+    found = engine.thinned(whole, tolerance=0.02)
+    assert asked == pytest.approx([8.0, 6.0, 4.5, 4.5])  # 0.98 of the share is above 0.97 of it
+    assert found.parts["kernels"] == pytest.approx(math.hypot(0.96 * share, 0.005), rel=1e-6)
+
+
+def test_eighths_of_a_round_field_give_all_of_it(monkeypatch):
+    """PSFs that know their place alone, of a lens that is the same to all sides: mirrored in x, y and the diagonal."""
+    ring = torch.tensor([-6.0, -2.5, 0.0, 2.5, 6.0]).double()
+    grid = torch.arange(-3, 4).double()
+
+    def psf(x, y):
+        away = torch.hypot(grid[:, None] - 0.3 * y, grid - 0.3 * x)
+        return torch.exp(-away) * (1 + 0.02 * (x * grid + y * grid[:, None]))
+
+    def spectral(optics, at, depths, waves, window):
+        assert len(at) == 6
+        return torch.stack([torch.stack([psf(x, y)]) for x, y in at])
+
+    monkeypatch.setattr(engine, "spectral", spectral)
+    made = Plan(ring, ring, torch.ones(1).double(), WAVES, Window(7, 1.0), folds=True)
+    out = engine._folded(OPTICS, made)
+    for i, y in enumerate(ring):
+        for j, x in enumerate(ring):
+            assert out[i, j, 0].numpy() == pytest.approx(psf(x, y).numpy(), rel=1e-9), (i, j)
