@@ -76,7 +76,8 @@ VIEWS = {
     "asbuilt": "characterize.commands.view:asbuilt",
     "run": "codesign.commands.view:panels",
 }
-
+# and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``
+TOLD = {"mask": "layout.commands.info"}
 
 _AGAIN_S = 0.02  # after which a dropped interrupt comes again
 _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
@@ -207,6 +208,8 @@ def _dispatch(verb: str, words: list[str]) -> int:
         module.SOURCES.update(PSF_SOURCES)
     if verb == "view":
         module.VIEWS.update(VIEWS)
+    if verb == "info":
+        module.TOLD.update(TOLD)
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
     return int(module.run(options))
 

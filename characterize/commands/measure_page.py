@@ -15,19 +15,22 @@ COLUMNS = {  # of a frame's record, and as the page has them
     "angle_deg": "angle / deg",
     "spot.fwhm_um": "width at half maximum / µm",
     "spot.ee80_um": "radius of 80 % of the light / µm",
-    "mtf50_x_per_um": "MTF at one half, x / (1/um)",
-    "mtf50_y_per_um": "MTF at one half, y / (1/um)",
+    "mtf50_x_per_um": "MTF is one half, x / (1/µm)",
+    "mtf50_y_per_um": "MTF is one half, y / (1/µm)",
     "strehl": "Strehl ratio",
     "efficiency": "focusing efficiency",
 }
+CURVES = "Modulation transfer along x up to the pixel's Nyquist frequency, and light within a radius; one line a frame."
+_NAMED = 8  # lines that a legend holds
 
 
 def frames_page(path: Path, found: frames.Quality) -> None:
     """Every frame with its numbers, and encircled energy over the radius."""
-    rows = [tuple(attrgetter(name)(row) for name in COLUMNS) for row in found.frames]
+    columns = {words: [attrgetter(name)(row) for row in found.frames] for name, words in COLUMNS.items()}
+    known = {words: column for words, column in columns.items() if any(value == value for value in column)}  # not nan
     sections = [
-        report.Section("Frames", "", [report.Table(tuple(COLUMNS.values()), rows)]),
-        report.Section("Curves", "", [report.Figure(_curves(found), "One line a frame.", wide=True)]),
+        report.Section("Frames", "", [report.Table(tuple(known), list(zip(*known.values(), strict=True)))]),
+        report.Section("Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]),
     ]
     fields = list(found.best_depth_um.items())
     if fields:
@@ -42,10 +45,7 @@ def frames_page(path: Path, found: frames.Quality) -> None:
 
 def _curves(found: frames.Quality) -> bytes:
     """Modulation over frequency and encircled energy over the radius."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 3))
-    mtf, energy = figure.subplots(1, 2)
+    figure, (mtf, energy) = report.canvas(1, 2)
     radius = np.linspace(0, min(found.light.shape[1:]) / 2 * found.step_um, 60)
     for row, image in zip(found.frames, found.light, strict=True):
         curve = metrics.mtf_of_psf(image, step_um=found.step_um)
@@ -56,22 +56,23 @@ def _curves(found: frames.Quality) -> bytes:
     mtf.set_ylabel("modulation along x")
     energy.set_xlabel("radius / µm")
     energy.set_ylabel("share of the light")
+    if len(found.frames) <= _NAMED:
+        energy.legend(fontsize=7)
     return report.png(figure)
 
 
 def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) -> None:
     """The edge and the modulation across it."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 3))
-    picture, curve = figure.subplots(1, 2)
+    figure, (picture, curve) = report.canvas(1, 2)
     picture.imshow(image, cmap="gray")
     picture.set_axis_off()
     curve.plot(found.frequency_per_um, found.modulation)
     curve.axvline(0.5 / pixel_um, color="0.6", linestyle=":")
     curve.set_xlabel("cycles / µm")
     curve.set_ylabel("modulation")
-    caption = f"Modulation one half at {found.mtf50_per_um:.4g} per um; dotted: Nyquist's frequency of the pixels."
+    caption = (
+        f"Modulation one half at {found.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
+    )
     report.write(path, "Slanted edge", [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])])
 
 

@@ -8,6 +8,7 @@ from characterize.captures import capture as captures
 from characterize.inference import AsBuilt
 from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
+from metalens.ground.report import in_words
 from metalens.psf import PsfStack
 from metalens.view import Axis, Images, Numbers, Panel, at_brightest
 
@@ -18,7 +19,10 @@ def capture(path: Path) -> list[Panel]:
     frames = np.asarray(read.frames, float)
     step = read.pixel_um if np.isfinite(read.pixel_um) else 1.0
     rows = [
-        (name, *(round(float(v), 6) for v in (position, *np.degrees(angle), exposure)))
+        (
+            name,
+            *(round(float(v), 6) if np.isfinite(v) else "not stated" for v in (position, *np.degrees(angle), exposure)),
+        )
         for name, position, angle, exposure in zip(
             read.names, read.position_um, read.angle_rad, read.exposure_s, strict=True
         )
@@ -28,7 +32,7 @@ def capture(path: Path) -> list[Panel]:
         ("pixel / µm", read.pixel_um),
         ("wavelength / µm", read.wavelength_um),
     ]
-    about += [(key, str(value)) for key, value in sorted(read.about.items())]
+    about += [(in_words(key), str(value)) for key, value in sorted(read.about.items())]
     about += [("put right", text) for text in read.corrections]
     return [
         Images("Frames", frames, [Axis("frame", list(read.names))], step, "counts"),

@@ -16,7 +16,7 @@ _TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus
 _SURE = 0.9  # likeness from which on the nominal lens explains the frames
 _ZEROS = 17
 _DISTANCES = 17  # of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at NA 0.25
-MIRRORED = tuple("mirrored, then " + words for words in TURNS)
+MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

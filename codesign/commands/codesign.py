@@ -75,7 +75,9 @@ def run(options: Options) -> int:
         rows, said = _work(options, settings, device, draft.path)
     count = torch.get_num_threads()
     values = {"rows": rows, "folder": str(options.output), "image": said, "threads": count}
-    words = f"trained on {count} threads; another number changes the last digits, and with them the run"
+    words = (
+        f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
+    )
     options.console.result(values, f"{_table(rows)}\n{formed.words(said)}\n{words}")
     return 0
 

@@ -95,7 +95,7 @@ def _overview(job: Job, shots: dict[str, bytes]) -> Section:
 
 def _rules(job: Job, shots: dict[str, bytes]) -> Section:
     found = job.drc
-    rows = [[rule, found.limits[rule], count] for rule, count in found.counts.items()]
+    rows = [[rule, _limit(rule, found.limits[rule]), count] for rule, count in found.counts.items()]
     items: list[Figure | Table] = [
         Figure(shots["margins.png"], "What was found (bar) beside what is allowed (line).", wide=True),
         Table(("rule", "limit", "violations"), rows, "Checked on the drawn polygons, all pillars."),
@@ -107,6 +107,10 @@ def _rules(job: Job, shots: dict[str, bytes]) -> Section:
         head = ("rule", "(x, y) / nm", "found", "needed", "where")
         items.append(Table(head, places, "The first violations; mask.lyrdb marks up to 500 of each rule."))
     return Section("Design rules", found.summary + ".", items)
+
+
+def _limit(rule: str, value: float) -> str:
+    return f"{100 * value:g} %" if rule == "density" else f"{value:g} nm"
 
 
 def _shaped(job: Job) -> Section:

@@ -75,7 +75,7 @@ def _layers(content: MaskContent, outlines: list[Outline], dose: dict[LayerNumbe
         area = sum(len(o.places) * abs(polygon.twice_area(o.corners)) / 2 for o in some) * (1e-3 * content.unit_nm) ** 2
         name = content.layer_names.get(layer, "")
         rows.append((number, name, sum(len(o.places) for o in some), area, dose.get(layer, "none stated")))
-    return Numbers("Layers", ("layer/datatype", "name", "shapes", "area / um²", "relative dose"), rows)
+    return Numbers("Layers", ("layer/datatype", "name", "shapes", "area / µm²", "relative dose"), rows)
 
 
 def _marks(path: Path) -> list[tuple[float, float, str]]:

@@ -1,5 +1,6 @@
-"""What a file is: kind, version, provenance, its arrays, and a small picture of the largest; networks as well."""
+"""What a file is: kind, version, provenance, arrays and a small picture of the largest; masks and networks as well."""
 
+import importlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +9,17 @@ from typing import Any
 import numpy as np
 import tyro
 
-from metalens.commands.common import Common
+from metalens.commands.common import MASKS, Common
 from metalens.ground import manifest, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import StoreError
 
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
+_HDF5 = b"\x89HDF"  # first bytes
+TOLD: dict[
+    str, str
+] = {}  # kind of file: module of a package above with ``told`` and ``text``, filled by the command line
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,8 @@ class Options(Common):
     """Options of ``metalens info``.
 
     Attributes:
-        file: an artefact of this toolchain: HDF5, a network or checkpoint (safetensors), or a folder with a manifest.
+        file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or checkpoint (safetensors), a
+            folder with a manifest, or any file of one.
     """
 
     file: tyro.conf.Positional[Path]
@@ -38,10 +44,24 @@ def run(options: Options) -> int:
         told = network(options.file)
         options.console.result(told, _network_text(told))
         return 0
+    if options.file.suffix.lower() in MASKS and "mask" in TOLD:
+        module = importlib.import_module(TOLD["mask"])
+        told = module.told(options.file)
+        options.console.result(told, module.text(told))
+        return 0
+    if (listed := member(options.file)) is not None:
+        options.console.result(listed, _member_text(listed))
+        return 0
     stored = store.load(options.file)
+    about = _about(options.file.name, stored)
+    options.console.result(about, _text(stored, about["arrays"]))
+    return 0
+
+
+def _about(name: str, stored: store.Stored) -> dict[str, Any]:
     arrays = {name: f"{a.dtype} {tuple(a.shape)}" for name, a in stored.arrays.items()}
-    about = {
-        "file": options.file.name,
+    return {
+        "file": name,
         "kind": stored.kind,
         "version": stored.version,
         "attributes": stored.attributes,
@@ -53,8 +73,30 @@ def run(options: Options) -> int:
             "versions": dict(stored.provenance.versions),
         },
     }
-    options.console.result(about, _text(stored, arrays))
-    return 0
+
+
+def member(path: Path) -> dict[str, Any] | None:
+    """A file that is no HDF5, as the manifest of its folder lists it: command and versions; None where none does.
+
+    Raises:
+        StoreError: it is not as it was written.
+    """
+    found = manifest.read(path.parent) if path.is_file() else None
+    listed = (found or {}).get("files", {}).get(path.name)
+    if found is None or listed is None:
+        return None
+    with open(path, "rb") as file:
+        if file.read(len(_HDF5)) == _HDF5:
+            return None
+    if store.sha256(path) != listed["sha256"]:
+        raise StoreError(f"{path}: not as `metalens {found['command']}` wrote it; make it again")
+    return {"file": path.name, "command": found["command"], "versions": found["versions"], **listed}
+
+
+def _member_text(told: dict[str, Any]) -> str:
+    versions = ", ".join(f"{k} {v}" for k, v in told["versions"].items())
+    first = f"{told['file']}: {told['bytes']:,} bytes, as it was written by\n  metalens {told['command']}"
+    return f"{first}\nmade with {versions}"
 
 
 def folder(path: Path) -> dict[str, Any]:

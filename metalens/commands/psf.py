@@ -257,6 +257,19 @@ def _budget_table(stack: psf.PsfStack) -> Table:
     )
 
 
+def _key_figures(stack: psf.PsfStack) -> list[KeyFigure]:
+    """What was computed, how well, and what the model leaves out of it."""
+    found, shape = _budget(stack), (len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um))
+    counted = " × ".join(map(str, shape))
+    figures = [
+        KeyFigure("field angles × depths × wavelengths", counted),
+        KeyFigure("relative error of what is computed", f"{stack.error:.2g}", stack.converged),
+        KeyFigure("with what the model leaves out", f"{found.total:.2g}"),
+    ]
+    known = not math.isnan(found.outside)
+    return figures + ([KeyFigure("of the light falls beside the window", f"{found.outside:.2g}")] if known else [])
+
+
 def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None:
     """One page with all pictures and the energies."""
     energy = np.asarray(stack.energy_um2)
@@ -265,7 +278,7 @@ def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None
         for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
     ]
     table = Table(
-        ("x / deg", "y / deg", "least", "most"), rows, "Light in the window for unit irradiance, um², over depth."
+        ("x / deg", "y / deg", "least", "most"), rows, "Light in the window for unit irradiance, µm², over depth."
     )
     figures = [Figure(image, CAPTIONS[name], wide=True) for name, image in pictures.items()]
     write(
@@ -276,5 +289,5 @@ def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None
             Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
             Section("Energy", f"Method: {stack.reason}.", [table]),
         ],
-        key_figures=[KeyFigure("relative error", f"{stack.error:.2g}", stack.converged)],
+        key_figures=_key_figures(stack),
     )

@@ -19,6 +19,7 @@ FOLDERS = {
     "run": ("log.jsonl", "checkpoint.safetensors"),
     "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
 }
+GENERATOR, _HEAD = 'content="metalens toolchain"', 400  # what tells these pages, and characters that hold it
 OWN = {"library": "library_panels", "axes-library": "axes_panels", "lens": "lens_panels", "psf": "psf_panels"}
 
 
@@ -29,7 +30,8 @@ class Options(Common):
     Attributes:
         file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain; a mask (GDSII or OASIS);
             or the folder of a mask, of captures, or of a co-design run.
-        output: the page to write; by default the file's name with .html, beside it.
+        output: the page to write; by default the file's name with .html, beside it, or with _view.html where a report
+            of that name stands there.
         serve: show the page in a browser on this machine and follow what grows, until Ctrl-C; nothing is written. A
             folder of several artefacts begins with a list of them.
         port: of --serve on 127.0.0.1; 0: any that is free.
@@ -47,7 +49,7 @@ def run(options: Options) -> int:
         return _served(options)
     if options.port:
         raise ConfigError("--port: only with --serve")
-    target = options.output or options.file.with_name(options.file.name.removesuffix(".h5") + ".html")
+    target = options.output or _beside(options.file)
     with options.claim(target) as draft:
         title, panels = _shown(options.file)
         write(draft.path, title, panels, about=_about(options.file))
@@ -57,6 +59,17 @@ def run(options: Options) -> int:
         f"{target}: {len(panels)} figures of {options.file.name}, {size / 1e6:.2g} MB; open it in a browser",
     )
     return 0
+
+
+def _beside(path: Path) -> Path:
+    """NAME.html beside it; NAME_view.html where the first is another page, as the report of ``psf`` or ``fit``."""
+    own = path.resolve() if not path.name else path
+    target = own.with_name(own.name.removesuffix(".h5") + ".html")
+    if not target.is_file():
+        return target
+    with open(target, encoding="utf-8", errors="replace") as file:
+        head = file.read(_HEAD)
+    return target if GENERATOR in head else target.with_name(f"{target.stem}_view.html")
 
 
 def _served(options: Options) -> int:

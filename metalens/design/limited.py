@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,17 +14,22 @@ from metalens.ground.errors import StoreError
 
 _MEMORY, _A_BYTE = 2 << 30, 40  # bytes of address space: numpy and scipy take one GB; more for every byte of the file
 _SECONDS = 120
+_A = {"MATLAB": "a MATLAB", "NPZ": "an NPZ"}
 _CHILD = """
 import io, resource, sys
-sys.path[:] = sys.argv[4:]
-memory, seconds = int(sys.argv[2]), int(sys.argv[3])
+kind, memory, seconds = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+sys.path[:] = sys.argv[5:]
 resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
 resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 import numpy as np
-from scipy.io import loadmat
 try:
-    held = loadmat(io.BytesIO(sys.stdin.buffer.read()))
+    given = io.BytesIO(sys.stdin.buffer.read())
+    if kind == "NPZ":
+        held = dict(np.load(given, allow_pickle=False))
+    else:
+        from scipy.io import loadmat
+        held = loadmat(given)
     arrays = {k: v for k, v in held.items() if isinstance(v, np.ndarray) and v.dtype.kind in "biufc"}
     out = io.BytesIO()
     np.savez(out, **{k: v for k, v in arrays.items() if not k.startswith("__")})
@@ -34,13 +40,13 @@ except BaseException as error:
 """
 
 
-def matlab(path: Path) -> dict[str, Array]:
-    """Numeric arrays of a MATLAB 4 or 5 file, by name.
+def arrays(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Array]:
+    """Numeric arrays of a MATLAB 4 or 5 file, or of an NPZ file of NumPy, by name.
 
     Raises:
         StoreError: no such file, damaged, or more than the child may take.
     """
-    words = [sys.executable, "-I", "-c", _CHILD, str(path)]
+    words = [sys.executable, "-I", "-c", _CHILD, str(path), kind]
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     try:
         with open(path, "rb") as file:
@@ -51,11 +57,11 @@ def matlab(path: Path) -> dict[str, Array]:
             )
         if done.returncode:
             told = done.stderr.decode("utf-8", "replace").rpartition("REFUSED ")
-            raise StoreError(f"{path}: not a MATLAB file: {told[2] if told[1] else _death(done.returncode)}")
+            raise StoreError(f"{path}: not {_A[kind]} file: {told[2] if told[1] else _death(done.returncode)}")
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as held:
             return {name: held[name] for name in held.files}
     except subprocess.TimeoutExpired:
-        raise StoreError(f"{path}: not a MATLAB file: its reader took more than {_SECONDS} s") from None
+        raise StoreError(f"{path}: not {_A[kind]} file: its reader took more than {_SECONDS} s") from None
     except OSError as error:
         raise StoreError(f"{path}: cannot be read ({error.strerror})") from None
     except MemoryError:

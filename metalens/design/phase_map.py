@@ -4,7 +4,7 @@ import math
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -34,22 +34,22 @@ class Samples:
 def read(shape: PhaseMap) -> Samples:
     """The file of a :class:`metalens.profiles.PhaseMap`, by the ending of its name.
 
-    ``.npy``; ``.mat`` (MATLAB 4 to 7.3); ``.dat`` (Zemax grid phase, which brings its own spacing); anything else is
-    text: rows of numbers parted by commas, semicolons, tabs or blanks.
+    ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named; ``.dat`` (Zemax grid phase,
+    which brings its own spacing); anything else is text: rows of numbers parted by commas, semicolons, tabs or blanks.
 
     Raises:
         LensError: missing or unreadable file, no pitch, not 2-D, or a value that is not finite (row and column named).
     """
     path = shape.file
     if not path.is_file():
-        raise LensError(f"{path}: no such file; need a phase map (.npy, .csv, .mat or a Zemax grid phase .dat)")
+        raise LensError(f"{path}: no such file; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)")
     ending = path.suffix.lower()
     if ending == ".dat":
         samples = _zemax(path, shape.pitch_um)
     else:
         if shape.pitch_um is None:
             raise LensError(f"{path}: a {ending or 'text'} file does not tell its spacing; give pitch_um")
-        reader = {".npy": _npy, ".mat": _mat}.get(ending, _text)
+        reader = {".npy": _npy, ".npz": _npz, ".mat": _mat}.get(ending, _text)
         phase = _checked(reader(path, shape.variable), path)
         samples = Samples(phase, (shape.pitch_um, shape.pitch_um))
     return Samples(-samples.phase_rad, samples.step_um, samples.centre_um) if shape.conjugate else samples
@@ -133,14 +133,23 @@ def _text(path: Path, variable: str | None) -> Any:
 
 def _no_variable(path: Path, variable: str | None) -> None:
     if variable is not None:
-        raise LensError(f"{path}: variable = {variable!r} is for .mat files; this one holds a single array")
+        raise LensError(f"{path}: variable = {variable!r} is for .mat and .npz files; this one holds a single array")
 
 
 def _mat(path: Path, variable: str | None) -> Any:
     """A matrix of a MATLAB file; the only 2-D one where no name is given."""
     import h5py
 
-    held = _mat73(path) if h5py.is_hdf5(path) else _mat5(path)
+    return _named(path, _mat73(path) if h5py.is_hdf5(path) else _held(path, "MATLAB"), variable)
+
+
+def _npz(path: Path, variable: str | None) -> Any:
+    """A matrix of a NumPy archive, chosen as in a MATLAB file."""
+    return _named(path, _held(path, "NPZ"), variable)
+
+
+def _named(path: Path, held: dict[str, Any], variable: str | None) -> Any:
+    """The matrix of that name; without one the only matrix."""
     arrays = {k: v for k, v in held.items() if isinstance(v, np.ndarray) and v.ndim == 2 and min(v.shape) > 1}
     if variable is not None:
         if variable not in held:
@@ -151,9 +160,9 @@ def _mat(path: Path, variable: str | None) -> Any:
     return next(iter(arrays.values()))
 
 
-def _mat5(path: Path) -> dict[str, Any]:
+def _held(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Any]:
     try:
-        return dict(limited.matlab(path))
+        return dict(limited.arrays(path, kind))
     except StoreError as error:
         raise LensError(str(error)) from None
 

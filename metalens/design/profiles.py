@@ -101,10 +101,10 @@ class Cubic:
 class PhaseMap:
     """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see :mod:`metalens.design.phase_map`.
 
-    file: its path (.npy, .mat, a Zemax grid phase .dat, else text).
+    file: its path (.npy, .npz, .mat, a Zemax grid phase .dat, else text).
     pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the phasor exp(i phase).
     add_focus: whether the hyperbolic focus is added to the map.
-    variable: name of the matrix in a .mat file that holds several.
+    variable: name of the matrix in a .mat or .npz file that holds several.
     conjugate: change the sign, for maps made with exp(+iwt).
     """
 

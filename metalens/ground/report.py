@@ -80,6 +80,7 @@ class KeyFigure:
     good: bool | None = None
 
 
+PLAIN = 1e7  # up to here a number is written without a power of ten
 ROUNDING = 1e-12  # what is smaller in the units of this toolchain (um, rad, shares, electrons) is rounding
 UNITS = {"um": "µm", "nm": "nm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "seconds": "s", "e": "electrons"}
 UNITS |= {"px": "px", "mb": "MB", "waves": "waves", "um2": "µm²", "rad2": "rad²", "e2": "electrons²", "percent": "%"}
@@ -116,15 +117,18 @@ def in_words(key: str) -> str:
 def in_figures(value: Any, digits: int = 4) -> str:
     """A value as a reader wants it: ``digits`` significant digits, yes and no, 0 for what rounding has left.
 
-    >>> [in_figures(v) for v in (0.123456, True, 7.2e-15, None, "air", float("nan"))]
-    ['0.1235', 'yes', '0', '–', 'air', 'nan']
+    >>> [in_figures(v) for v in (0.123456, 19553.2, 7.2e-15, True, None, "air", float("nan"))]
+    ['0.1235', '19550', '0', 'yes', '–', 'air', 'nan']
     """
     if value is None:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return "0" if abs(value) < ROUNDING else f"{value:.{digits}g}"
+        shown = f"{value:.{digits}g}"
+        if 10**digits <= abs(value) < PLAIN:
+            return f"{float(shown):.0f}"
+        return "0" if abs(value) < ROUNDING else shown
     return str(value)
 
 

@@ -43,7 +43,7 @@ def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving
     exact = exact_seconds(case)
     apart = grids.seconds(case, tolerance) + _PLAN_SECONDS + 2 * pillars * _PILLAR
     if not moving and apart < exact and grids.is_wide(case, tolerance):
-        reason = f"wide window by Fourier transforms: {apart:.2g} s, exact sum {exact:.2g} s"
+        reason = f"wide window by Fourier transforms: {_told(apart)} s, exact sum {_told(exact)} s"
         return Choice("wide", reason, ((case,),), apart)
     with one_blas_thread():
         cut = _windows(case, tolerance)
@@ -52,14 +52,19 @@ def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving
     windowed = sum(seconds + pillars * _PILLAR for seconds, _ in plans)
     if exact < windowed and not differentiable:
         size = f"{pillars} pillars at {_points(case)} points"
-        reason = f"exact sum: {size} take {exact:.2g} s, windowed {windowed:.2g} s"
+        reason = f"exact sum: {size} take {_told(exact)} s, windowed {_told(windowed)} s"
         return Choice("exact", reason, ((case,),), exact)
-    times = f"{windowed:.2g} s, exact sum {exact:.2g} s"
+    times = f"{_told(windowed)} s, exact sum {_told(exact)} s"
     if len(found) > 1:
         why = f"the whole window would need over {MOST_NODES} nodes or a large table"
         return Choice("tiled", f"windowed in {len(found)} tiles: {why}; {times}", cut, windowed)
     rows, columns = plans[0][1]
     return Choice("windowed", f"windowed: {rows} x {columns} nodes, {times}", cut, windowed)
+
+
+def _told(seconds: float) -> str:
+    """Two digits, never as a power of ten: ``580``, ``1.4``."""
+    return f"{float(f'{seconds:.2g}'):g}"
 
 
 def exact_seconds(case: Case) -> float:

@@ -29,7 +29,6 @@ def library_panels(path: Path) -> list[Panel]:
     x, error = 1e3 * made.diameter_um, made.t_error
     phase = np.unwrap(np.angle(made.t), axis=-1)
     bands = [(1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()]
-    worst = 1e3 * error.max()
     return [
         Curves(
             "Transmission of the pillar",
@@ -40,7 +39,7 @@ def library_panels(path: Path) -> list[Panel]:
             axes,
             {"|t|": error, "|r|": error},
             bands,
-            f"Bands: error bars of the solver, at most {worst:.2g}e-3. Shaded: resonances, to their half-width.",
+            f"Bands: error bars of the solver, at most {error.max():.1e}. Shaded: resonances, to their half-width.",
         ),
         Curves(
             "Phase of the pillar",

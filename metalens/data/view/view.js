@@ -93,7 +93,7 @@ function plot(parent, title, xName, yName, log) {
     chart?.destroy();
     chart = new uPlot({ width, height: 260, title, series, bands: shade, plugins: [drawn], scales: { x: { time: false }, y: log ? { distr: 3 } : {} }, legend: { show: Object.keys(lines).length > 1 },
       axes: [{ label: xName, values: ticks, ...ink }, { label: yName, size: (_, shown) => 36 + 8 * Math.max(3, ...(shown ?? []).map((v) => v.length)), values: ticks, ...ink }] }, data, parent);
-    chart.root.querySelectorAll(".u-legend .u-series").forEach((row) => { if (/ [+-] bar$/.test(row.textContent.trim().split(":")[0].trim())) row.style.display = "none"; });
+    chart.root.querySelectorAll(".u-legend .u-series").forEach((row) => { if (/ [+-] bar$/.test(row.querySelector(".u-label")?.textContent.trim() ?? "")) row.style.display = "none"; });
   };
 }
 
@@ -250,7 +250,7 @@ function board(panel, section, box, um, closeup, paint, tell) {
     e.preventDefault();
   });
   for (const [name, act] of [["zoom in", () => zoom(2)], ["zoom out", () => zoom(0.5)], ["whole", whole], ["one pillar", () => { view.scale = closeup; later(); }]]) element("button", controls, { type: "button" }, name).addEventListener("click", act);
-  addEventListener("resize", () => { const keep = view.scale / fit; sized(); view.scale = keep * fit; later(); });
+  addEventListener("resize", () => { const keep = view.scale / fit; sized(); view.scale = keep * fit; draw(); }); // at once: paper waits for no frame
   whole();
   return { controls, later };
 }
@@ -329,7 +329,7 @@ function firstAbove(sorted, value) {
 }
 async function drawing(panel, section) {
   const outlines = (await Promise.all(panel.outlines.map(placed))).sort((a, b) => b.area - a.area), hidden = new Set();
-  const names = [...new Set(outlines.map((o) => o.layer))].sort();
+  const names = [...new Set(outlines.map((o) => o.layer))].sort((a, b) => a.localeCompare(b, undefined, { numeric: true }));
   const palette = names.map((_, i) => (names.length < 2 ? [0, 34, 78] : colour(CIVIDIS, (0.86 * i) / (names.length - 1)).map(Math.round)));
   const left = Math.min(...outlines.map((o) => o.box.left)), top = Math.max(...outlines.map((o) => o.box.high));
   const box = { w: Math.max(...outlines.map((o) => o.box.right)) - left, h: top - Math.min(...outlines.map((o) => o.box.low)) };
@@ -419,6 +419,10 @@ const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawin
   }
   const about = document.getElementById("about");
   for (const [name, value] of Object.entries(data.about)) { element("dt", about, {}, name); element("dd", about, {}, typeof value === "object" ? Object.entries(value).map(([k, v]) => `${k}: ${v}`).join("\n") : String(value)); }
-  status.textContent = `${data.panels.length} figures`;
+  // on paper everything is as wide as the sheet: figures are drawn anew for it, and for the screen again afterwards
+  for (const [when, on] of [["beforeprint", true], ["afterprint", false]]) addEventListener(when, () => { document.body.classList.toggle("paper", on); dispatchEvent(new Event("resize")); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => dispatchEvent(new Event("resize")));
+  const tables = data.panels.filter((panel) => panel.type === "Numbers").length, drawn = data.panels.length - tables, of = (n, what) => (n ? [`${n} ${what}${n > 1 ? "s" : ""}`] : []);
+  status.textContent = [...of(drawn, "figure"), ...of(tables, "table")].join(", ");
   document.body.dataset.ready = "true";
 })();

@@ -99,6 +99,7 @@ def test_conjugate_turns_the_sign(tmp_path):
         ("a.csv", b"1,2\n3\n", "not a phase map"),
         ("a.npy", b"\x93NUMPY", "not a phase map"),
         ("a.mat", b"MATLAB 5.0 MAT-file", "not a MATLAB file"),
+        ("a.npz", b"PK\x03\x04", "not an NPZ file"),
     ],
 )
 def test_broken_files_are_refused_by_name(tmp_path, name, content, message):
@@ -113,7 +114,7 @@ def test_settings_that_do_not_fit_the_file_are_refused(tmp_path):
     path = write(tmp_path, "npy")
     with pytest.raises(LensError, match="give pitch_um"):
         phase_map.read(PhaseMap(path))
-    with pytest.raises(LensError, match=r"is for \.mat files"):
+    with pytest.raises(LensError, match=r"is for \.mat and \.npz files"):
         phase_map.read(PhaseMap(path, 1.0, variable="phi"))
     with pytest.raises(LensError, match="leave pitch_um out"):
         phase_map.read(PhaseMap(write(tmp_path, "dat"), 3.0))
@@ -128,6 +129,18 @@ def test_a_matrix_is_chosen_by_name_where_there_are_several(tmp_path):
     with pytest.raises(LensError, match="did you mean 'phi'"):
         phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="ph"))
     assert phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="phi")).phase_rad == pytest.approx(PHASE)
+
+
+def test_an_archive_of_numpy_gives_its_only_matrix_or_the_named_one(tmp_path):
+    np.savez(tmp_path / "one.npz", phase=PHASE, pitch_um=STEP, x_um=np.arange(9))
+    assert phase_map.read(PhaseMap(tmp_path / "one.npz", STEP)).phase_rad == pytest.approx(PHASE)
+    np.savez_compressed(tmp_path / "two.npz", phase=PHASE, amplitude=PHASE + 1)
+    with pytest.raises(LensError, match=r"2 matrices \(amplitude, phase\); name one"):
+        phase_map.read(PhaseMap(tmp_path / "two.npz", STEP))
+    assert phase_map.read(PhaseMap(tmp_path / "two.npz", STEP, variable="phase")).phase_rad == pytest.approx(PHASE)
+    np.savez(tmp_path / "objects.npz", phase=np.array([{}], dtype=object))
+    with pytest.raises(LensError, match=r"objects\.npz: not an NPZ file: ValueError"):
+        phase_map.read(PhaseMap(tmp_path / "objects.npz", STEP))
 
 
 def test_every_flipped_bit_of_a_header_is_refused_or_read(tmp_path):

@@ -128,12 +128,12 @@ def test_an_attribute_of_the_wrong_kind_is_a_store_error(tmp_path, value):
 
 def test_matlab_files_are_read_by_a_child_that_may_die(tmp_path):
     savemat(tmp_path / "a.mat", {"p": np.array([[1.5, 2.0], [3.0, 4.0]]), "words": "x"})
-    assert list(limited.matlab(tmp_path / "a.mat")) == ["p"]
+    assert list(limited.arrays(tmp_path / "a.mat", "MATLAB")) == ["p"]
     whole = (tmp_path / "a.mat").read_bytes()
     for damaged in (whole[:150], whole[:128] + b"\xff" * 64, b""):
         (tmp_path / "b.mat").write_bytes(damaged)
         with pytest.raises(StoreError, match=r"b\.mat: not a MATLAB file"):
-            limited.matlab(tmp_path / "b.mat")
+            limited.arrays(tmp_path / "b.mat", "MATLAB")
 
 
 def test_what_nobody_foresaw_is_one_line_and_a_report(monkeypatch, capsys):

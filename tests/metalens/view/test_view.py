@@ -12,7 +12,8 @@ from metalens import lens, psf
 from metalens.cell import Cell, Index
 from metalens.commands import view
 from metalens.design import make
-from metalens.ground.errors import StoreError
+from metalens.ground import store
+from metalens.ground.errors import OutputError, StoreError
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
 from metalens.view import Axis, Classes, Curves, Images, Numbers, artefacts, page
@@ -120,6 +121,20 @@ def test_the_command_writes_a_page_once(folder, tmp_path):
     target = tmp_path / "out.html"
     assert view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
     assert _content(target.read_text(encoding="utf-8"))["about"]["made with"]
+
+
+def test_a_page_goes_beside_a_report_of_the_same_name(tmp_path):
+    store.save(tmp_path / "psf.h5", "odd", {"image": np.eye(12)}, provenance=store.Provenance())
+    report = tmp_path / "psf.html"
+    report.write_text('<!doctype html><meta name="generator" content="metalens"><p>report</p>', encoding="utf-8")
+    options = view.Options(file=tmp_path / "psf.h5", quiet=True)
+    assert view.run(options) == 0
+    assert "report" in report.read_text(encoding="utf-8")
+    assert "odd" in (tmp_path / "psf_view.html").read_text(encoding="utf-8")
+    report.unlink()
+    assert view.run(options) == 0
+    with pytest.raises(OutputError, match=r"psf\.html exists"):  # a page is not written over without a word
+        view.run(options)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no browser to show the page in: install chromium")
