@@ -243,8 +243,8 @@ def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: 
     if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
         source, told = (1e-3 * d for d in (focus.source_distance_um, focus.sensor_distance_um))
         console.say(
-            f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens for a source at {source:g} mm "
-            f"(source_distance_mm); sensor_distance_mm = {told:g}"
+            f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens "
+            f"(source_distance_mm = {source:g}); sensor_distance_mm = {told:g}"
         )
     return False
 
