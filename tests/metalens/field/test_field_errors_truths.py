@@ -174,3 +174,53 @@ def test_eighths_of_a_round_field_give_all_of_it(monkeypatch):
     for i, y in enumerate(ring):
         for j, x in enumerate(ring):
             assert out[i, j, 0].numpy() == pytest.approx(psf(x, y).numpy(), rel=1e-9), (i, j)
+
+
+def test_only_places_that_no_node_holds_judge_an_interpolation():
+    """Between 0, 1, 2 and 12 lies 7 alone: half-way between neighbours is a node itself."""
+    base, change = psf_of(1.0, (1,)), psf_of(1.0, (1,)) - psf_of(1.0, (1,))
+
+    def at(places):
+        return torch.stack([2.0 * (base + 1e-5 * float(i) ** 4 * change) for i in places])
+
+    known = plan._Known(at)
+    nodes = [0.0, 1.0, 2.0, 12.0]
+    cubic = np.linalg.solve(np.vander(nodes, 4), np.array(nodes) ** 4) @ np.vander([7.0], 4)[0]
+    got = base + 1e-5 * cubic * change
+    want = plan.relative(got, base + 1e-5 * 7.0**4 * change)
+    assert known.error([0, 1, 2, 12]) == pytest.approx(float(want[0]), rel=1e-9)
+    assert sorted(known.kept) == [0, 1, 2, 7, 12]
+
+
+def test_one_draw_stands_for_all_points_and_the_whole_spectrum(monkeypatch):
+    """12 points and weights of 0.6 and 1.4, whose sum is 2: 24 times the product with the light of that point."""
+    from metalens.field import subset
+
+    light = psf_of(1.0, (1, 3))
+    asked = {}
+
+    def psfs(optics, at, *, depths_um, wavelength_um, window, finest_um):
+        asked.update(at=at, wave=wavelength_um, finest=finest_um)
+        return light
+
+    monkeypatch.setattr(subset, "psfs", psfs)
+    gradient = torch.from_numpy(RNG.normal(size=(3, 4, 3, 7, 7)))
+    waves = Nodes(np.array([0.82, 0.88]), np.array([0.6, 1.4]), 0.0)
+    made = Plan(Y, X, PLAN.depths_um, waves, PLAN.window, folds=False)
+    found = subset.term(OPTICS, made, gradient, 6, 1)
+    assert float(found) == pytest.approx(24 * float((gradient[1, 2] * light[0]).sum()), rel=1e-9)
+    assert asked["at"].tolist() == [[420.0, 40.0]]
+    assert (asked["wave"], asked["finest"]) == (0.88, 0.82)
+
+
+def test_a_near_sheet_hides_what_it_covers_of_a_far_one():
+    """Light 0.2 through coverage 0.3 before light 0.5 through 0.8, of which 0.7 is free; in the sheets' own sum 1.1."""
+    from metalens.field.forming import _over
+
+    light, cover = torch.tensor([[[[0.2]], [[0.5]]]]).double(), torch.tensor([[[[0.3]], [[0.8]]]]).double()
+    seen = (0.2 + 0.5 * 0.7 / 0.8) / (0.3 + 0.7) * 1.1
+    assert float(_over(light, cover)) == pytest.approx(seen, rel=1e-6)
+    alone = torch.tensor([[[[0.0]], [[0.8]]]]).double()
+    assert float(_over(light * torch.tensor([0.0, 1.0])[None, :, None, None], alone)) == pytest.approx(0.5, rel=1e-6)
+    whole = torch.tensor([[[[1.0]], [[0.4]]]]).double()
+    assert float(_over(light, whole)) == pytest.approx(0.2 * 1.4, rel=1e-6)  # nothing of the far one
