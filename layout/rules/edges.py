@@ -1,4 +1,4 @@
-"""Widths, notches and spaces of any polygons, edge against edge: exact for the parts of two edges that face."""
+"""Widths, notches and spaces of any polygons, edge against edge: exact where two of them see each other."""
 
 import numpy as np
 
@@ -6,23 +6,30 @@ from layout.process import compiled
 from metalens.ground.arrays import Array
 
 WIDTH, SPACE = 0, 1
+KNOWN = -1  # shape number of contours whose widths are measured elsewhere
+_TRIES = 400  # parts of two edges that are looked at, nearest first, where others stand between them
+_SHORTEST = 1 / 16  # of the rule: parts so short are not halved
+_NEAR = 1e-7  # units: a line that ends that near to an edge does not cross it
 
 
 def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
     """(n, 4) pairs of edges that face each other too near: first edge, second edge, kind, distance.
 
     Args:
-        edges: (m, 4) x, y to x, y, the inside to the left. shape: (m,) which polygon each belongs to.
+        edges: (m, 4) x, y to x, y, the inside to the left. shape: (m,) which polygon each belongs to; of ``KNOWN`` no
+            widths are measured.
         feature: least width (edges of one shape that face through its inside). gap: least space (through the outside,
             of one shape or two).
 
-    Edges that share a corner face nowhere; of any other pair the parts count that lie before each other.
+    Edges that share a corner face nowhere; of any other pair the parts count that lie before each other and see each
+    other: through the inside for a width, through the outside for a space.
     """
     order = np.argsort(np.minimum(edges[:, 0], edges[:, 2]), kind="stable")
+    reach = np.maximum.accumulate(np.maximum(edges[order, 0], edges[order, 2]).astype(float))
     room = 1 << 12
     while True:
         found = np.empty((room, 4))
-        count = _sweep(np.asarray(edges[order], float), np.asarray(shape[order], np.int64), feature, gap, found)
+        count = _sweep(np.asarray(edges[order], float), np.asarray(shape[order], np.int64), reach, feature, gap, found)
         if count < room:
             break
         room *= 4
@@ -32,7 +39,7 @@ def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
 
 
 @compiled
-def _sweep(edges: Array, shape: Array, feature: float, gap: float, found: Array) -> int:
+def _sweep(edges: Array, shape: Array, reach: Array, feature: float, gap: float, found: Array) -> int:
     """Fill ``found``; the number of pairs, or its length where it is full."""
     count, most = 0, max(feature, gap)
     for i in range(edges.shape[0]):
@@ -48,10 +55,10 @@ def _sweep(edges: Array, shape: Array, feature: float, gap: float, found: Array)
                 continue
             for kind in range(2):
                 limit = feature if kind == 0 else gap
-                if kind == 0 and shape[i] != shape[j]:
+                if kind == 0 and (shape[i] != shape[j] or shape[i] == KNOWN):
                     continue
-                away = _facing_distance(edges[i], edges[j], 1.0 if kind == 0 else -1.0)
-                if 0 < away < limit - 1e-9:
+                away = _seen(i, j, edges, reach, 1.0 if kind == 0 else -1.0, limit)
+                if away > 0:
                     if count == found.shape[0]:
                         return count
                     found[count, 0], found[count, 1], found[count, 2], found[count, 3] = i, j, kind, away
@@ -60,13 +67,119 @@ def _sweep(edges: Array, shape: Array, feature: float, gap: float, found: Array)
 
 
 @compiled
-def _facing_distance(a: Array, b: Array, side: float) -> float:
-    """Distance of the parts that lie before each other, to the left (side 1) or right (-1); -1 where none does."""
-    p, q = _before(a, b, side), _before(b, a, side)
+def _seen(i: int, j: int, edges: Array, reach: Array, side: float, limit: float) -> float:
+    """Distance of the parts of two edges that lie before each other, to the left (side 1) or right (-1), and see each
+    other; -1 where none does, or none nearer than ``limit``.
+    """
+    p, q = _before(edges[i], edges[j], side), _before(edges[j], edges[i], side)
     if p[4] == 0 or q[4] == 0:
         return -1.0
-    least = min(_to(p[0], p[1], q), _to(p[2], p[3], q))
-    return float(min(least, _to(q[0], q[1], p), _to(q[2], q[3], p)) ** 0.5)
+    pair, line = np.empty(9), np.empty(4)
+    pair[:4], pair[4:8] = p[:4], q[:4]
+    pair[8] = _nearest(pair, line)
+    if not 0 < pair[8] < limit - 1e-9:
+        return -1.0
+    if _is_free(line, i, j, edges, reach, side):
+        return float(pair[8])
+    parts = np.empty((3 * _TRIES + 4, 9))
+    count = _halves(pair, limit, parts, 0)
+    for _ in range(_TRIES):
+        if count == 0:
+            return -1.0
+        best = np.argmin(parts[:count, 8])
+        pair[:] = parts[best]
+        _nearest(pair, line)
+        if _is_free(line, i, j, edges, reach, side):
+            return float(pair[8])
+        parts[best] = parts[count - 1]
+        count = _halves(pair, limit, parts, count - 1)
+    return -1.0
+
+
+@compiled
+def _halves(pair: Array, limit: float, parts: Array, count: int) -> int:
+    """Put both halves of both edges of a pair, that are nearer than ``limit``, behind the first ``count`` parts."""
+    line, least = np.empty(4), _SHORTEST * limit
+    if max(abs(pair[0] - pair[2]), abs(pair[1] - pair[3]), abs(pair[4] - pair[6]), abs(pair[5] - pair[7])) < least:
+        return count
+    for k in range(4):
+        made = parts[count]
+        made[:] = pair
+        for edge, half in ((0, k & 1), (4, k >> 1)):
+            for axis in range(2):
+                middle = (pair[edge + axis] + pair[edge + 2 + axis]) / 2
+                made[edge + axis + (0 if half else 2)] = middle
+        made[8] = _nearest(made, line)
+        count += 1 if made[8] < limit else 0
+    return count
+
+
+@compiled
+def _nearest(pair: Array, line: Array) -> float:
+    """Distance of two edges (the first eight numbers) that do not cross; ``line``: between their nearest points."""
+    best = np.inf
+    for k in range(4):
+        end, edge = (pair[2 * k : 2 * k + 2], pair[4:8] if k < 2 else pair[:4])
+        dx, dy = edge[2] - edge[0], edge[3] - edge[1]
+        long = dx * dx + dy * dy
+        t = 0.0 if long == 0 else min(max(((end[0] - edge[0]) * dx + (end[1] - edge[1]) * dy) / long, 0.0), 1.0)
+        x, y = edge[0] + t * dx, edge[1] + t * dy
+        away = (end[0] - x) ** 2 + (end[1] - y) ** 2
+        if away < best:
+            best = away
+            line[:2] = end
+            line[2], line[3] = x, y
+    return float(best**0.5)
+
+
+@compiled
+def _is_free(line: Array, i: int, j: int, edges: Array, reach: Array, side: float) -> bool:
+    """Whether a line between edges ``i`` and ``j`` crosses no other, and leaves corners on the wanted side."""
+    low, high = min(line[0], line[2]), max(line[0], line[2])
+    bottom, top = min(line[1], line[3]), max(line[1], line[3])
+    corners, numbers = np.zeros((2, 4)), np.zeros(4, np.int64)  # directions into and out of the corner at each end
+    for k in range(np.searchsorted(reach, low), edges.shape[0]):
+        e = edges[k]
+        if min(e[0], e[2]) > high:
+            break
+        if max(e[0], e[2]) < low or min(e[1], e[3]) > top or max(e[1], e[3]) < bottom:
+            continue
+        for end in range(2):
+            for tip in range(2):
+                if e[2 - 2 * tip] == line[2 * end] and e[3 - 2 * tip] == line[2 * end + 1]:
+                    corners[end, 2 * tip], corners[end, 2 * tip + 1] = e[2] - e[0], e[3] - e[1]
+                    numbers[2 * end + tip] += 1
+        if k not in (i, j) and _cross(line, e):
+            return False
+    for end in range(2):
+        if numbers[2 * end] == 1 and numbers[2 * end + 1] == 1:
+            away = 1.0 if end == 0 else -1.0
+            if not _leaves(corners[end], away * (line[2] - line[0]), away * (line[3] - line[1]), side):
+                return False
+    return True
+
+
+@compiled
+def _cross(line: Array, e: Array) -> bool:
+    """Whether a line passes through an edge, farther than rounding from its own ends."""
+    dx, dy = line[2] - line[0], line[3] - line[1]
+    one = dx * (e[1] - line[1]) - dy * (e[0] - line[0])
+    two = dx * (e[3] - line[1]) - dy * (e[2] - line[0])
+    if (one > 0) == (two > 0):
+        return False
+    ex, ey = e[2] - e[0], e[3] - e[1]
+    one = ex * (line[1] - e[1]) - ey * (line[0] - e[0])
+    two = ex * (line[3] - e[1]) - ey * (line[2] - e[0])
+    return bool(one * two < 0 and min(abs(one), abs(two)) > _NEAR * (ex * ex + ey * ey) ** 0.5)
+
+
+@compiled
+def _leaves(corner: Array, dx: float, dy: float, side: float) -> bool:
+    """Whether a direction from a corner (directions in and out of it) goes to its left (side 1) or right (-1)."""
+    of_one = side * (corner[0] * dy - corner[1] * dx) >= 0
+    of_two = side * (corner[2] * dy - corner[3] * dx) >= 0
+    turned = side * (corner[0] * corner[3] - corner[1] * corner[2]) > 0
+    return bool(of_one and of_two) if turned else bool(of_one or of_two)
 
 
 @compiled
@@ -86,12 +199,3 @@ def _before(line: Array, edge: Array, side: float) -> Array:
         else:
             out[2], out[3] = x, y
     return out
-
-
-@compiled
-def _to(x: float, y: float, edge: Array) -> float:
-    """Squared distance from a point to an edge."""
-    dx, dy = edge[2] - edge[0], edge[3] - edge[1]
-    long = dx * dx + dy * dy
-    t = 0.0 if long == 0 else min(max(((x - edge[0]) * dx + (y - edge[1]) * dy) / long, 0.0), 1.0)
-    return float((x - edge[0] - t * dx) ** 2 + (y - edge[1] - t * dy) ** 2)

@@ -201,10 +201,14 @@ def _by_edges(
     lines, owner = [], []
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
-        contours = region.union(shapes) if len(shapes) > 1 or not _is_convex(shapes[0]) else shapes
-        for contour in map(_plain, contours):
+        whole = len(shapes) == 1 and _is_convex(shapes[0])
+        contours = [_plain(c) for c in (shapes if whole else region.union(shapes))]
+        for contour in contours:
+            known = _is_convex(contour) and (whole or not _holds(contour, contours))
+            if known and number < len(groups):
+                _narrow(contour, rules, report, name)
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
-            owner.append(np.full(len(contour), number))
+            owner.append(np.full(len(contour), facing.KNOWN if known else number))
     edge, shape = np.concatenate(lines), np.concatenate(owner)
     feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
     for a, b, kind, away in facing.facing(edge, shape, feature, gap).tolist():
@@ -217,6 +221,25 @@ def _by_edges(
             report.minimum_feature_nm = min(report.minimum_feature_nm, value)
         else:
             report.minimum_gap_nm = min(report.minimum_gap_nm, value)
+
+
+def _holds(contour: Array, others: list[Array]) -> bool:
+    """Whether another contour lies within a convex one: it has a hole."""
+    edges = np.roll(contour, -1, axis=0) - contour
+    for other in others:
+        to = other[0] - contour
+        if other is not contour and (edges[:, 0] * to[:, 1] >= edges[:, 1] * to[:, 0]).all():
+            return True
+    return False
+
+
+def _narrow(contour: Array, rules: Rules, report: DrcReport, name: str) -> None:
+    """Width of a convex contour that shapes have together."""
+    width = convex.width(contour) * report.unit_nm
+    report.minimum_feature_nm = min(report.minimum_feature_nm, width)
+    if width < rules.minimum_feature_nm - 1e-9:
+        box = (*contour.min(0).tolist(), *contour.max(0).tolist())
+        report.add("feature", 1, Violation("feature", box, width, rules.minimum_feature_nm, f"shape of {name}"))
 
 
 def _off_grid(layer: _Layer, rules: Rules, unit_nm: float, report: DrcReport) -> None:

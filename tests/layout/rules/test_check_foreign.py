@@ -130,3 +130,74 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
     values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)  # no Infinity, which JSON does not know
     assert (values["minimum_gap_nm"], values["minimum_feature_nm"]) == (None, 170.0)
+
+
+def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
+    """A round pillar is as wide as its diameter wherever it stands; KLayout's projection says the same."""
+    made = db.Layout()
+    top, pillar, layer = made.create_cell("TOP"), made.create_cell("P"), made.layer(1, 0)
+    angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
+    corners = np.rint(51 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
+    pillar.shapes(layer).insert(db.Polygon([db.Point(*map(int, p)) for p in corners]))
+    top.insert(db.CellInstArray(pillar.cell_index(), db.Trans(0, 0), db.Vector(400, 0), db.Vector(0, 390), 5, 4))
+    angled = [(-900, -900), (3000, -900), (3000, -100), (-100, -100), (-100, 2500), (-900, 2500)]
+    top.shapes(layer).insert(db.Polygon([db.Point(*p) for p in angled]))
+    path = tmp_path / "m.gds"
+    made.write(str(path))
+    region = db.Region(top.begin_shapes_rec(layer))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=45, minimum_feature_nm=95))
+    assert report.ok
+    assert region.width_check(95, False, db.Region.Projection).is_empty()
+    thin = foreign.check(read(path), Rules(minimum_gap_nm=50, minimum_feature_nm=102))
+    assert thin.counts["feature"] == 20
+    assert thin.minimum_gap_nm == 49  # of the first row and column to the bar: 100 less 51
+    assert not region.space_check(50, False, db.Region.Euclidian).is_empty()
+    assert region.space_check(49, False, db.Region.Euclidian).is_empty()
+
+
+def staircase(rng):
+    steps = np.cumsum(rng.integers(60, 230, (int(rng.integers(2, 5)), 2)), axis=0)
+    points = [(0, 0), (int(steps[-1, 0]), 0)]
+    for k, (_, y) in enumerate(steps.tolist()):
+        left = int(steps[len(steps) - 2 - k, 0]) if k < len(steps) - 1 else 0
+        points += [(points[-1][0], y), (left, y)]
+    return points
+
+
+def ell(rng):
+    w, h = rng.integers(200, 900, 2).tolist()
+    a, b = int(rng.integers(40, w - 30)), int(rng.integers(40, h - 30))
+    return [(0, 0), (w, 0), (w, b), (a, b), (a, h), (0, h)]
+
+
+def fork(rng):
+    w, h = rng.integers(300, 900, 2).tolist()
+    a, b = int(rng.integers(40, w // 2 - 20)), int(rng.integers(40, h - 60))
+    c = int(rng.integers(a + 20, w - 40))
+    return [(0, 0), (w, 0), (w, h), (c, h), (c, b), (a, b), (a, h), (0, h)]
+
+
+def klayout_least(check, most):
+    """Smallest whole limit that a check of KLayout finds broken, less one: what it measures, rounded down."""
+    return next((d - 1 for d in range(1, most + 1) if check(d, True, db.Region.Euclidian).count()), most)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(tmp_path, seed):
+    """Overlapping, touching, nested, holes, arrays: exact, since upright edges have whole distances or corners."""
+    rng, most = np.random.default_rng(seed), 110
+    made = db.Layout()
+    top, sub, layer = made.create_cell("TOP"), made.create_cell("SUB"), made.layer(3, 1)
+    for n in range(int(rng.integers(2, 16))):
+        points = (staircase, ell, fork)[n % 3](rng)
+        x, y = rng.integers(-2200, 2200, 2).tolist()
+        turned = db.Trans(int(rng.integers(0, 8)), x, y)
+        (sub if n == 1 else top).shapes(layer).insert(db.Polygon([db.Point(*p) for p in points]).transformed(turned))
+    steps = (db.Vector(int(rng.integers(700, 1300)), 40), db.Vector(-30, int(rng.integers(700, 1300))))
+    top.insert(db.CellInstArray(sub.cell_index(), db.Trans(seed % 8, 50, -70), *steps, 2, 3))
+    path = tmp_path / f"m.{('gds', 'oas')[seed % 2]}"
+    made.write(str(path))
+    region = db.Region(top.begin_shapes_rec(layer))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=most, minimum_feature_nm=most))
+    own = [min(np.floor(v + 1e-9), most) for v in (report.minimum_gap_nm, report.minimum_feature_nm)]
+    assert own == [klayout_least(region.space_check, most), klayout_least(region.width_check, most)]

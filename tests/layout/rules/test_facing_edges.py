@@ -101,3 +101,42 @@ def test_pillars_and_their_area_are_counted_by_tiles():
     assert counts.tolist() == [1, 2, 3]
     assert cover.tolist() == [[7.0, 11.0], [22.0, 7.0], [0.0, 0.0]]
     assert math.isclose(cover.sum(), 2 * 7 + 3 * 11)
+
+
+def test_edges_that_stand_behind_others_do_not_face():
+    """A step of the outline beside a hole: 60 up and 80 across through the solid between them, which is no space."""
+    slab = [(0, 0), (400, 0), (400, 200), (180, 200), (180, 500), (0, 500)]
+    hole = [(100, 40), (100, 140), (260, 140), (260, 40)]  # clockwise; its right edge ends 80 and 60 from the step
+    lines = np.concatenate([contour(*slab), contour(*hole)])
+    rows = edges.facing(lines, np.zeros(len(lines), int), 1.0, 99.9)
+    assert rows.size == 0
+    open_slab = [
+        (0, 0),
+        (400, 0),
+        (400, 200),
+        (180, 200),
+        (180, 140),
+        (260, 140),
+        (260, 40),
+        (100, 40),
+        (100, 500),
+        (0, 500),
+    ]
+    opened = edges.facing(contour(*open_slab), np.zeros(10, int), 1.0, 80.5)
+    assert [round(away, 9) for away in opened[:, 3].tolist()] == [80.0]  # the same step, now beside an open space
+
+
+def test_what_is_hidden_at_one_end_is_measured_where_it_is_seen():
+    """Two long sides 50 apart, a post of 30 between their left ends, which are nearest: what is seen counts."""
+    low, high = [(0, 0), (900, 0), (900, 90), (0, 90)], [(0, 140), (900, 149), (900, 250), (0, 250)]
+    post = [(-20, 100), (60, 100), (60, 130), (-20, 130)]
+    pairs = found([low, high, post], 1.0, 60.0)[0]
+    spaces = [away for _, away in pairs]
+    assert min(spaces) == 10.0  # post to either side
+    beside_post = [away for away in spaces if away > 11]
+    assert beside_post[0] == pytest.approx(50 + 9 * 60 / 900, abs=0.1)  # where the post ends, not 50
+
+
+def test_shapes_of_known_width_have_no_width_here():
+    lines = contour(*BAR)
+    assert len(edges.facing(lines, np.full(4, edges.KNOWN), 37.5, 1.0)) == 0
