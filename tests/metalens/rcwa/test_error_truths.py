@@ -1,0 +1,153 @@
+"""Error bars of coupled waves from typed truncations: how far the last ones lie apart, and what is added."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from metalens.cell import Cell, Index, Light
+from metalens.rcwa import anchored, any_shape, solver, wall
+from metalens.rcwa.anchored import Anchors
+from metalens.rcwa.solver import Truncated
+
+CELL = Cell(0.4, 0.5, Index(3.5), Index(1.45))
+LIGHT = Light(0.85)
+
+
+@pytest.mark.parametrize(("reach", "times"), [(6, 7.2), (8, 6.0), (12, 3.6), (13, 3.0), (16, 3.0)])
+def test_few_orders_are_trusted_less(reach, times):
+    assert solver.safety(reach) == pytest.approx(times, rel=1e-12)
+
+
+def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what_is_trusted():
+    """Two diameters; the first of six truncations, farther than all, is no longer looked at."""
+    t = np.array([[9.0, 9j], [0.51, 0.3j], [0.55, 0.35j], [0.52, 0.33j], [0.5, 0.32j], [0.53, 0.31j]])
+    apart = [max(0.02, 0.02, 0.01, 0.03), max(0.01, 0.04, 0.02, 0.01)]
+    assert solver._estimate(t, 9) == pytest.approx(5.4 * np.array(apart), rel=1e-9)
+    assert np.isinf(solver._estimate(t[:1], 9)).all()
+    both = [np.array([[a, 0.1], [0.2j, b]]) for a, b in t]
+    assert any_shape._moved(both, 9) == pytest.approx(5.4 * 0.04, rel=1e-9)
+    assert any_shape._moved(both[:1], 9) == pytest.approx(5.4)
+
+
+def test_pillars_between_the_orders_are_not_believed():
+    """Ten orders on 0.4 um resolve 0.04 um: below, the whole effect is in doubt, where that is more than the error."""
+    this = SimpleNamespace(cell=CELL)
+    wide, change = np.array([0.039, 0.039, 0.041]), np.array([0.2j, -0.004, 0.2])
+    error = np.array([0.01, 0.013, 0.01])
+    assert solver._blur(this, wide, 10, change, error) == pytest.approx([0.2, 0.013, 0.01])
+
+
+def test_each_diameter_stops_at_the_first_truncation_that_meets_the_tolerance(monkeypatch):
+    """Truncations off by a / reach², a of 0.5 and 0.1, and 2e-4 left of a wall: reaches, counts and errors by hand."""
+    size = {0.11: 0.5, 0.23: 0.1}
+    this = SimpleNamespace(
+        cell=CELL, k0=2 * math.pi / 0.85, symmetry="x", between=1.0, pillar=3.5, media=None, wavelength_um=0.85
+    )
+
+    def truncated(this, diameters, reach, stages):
+        assert stages == 3
+        t = np.array([0.6 + size[round(float(d), 3)] / reach**2 for d in diameters])
+        return Truncated(t.astype(complex), 0.2j * t, np.full(len(t), 0.99))
+
+    monkeypatch.setattr(solver, "truncated", truncated)
+    empty = Truncated(np.array([0.97 + 0j]), np.array([0.03 + 0j]), np.ones(1))
+    monkeypatch.setattr(solver, "film", lambda this, index: empty)
+    monkeypatch.setattr(solver, "wall_stages", lambda this, wide, tolerance: (3, 2e-4))
+    found = solver.solve_case(this, np.array([0.11, 0.23]), tolerance=0.015, harmonics=None)
+
+    def error(a, reach):
+        return (3 + 0.6 * max(0, 13 - reach)) * a * (1 / (reach - 4) ** 2 - 1 / reach**2) + 2e-4
+
+    for one, a in zip(found, (0.5, 0.1), strict=True):
+        reach = next(n for n in (*range(8, 16), 16) if error(a, n) <= 0.015 or n == 16)
+        assert one.t == pytest.approx(0.6 + a / reach**2)
+        assert one.t_error == pytest.approx(error(a, reach), rel=1e-9)
+        assert one.converged == (error(a, reach) <= 0.015)
+        orders = sum(i * i + j * j <= reach**2 for i in range(-reach, reach + 1) for j in range(-reach, reach + 1))
+        assert one.orders == orders
+    assert (found[0].converged, found[1].converged) == (True, True)
+    fixed = solver.solve_case(this, np.array([0.23]), tolerance=1e-9, harmonics=7)[0]
+    assert fixed.t_error == pytest.approx(6.6 * 0.1 * (1 / 9 - 1 / 49) + 2e-4, rel=1e-9)
+    assert not fixed.converged
+
+
+def test_a_layer_without_contrast_is_a_film_to_rounding():
+    """The disc's share of the cell times the contrast times its phase, below 1e-13."""
+    this = SimpleNamespace(cell=CELL, k0=7.4, pillar=1.3, between=1.0)
+    edge = math.sqrt(1e-13 / (math.pi / 4 * 0.69 * 7.4 * 0.5)) * 0.4
+    assert solver.homogeneous(this, np.array([0.99 * edge, 1.01 * edge])).tolist() == [True, False]
+
+
+def test_anchored_bars_add_what_truncations_modes_collocation_and_shifts_leave(monkeypatch):
+    """Mean of four neighbours; the farthest of them, half of the mean rest of four shifts, modes, stages."""
+    t = {4: 0.61, 5: 0.58, 6: 0.604, 7: 0.597, 8: 0.601, 9: 0.5985}
+    rest = {4: 0.05, 5: 0.004, 6: 0.006, 7: 0.002, 8: 0.003, 9: 0.0014}
+    asked = []
+
+    def truncated(this, diameter, reach, stages, *, moved):
+        asked.append((reach, stages, float(moved(diameter)[0])))
+        return Truncated(np.array([t[reach] + 0j]), np.array([0.1j * t[reach]]), np.array([0.98]))
+
+    monkeypatch.setattr(anchored, "case", lambda cell, light: cell)
+    monkeypatch.setattr(anchored, "wall_stages", lambda *_: (5, 3e-4))
+    monkeypatch.setattr(anchored, "truncated", truncated)
+    monkeypatch.setattr(
+        anchored, "shifted", lambda bare, anchors, reach: anchored.Shift(lambda d: 1e-3 * reach, rest[reach])
+    )
+    upright = [SimpleNamespace(t=0.6, r=0.06j, t_error=e) for e in (1e-4, 7e-4)]
+
+    def bar(reach):
+        last = np.array([t[k] for k in range(reach - 3, reach + 1)])
+        mean = last.mean()
+        return mean, np.abs(last - mean).max() + 0.5 * np.mean([rest[k] for k in range(reach - 3, reach + 1)]) + 1e-3
+
+    for tolerance, reach in ((1e-1, 7), (bar(8)[1] * 1.001, 8), (1e-6, 9)):
+        asked.clear()
+        found = anchored.solve_anchored(CELL, 0.2, LIGHT, upright, tolerance=tolerance)
+        assert asked[-1] == (reach, 5, pytest.approx(0.2 + 1e-3 * reach))
+        mean, error = bar(reach)
+        assert found.t == pytest.approx(mean, rel=1e-12)
+        assert found.r == pytest.approx(0.1j * mean, rel=1e-12)
+        assert found.t_error == pytest.approx(error, rel=1e-9)
+        assert found.converged == (error <= tolerance)
+        assert found.orders == {7: 149, 8: 197, 9: 253}[reach]
+
+
+def test_a_shift_is_the_least_of_squares_of_both_amplitudes_and_leaves_what_no_shift_explains(monkeypatch):
+    """Amplitudes that are straight in the diameter: the truncation's are those of pillars 3 + 20 D nm wider, and at
+    right angles to all slopes 0.004 of t are off at one node and 0.003 at the other."""
+    slope = np.array([1.3 + 0.4j, -0.7 + 0.9j])
+    nodes, off = np.array([0.15, 0.21]), np.array([0.004, 0.003])
+    across = 1j * np.array([1.3 + 0.4j, -0.7 + 0.9j]) / abs(1.3 + 0.4j)
+
+    def amplitudes(bare, diameter, reach):
+        return (diameter[:, None] - 0.003 - 0.02 * nodes[:, None]) * slope
+
+    monkeypatch.setattr(anchored, "_amplitudes", amplitudes)
+    known = nodes[:, None] * slope + off[:, None] * across
+    found = anchored.shifted(None, Anchors(nodes, known, 0.0), 6)
+    assert found.at(nodes) == pytest.approx(0.003 + 0.02 * nodes, rel=1e-6)
+    assert found(np.array([0.18])) == pytest.approx([0.18 + 0.003 + 0.0036], rel=1e-6)
+    assert found.left == pytest.approx(math.sqrt((0.004**2 + 0.003**2) / 2), rel=1e-6)
+    far = Anchors(nodes, (nodes[:, None] + 0.5) * slope, 0.0)
+    assert anchored.shifted(None, far, 6).at(nodes) == pytest.approx([0.01, 0.01])  # no truncation is that far off
+
+
+@pytest.mark.parametrize("stages", [4, 6])
+def test_collocation_integrates_polynomials_from_the_foot_to_every_point(stages):
+    c, b, a = wall.gauss(stages)
+    for n in range(2 * stages):
+        assert b @ c**n == pytest.approx(1 / (n + 1), rel=1e-10)
+        if n < stages:
+            assert a @ c**n == pytest.approx(c ** (n + 1) / (n + 1), rel=1e-9)
+
+
+@pytest.mark.parametrize(("tolerance", "stages"), [(1.0, 5), (4e-4, 7), (1e-9, 10)])
+def test_stages_of_a_wall_are_enough_where_one_more_changes_a_tenth_of_the_tolerance(tolerance, stages):
+    """Off by 10^(1 - stages) of (1, 2): the last change is 2 (10^-(m-2) - 10^-(m-1))."""
+    found, left = wall.enough(lambda m: np.array([0.3, 0.7j]) + 10.0 ** (1 - m) * np.array([1.0, 2.0]), tolerance)
+    assert found == stages
+    assert left == pytest.approx(2 * (10.0 ** (2 - stages) - 10.0 ** (1 - stages)), rel=1e-6)
+    assert (left <= tolerance / 10) is (stages < 10)
