@@ -57,7 +57,7 @@ class Case:
 
     pitch_um: of the pixels. electrons: that a white object gives in a pixel of 9 um. steps: of ``batch`` frames.
     width, depth: of the elastic network, and blocks of each of its stages. network: it, or a baseline in its place.
-    angle_deg: field angle of the frames.
+    angle_deg: field angle of the frames. fresh: every frame is rendered anew, in place of a pool that is seen again.
     """
 
     pitch_um: float
@@ -68,13 +68,14 @@ class Case:
     network: Name = "supernet"
     angle_deg: float = 0.0
     batch: int = 32
+    fresh: bool = False
 
 
 CASES = {
     "p9": Case(9.0),
     "p18": Case(18.0),
-    "p18blur": Case(18.0, steps=1600, width=0.25, depth=3, batch=16),
-    "p18blurlong": Case(18.0, steps=4800, width=0.25, depth=3, batch=16),
+    "p18blur": Case(18.0, steps=1600, width=0.25, depth=3, batch=16, fresh=True),
+    "p18blurlong": Case(18.0, steps=4800, width=0.25, depth=3, batch=16, fresh=True),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
     "p9dim": Case(9.0, electrons=400.0),
@@ -141,9 +142,9 @@ def architecture_of(case: Case) -> Architecture:
     return Architecture((case.depth,) * 5, (5,) * SPACE.slots, (3,) * SPACE.slots, case.width, 1.0)
 
 
-def scenes_of(stream: int) -> EyeScenes:
-    """Frames of a stream; the same for every run."""
-    return EyeScenes(SCENES, 9.0, 2000.0, 0, stream)
+def scenes_of(stream: int, seed: int = 0) -> EyeScenes:
+    """Frames of a stream; those of one seed are the same for every run."""
+    return EyeScenes(SCENES, 9.0, 2000.0, seed, stream)
 
 
 def pool_of(work: Path) -> pool.Pool:
@@ -192,7 +193,9 @@ def train_one(work: Path, case: Case, lens: str, seed: int, *, kept_at: Path) ->
     """The trainer at the end of its run, with the batch statistics of the final lens; goes on from ``kept_at``."""
     optics, moving = optics_of(lens, angle_deg=case.angle_deg)
     settings = InnerConfig(steps=case.steps, batch=case.batch, seed=seed, optics=moving, optics_weight=0.0)
-    scenes = PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
+    scenes: Scenes = (
+        scenes_of(TRAINING, seed) if case.fresh else PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
+    )
     made = inner.model(optics, pitch_um=case.pitch_um, seed=seed, space=SPACE, network=case.network)
     if "oblique" in lens:
         with torch.no_grad():
@@ -315,7 +318,7 @@ PLAN += [
     f"{case}/{lens}/{seed}"
     for case in ("p18blur", "p18blurlong")
     for seed in range(5)
-    for lens in ("hyper40", "hyper33")
+    for lens in ("hyper40", "hyper33", "swift40")
 ]
 PLAN += [f"p18dim/{lens}/0" for lens in ("hyper33", "joint33", "hyper20", "hyper28")]
 PLAN += [f"{case}/{lens}/{seed}" for case in ("p9dim", "p18small") for seed in range(3) for lens in MAIN]
