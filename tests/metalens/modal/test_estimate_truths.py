@@ -1,0 +1,96 @@
+"""What both forms say of one another, from forms that are typed in; half-spaces and cutoffs in closed form."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from metalens.modal import engine, match
+from metalens.modal.engine import Form
+
+RNG = np.random.default_rng(77)
+CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42)
+
+
+def matrix(scale=1.0):
+    return scale * (RNG.normal(size=(2, 2)) + 1j * RNG.normal(size=(2, 2)))
+
+
+def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_neither_hides_the_other(monkeypatch):
+    """Two travelling modes, in another order in the other form: what their wavenumbers explain, element by element of
+    absolute sizes, and what is left; drift by how far each wavenumber squared lies below the densest medium's."""
+    q = np.array([4.9 + 0.01j, 2.2 + 0.03j])
+    other = np.array([2.2 + 0.05j, 4.93 + 0.01j])
+    by_q = np.stack([matrix(), matrix()])
+    first = Form(matrix(), 0.93, 210, q, by_q, 0.011)
+    second = Form(first.matrix + matrix(0.02), 0.97, 230, other, by_q[:0], 0.004)
+    monkeypatch.setattr(engine, "solve_form", lambda case, plan, *, magnetic, weak: second if magnetic else first)
+    found = engine.evaluate(CASE, None)
+    explained = [by_q[0] * (q[0] - other[1]), by_q[1] * (q[1] - other[0])]
+    rest = first.matrix - second.matrix - explained[0] - explained[1]
+    spread = (np.abs(explained[0]) + np.abs(explained[1])).max() + np.abs(rest).max()
+    assert found.spread == pytest.approx(spread / 2, rel=1e-12)
+    dense = 1.7**2 * (9.0 + 0.2j)
+    drift = sum(np.abs(by_q[k]) * abs(dense - q[k] ** 2) / (2 * abs(q[k])) for k in (0, 1))
+    assert found.drift == pytest.approx(drift.max(), rel=1e-12)
+    assert found.energy == pytest.approx(0.95)
+    assert (found.unknowns, found.grazing, found.bloch) == (440, 0.011, 0.31)
+    assert found.size == pytest.approx(1.7 * math.sqrt(abs(9.0 + 0.2j)) / math.pi, rel=1e-12)
+    mean = (first.matrix + second.matrix) / 2
+    assert np.abs(found.matrix - mean).max() < 0.05 * np.abs(first.matrix - second.matrix).max()  # second order
+
+
+def test_the_mean_of_matrices_with_one_basis_is_of_the_roots_of_their_products():
+    turn = np.linalg.qr(matrix())[0]
+    a, b = np.array([0.8 + 0.3j, 0.6 - 0.4j]), np.array([0.75 + 0.35j, 0.62 - 0.5j])
+    got = engine.geometric_mean((turn * a) @ turn.conj().T, (turn * b) @ turn.conj().T)
+    assert got == pytest.approx((turn * (a * np.sqrt(b / a))) @ turn.conj().T, rel=1e-9)
+    black = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-5]])
+    assert engine.geometric_mean(black, 3 * black) == pytest.approx(2 * black)
+    assert engine.determinant(np.array([[2.0, 3j], [1.5, -1.0]])) == pytest.approx(-2 - 4.5j)
+
+
+def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_least_is_kept(monkeypatch):
+    errors = {"a": 0.4, "b": 0.02, "c": 0.05}
+
+    def rung(name):
+        choice = SimpleNamespace(plan=name)
+        return SimpleNamespace(
+            name=name, choice=lambda rho: choice, weak=1e-9, error=lambda solution, rho: errors[solution]
+        )
+
+    monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in errors))
+    monkeypatch.setattr(engine, "first_rung", lambda tolerance: 0)
+    monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
+    met = engine.climb(CASE, 0.02)
+    assert (met.solution, met.error, met.converged) == ("b", 0.02, True)
+    missed = engine.climb(CASE, 0.01)
+    assert (missed.solution, missed.error, missed.converged) == ("b", 0.02, False)
+    assert engine.climb(CASE, 0.5).solution == "a"
+
+
+def test_half_spaces_admit_modes_as_plane_waves_of_their_own_kind():
+    """i kz and i k0² eps / kz of the electric form, i kz / eps and i k0² / kz of the magnetic one."""
+    te, tm = np.array([0.3, 9.0]), np.array([1.1, 5.0, 2.25 * 1.7**2])
+    basis = SimpleNamespace(te=te, te_exact=te, tm_exact=tm)
+    k0, eps = 1.7, 2.25
+
+    def kz(square):
+        value = k0**2 * eps - square
+        return math.sqrt(value) if value > 0 else 1j * math.sqrt(-value) if value < 0 else 1e-8 * k0
+
+    for magnetic, first, second in ((False, 1.0, eps), (True, 1 / eps, 1.0)):
+        want = [1j * kz(s) * first for s in te] + [1j * k0**2 * second / kz(s) for s in tm]
+        found = match.half_space(basis, k0, eps, magnetic=magnetic)
+        assert found.admittance == pytest.approx(np.array(want), rel=1e-9)
+        assert found.ports.tolist() == [0, 2, 3, 4]  # the last at its cutoff, moved off it
+
+
+def test_orders_near_their_cutoff_take_the_wavenumbers_of_the_lattice():
+    """(0.4 - pi)² + pi² = 17.386 near a cutoff of 17: within a tenth of it, and 2 % of what the mesh has."""
+    exact = (0.4 - math.pi) ** 2 + math.pi**2
+    squares = np.array([1.01 * exact, 1.03 * exact, 0.4**2, 0.8 * exact, 0.995 * exact])
+    got = match.near_cutoff(squares, 17.0, 0.4)
+    assert got == pytest.approx([exact, 1.03 * exact, 0.16, 0.8 * exact, exact])
+    assert match.near_cutoff(squares, 40.0, 0.4) is squares
