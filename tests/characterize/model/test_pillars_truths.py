@@ -85,10 +85,12 @@ def test_entries_of_the_table_are_the_nearest_diameters_and_none_is_the_last(pil
         assert table[:, p] == pytest.approx(np.array(want), abs=2e-4 * np.abs(pillars.basis).max())
 
 
-def test_a_cubic_between_samples_holds_quadratics():
-    place = np.array([1.0, 1.3, 4.77, 6.0, 7.2])
-    values = 3 - 0.7 * np.arange(9.0) + 0.21 * np.arange(9.0) ** 2
-    assert model._cubic(values, place) == pytest.approx(3 - 0.7 * place + 0.21 * place**2, rel=1e-12)
+def test_a_cubic_between_samples_is_exact_for_cubics_from_end_to_end():
+    def of(x):
+        return 3 - 0.7 * x + 0.21 * x**2 - 0.013 * x**3
+
+    place = np.array([0.0, 0.4, 1.0, 1.3, 4.77, 6.0, 7.2, 8.0])
+    assert model._cubic(of(np.arange(9.0)), place) == pytest.approx(of(place), rel=1e-12)
 
 
 def test_light_meets_pillars_at_the_angle_of_its_slopes_where_the_proxy_knows_angles():
