@@ -176,3 +176,46 @@ def test_nodes_of_the_depths_are_six_a_turn_and_24_more():
             place = (along, beside) if i == 0 else (beside, along)
             turns = max(turns, abs(source(*place, inverse) - source(*place, middle)) / 0.85)
         assert wide._coarse(CASE, i, grid) == 24 + math.ceil(6 * turns)
+
+
+LARGE = Case((420, 540), 0.37, 0.85, 640.0, (0.11, -0.07), (1 / 4e3, 1 / 9e3), (66.0, -51.0), 0.9, (230, 170))
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
+def test_grids_of_a_wide_window_hold_its_light_its_fade_and_the_kernels_band(tolerance):
+    """Every number of both axes by its formula, from the rays, the band and the tolerance alone."""
+    found, k = grids.axes(LARGE, tolerance), 2 * math.pi / 0.85
+    fits = grids._fitted(LARGE, list(LARGE.half_window_um))
+    for _ in range(2):  # rays to where the quadratic leaves them
+        reached = [w + fit.extra_um for w, fit in zip(LARGE.half_window_um, fits, strict=True)]
+        fits = grids._fitted(LARGE, reached)
+    sharp = math.sqrt(0.8 * math.log(1 / tolerance))
+    fade = 2 * sharp**2 / k
+    for i, axis_ in enumerate(found):
+        half, lens = LARGE.half_window_um[i], LARGE.half_size_um[i]
+        fit = fits[i]
+        assert axis_.most == pytest.approx(fit.most, rel=1e-9)
+        guard = math.sqrt(2 * fade * axis_.most / (2 * (half + fit.extra_um)))
+        assert axis_.guard == pytest.approx(guard, rel=1e-9)
+        assert axis_.sharp == pytest.approx(sharp, rel=1e-12)
+        coarse = 0.85 / 2 / (axis_.most + axis_.guard)
+        assert axis_.every == math.ceil(0.9 / coarse)
+        period = axis_.fine * 0.9 / axis_.every
+        beyond = grids._beyond(LARGE, fits, [a.guard for a in found])[i]
+        width = 2 * (half + beyond) + 4 * sharp**2 / k / axis_.guard
+        assert width * (1 - 1e-9) <= period < 1.1 * width  # factors of 2, 3 and 5 lie as close
+        assert min(period / coarse, axis_.fine) * (1 - 1e-9) <= axis_.size < 1.1 * period / coarse + 8
+        assert axis_.step_um * axis_.first == pytest.approx(0.85 * axis_.stretch_um * axis_.size / period, rel=1e-9)
+        band = grids._band(LARGE, i, fit.extra_um)
+        assert axis_.over == pytest.approx(0.85 / (2 * band) / axis_.step_um, rel=1e-9)
+        assert axis_.over >= 1.2
+        assert axis_.taps == math.ceil(1 + math.log(10 / tolerance) * axis_.over / (math.pi * (axis_.over - 1)))
+        assert axis_.count == math.ceil(2 * lens / axis_.step_um) + 2 * axis_.taps + 1 <= axis_.first
+        assert axis_.first_um == pytest.approx(-(axis_.count - 1) / 2 * axis_.step_um)
+        assert (axis_.middle, axis_.reach_um) == pytest.approx((fit.middle, fit.reach_um), rel=1e-9)
+
+
+def test_windows_whose_rays_no_quadratic_follows_have_no_grids():
+    near = replace(LARGE, sensor_distance_um=30.0)
+    assert grids.axes(near, 1e-4) is None
+    assert grids.seconds(near, 1e-4) == math.inf
