@@ -1,0 +1,114 @@
+"""The virtual bench number by number: where light comes from and lands, what a camera reads, with typed light."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.bench import bench
+from characterize.bench.bench import Camera, Truth
+from characterize.model import Known
+
+
+def truth(**more):
+    camera = Camera(pixels=6, pixel_um=1.7, bits=12, gain_e=2.6, offset=31.0, read_noise_e=4.1, hot_share=0.0)
+    return Truth(**({"depths_um": (21e3, 26e3, 34e3), "camera": camera} | more))
+
+
+def knows(**values):
+    return tuple(Known(name, value, 0.0) for name, value in values.items())
+
+
+def test_every_angle_has_every_depth():
+    depth, angle = truth(angles_deg=(0.0, 7.0)).stated
+    assert depth.tolist() == [21e3, 26e3, 34e3] * 2
+    assert angle[:, 0] == pytest.approx([0.0] * 3 + [math.radians(7.0)] * 3)
+    assert not angle[:, 1].any()
+
+
+def test_the_background_is_a_plane_that_is_never_below_nothing():
+    made = bench.background(truth(parameter=knows(background_e=4.0, background_x_e=3.0, background_y_e=-6.0)))
+    for i in range(6):
+        for j in range(6):
+            assert made[i, j] == pytest.approx(max(4 + 3 * (j - 3) / 3 - 6 * (i - 3) / 3, 0.0))
+
+
+def test_light_falls_with_the_square_of_its_true_distance_and_adds_over_the_line(monkeypatch):
+    """Depths off by a zero of 400 and a scale of 0.02 about their mean of 27 mm; each of five lines by its weight."""
+    seen = []
+    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=np.ones((4, 5))))
+
+    def frames(lens, truth, colour, t, way, depth):
+        seen.append(colour[bench.PLACE["wavelength_nm"]])
+        return (1 + colour[bench.PLACE["wavelength_nm"]]) ** 2 * np.ones((len(depth), 6, 6)) * depth[:, None, None]
+
+    monkeypatch.setattr(bench, "_frames", frames)
+    monkeypatch.setattr(bench.made, "pillars", lambda *given, **more: None)
+    monkeypatch.setattr(
+        bench,
+        "_alike",
+        lambda *_: iter([(SimpleNamespace(incidence_rad=0.0), [0, 2]), (SimpleNamespace(incidence_rad=0.0), [1])]),
+    )
+    about = knows(stage_zero_um=400.0, stage_scale=0.02, bandwidth_nm=3.0, wavelength_nm=0.5)
+    light = bench.irradiance(lens, truth(parameter=about), None)
+    mean_square = 1.5**2 + 3.0**2  # of a Gaussian line about 1.5: exact in five lines
+    for n, z in enumerate((21e3, 26e3, 34e3)):
+        true = z + 400 + 0.02 * (z - 27e3)
+        assert light[n] == pytest.approx(np.full((6, 6), mean_square / true), rel=1e-9)
+    assert len(seen) == 10
+
+
+def test_sources_off_the_axis_come_from_their_own_side_and_the_window_stays_with_the_stage():
+    """dx/dz of the light less the source's own place over its depth; the window by what it was moved."""
+    lens = SimpleNamespace(sensor_distance_um=1900.0, proxy=SimpleNamespace(max_angle_rad=0.5))
+    x = truth(
+        parameter=knows(
+            distance_um=60.0, tilt_x_deg=0.8, tilt_y_deg=-0.5, source_x_um=300.0, source_y_um=-120.0,
+            decentre_x_um=4.0, decentre_y_um=-7.0,
+        )
+    ).vector()  # fmt: skip
+    depth, angle = np.array([2e4, 3e4, 3e4]), np.array([[0.0, 0.0], [0.0, 0.0], [0.1, -0.2]])
+    found = [(way, index) for way, index in bench._alike(lens, truth(), x, depth, angle)]
+    assert [index for _, index in found] == [[0], [1], [2]]
+    for way, (n,) in found:
+        chief = [
+            math.tan(angle[n, 0]) + math.tan(math.radians(0.8)),
+            math.tan(angle[n, 1]) + math.tan(math.radians(-0.5)),
+        ]
+        source = [chief[0] - 300 / depth[n], chief[1] + 120 / depth[n]]
+        assert way.source == pytest.approx(tuple(source))
+        assert way.shift_um == pytest.approx((1960 * (chief[0] - source[0]) + 4, 1960 * (chief[1] - source[1]) - 7))
+        assert way.incidence_rad == pytest.approx(math.atan(math.hypot(*source)))
+    plain = truth().vector()
+    same = [index for _, index in bench._alike(lens, truth(), plain, depth, angle)]
+    assert same == [[0, 1], [2]]  # one way in, one call
+    glass = truth(parameter=knows(glass_um=150.0)).vector()
+    assert [index for _, index in bench._alike(lens, truth(), glass, depth, angle)] == [[0], [1], [2]]
+
+
+def test_a_read_out_has_photon_read_and_rounding_noise_over_its_offset():
+    """500 electrons at 2.6 a count and 4.1 of read noise: variance 500 + 16.81 + 2.6² / 12 e², mean 500 / 2.6 + 31."""
+    camera = truth().camera
+    counts = bench._read(np.full((400, 300), 500.0), camera, np.random.default_rng(4), np.zeros((400, 300), bool))
+    assert counts.dtype == np.uint16
+    assert counts.mean() == pytest.approx(500 / 2.6 + 31, abs=0.15)  # 120 000 pixels: sigma 0.025
+    assert counts.astype(float).var() * 2.6**2 == pytest.approx(500 + 16.81 + 2.6**2 / 12, rel=0.02)  # sigma 0.4 %
+    hot = np.zeros((4, 5), bool)
+    hot[2, 3] = True
+    full = bench._read(np.full((4, 5), 1e9), camera, np.random.default_rng(4), hot)
+    assert full[0, 0] == 4095
+    assert full[2, 3] == int(0.97 * 4095)
+
+
+def test_frames_are_as_bright_as_asked_for_and_flats_half_full(monkeypatch):
+    light = np.linspace(0.1, 0.9, 108).reshape(3, 6, 6)
+    monkeypatch.setattr(bench, "irradiance", lambda *_: light)
+    made = bench.shoot(
+        None, truth(peak_e=3100.0, parameter=knows(background_e=12.0), dark_frames=3, flat_frames=5), None
+    )
+    assert made.electrons == pytest.approx(light / 0.9 * 3100 + 12)
+    assert (len(made.frames), len(made.dark), len(made.flat)) == (3, 3, 5)
+    assert made.dark.mean() == pytest.approx(31, abs=1.0)
+    assert made.flat.mean() == pytest.approx(31 + 0.5 * (4096 - 31), rel=0.01)
+    assert made.frames[2, 5, 5] == pytest.approx(3112 / 2.6 + 31, abs=5 * math.sqrt(3129) / 2.6)
