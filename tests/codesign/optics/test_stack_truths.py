@@ -1,0 +1,85 @@
+"""Settings of the trained optics and what follows from them, by the formulas of their docstrings."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.optics import stack as optics
+from codesign.optics.stack import OpticsConfig, Stack
+
+OWN = OpticsConfig(
+    aperture_mm=0.7, sensor_distance_mm=1.6, wavelength_nm=790.0, focus_mm=17.0, depths_mm=(11.0, 47.0), depth_count=7,
+    sample_um=7.0, window_samples=21, fwhm_nm=24.0, filter_nm=10.0, polynomials=0,
+)  # fmt: skip
+
+
+def test_a_filter_before_a_line_passes_its_share():
+    """Two Gaussians about one wavelength: w / sqrt(w² + s²) of the light, 10 of 26; without a filter all."""
+    assert OWN.passed == pytest.approx(10 / 26)
+    assert OpticsConfig().passed == 1.0
+
+
+def test_depths_are_even_in_their_inverse():
+    want = [1e3 / (1 / 11 + n / 6 * (1 / 47 - 1 / 11)) for n in range(7)]
+    assert OWN.depths_um.tolist() == pytest.approx(want)
+
+
+def test_samples_of_the_intensity_show_its_finest_detail():
+    """wavelength / (4 NA) apart or less, NA the sine of the rim: 0.926 um here, so 7.6 of them in 7 um, odd: 9."""
+    sine = 350 / math.hypot(350, 1600)
+    assert 0.79 / (4 * sine) == pytest.approx(0.924, abs=2e-3)
+    need = math.ceil(7.0 / (0.79 / (4 * sine)))
+    assert OWN.fine == need + 1 - need % 2 == 9
+
+
+def test_the_pupil_has_the_nodes_that_the_window_asks_for():
+    """A twentieth more than the period of the nodes' spacing in sines, an even number; 64 at least."""
+    pupil = OWN.pupil
+    assert (pupil.radius_um, pupil.sensor_distance_um, pupil.wavelength_um) == (350.0, 1600.0, pytest.approx(0.79))
+    width = 21 * 7.0 * 1.05
+    assert pupil.period_um >= width * (1 - 1e-9)
+    assert pupil.period_um < width * (1 + 3 / pupil.nodes)
+    assert pupil.nodes % 2 == 0
+    assert OpticsConfig(window_samples=3).pupil.nodes == 64
+
+
+def test_start_and_focus_carry_lengths_in_micrometres():
+    made = OpticsConfig(aperture_mm=0.7, foci_mm=(15.0, 22.5), focus_mm=17.0, sensor_distance_mm=1.6, wavelength_nm=790)
+    assert made.start.radius_um == pytest.approx(350.0)
+    assert made.start.foci_um == pytest.approx((15e3, 22.5e3))
+    for focus in (made.focus, made.start.focus):
+        assert (focus.wavelength_um, focus.sensor_distance_um) == pytest.approx((0.79, 1600.0))
+        assert focus.source_distance_um == pytest.approx(17000.0)
+
+
+def test_kernels_are_of_psfs_of_sum_one():
+    light = torch.rand(3, 5, 5, dtype=torch.float64) + 0.1
+    light = light * torch.tensor([0.3, 1.0, 2.7])[:, None, None]
+    made = Stack(light, torch.tensor([1e4, 2e4, 3e4], dtype=torch.float64)).basis(1e-9)
+    back = torch.einsum(
+        "dr,ryx->dyx", torch.as_tensor(made.weights)[0, 0].double(), torch.as_tensor(made.kernels).double()
+    )
+    want = light / light.sum((1, 2), keepdim=True)
+    assert back.numpy() == pytest.approx(want.numpy(), abs=1e-6)
+
+
+def test_light_of_the_stack_is_that_of_the_pupil_by_plain_sums():
+    """Rayleigh's quadratic lens seen at two depths: |Σ light of the nodes exp(i f x)|² over whole samples, by sums over
+    all frequencies that a sample's grid can show; the share of the light of the aperture."""
+    made = optics.stack(OWN, torch.zeros(0)).intensity.double().numpy()
+    carriers, _ = optics._carriers(OWN)
+    pupil, light = OWN.pupil, carriers[4].numpy()
+    nodes = light.shape[0]
+    most = math.floor(pupil.period_um / 14.0)
+    auto = np.fft.fft2(np.abs(np.fft.fft2(light, s=(3 * nodes, 3 * nodes))) ** 2) / (3 * nodes) ** 2
+    harmonic = np.arange(-most, most + 1)
+    sinc = np.sinc(harmonic / pupil.period_um * 7.0)
+    place = (np.arange(21) - 10) * 7.0
+    wave = np.exp(2j * np.pi * np.outer(place, harmonic) / pupil.period_um) * sinc
+    kept = auto[np.ix_(harmonic, harmonic)]
+    want = (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / (np.abs(light) ** 2).sum()
+    scale = want.sum() / made[4].sum()
+    assert made[4] == pytest.approx(want / scale, abs=2e-3 * made[4].max())
+    assert scale == pytest.approx(1.0, rel=1e-3)
