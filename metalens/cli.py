@@ -74,7 +74,11 @@ VIEWS = {
     "mask": "layout.commands.view:panels",
     "capture": "characterize.commands.view:capture",
     "asbuilt": "characterize.commands.view:asbuilt",
+    "pupil": "characterize.commands.view:pupil",
     "run": "codesign.commands.view:panels",
+    "scene": "codesign.commands.view:scene",
+    "layers": "codesign.commands.view:layers",
+    "budget": "codesign.commands.view:budget",
 }
 # and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``
 TOLD = {"mask": "layout.commands.info"}

@@ -7,6 +7,7 @@ import numpy as np
 from characterize.captures import capture as captures
 from characterize.inference import AsBuilt
 from characterize.model import PARAMETERS, PLACE
+from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.report import in_words
 from metalens.psf import PsfStack
@@ -66,6 +67,33 @@ def asbuilt(path: Path) -> list[Panel]:
         Numbers("What is known", ("", "in words"), _words(made)),
     ]
     return [*panels, _psf(made.psf())]
+
+
+def pupil(path: Path) -> list[Panel]:
+    """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the numbers."""
+    stored = store.load(path, "pupil")
+    held, about = stored.arrays, stored.attributes
+    names = [name.decode() if isinstance(name, bytes) else str(name) for name in held["names"].tolist()]
+    rows = list(zip(names, held["value"].tolist(), held["sigma"].tolist(), strict=True))
+    planes = [Axis("plane", held["position_um"].tolist(), "µm")]
+    both = np.stack([held["measured"], held["predicted"]])
+    step = 2 / held["phase_rad"].shape[-1]
+    said = [(in_words(key), str(about[key])) for key in sorted(about) if key != "spec"]
+    return [
+        Images("Phase in the pupil", np.nan_to_num(held["phase_rad"]), [], step, "rad", signed=True, across="radius"),
+        Images("Amplitude in the pupil", np.nan_to_num(held["amplitude"]), [], step, "of its mean", across="radius"),
+        Images(
+            "Stack as measured and as fitted",
+            both / both.max(),
+            [Axis("shown", ["measured", "fitted"], blink=True), *planes],
+            1.0,
+            "of the brightest pixel",
+            across="pixels",
+        ),
+        Images("Measured less fitted", held["residual_sigma"], planes, 1.0, "sigma", signed=True, across="pixels"),
+        Numbers("Parameters", ("parameter", "value", "standard error"), rows),
+        Numbers("How good it is", ("", "value"), said),
+    ]
 
 
 def _psf(stack: PsfStack) -> Panel:

@@ -1,14 +1,16 @@
-"""Panels of a co-design run: how it trained, what its networks read and cost, and the lens it ended with."""
+"""Panels of a co-design run (how it trained, what its networks read, its lens), of rendered eyes, and of a budget."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from metalens.ground import report
+from codesign.commands import budget as budgets
+from metalens.ground import report, store
 from metalens.ground.errors import StoreError
-from metalens.view import Curves, Numbers, Panel, lens_panels
+from metalens.view import Axis, Curves, Images, Numbers, Panel, lens_panels
 
 LOG, RESULT, LENS = "log.jsonl", "result.json", "lens.h5"
 
@@ -61,3 +63,49 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
     names = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float, str))})
     table = [[row.get(name, "") for name in names] for row in rows]
     return [Numbers("Networks of the run", [report.in_words(name) for name in names], table)]
+
+
+def scene(path: Path) -> list[Panel]:
+    """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of every frame."""
+    held = store.load(path, "scene").arrays
+    count = len(held["radiance"])
+    frames, full = [Axis("frame", list(range(count)))], float(np.iinfo(held["radiance"].dtype).max)
+    far = held["coverage"] > full / 2  # the far sheet shows where it covers most of the pixel
+    depth_mm = 1e-3 * np.where(far, held["depth_um"][:, 1], held["depth_um"][:, 0])
+    labels = {k.removeprefix("labels/"): v for k, v in held.items() if k.startswith("labels/")}
+    told = {name: value for name in ("slip_um", "pupil_um", "visible") if (value := labels.get(name)) is not None}
+    head = [f"{report.in_words(name)}{axis}" for name, v in told.items() for axis in ([""] if v.ndim == 1 else _XYZ)]
+    rows = [[i, *np.concatenate([np.atleast_1d(v[i]) for v in told.values()]).tolist()] for i in range(count)]
+    return [
+        Images(
+            "Rendered eyes", held["radiance"].sum(1, dtype=float) / full, frames, 1.0, "of full light", across="pixels"
+        ),
+        Images("Depth", depth_mm, frames, 1.0, "mm from the lens", across="pixels", from_least=True),
+        Images("Pupil", held["pupil"] / full, frames, 1.0, "share of the pixel", across="pixels"),
+        Numbers("Labels", ("frame", *head), rows, "Positions in the camera's axes; labels.csv holds all of them."),
+    ]
+
+
+def layers(path: Path) -> list[Panel]:
+    """The layers of one frame, as images are formed of them."""
+    held = store.load(path, "layers").arrays
+    axis = [Axis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
+    return [
+        Images("Light of a layer", held["radiance"], axis, 1.0, "of full light", across="pixels"),
+        Images("What a layer covers", held["coverage"], axis, 1.0, "share of the pixel", across="pixels"),
+    ]
+
+
+def budget(path: Path) -> list[Panel]:
+    """Every link from pillar to answer with its error."""
+    rows = [
+        (row.link, row.phase_rad, row.psf, math.degrees(row.gaze_rad), "yes" if row.counted else "no", row.method)
+        for row in budgets.load(path)
+    ]
+    shown = [tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row) for row in rows]
+    head = ("link", "phase / rad", "PSF, relative L2", "gaze / deg", "in the sum", "how")
+    words = "The last row is the root of the sum of squares of those that are in the sum."
+    return [Numbers("Error of every link", head, shown, words)]
+
+
+_XYZ = (", x", ", y", ", z")

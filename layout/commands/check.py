@@ -1,6 +1,7 @@
 """Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid; violations as markers for KLayout."""
 
 import contextlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,14 +85,19 @@ def _values(found: DrcReport) -> dict[str, Any]:
     }
 
 
+def _gap(found: DrcReport) -> str:
+    """Only gaps that break the rule are all looked at."""
+    least = found.minimum_gap_nm
+    return f"smallest gap {told(least)}" if math.isfinite(least) else f"no gap below {found.limits['gap']:g} nm"
+
+
 def _text(path: Path, found: DrcReport, form: list[Finding]) -> str:
     broken = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
     broken += f"{', ' if broken else ''}{len(form)} of form" if form else ""
     verdict = f"FAILS: design rules broken: {broken}" if broken else "keeps the design rules"
     lines = [
         f"{path}: {verdict}",
-        f"  {found.pillars:,} shapes; smallest gap below the rule's reach "
-        f"{told(found.minimum_gap_nm)}, thinnest {told(found.minimum_feature_nm)}",
+        f"  {found.pillars:,} shapes; {_gap(found)}, thinnest {told(found.minimum_feature_nm)}",
     ]
     lines += [
         f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.value:.4g} nm, need {v.limit:.4g}; {v.text}"

@@ -133,7 +133,7 @@ def _check_layer(layer: _Layer, rules: Rules, report: DrcReport, name: str) -> N
         text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
         value *= report.unit_nm
         report.add("gap", 1, Violation("gap", layer.box(a, b), value, rules.minimum_gap_nm, text))
-    least = apart[alone[one] & alone[two]].min(initial=math.inf) * report.unit_nm
+    least = apart[both].min(initial=math.inf) * report.unit_nm  # of pairs further apart only some were looked at
     report.minimum_gap_nm = min(report.minimum_gap_nm, float(least))
     beside = np.unique(np.concatenate([one[alone[one] & ~alone[two]], two[alone[two] & ~alone[one]]]))
     other = np.flatnonzero(~alone)

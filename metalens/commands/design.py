@@ -241,10 +241,9 @@ def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: 
         return True
     elsewhere = meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
     if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
-        source, told = (1e-3 * d for d in (focus.source_distance_um, focus.sensor_distance_um))
+        seen = f"{elsewhere * 1e-3:.4g} mm behind the lens for a source at {1e-3 * focus.source_distance_um:g} mm"
         console.say(
-            f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens "
-            f"(source_distance_mm = {source:g}); sensor_distance_mm = {told:g}"
+            f"the rays of the map come together {seen}; sensor_distance_mm = {focus.sensor_distance_um / 1e3:g}"
         )
     return False
 

@@ -20,7 +20,13 @@ FOLDERS = {
     "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
 }
 GENERATOR, _HEAD = 'content="metalens toolchain"', 400  # what tells these pages, and characters that hold it
-OWN = {"library": "library_panels", "axes-library": "axes_panels", "lens": "lens_panels", "psf": "psf_panels"}
+OWN = {
+    "library": "library_panels",
+    "axes-library": "axes_panels",
+    "lens": "lens_panels",
+    "psf": "psf_panels",
+    "far-field": "far_field_panels",
+}
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,8 @@ def run(options: Options) -> int:
     size = target.stat().st_size
     options.console.result(
         {"page": target.name, "panels": len(panels), "bytes": size},
-        f"{target}: {len(panels)} figures of {options.file.name}, {size / 1e6:.2g} MB; open it in a browser",
+        f"{target}: {len(panels)} part{'s' * (len(panels) > 1)} of {options.file.name}, {size / 1e6:.2g} MB; open it "
+        "in a browser",
     )
     return 0
 
@@ -104,10 +111,12 @@ def kind_of(path: Path) -> str:
     if path.is_dir():
         if kind := _folder_kind(path):
             return kind
-        inside = [p.relative_to(path).as_posix() for p in _inside(path)]
+        inside = [str(p) for p in _inside(path)]
+        pages = [str(p) for p in sorted(path.glob("*.html"))]
         raise ConfigError(
             f"{path} is no folder of a mask, of captures or of a run"
-            + (f"; give one of {', '.join(inside[:9])}" if inside else "; give a file")
+            + (f"; give one of {', '.join(inside[:9])}" if inside else "; give a file" if not pages else "")
+            + (f"; its own page is {', '.join(pages[:3])}" if pages else "")
         )
     return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
 

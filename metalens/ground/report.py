@@ -94,6 +94,7 @@ WORDS = {
     "iou": "overlap of masks",
     "strehl": "Strehl ratio",
 }
+WORDS |= {"mmacs": "million MACs"}
 WORDS |= {"fwhm": "width at half maximum", "macs": "MACs", "chi2": "chi²", "dof": "degree of freedom", "t": "t"}
 WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time"}
 
@@ -103,13 +104,14 @@ def in_words(key: str) -> str:
 
     >>> in_words("max_phase_error_rad")
     'largest phase error / rad'
-    >>> in_words("mtf50_x_per_um")
-    'mtf50 x / (1/µm)'
+    >>> [in_words(key) for key in ("mtf50_x_per_um", "depth_response_mm_per_mm", "mmacs")]
+    ['mtf50 x / (1/µm)', 'depth response / (mm/mm)', 'million MACs']
     """
     *parts, last = key.split("_")
     unit = UNITS.get(last, "") if parts else ""
     if unit and parts[-1] == "per":
-        unit, parts = f"(1/{unit})", parts[:-1]
+        over = UNITS.get(parts[-2], "") if len(parts) > 2 else ""
+        unit, parts = (f"({over}/{unit})", parts[:-2]) if over else (f"(1/{unit})", parts[:-1])
     said = " ".join(WORDS.get(part, part) for part in (parts if unit else [*parts, last]))
     return f"{said} / {unit}" if unit else said
 

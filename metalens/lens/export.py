@@ -81,8 +81,9 @@ def arrays(lens: Lens) -> dict[str, Array]:
 class GridPhase:
     """Phase on a square grid, +y down as everywhere here.
 
-    phase_rad: (n, n), nan where there is no lens. step_um: of the points. error_rad: largest difference between the
-    pillars and the cubic interpolation of the points, a few points inside the rim, where a program has all it needs.
+    phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be interpolated; nan further out.
+    step_um: of the points. error_rad: largest difference between the pillars and the cubic interpolation of the points,
+    a few points inside the rim, where a program has all it needs.
     """
 
     phase_rad: Array
@@ -131,7 +132,33 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
     inner = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
     whole = map_coordinates(inner, back, order=1) > 1 - 1e-9
     read = map_coordinates(_filled(grid), [b[whole] for b in back], order=3, mode="nearest")
-    return GridPhase(grid, step, float(np.abs(read - phase[there][whole]).max(initial=0)))
+    beyond = _continued(phase, _RIM * step / d.pitch_um + 1)
+    return GridPhase(
+        map_coordinates(beyond, where, order=1, cval=np.nan),
+        step,
+        float(np.abs(read - phase[there][whole]).max(initial=0)),
+    )
+
+
+def _continued(phase: Array, reach: float) -> Array:
+    """Sites up to ``reach`` beyond the data, by the parabola through the nearest that has some and two behind it."""
+    from scipy.ndimage import distance_transform_edt
+
+    away, nearest = distance_transform_edt(np.isnan(phase), return_indices=True)
+    at = np.argwhere((away > 0) & (away <= reach))
+    rim = nearest[:, at[:, 0], at[:, 1]].T
+    first, second, third = (_at(phase, rim - k * (at - rim)) for k in range(3))
+    straight = np.where(np.isnan(second), first, 2 * first - second)
+    out = phase.copy()
+    out[at[:, 0], at[:, 1]] = np.where(np.isnan(second + third), straight, 3 * first - 3 * second + third)
+    return out
+
+
+def _at(grid: Array, places: Array) -> Array:
+    """Values at (n, 2) whole places; nan outside."""
+    inside = ((places >= 0) & (places < grid.shape)).all(1)
+    row, column = np.where(inside[:, None], places, 0).T
+    return np.where(inside, grid[row, column], np.nan)
 
 
 def _filled(grid: Array) -> Array:

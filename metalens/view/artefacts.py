@@ -140,8 +140,35 @@ def psf_panels(path: Path) -> list[Panel]:
     ]
 
 
+def far_field_panels(path: Path) -> list[Panel]:
+    """Light over direction cosines, what cones about the axis hold, and the beams."""
+    stored = store.load(path, "far-field")
+    held, about = stored.arrays, stored.attributes
+    share, sine, angles = np.asarray(held["share"], float), np.asarray(held["sine"]), held["angles_deg"]
+    step, names = float(sine[1] - sine[0]), [Axis("light from", [_degrees(pair) for pair in angles])]
+    edges = np.degrees(np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1))))
+    beams = [(_degrees(angles[int(i)]), x, y, part) for i, x, y, part in held["beams"].tolist()]
+    words = (
+        f"Direction cosines along x and y of light of {1e3 * float(about['wavelength_um']):g} nm, in squares "
+        f"{step:.3g} wide; relative error {float(np.max(held['error'])):.1e}."
+    )
+    passed = ", ".join(f"{_degrees(pair)}: {part:.3f}" for pair, part in zip(angles, held["transmitted"], strict=True))
+    cone = {"share": np.cumsum(held["rings"], axis=-1)}
+    return [
+        Images("Far field", share / share.max(), names, step, "of the brightest", words, across="sine"),
+        Curves(
+            "Light within a cone about the axis", edges, "angle / deg", cone, "share of the light that passes", names
+        ),
+        Numbers("Beams", ("light from", "sine x", "sine y", "share"), beams, f"Passes the pillars from {passed}."),
+    ]
+
+
 def _angle(pair: Array) -> str:
-    x, y = np.degrees(pair)
+    return _degrees(np.degrees(pair))
+
+
+def _degrees(pair: Array) -> str:
+    x, y = pair
     return f"{x:.3g}, {y:.3g} deg"
 
 
@@ -154,7 +181,7 @@ def plain_panels(path: Path) -> list[Panel]:
             continue
         if array.ndim >= 2 and min(array.shape[-2:]) >= 8:
             axes = [Axis(f"axis {i}", list(range(n))) for i, n in enumerate(array.shape[:-2])]
-            out.append(Images(name, _finite(array), axes, 1.0, signed=bool(array.min() < 0)))
+            out.append(Images(name, _finite(array), axes, 1.0, signed=bool(array.min() < 0), across="samples"))
         elif array.ndim == 1 and len(array) >= 8:
             out.append(Curves(name, np.arange(len(array)), "index", {name: _finite(array)}, ""))
     rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]

@@ -62,6 +62,8 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "unit": panel.unit,
             "signed": panel.signed,
             "optics": panel.optics,
+            "across": panel.across,
+            "fromLeast": panel.from_least,
         }
     if isinstance(panel, Curves):
         return shared | {

@@ -35,7 +35,8 @@ class Images:
     """A stack of images, one slider an axis before (y, x).
 
     values: (*axes, y, x) real; shown in single precision.
-    step_um: spacing of the samples; centre at (n-1)/2.
+    step_um: spacing of the samples; centre at (n-1)/2. across: its unit, where it is no length.
+    from_least: whether colours begin at the least value in place of zero (depths).
     unit: of the values. signed: zero has a colour of its own (residuals). optics: MTF and encircled energy are shown.
     """
 
@@ -47,6 +48,8 @@ class Images:
     caption: str = ""
     signed: bool = False
     optics: bool = False
+    across: str = "µm"
+    from_least: bool = False
 
     def __post_init__(self) -> None:
         counts = tuple(len(axis.values) for axis in self.axes)

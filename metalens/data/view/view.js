@@ -110,7 +110,7 @@ async function images(panel, section) {
   const figure = element("figure", views, { style: "margin:0" });
   const canvas = element("canvas", figure, { class: "image", width: nx, height: ny, tabindex: 0, role: "img", "aria-label": `${panel.title}; arrow keys move the cross` });
   const readout = element("p", section, { class: "readout", "aria-live": "polite" });
-  const right = element("div", views, { class: "plot" }), profile = plot(right, "Along the cross", "x / µm", panel.unit, false);
+  const right = element("div", views, { class: "plot" }), profile = plot(right, "Along the cross", `x / ${panel.across}`, panel.unit, false);
   const optics = panel.optics ? { mtf: plot(right, "MTF", "cycles / mm", "contrast", false), energy: plot(right, "Encircled energy", "radius / µm", "share", false) } : null;
   let cross = [Math.floor(ny / 2), Math.floor(nx / 2)], log = false, own = true;
   const table = panel.signed ? TABLE(SIGNED) : TABLE(CIVIDIS), ends = bar(figure, table);
@@ -118,7 +118,7 @@ async function images(panel, section) {
   for (const v of values) if (Math.abs(v) > all) all = Math.abs(v);
   const place = sliders(panel, controls, () => draw());
   const tick = (name, start, act) => { const l = element("label", controls, { class: "tick" }), b = element("input", l, { type: "checkbox" }); b.checked = start; l.append(name); b.addEventListener("change", () => { act(b.checked); draw(); }); };
-  if (!panel.signed) tick("logarithmic", false, (v) => { log = v; });
+  if (!panel.signed && !panel.fromLeast) tick("logarithmic", false, (v) => { log = v; });
   tick("own scale", true, (v) => { own = v; });
   const image = () => values.subarray(place() * size, (place() + 1) * size);
   const um = (k, n) => (k - (n - 1) / 2) * panel.step;
@@ -128,19 +128,20 @@ async function images(panel, section) {
     if (own) for (const k of place.others()) for (const v of values.subarray(k * size, (k + 1) * size)) top = Math.max(top, Math.abs(v));
     else top = all;
     top = top || 1;
+    const low = panel.fromLeast ? at.reduce((a, b) => Math.min(a, b), Infinity) : 0, over = top - low || 1;
     for (let i = 0; i < size; i++) {
-      let t = panel.signed ? 0.5 + at[i] / top / 2 : at[i] / top;
+      let t = panel.signed ? 0.5 + at[i] / top / 2 : (at[i] - low) / over;
       if (log) t = 1 + Math.log10(Math.max(t, 1e-4)) / 4;
       const c = table[Math.max(0, Math.min(255, Math.round(255 * t)))];
       out.data.set([c[0], c[1], c[2], 255], 4 * i);
     }
     context.putImageData(out, 0, 0);
-    ends(panel.signed ? -top : log ? 1e-4 * top : 0, top, `${panel.unit}; ${text(nx * panel.step)} × ${text(ny * panel.step)} µm`);
+    ends(panel.signed ? -top : log ? 1e-4 * top : low, top, `${panel.unit}; ${text(nx * panel.step)} × ${text(ny * panel.step)} ${panel.across}`);
     context.fillStyle = "#ffffff50";
     context.fillRect(0, cross[0], nx, 0.5); context.fillRect(cross[1], 0, 0.5, ny);
     const x = Array.from({ length: nx }, (_, k) => um(k, nx));
     profile(x, { "along x": { y: at.subarray(cross[0] * nx, (cross[0] + 1) * nx) }, ...(nx === ny ? { "along y": { y: x.map((_, k) => at[k * nx + cross[1]]) } } : {}) });
-    readout.textContent = `x ${text(um(cross[1], nx))} µm, y ${text(um(cross[0], ny))} µm: ${text(at[cross[0] * nx + cross[1]])} ${panel.unit}` + (log ? "; four decades shown" : "");
+    readout.textContent = `x ${text(um(cross[1], nx))} ${panel.across}, y ${text(um(cross[0], ny))} ${panel.across}: ${text(at[cross[0] * nx + cross[1]])} ${panel.unit}` + (log ? "; four decades shown" : "");
     if (optics) {
       const t = transfer(at, ny, nx, panel.step), e = encircled(at, ny, nx, panel.step);
       optics.mtf(t.f, { "along x": { y: t.x }, "along y": { y: t.y } });
@@ -150,7 +151,7 @@ async function images(panel, section) {
   const move = (dy, dx) => { cross = [Math.max(0, Math.min(ny - 1, cross[0] + dy)), Math.max(0, Math.min(nx - 1, cross[1] + dx))]; draw(); };
   canvas.addEventListener("click", (event) => { const r = canvas.getBoundingClientRect(); cross = [Math.min(ny - 1, Math.floor((event.clientY - r.top) / r.height * ny)), Math.min(nx - 1, Math.floor((event.clientX - r.left) / r.width * nx))]; draw(); });
   canvas.addEventListener("keydown", (event) => { const step = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key]; if (step) { event.preventDefault(); move(...step); } });
-  tableOf(section, ["y / µm", "x / µm", panel.unit || "value"], () => { const at = image(), rows = []; for (let i = 0; i < ny; i += Math.ceil(ny / 40)) for (let k = 0; k < nx; k += Math.ceil(nx / 40)) rows.push([um(i, ny), um(k, nx), at[i * nx + k]]); return rows; }, "Data of this image (every few samples)");
+  tableOf(section, [`y / ${panel.across}`, `x / ${panel.across}`, panel.unit || "value"], () => { const at = image(), rows = []; for (let i = 0; i < ny; i += Math.ceil(ny / 40)) for (let k = 0; k < nx; k += Math.ceil(nx / 40)) rows.push([um(i, ny), um(k, nx), at[i * nx + k]]); return rows; }, "Data of this image (every few samples)");
   draw();
   addEventListener("resize", draw);
 }
@@ -195,18 +196,31 @@ async function curves(panel, section) {
   addEventListener("resize", draw);
 }
 
-// Every site of a map: sums and counts over 2, 4, 8 ... sites, so that far away the mean of a screen pixel is drawn.
+// Every site of a map: sums and counts over 2, 4, 8 ... sites, so that far away the mean of a screen pixel is drawn. Each
+// level is the one before under the weights 1 3 3 1 along both axes, which leave less of fine zones than equal ones do.
 function pyramid(index, sizes, ny, nx) {
   const levels = [];
   let sum = new Float32Array(ny * nx), count = new Float32Array(ny * nx), h = ny, w = nx;
   for (let i = 0; i < index.length; i++) if (index[i]) { sum[i] = sizes[index[i] - 1]; count[i] = 1; }
   while (h > 1 && w > 1) {
-    const H = Math.ceil(h / 2), W = Math.ceil(w / 2), s = new Float32Array(H * W), c = new Float32Array(H * W);
-    for (let i = 0; i < h; i++) for (let k = 0; k < w; k++) { const to = (i >> 1) * W + (k >> 1); s[to] += sum[i * w + k]; c[to] += count[i * w + k]; }
-    [sum, count, h, w] = [s, c, H, W];
+    const H = Math.ceil(h / 2), W = Math.ceil(w / 2);
+    [sum, count] = [halved(sum, h, w), halved(count, h, w)];
+    [h, w] = [H, W];
     levels.push({ sum, count, h, w, sites: 2 ** (levels.length + 1) });
   }
   return levels;
+}
+function halved(from, h, w) {
+  const H = Math.ceil(h / 2), W = Math.ceil(w / 2), half = new Float32Array(h * W), out = new Float32Array(H * W);
+  for (let i = 0; i < h; i++) for (let k = 0; k < W; k++) {
+    const at = i * w + 2 * k;
+    half[i * W + k] = 0.375 * (from[at] + (2 * k + 1 < w ? from[at + 1] : 0)) + 0.125 * ((k ? from[at - 1] : 0) + (2 * k + 2 < w ? from[at + 2] : 0));
+  }
+  for (let i = 0; i < H; i++) for (let k = 0; k < W; k++) {
+    const at = 2 * i * W + k;
+    out[i * W + k] = 0.375 * (half[at] + (2 * i + 1 < h ? half[at + W] : 0)) + 0.125 * ((i ? half[at - W] : 0) + (2 * i + 2 < h ? half[at + 2 * W] : 0));
+  }
+  return out;
 }
 // A plane to move about on: drag, wheel, keys, buttons. box: {w, h} of the whole in its own lengths, y down, from 0.
 // paint(c, view) draws what view = {scale, cx, cy, W, H} shows (scale: pixels a length); tell(x, y, scale) says what lies there.
@@ -278,22 +292,30 @@ async function classes(panel, section) {
       c.beginPath(); c.arc((k + 0.5 - cx) * scale + W / 2, (i + 0.5 - cy) * scale + H / 2, radius, 0, 7); c.fill();
     }
   }
+  // far away: between the four nearest of a level whose sites are a pixel or more, so that nothing is passed over
   function far(c, { scale, cx, cy, W, H }) {
-    const level = scale >= 1 || !levels.length ? null : levels[Math.min(levels.length - 1, Math.max(0, Math.ceil(Math.log2(1 / scale)) - 1))];
-    const sites = level ? level.sites : 1, w = level ? level.w : nx, h = level ? level.h : ny, out = c.createImageData(W, H);
-    for (let y = 0; y < H; y++) {
-      const i = Math.floor((cy + (y + 0.5 - H / 2) / scale) / sites);
-      if (i < 0 || i >= h) continue;
-      for (let x = 0; x < W; x++) {
-        const k = Math.floor((cx + (x + 0.5 - W / 2) / scale) / sites);
-        if (k < 0 || k >= w) continue;
-        const at = i * w + k, count = level ? level.count[at] : index[at] ? 1 : 0;
-        if (!count) continue;
-        const rgb = shade(level ? level.sum[at] / count : sizes[index[at] - 1]), part = level ? Math.min(1, count / (sites * sites)) : 1;
-        out.data.set([...rgb.map((v) => 255 + part * (v - 255)), 255], 4 * (y * W + x));
-      }
+    const level = scale >= 1 || !levels.length ? null : levels[Math.min(levels.length - 1, Math.max(0, Math.ceil(Math.log2(1 / scale) - 1e-9) - 1))];
+    const out = c.createImageData(W, H), held = new Float64Array(2);
+    for (let y = 0; y < H; y++) for (let x = 0; x < W; x++) {
+      (level ? between : single)(level, cx + (x + 0.5 - W / 2) / scale, cy + (y + 0.5 - H / 2) / scale, held);
+      if (!(held[1] > 0)) continue;
+      const rgb = shade(held[0] / held[1]), part = Math.min(1, held[1]), to = 4 * (y * W + x);
+      for (let n = 0; n < 3; n++) out.data[to + n] = 255 + part * (rgb[n] - 255);
+      out.data[to + 3] = 255;
     }
     c.putImageData(out, 0, 0);
+  }
+  function single(_, atX, atY, held) {
+    const k = Math.floor(atX), i = Math.floor(atY), one = i >= 0 && k >= 0 && i < ny && k < nx ? index[i * nx + k] : 0;
+    held[0] = one ? sizes[one - 1] : 0; held[1] = one ? 1 : 0;
+  }
+  function between({ sum, count, h, w, sites }, atX, atY, held) {
+    const fx = atX / sites - 0.5, fy = atY / sites - 0.5, k = Math.floor(fx), i = Math.floor(fy);
+    held[0] = held[1] = 0;
+    for (let r = Math.max(0, i); r < Math.min(h, i + 2); r++) for (let q = Math.max(0, k); q < Math.min(w, k + 2); q++) {
+      const part = (1 - Math.abs(fy - r)) * (1 - Math.abs(fx - q)), at = r * w + q;
+      held[0] += part * sum[at]; held[1] += part * count[at];
+    }
   }
   function tell(atX, atY, scale) {
     const k = Math.floor(atX), i = Math.floor(atY);
@@ -408,7 +430,7 @@ async function drawing(panel, section) {
   }, "Shapes and how many copies they have");
 }
 
-const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Numbers: async (panel, section) => fill(element("div", section, { class: "scroll", tabindex: 0 }), panel.head, panel.rows) };
+const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Numbers: async (panel, section) => fill(element("div", section, { class: panel.rows.length > 40 ? "scroll" : "scroll whole", tabindex: 0 }), panel.head, panel.rows) };
 (async () => {
   const data = JSON.parse(document.getElementById("data").textContent), main = document.getElementById("panels"), status = document.getElementById("status");
   for (const panel of data.panels) {

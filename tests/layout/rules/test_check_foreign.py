@@ -126,7 +126,7 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     made.write(str(tmp_path / "one.gds"))
     assert cli.main(["check", str(tmp_path / "one.gds")]) == 0
     told = capsys.readouterr().out
-    assert "smallest gap below the rule's reach none, thinnest 170.0 nm" in told
+    assert "no gap below 70 nm, thinnest 170.0 nm" in told
     assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
     values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)  # no Infinity, which JSON does not know
     assert (values["minimum_gap_nm"], values["minimum_feature_nm"]) == (None, 170.0)
