@@ -25,6 +25,7 @@ SETTINGS = {
     "STUDY.toml": ("metalens.pillars.study", "Study", "study"),
     "DESIGN.toml": ("metalens.commands.design", "Design", "design"),
     "PSF.toml": ("metalens.commands.psf", "Settings", "psf"),
+    "ARRANGEMENT.toml": ("layout.arrange", "Arrangement", "layout"),
     "PROCESS.toml": ("layout.process.process", "Process", "layout"),
     "TRUTH.toml": ("characterize.bench.bench", "Truth", "capture --truth"),
     "PROTOCOL.toml": ("characterize.bench.protocol", "Protocol", "capture --protocol"),
@@ -32,6 +33,7 @@ SETTINGS = {
     "PUPIL.toml": ("characterize.pupil.record", "PupilSpec", "fit --pupil"),
     "SCENE.toml": ("codesign.commands.scene", "Scene", "scene"),
     "RUN.toml": ("codesign.train.run", "RunConfig", "codesign"),
+    "OPTICS.toml": ("codesign.commands.evaluate_optics", "Settings", "evaluate optics --config"),
     "PLAN.toml": ("codesign.budget.plan", "PlanConfig", "plan"),
     "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
 }

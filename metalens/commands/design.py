@@ -241,10 +241,8 @@ def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: 
         return True
     elsewhere = meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
     if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
-        seen = f"{elsewhere * 1e-3:.4g} mm behind the lens for a source at {1e-3 * focus.source_distance_um:g} mm"
-        console.say(
-            f"the rays of the map come together {seen}; sensor_distance_mm = {focus.sensor_distance_um / 1e3:g}"
-        )
+        told = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {focus.sensor_distance_um / 1e3:g} mm"
+        console.say(f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}")
     return False
 
 
