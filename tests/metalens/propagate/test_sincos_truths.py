@@ -1,0 +1,32 @@
+"""Sines and cosines of turns, as the compiled loops have them, against those of the standard library."""
+
+import math
+
+import numpy as np
+
+from metalens.propagate import sincos
+
+T = np.concatenate([np.linspace(-0.5, 0.5, 20_001), [1e-9, -3e-5, 0.25, -0.25, 0.125]])
+
+
+def test_double_turns_are_right_to_rounding():
+    c, s = sincos.turns64.py_func(T)
+    assert np.abs(c - np.cos(2 * np.pi * T)).max() < 7e-16  # three roundings of one
+    assert np.abs(s - np.sin(2 * np.pi * T)).max() < 7e-16
+    assert sincos.turns64.py_func(0.0) == (1.0, 0.0)
+
+
+def test_single_turns_are_right_to_four_in_ten_million_and_to_a_sixth_of_that_on_average():
+    c, s = sincos.turns32.py_func(T)
+    assert c.dtype == s.dtype == np.float32
+    exact = T.astype(np.float32).astype(float)
+    for got, want in ((c, np.cos(2 * np.pi * exact)), (s, np.sin(2 * np.pi * exact))):
+        assert np.abs(got - want).max() < 4.2e-7
+        assert np.sqrt(((got - want) ** 2).mean()) < 8e-8
+
+
+def test_power_series_end_where_double_precision_does():
+    """The next term of sin(πt)/t and cos(πt) at half a turn lies below a rounding."""
+    for odd, count in ((1, 11), (0, 12)):
+        left = math.pi ** (2 * count + odd) / math.factorial(2 * count + odd) * 0.25**count
+        assert left < 2.3e-16
