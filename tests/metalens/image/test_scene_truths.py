@@ -1,0 +1,78 @@
+"""Sheets, layers and weights of a scene in closed form: what hides what, and what two depths share."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens.image import Frames, scene
+from metalens.image.scene import PsfBasis
+
+RNG = np.random.default_rng(17)
+
+
+def sheets(near, far):
+    return torch.tensor([[[[near]], [[far]]]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.7])
+def test_a_near_sheet_hides_what_it_covers_of_a_far_one(mean):
+    """Light 0.2 through coverage 0.3 before 0.5 through 0.8, of which 0.7 is free: (0.2 + 0.5 * 0.7 / 0.8) / 1, and
+    the mean that was taken off all light comes back whole."""
+    got = scene._over(sheets(0.2, 0.5), sheets(0.3, 0.8), mean)
+    assert float(got) == pytest.approx(0.2 + 0.5 * 0.7 / 0.8 + mean, rel=1e-9)
+    bright = scene._over(sheets(0.2, 0.5), sheets(0.9, 0.0), 0.0)  # no far sheet: the near one over what it covers
+    assert float(bright) == pytest.approx(0.2 / 0.9, rel=1e-9)
+
+
+def test_light_between_two_depths_is_shared_by_its_inverse_depth():
+    """Sources at 12, 16 and 30 mm, nodes at 10, 20 and 40 mm; the last sheet is empty."""
+    depths = torch.tensor([10e3, 20e3, 40e3], dtype=torch.float64)
+    where = torch.tensor([[[[12e3, 16e3, 30e3]], [[99e3, 99e3, 99e3]]]], dtype=torch.float64)
+    light = torch.tensor([[[[2.0, 3.0, 5.0]], [[0.0, 0.0, 0.0]]]], dtype=torch.float64)
+    cover = torch.tensor([[[[1.0, 0.5, 1.0]], [[0.0, 0.0, 0.0]]]], dtype=torch.float64)
+    made = scene.cut(Frames(light, cover, where), depths)
+
+    def share(z, a, b):
+        return (1 / z - 1 / b) / (1 / a - 1 / b)
+
+    s, t, u = share(12e3, 10e3, 20e3), share(16e3, 10e3, 20e3), share(30e3, 20e3, 40e3)
+    want = [[2 * s, 3 * t, 0.0], [2 * (1 - s), 3 * (1 - t), 5 * u], [0.0, 0.0, 5 * (1 - u)]]
+    assert made.radiance[0, :, 0].numpy() == pytest.approx(np.array(want), abs=1e-12)
+    covers = np.array(want) * np.array([1 / 2, 0.5 / 3, 1 / 5])
+    assert made.coverage[0, :, 0].numpy() == pytest.approx(covers, abs=1e-12)
+    assert made.depth_um.tolist() == [10e3, 20e3, 40e3]
+
+
+def test_weights_over_the_field_are_bilinear_and_over_depth_straight_in_inverse_depth():
+    """2 x 3 field points and two depths of one kernel; a frame of 3 x 5 pixels from corner to corner."""
+    weights = torch.from_numpy(RNG.uniform(0.2, 1.0, (2, 3, 2, 1)))
+    psf = PsfBasis(torch.ones(1, 3, 3), weights, torch.tensor([10e3, 30e3], dtype=torch.float64), 0.0, 0.0)
+    depth = torch.full((1, 3, 5), 14e3, dtype=torch.float64)
+    got = scene.weight_maps(psf, depth)[0, 0].numpy()
+    deep = (1 / 10e3 - 1 / 14e3) / (1 / 10e3 - 1 / 30e3)
+    at = (1 - deep) * weights[..., 0, 0].numpy() + deep * weights[..., 1, 0].numpy()
+    for i in range(3):
+        for j in range(5):
+            y, x = i / 2, j / 2
+            a, b = min(int(y), 0), min(int(x), 1)
+            u, v = y - a, x - b
+            want = (1 - u) * ((1 - v) * at[a, b] + v * at[a, b + 1]) + u * (
+                (1 - v) * at[a + 1, b] + v * at[a + 1, b + 1]
+            )
+            assert got[i, j] == pytest.approx(want, abs=3e-4)  # depths are coded in 4096 steps of their range
+
+
+def test_border_pixels_go_on_half_to_either_side():
+    row = torch.arange(4.0).reshape(1, 1, 4)
+    got = scene._padded(row, (1, 9))[0, 0].tolist()
+    assert got == [0, 1, 2, 3, 3, 3, 3, 0, 0]
+
+
+def test_the_mean_of_frames_is_their_light_over_their_coverage():
+    frames = SimpleNamespace(
+        radiance=torch.tensor([1.0, 2.0, 3.0, 6.0]).reshape(1, 2, 1, 2),
+        coverage=torch.tensor([1.0, 0.5, 0.0, 1.5]).reshape(1, 2, 1, 2),
+    )
+    assert float(scene._mean(frames)) == pytest.approx(4.0)
