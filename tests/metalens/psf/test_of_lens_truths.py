@@ -1,0 +1,109 @@
+"""What a lens's PSF stack is made of, with typed stacks: mean of polarisations, cones of rays, worst directions."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from metalens.ground.store import Provenance
+from metalens.lens import Layers
+from metalens.psf import of_lens
+from metalens.psf.budget import Budget
+from metalens.psf.record import PsfStack
+
+RNG = np.random.default_rng(3)
+
+
+def lens(knows_angles=0.0):
+    return SimpleNamespace(
+        layers=Layers(),
+        sensor_distance_um=700.0,
+        wavelength_um=0.85,
+        diameters=SimpleNamespace(radius_um=200.0, pitch_um=0.4),
+        proxy=SimpleNamespace(max_angle_rad=knows_angles),
+        hand="",
+        pairs=None,
+    )
+
+
+def stack(angle, error, energy):
+    light = RNG.uniform(0.2, 1.0, (1, 2, 3, 4)).astype(np.float32)
+    return PsfStack(
+        light / light.sum((-1, -2), keepdims=True),
+        np.array([energy], np.float32),
+        depths_um=np.array([2e3, 5e3]),
+        angles_rad=np.array([angle]),
+        wavelengths_um=np.array([0.85]),
+        weights=np.ones(1),
+        step_um=0.6,
+        centres_um=np.array([[1.0, 2.0]]) * (1 + angle[0]),
+        sensor_distance_um=700.0,
+        tolerance=1e-3,
+        error=error,
+        reason=f"error {error:g}",
+    )
+
+
+def test_light_without_polarisation_is_the_mean_irradiance_of_both():
+    """Shares of sum 1 are weighed by their light: 3 and 9 um² of one and 5 and 3 of the other; the worse error."""
+    x, y = stack((0.0, 0.0), 2e-4, (3.0, 9.0)), stack((0.0, 0.0), 7e-4, (5.0, 3.0))
+    made = of_lens.unpolarised(x, y)
+    assert made.energy_um2 == pytest.approx(np.array([[4.0, 6.0]]))
+    for k, (a, b) in enumerate(((3, 5), (9, 3))):
+        want = (a * x.intensity[0, k] + b * y.intensity[0, k]) / (a + b)
+        assert made.intensity[0, k] == pytest.approx(want, rel=1e-5)
+    assert made.error == 7e-4
+    assert made.intensity.dtype == np.float32
+
+
+def test_the_aperture_is_half_the_spread_of_sines_seen_from_the_chief_rays_place():
+    """On the axis the sine of the rim; at an angle of rays in the plane of incidence, whatever its azimuth."""
+    edge = 200.2
+    assert of_lens.aperture(lens(), (0.0, 0.0)) == pytest.approx(edge / math.hypot(edge, 700), rel=1e-9)
+    for angle in ((0.3, 0.0), (0.0, -0.3), (0.2, -0.15)):
+        reach = 700 * math.hypot(math.tan(angle[0]), math.tan(angle[1]))
+        sines = [(reach + s * edge) / math.hypot(reach + s * edge, 700) for s in (1, -1)]
+        assert of_lens.aperture(lens(), angle) == pytest.approx((sines[0] - sines[1]) / 2, rel=1e-9)
+
+
+def test_pillars_are_asked_at_the_angle_of_both_slopes_where_they_know_angles():
+    want = math.atan(math.hypot(math.tan(0.2), math.tan(-0.15)))
+    assert of_lens.incidence(lens(0.5), (0.2, -0.15)) == pytest.approx(want)
+    assert of_lens.incidence(lens(), (0.2, -0.15)) == 0.0
+
+
+def test_phases_of_pillars_are_wrapped_to_half_a_turn_either_way():
+    made = lens()
+    made.phase_rad = lambda wavelength, tilt: np.array([0.3, 4.0, -9.0, 100.0])
+    made.transmission = lambda wavelength, tilt: np.array([0.9, 0.8, 0.7, 0.0])
+    phase, level = of_lens.pillar_maps(made, 0.85, (0.1, 0.0))
+    assert phase == pytest.approx([0.3, 4 - 2 * math.pi, -9 + 2 * math.pi, 100 - 32 * math.pi])
+    assert level.tolist() == [0.9, 0.8, 0.7, 0.0]
+
+
+def test_directions_are_joined_in_their_order_with_the_worst_error_and_its_reason():
+    parts = [
+        stack((0.0, 0.1), 2e-4, (1.0, 2.0)),
+        stack((0.2, 0.0), 9e-4, (3.0, 4.0)),
+        stack((0.3, 0.0), 4e-4, (5.0, 6.0)),
+    ]
+    made = of_lens._joined(parts, Provenance())
+    assert made.energy_um2.tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert made.angles_rad[:, 0].tolist() == [0.0, 0.2, 0.3]
+    assert made.centres_um[:, 1] == pytest.approx([2.0, 2.4, 2.6])
+    assert (made.error, made.reason) == (9e-4, "error 0.0009")
+    assert made.intensity.shape == (3, 2, 3, 4)
+
+
+def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(of_lens, "with_model", lambda budget, **about: asked.update(about, budget=budget) or budget)
+    part = dataclasses.replace(stack((0.2, -0.15), 2e-4, (1.0, 2.0)), budget=Budget(1e-4, sampling=2e-4))
+    of_lens._budget(lens(), (0.2, -0.15), part, SimpleNamespace(error=0.013), True, "rough")
+    assert asked["budget"] == Budget(1e-4, sampling=2e-4, spectrum=0.013)
+    assert asked["aperture"] == pytest.approx(of_lens.aperture(lens(), (0.2, -0.15)))
+    assert asked["incidence_rad"] == pytest.approx(math.atan(math.hypot(math.tan(0.2), math.tan(-0.15))))
+    assert (asked["vector"], asked["has_angles"], asked["left_out"]) == (True, False, "rough")
+    assert asked["ghost"] == lens().layers.ghost(0.85)
