@@ -13,11 +13,12 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from metalens import cli
+from metalens.ground import reading
 
 CELL = "[cell]\npitch_um = {}\npillar = {{n = 3.6}}\n[sweep]\nwavelengths_um = [0.85]\nsamples = 40\ntolerance = 0.05\n"
 DESIGN = "aperture_mm = {}\nlibrary = 'library.h5'\n"
@@ -88,12 +89,16 @@ _UNTYPED = 70
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """What came of a command: exit status (negative: a signal), errors in words, seconds, file operations."""
+    """What came of a command: exit status (negative: a signal), errors in words, seconds, file operations.
+
+    times: seconds of the processor at every operation, and at the end.
+    """
 
     status: int
     told: str
     seconds: float
     operations: int
+    times: tuple[float, ...] = ()
 
 
 @dataclass(eq=False, slots=True)
@@ -108,38 +113,76 @@ class Child:
         """Its end."""
         status = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
         seconds, report = time.perf_counter() - self.start, self.told.with_suffix(".json")
-        made = json.loads(report.read_text()) if report.is_file() else {"operations": 0, "modules": []}
-        _load(made["modules"])
+        nothing: dict[str, Any] = {"operations": 0, "modules": [], "times": []}
+        made = json.loads(report.read_text()) if report.is_file() else nothing
+        load(made["modules"])
         words = self.told.read_text("utf-8", "replace")
         for path in (self.told, report):
             path.unlink(missing_ok=True)
-        return Ended(status, words, seconds, made["operations"])
+        return Ended(status, words, seconds, made["operations"], tuple(made["times"]))
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """A file operation that is about to be done: its number from 1, the audit event and what it is called with."""
+
+    number: int
+    event: str
+    arguments: tuple[Any, ...]
+
+    @property
+    def writes(self) -> bool:
+        """Whether a disk without room, or one that fails, may refuse it."""
+        if self.event == "open":
+            return bool(self.arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+        return self.event in ("os.mkdir", "os.rename", "fsync")
+
+
+Each = Callable[[Operation], object]
+
+
+def at(number: int, act: Callable[[], object]) -> Each:
+    """Something that is done at one file operation."""
+    return lambda operation: act() if operation.number == number else None
 
 
 @dataclass(eq=False, slots=True)
-class _Hook:
-    """Counts the file operations of this process in a folder, and does something at one of them."""
+class Hook:
+    """Counts the file operations of this process in a folder, and calls ``each`` at every one.
+
+    told: where the command's errors go.
+    """
 
     folder: str
-    at: int
-    act: Callable[[], object]
-    process: int
+    each: Each
+    told: Path
+    process: int = field(default_factory=os.getpid)
     seen: int = 0
+    busy: bool = False
+    times: list[float] = field(default_factory=list)
 
     def __call__(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if not event.startswith(_EVENTS) or os.getpid() != self.process:
+        if self.busy or not event.startswith(_EVENTS) or os.getpid() != self.process:
             return
         path = arguments[0] if arguments else ""
         named = os.fsdecode(path) if isinstance(path, (str, bytes, os.PathLike)) else ""
         if os.path.isabs(named) and not named.startswith(self.folder):
             return
+        self.reached(event, arguments)
+
+    def reached(self, event: str, arguments: tuple[Any, ...] = ()) -> None:
+        """Before one operation more."""
         self.seen += 1
-        if self.seen == self.at:
-            self.act()
+        self.times.append(time.process_time())
+        self.busy = True
+        try:
+            self.each(Operation(self.seen, event, arguments))
+        finally:
+            self.busy = False
 
 
-def begin(folder: Path, aside: Path, words: str, *, at: int = 0, act: Callable[[], object] = int) -> Child:
-    """Start a command in ``folder``; at its file operation number ``at`` it calls ``act`` on itself.
+def begin(folder: Path, aside: Path, words: str, each: Each = bool) -> Child:
+    """Start a command in ``folder``; before every file operation it calls ``each``.
 
     aside: a folder for what it says.
     """
@@ -150,28 +193,31 @@ def begin(folder: Path, aside: Path, words: str, *, at: int = 0, act: Callable[[
     start = time.perf_counter()
     process = os.fork()
     if process == 0:
-        _child(folder, told, words, at, act)
+        _child(folder, told, words, each)
     return Child(process, told, start)
 
 
-def _child(folder: Path, told: Path, words: str, at: int, act: Callable[[], object]) -> None:
+def _child(folder: Path, told: Path, words: str, each: Each) -> None:
     """Run the command in this forked process and end it."""
-    status = _UNTYPED
+    status, begun = _UNTYPED, time.process_time()
+    hook = Hook(str(folder), each, told)
     try:
         os.chdir(folder)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(os.open(told, os.O_WRONLY | os.O_APPEND), 2)
         sys.argv = ["metalens", *words.split()]
-        hook = _Hook(str(folder), at, act, os.getpid())
+        getattr(each, "meet", bool)(hook)
+        _count_writes(hook)
         sys.addaudithook(hook)
         try:
             status = cli.main(words.split())
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else _UNTYPED
-        hook.at = 0
-        made = {"operations": hook.seen, "modules": [] if at else sorted(sys.modules)}
-        told.with_suffix(".part").write_text(json.dumps(made))
-        told.with_suffix(".part").replace(told.with_suffix(".json"))
+        hook.busy = True
+        took = [*(t - begun for t in hook.times), time.process_time() - begun]
+        made = {"operations": hook.seen, "modules": sorted(sys.modules) if each is bool else [], "times": took}
+        hook.told.with_suffix(".part").write_text(json.dumps(made))
+        hook.told.with_suffix(".part").replace(hook.told.with_suffix(".json"))
     except BaseException:  # noqa: BLE001 (what is judged)
         traceback.print_exc()
     finally:
@@ -179,7 +225,25 @@ def _child(folder: Path, told: Path, words: str, at: int, act: Callable[[], obje
         os._exit(status)
 
 
-def _load(names: list[str]) -> None:
+def _count_writes(hook: Hook) -> None:
+    """Two operations that are no audit events: flushing, and a write of the HDF5 library."""
+    flush, write = os.fsync, reading.Through.write
+
+    def flushed(handle: Any) -> None:
+        if os.getpid() == hook.process and not hook.busy:
+            hook.reached("fsync")
+        flush(handle)
+
+    def written(file: reading.Through, content: Any) -> int:
+        if os.getpid() == hook.process and not hook.busy:
+            hook.reached("write")
+        return write(file, content)
+
+    os.fsync = flushed
+    reading.Through.write = written  # type: ignore[method-assign]
+
+
+def load(names: list[str]) -> None:
     """Load what a command loaded, so that the next one finds it."""
     for name in names:
         if name not in sys.modules and not name.startswith("__mp"):
@@ -187,8 +251,8 @@ def _load(names: list[str]) -> None:
                 importlib.import_module(name)
 
 
-def inputs(folder: Path, verbs: tuple[str, ...]) -> Iterator[str]:
-    """Write the settings files; words of the commands that make the other inputs of some verbs."""
+def settings(folder: Path) -> dict[str, str]:
+    """Write the settings files; their text by name."""
     texts = {"psf.toml": "depths_mm = [16.0, 18.0, 1.0]\nangles_deg = [0.0]\nsamples = 32\n", "optics.toml": OPTICS}
     texts |= {"process.toml": "", "known.toml": '[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n'}
     for i, (pitch, aperture, pixels) in enumerate(((0.3, 0.02, 24), (0.32, 0.03, 32))):
@@ -198,8 +262,14 @@ def inputs(folder: Path, verbs: tuple[str, ...]) -> Iterator[str]:
         texts |= {f"truth{i}.toml": f"depths_um = [16000.0, 20000.0, 30000.0]\nseed = {i}\n{CAMERA}"}
         texts |= {f"plan{i}.toml": PLAN.format(5 + i), f"run{i}.toml": RUN.format(3 + i)}
         texts |= {f"chain{i}.toml": CHAIN.format(i), f"rules{i}.toml": f"[rules]\nminimum_gap_nm = {200 + i}\n"}
+    texts["shots.toml"] = f"depths_um = [2000.0, 3000.0, 5000.0]\nseed = 3\n{CAMERA}"
     for name, text in texts.items():
         (folder / name).write_text(text)
+    return texts
+
+
+def inputs(verbs: tuple[str, ...]) -> Iterator[str]:
+    """Words of the commands that make the other inputs of some verbs."""
     yield "library cell0.toml -o library.h5 --accept-partial-turn"
     yield from (f"design design{i}.toml -o lens{i}.h5 --accept-partial-turn" for i in (0, 1))
     if {"measure", "fit"} & set(verbs):
@@ -209,7 +279,6 @@ def inputs(folder: Path, verbs: tuple[str, ...]) -> Iterator[str]:
     if "check" in verbs:
         yield "layout lens0.h5 -o mask0"
     if "retrain" in verbs:
-        (folder / "shots.toml").write_text(f"depths_um = [2000.0, 3000.0, 5000.0]\nseed = 3\n{CAMERA}")
         yield "codesign run0.toml -o run0"
         yield "capture run0/lens.h5 --truth shots.toml -o shots"
         yield "fit shots --design run0/lens.h5 --metrology known.toml -o asbuilt.h5 --insist"

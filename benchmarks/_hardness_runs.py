@@ -6,14 +6,14 @@ from it, so it can be had again.
 """
 
 import contextlib
-import ctypes
 import hashlib
+import json
 import os
 import random
 import resource
 import shutil
 import signal
-import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -21,14 +21,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks import _hardness_commands as commands
+from benchmarks import _hardness_kept as kept
+from benchmarks import _hardness_mounts as mounts
 from benchmarks._hardness_commands import RESUMABLE, VERBS, Child, Ended
 from metalens.ground import manifest, transaction
 from metalens.ground.errors import MetalensError
 
 SEED = 5
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-DISK = 64 << 20  # bytes of the small file system
-_NEW_NAMESPACE = 0x20000  # CLONE_NEWNS of Linux
+DISK = 192 << 20  # bytes of the small file system
 _OPEN = (transaction.UNFINISHED, ".resume")  # what an interrupted run may leave for the next
 State = dict[str, str]
 
@@ -48,39 +49,54 @@ class Bench:
     known: dict[str, list[State]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     operations: dict[str, int] = field(default_factory=dict)
+    times: dict[str, list[float]] = field(default_factory=dict)
     found: list[str] = field(default_factory=list)
 
-    def begin(self, words: str, *, at: int = 0, act: Callable[[], object] = int) -> Child:
+    def begin(self, words: str, each: commands.Each = bool) -> Child:
         """Start a command in the folder."""
-        return commands.begin(self.folder, self.aside, words, at=at, act=act)
+        return commands.begin(self.folder, self.aside, words, each)
 
     def prepare(self) -> None:
-        """Inputs, and the two whole results of every verb, kept aside."""
-        for words in commands.inputs(self.folder, self.verbs):
-            self._must(words)
-        for verb in self.verbs:
-            words, output = VERBS[verb]
-            states: list[list[State]] = [[], []]
-            for i, more in (
-                (1, " --force"),
-                (1, ""),
-                (0, " --force"),
-                (0, ""),
-            ):  # what differs tells of times and words
-                if not more:
-                    self.clear(output)
-                end = self._must(words.format(i) + more)
-                states[i].append(self.state(output))
-                self.seconds[verb], self.operations[verb] = end.seconds, end.operations
-            self.known[verb] = [{n: h if h == b.get(n) else "" for n, h in a.items()} for a, b in states]
-            if any(a.keys() != b.keys() for a, b in states) or self.known[verb][0] == self.known[verb][1]:
-                raise RuntimeError(f"{verb}: other names from the same settings, or the same from both: {states}")
-            shutil.copytree(self.folder / output, self.aside / verb) if (self.folder / output).is_dir() else None
-            for path in self._left(output):
-                if path.is_file():
-                    (self.aside / verb).mkdir(exist_ok=True)
-                    shutil.copy2(path, self.aside / verb / path.name)
-            self.clear(output)
+        """Inputs, and the two whole results of every verb, kept aside; what an earlier bench made is taken from it."""
+        texts = commands.settings(self.folder)
+        cached = kept.inputs(texts)
+        for words in commands.inputs(self.verbs):
+            output = words.partition(" -o ")[2].split()[0]
+            if not (self.folder / output).exists() and not kept.taken(cached / output, self.folder / output):
+                self._must(words)
+                kept.put(self.folder / output, cached / output)
+        commands.load(kept.modules())
+        sources = kept.sources(texts)
+        for verb in [verb for verb in self.verbs if verb not in self.known]:
+            about = kept.results(sources, verb, VERBS[verb][0])
+            if not kept.taken(about, self.aside / verb):
+                self._make(verb)
+                kept.put(self.aside / verb, about)
+            told = json.loads((self.aside / verb / kept.TOLD).read_text("utf-8"))
+            self.known[verb], self.times[verb] = told["known"], told["times"]
+            self.operations[verb], self.seconds[verb] = len(told["times"]) - 1, told["seconds"]
+            commands.load(told["modules"])
+
+    def _make(self, verb: str) -> None:
+        """The two results of a verb; what differs between two runs of the same settings tells of times and words."""
+        words, output = VERBS[verb]
+        states, aside = [], self.aside / verb
+        for i, more in ((0, ""), (1, ""), (1, " --force")):
+            self.clear(output) if not more else None
+            end = self._must(words.format(i) + more)
+            states.append(self.state(output))
+            if len(states) == 1:
+                aside.mkdir()
+                for path in self._left(output):
+                    kept.copied(path, aside / path.name)
+        first, one, other = states
+        if one.keys() != other.keys() or first == one:
+            raise RuntimeError(f"{verb}: other names from the same settings, or the same from both: {states}")
+        varying = {name for name, found in one.items() if found != other[name]}
+        known = [{name: "" if name in varying else found for name, found in state.items()} for state in (first, one)]
+        told = {"known": known, "times": end.times, "seconds": end.seconds, "modules": sorted(sys.modules)}
+        (aside / kept.TOLD).write_text(json.dumps(told), "utf-8")
+        self.clear(output)
 
     def _must(self, words: str) -> Ended:
         end = self.begin(words).wait()
@@ -111,10 +127,9 @@ class Bench:
         """Put the result of the first settings in place."""
         output = VERBS[verb][1]
         self.clear(output)
-        if Path(output).suffix:
-            shutil.copytree(self.aside / verb, self.folder, dirs_exist_ok=True)
-        else:
-            shutil.copytree(self.aside / verb, self.folder / output)
+        for path in (self.aside / verb).iterdir():
+            if path.name != kept.TOLD:
+                kept.copied(path, self.folder / path.name)
 
     def scratch(self, *, unfinished: bool = False) -> list[str]:
         """Names that no run may leave."""
@@ -152,7 +167,7 @@ class Bench:
         number = chance.choice(SIGNALS)
         if chance.random() < 0.5:
             at = chance.randint(1, self.operations[verb])
-            child = self.begin(words + " --force", at=at, act=commands.signalled(number))
+            child = self.begin(words + " --force", commands.at(at, commands.signalled(number)))
             how = f"{number.name} at operation {at}"
         else:
             child, after = self.begin(words + " --force"), self.seconds[verb] * chance.uniform(0, 1.1)
@@ -160,13 +175,13 @@ class Bench:
             os.kill(child.process, number)
             how = f"{number.name} after {after:.3f} s"
         end = child.wait()
-        self._judge(end.status in (0, 1, 130, -number), f"{how}: ended with {end.status}, {end.told[-300:]}")
+        self.expect(end.status in (0, 1, 130, -number), f"{how}: ended with {end.status}, {end.told[-300:]}")
         killed = end.status == -signal.SIGKILL
-        self._judge(self.which(verb, companions=not killed) >= 0, f"{how}: mixed or lost: {sorted(self.state('out'))}")
-        self._judge(killed or not self.scratch(unfinished=True), f"{how}: left {self.scratch()}")
-        self._again(verb, words, how)
+        self.expect(self.which(verb, companions=not killed) >= 0, f"{how}: mixed or lost: {sorted(self.state('out'))}")
+        self.expect(killed or not self.scratch(unfinished=True), f"{how}: left {self.scratch()}")
+        self.again(verb, words, how)
 
-    def _again(self, verb: str, words: str, how: str) -> None:
+    def again(self, verb: str, words: str, how: str) -> None:
         """The next run is as if nothing had been: a resumed one too."""
         begun = verb in RESUMABLE and transaction.unfinished(self.folder / VERBS[verb][1]).is_dir()
         more = " --resume" if begun else " --force"
@@ -174,8 +189,8 @@ class Bench:
         if begun and end.status == 2:  # killed before there was anything to resume from
             end = self.begin(words + " --force").wait()
         good = end.status in (0, 1) and self.which(verb) == 1
-        self._judge(good, f"{how}, then{more}: {end.status}, {end.told[-300:]}, {sorted(self.state('out'))}")
-        self._judge(not self.scratch(), f"{how}, then{more}: left {self.scratch()}")
+        self.expect(good, f"{how}, then{more}: {end.status}, {end.told[-300:]}, {sorted(self.state('out'))}")
+        self.expect(not self.scratch(), f"{how}, then{more}: left {self.scratch()}")
 
     def _pair(self, verb: str, chance: random.Random) -> None:
         """Two commands write one output at about once: one result whole, the other refused or later."""
@@ -188,8 +203,8 @@ class Bench:
         ends = [first.wait(), second.wait()]
         told = f"force {force}, ends {[e.status for e in ends]}: {' '.join(e.told[-300:] for e in ends)}"
         statuses = sorted(e.status for e in ends)
-        self._judge(0 <= statuses[0] <= 1 and 0 <= statuses[1] <= 2, told)
-        self._judge(self.which(verb) >= 0 and not self.scratch(), f"mixed, or left {self.scratch()}: {told}")
+        self.expect(0 <= statuses[0] <= 1 and 0 <= statuses[1] <= 2, told)
+        self.expect(self.which(verb) >= 0 and not self.scratch(), f"mixed, or left {self.scratch()}: {told}")
 
     def _fill(self, verb: str, chance: random.Random) -> None:
         """The disk is full from some file operation on, or no file may grow beyond a size; a good result stands."""
@@ -197,23 +212,23 @@ class Bench:
         self.restore(verb)
         if self.fills and chance.random() < 0.7:
             at, spare = chance.randint(1, self.operations[verb]), int(10 ** chance.uniform(2, 5.5))
-            act, how = self._filler(spare), f"{spare} bytes left from operation {at}"
+            act, how = self.filler(spare), f"{spare} bytes left from operation {at}"
         else:
             at, most = 1, int(10 ** chance.uniform(2, 5))
             act, how = _limited(most), f"{most} bytes a file"
-        end = self.begin(words + " --force", at=at, act=act).wait()
+        end = self.begin(words + " --force", commands.at(at, act)).wait()
         (self.folder / "filler").unlink(missing_ok=True)
         stands = self.which(verb)
-        self._judge(
+        self.expect(
             end.status in (0, 1, 2) and "not foreseen" not in end.told, f"{how}: {end.status}, {end.told[-300:]}"
         )
-        self._judge(stands == (1 if end.status < 2 else 0), f"{how}: part of a result, {end.told[-300:]}")
-        self._judge(not self.scratch(unfinished=True), f"{how}: left {self.scratch()}")
-        self._again(verb, words, how)
+        self.expect(stands == (1 if end.status < 2 else 0), f"{how}: part of a result, {end.told[-300:]}")
+        self.expect(not self.scratch(unfinished=True), f"{how}: left {self.scratch()}")
+        self.again(verb, words, how)
 
-    def _filler(self, spare: int) -> Callable[[], None]:
+    def filler(self, spare: int, folder: Path | None = None) -> Callable[[], None]:
         """Takes all room of the small file system but ``spare`` bytes."""
-        path = self.folder / "filler"
+        path = (folder or self.folder) / "filler"
 
         def fill() -> None:
             room = shutil.disk_usage(path.parent).free - spare
@@ -223,7 +238,8 @@ class Bench:
 
         return fill
 
-    def _judge(self, good: bool, words: str) -> None:
+    def expect(self, good: bool, words: str) -> None:
+        """Note what went wrong."""
         if not good:
             self.found.append(words)
 
@@ -235,20 +251,12 @@ def _limited(most: int) -> Callable[[], None]:
 @contextlib.contextmanager
 def bench(verbs: tuple[str, ...]) -> Iterator[Bench]:
     """A bench on a small file system of this process alone, or in a plain folder where none can be made."""
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as aside:
-        fills = _mount(Path(folder))
+    with tempfile.TemporaryDirectory() as root, tempfile.TemporaryDirectory() as aside:
+        fills = mounts.own() and mounts.memory(Path(root), DISK)
+        folder = Path(root) / "main"
+        folder.mkdir()
         try:
-            yield Bench(Path(folder), Path(aside), verbs, fills)
+            yield Bench(folder, Path(aside), verbs, fills)
         finally:
             if fills:
-                subprocess.run(["umount", "-l", folder], check=False)
-
-
-def _mount(folder: Path) -> bool:
-    """Mount a small file system of memory where no other process sees it; False where that is not allowed."""
-    unshare = getattr(ctypes.CDLL(None), "unshare", None)
-    if unshare is None or unshare(_NEW_NAMESPACE) != 0:
-        return False
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "check": False}
-    made = [["mount", "--make-rprivate", "/"], ["mount", "-t", "tmpfs", "-o", f"size={DISK}", "none", str(folder)]]
-    return all(subprocess.run(words, **quiet).returncode == 0 for words in made)
+                mounts.gone(Path(root))

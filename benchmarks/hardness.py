@@ -4,6 +4,7 @@
     python -m benchmarks.hardness --kills 40 --writers 10 --disks 20    # so many more of each: runs add up
     python -m benchmarks.hardness --kills 40 --verbs design scene       # of some commands alone
     python -m benchmarks.hardness --mutations 100000 --kinds tiff png   # more damaged files, of some kinds alone
+    python -m benchmarks.hardness --points 2 --verbs psf layout         # every file operation of so many runs each
     python -m benchmarks.hardness --values --threads
 
 The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes; each is
@@ -25,6 +26,7 @@ from benchmarks import (
     Row,
     _hardness_commands,
     _hardness_files,
+    _hardness_points,
     _hardness_runs,
     _hardness_samples,
     _hardness_threads,
@@ -72,7 +74,32 @@ def runs(asked: dict[str, int], verbs: tuple[str, ...], seconds: float = math.in
             tried = _note(kind, verb, entry)
             if time.perf_counter() > end:
                 break
-    return [_of_trials(kind, tried[kind]) for kind in AGAINST if kind in tried]
+    return [_of_trials(kind, tried[kind], tried.get("points", {})) for kind in AGAINST if kind in tried]
+
+
+def points(sweeps: int, verbs: tuple[str, ...], seconds: float = math.inf) -> list[Row]:
+    """Kills, refused writes, full disks and second writers at every file operation of so many runs of every verb."""
+    end = time.perf_counter() + seconds
+    with _hardness_runs.bench(()) as bench:
+        if not bench.fills:
+            print("no mounts of one's own can be made here: file operations are not tried one by one")
+            return []
+        for verb, _ in itertools.product(verbs, range(sweeps)):
+            bench.verbs = (verb,)
+            bench.prepare()
+            entry = _tried().get("points", {}).get(verb, {"done": 0, "failed": {}})
+            sweep = _hardness_points.Sweep(bench, verb, entry["done"], fresh=entry["done"] % 2 == 1)
+            sweep.run()
+            for kind, count in sweep.counts.items():
+                entry[kind] = entry.get(kind, 0) + count
+            entry["done"] += 1
+            entry["failed"] |= {f"{sweep.number}: {how}": found for how, found in sweep.found.items()}
+            _note("points", verb, entry)
+            print(f"{verb}: {sweep.counts}, {len(sweep.found)} failed", flush=True)
+            if time.perf_counter() > end:
+                break
+    tried = _tried()
+    return [_of_trials(kind, tried.get(kind, {}), tried["points"]) for kind in AGAINST]
 
 
 def _trials(tried: Tried, asked: dict[str, int], verbs: tuple[str, ...]) -> Iterator[tuple[str, str, int]]:
@@ -90,12 +117,15 @@ def _trials(tried: Tried, asked: dict[str, int], verbs: tuple[str, ...]) -> Iter
                 done[kind, verb] += 1
 
 
-def _of_trials(kind: str, by_verb: dict[str, Any]) -> Row:
-    """The row of all trials of a kind so far."""
-    count, failed = (
-        sum(f(entry) for entry in by_verb.values()) for f in (lambda e: e["done"], lambda e: len(e["failed"]))
-    )
-    return _row(f"{count} {WORDS[kind]}", f"over {', '.join(sorted(by_verb))}", math.nan, failed, AGAINST[kind])
+def _of_trials(kind: str, by_verb: dict[str, Any], at_operations: dict[str, Any]) -> Row:
+    """The row of all trials of a kind so far: at moments drawn by chance, and at file operations."""
+    drawn = sum(entry["done"] for entry in by_verb.values())
+    systematic = sum(entry.get(kind, 0) for entry in at_operations.values())
+    failed = sum(len(entry["failed"]) for entry in by_verb.values())
+    failed += sum(found[0] == kind for entry in at_operations.values() for found in entry["failed"].values())
+    verbs = sorted({*by_verb, *(verb for verb, entry in at_operations.items() if entry.get(kind))})
+    case = f"{drawn + systematic} {WORDS[kind]}, {systematic} of them each at a file operation"
+    return _row(case, f"over {', '.join(verbs)}", math.nan, failed, AGAINST[kind])
 
 
 def mutations(copies: int, kinds: Sequence[str] = ()) -> Row:
@@ -168,7 +198,7 @@ def keep(found: list[Row]) -> None:
 def main() -> None:
     """The parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in (*AGAINST, "mutations"):
+    for name in (*AGAINST, "mutations", "points"):
         parser.add_argument(f"--{name}", type=int, default=0)
     for name in ("values", "threads"):
         parser.add_argument(f"--{name}", action="store_true")
@@ -179,6 +209,11 @@ def main() -> None:
     found, trials = [], {kind: getattr(asked, kind) for kind in AGAINST}
     if any(trials.values()):
         found += runs(trials, tuple(asked.verbs) or tuple(_hardness_commands.VERBS), asked.seconds)
+    found += (
+        points(asked.points, tuple(asked.verbs) or tuple(_hardness_commands.VERBS), asked.seconds)
+        if asked.points
+        else []
+    )
     found += [mutations(asked.mutations, asked.kinds)] if asked.mutations else []
     found += [bad_values()] if asked.values else []
     found += [threads()] if asked.threads else []

@@ -20,7 +20,7 @@ from typing import Any
 from metalens.ground import lock
 from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
 
-SUCCESS, FAILED_CHECK, BAD_INPUT = 0, 1, 2
+SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 # verb: (module that holds ``Options`` and ``run``, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
@@ -89,6 +89,13 @@ _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
+    try:
+        return _main(arguments)
+    except KeyboardInterrupt:  # before the verb began
+        return _refuse("interrupted before the work began", INTERRUPTED)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -145,7 +152,9 @@ def _guarded(words: list[str], *, debug: bool) -> int:
             raise
         return _refuse(told_of)
     except KeyboardInterrupt as error:
-        return _refuse(_said(error, "interrupted; the output is as it was before, or new if it was finished"), 130)
+        return _refuse(
+            _said(error, "interrupted; the output is as it was before, or new if it was finished"), INTERRUPTED
+        )
     except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
         return _refuse(f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}")
     finally:

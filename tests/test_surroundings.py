@@ -95,6 +95,15 @@ def test_an_interrupt_that_python_drops_comes_again(monkeypatch):
     assert not others
 
 
+def test_an_interrupt_before_the_work_is_one_line_too(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_prepare", interrupted)
+    assert main(["info", "absent.h5"]) == cli.INTERRUPTED == 130
+    assert capsys.readouterr().err == "metalens: error: interrupted before the work began\n"
+
+
 def test_a_command_in_a_folder_that_was_removed_is_refused(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()

@@ -23,6 +23,7 @@ from metalens.ground.errors import CaptureError, MetalensError
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
 _DEPTHS = (8, 10, 12, 14, 16)
 _DENSEST, _MOST_BYTES = 1040, 1 << 34  # values' bytes for a byte of the file, at best; of all frames of a file
+_LEAST_PNG = 33  # bytes of a PNG's mark and head
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -260,16 +261,19 @@ def _read_tiff(path: Path) -> Array:
         with tifffile.TiffFile(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             size = path.stat().st_size
-            claimed = 0
+            claimed, begun = 0, set[int]()
             for number, page in enumerate(file.pages):
                 claimed += page.nbytes
+                if page.offset in begun:  # the library would go round for ever
+                    raise CaptureError(
+                        f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring"
+                    )
+                begun.add(page.offset)
                 if page.nbytes > _DENSEST * sum(page.databytecounts) + 65536 or claimed > _MOST_BYTES:
                     raise CaptureError(f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes")
-                ends = [a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)]
-                if not ends or max(ends) > size:
-                    raise CaptureError(
-                        f"{path}: truncated in frame {number} ({size} bytes, need {max(ends, default=0)})"
-                    )
+                end = max((a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
+                if not 0 < end <= size:
+                    raise CaptureError(f"{path}: truncated in frame {number} ({size} bytes, need {end})")
                 if int(page.compression) in (6, 7, 33003, 33005, 34712):
                     raise CaptureError(f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain")
             images = np.stack([page.asarray() for page in file.pages])
@@ -286,11 +290,7 @@ def _read_tiff(path: Path) -> Array:
 def _read_png(path: Path) -> Array:
     import cv2
 
-    with open(path, "rb") as file:
-        head, size = file.read(33), path.stat().st_size
-    wide, high = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    if len(head) < 33 or wide * high > _DENSEST * 8 * size:
-        raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes for {wide} x {high} pixels)")
+    _check_png(path)
     try:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -300,6 +300,23 @@ def _read_png(path: Path) -> Array:
     if image.ndim == 3:  # blue comes first
         return np.asarray(image[None][..., [2, 1, 0, 3][: image.shape[-1]]])
     return np.asarray(image)
+
+
+def _check_png(path: Path) -> None:
+    """Refuse what claims more than the file holds: its pixels, or a block that the library would make room for."""
+    size, ends, begun = path.stat().st_size, 8, b""
+    with open(path, "rb") as file:
+        while size >= _LEAST_PNG and ends + 8 <= size and begun != b"IEND":
+            file.seek(ends)
+            head = file.read(24 if not begun else 8)
+            length, name = int.from_bytes(head[:4], "big"), head[4:8]
+            if not begun and (name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > _DENSEST * 8 * size):
+                raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)")
+            if begun and name == b"IHDR":
+                raise CaptureError(f"{path}: not a PNG file (a second head)")
+            ends, begun = ends + 12 + length, name
+    if begun != b"IEND" or ends > size:
+        raise CaptureError(f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})")
 
 
 def _read_hdf5(path: Path) -> Array:

@@ -1,12 +1,14 @@
 """One writer an output: a lock file beside it that names its owner; the lock of a dead owner is free."""
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import json
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -18,6 +20,7 @@ from metalens.ground.errors import OutputError
 
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")  # words of the command line, for locks and manifests
 _open: set[int] = set()
+_EXCHANGE, _HERE = 2, -100  # of renameat2
 _SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM") if hasattr(signal, s))
 
 
@@ -72,6 +75,17 @@ def folder(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Swap two names in one step; False where the system cannot."""
+    if not sys.platform.startswith("linux"):
+        return False
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if call is None:
+        return False
+    done: int = call(_HERE, os.fsencode(one.absolute()), _HERE, os.fsencode(other.absolute()), _EXCHANGE)
+    return done == 0
 
 
 def free(path: Path) -> bool:

@@ -9,21 +9,19 @@ Whatever ends the work early, the output is what it was before.
 """
 
 import contextlib
-import ctypes
 import os
 import shutil
-import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from metalens.ground import lock, manifest, store
 from metalens.ground.errors import OutputError
 
-ROOM = 1 << 22  # bytes that every output may need
-UNFINISHED = ".unfinished"
-_READY, _EXCHANGE, _HERE = "ready", 2, -100
+ROOM, UNFINISHED = 1 << 22, ".unfinished"  # bytes that every output may need; ending of long work
+IN_PLACE = "the new one is in place, but the disk did not confirm it"
+_READY = "ready"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,14 +234,15 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
         _refuse(target, others, terms, is_folder=False)
         (scratch / _READY).touch()
         store.sync_folder(scratch)
-        for name in others:
-            if target.with_name(name).exists():
-                target.with_name(name).rename(old / name)
-        (new / target.name).replace(target)
-        for name in made:
-            if name != target.name:
-                (new / name).replace(target.with_name(name))
-        store.sync_folder(target.parent)
+        with _finished(target, lambda: not (new / target.name).exists()):
+            for name in others:
+                if target.with_name(name).exists():
+                    target.with_name(name).rename(old / name)
+            (new / target.name).replace(target)
+            for name in made:
+                if name != target.name:
+                    (new / name).replace(target.with_name(name))
+            store.sync_folder(target.parent)
 
 
 def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False) -> None:
@@ -254,21 +253,36 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
     with lock.undisturbed(), lock.folder(target.parent):
         if not whoever:
             _refuse(target, (), terms, is_folder=True)
-        (scratch / _READY).write_text(f"{new.stat().st_ino}", encoding="ascii")
-        store.sync_folder(scratch)
-        _put(scratch, new, target)
+        number, ready, old = new.stat().st_ino, scratch / _READY, scratch / "old"
+        with _finished(target, lambda: old.exists() or (target.exists() and target.stat().st_ino == number), ready):
+            ready.write_text(f"{number}", encoding="ascii")
+            store.sync_folder(scratch)
+            _put(scratch, new, target)
 
 
 def _put(scratch: Path, new: Path, target: Path) -> None:
     """Exchange a finished folder with what stands."""
     if not target.exists():
         new.rename(target)
-    elif _exchange(new, target):
+    elif lock.exchange(new, target):
         new.rename(scratch / "old")
     else:
         target.rename(scratch / "old")
         new.rename(target)
     store.sync_folder(target.parent)
+
+
+@contextlib.contextmanager
+def _finished(target: Path, placed: Callable[[], bool], ready: Path | None = None) -> Iterator[None]:
+    """Where the disk refuses something: all is undone, or the new output is in place, and the error says so."""
+    try:
+        yield
+    except OSError as error:
+        if placed():
+            raise OutputError(f"{target}: {IN_PLACE} ({error.strerror}); check it when the disk is well") from error
+        if ready is not None:
+            ready.unlink(missing_ok=True)  # or leaving would put the new one in place after all
+        raise
 
 
 def _open_work(scratch: Path, target: Path, terms: Terms, *, resume: bool, grow: bool) -> bool:
@@ -321,17 +335,6 @@ def _recover_folder(scratch: Path, target: Path, inode: int) -> None:
                 _put(scratch, path, target)
         elif path.is_dir() and target.is_dir() and target.stat().st_ino == inode:
             path.rename(scratch / "replaced")
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Swap two names in one step; False where the system cannot."""
-    if not sys.platform.startswith("linux"):
-        return False
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if call is None:
-        return False
-    done: int = call(_HERE, os.fsencode(one.absolute()), _HERE, os.fsencode(other.absolute()), _EXCHANGE)
-    return done == 0
 
 
 def _sync(folder: Path) -> None:

@@ -101,6 +101,53 @@ def test_damaged_png_frames_are_refused_by_type_or_read_whole(tmp_path_factory, 
     assert found.frames.ndim == 3
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_tiff_whose_list_of_frames_is_a_ring_is_refused(tmp_path, first):
+    """The last of three frames names an earlier one as the next."""
+    path = tmp_path / "f.tif"
+    tifffile.imwrite(path, np.concatenate([FRAMES, FRAMES[:1] + 7]), photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as file:
+        places = [(page.offset, len(page.tags)) for page in file.pages]
+    assert len(places) == len(capture.load(path).frames) == 3
+    (last, tags), whole = places[-1], bytearray(path.read_bytes())
+    after = last + 2 + 12 * tags
+    whole[after : after + 4] = places[first][0].to_bytes(4, "little")
+    path.write_bytes(whole)
+    found, said = _read(lambda: capture.load(path))
+    assert found is None
+    assert f"{path}: damaged: frame 3 is an earlier one" in said
+
+
+@pytest.mark.parametrize("claim", [0xFF000000, 10_000])
+def test_a_png_block_longer_than_its_file_is_refused_before_room_is_made(tmp_path, monkeypatch, claim):
+    """The library takes the memory that the length claims, 4.3 GB here."""
+    import cv2
+
+    path = tmp_path / "f.png"
+    cv2.imwrite(str(path), FRAMES[0])
+    whole = path.read_bytes()
+    assert len(capture.load(path).frames) == 1
+    at = whole.index(b"IDAT") - 4
+    path.write_bytes(whole[:at] + claim.to_bytes(4, "big") + whole[at + 4 :])
+    monkeypatch.setattr(cv2, "imread", None)
+    found, said = _read(lambda: capture.load(path))
+    assert found is None
+    assert f"{path}: truncated or not a PNG file (a block ends at byte" in said
+
+
+def test_a_png_of_two_heads_is_refused(tmp_path):
+    """The size is judged by the first, pictures may be formed by the last."""
+    import cv2
+
+    path = tmp_path / "f.png"
+    cv2.imwrite(str(path), FRAMES[0])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:33] + whole[8:])
+    found, said = _read(lambda: capture.load(path))
+    assert found is None
+    assert "a second head" in said
+
+
 @settings(**LIMITS)
 @given(data=st.data())
 def test_damaged_bias_tables_are_refused_by_type_or_hold_numbers(tmp_path_factory, data):

@@ -2,7 +2,9 @@
 """Outputs appear whole or not at all, whatever ends the work; what is not ours stays, even with force."""
 
 import contextlib
+import errno
 import fcntl
+import itertools
 import json
 import os
 import random
@@ -319,3 +321,46 @@ def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(tmp_p
     finally:
         signal.signal(signal.SIGINT, before)
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_a_disk_that_refuses_at_any_renaming_or_flush_is_told_what_stands_now(tmp_path, monkeypatch, kind):
+    """Each in turn is refused once: the old result whole and said to be unchanged, or the new one and said so."""
+    target = tmp_path / ("out.h5" if kind == "file" else "out")
+
+    def make(value):
+        return save(target, value) if kind == "file" else put(target, a=f"value {value}")
+
+    make(1)
+    old = tree(tmp_path)
+    make(2)
+    new = tree(tmp_path)
+    assert old != new
+    calls = {"turn": 0, "refused": 0}
+
+    def refusing(before):
+        def call(*words, **more):
+            calls["turn"] += 1
+            if calls["turn"] == calls["refused"]:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return before(*words, **more)
+
+        return call
+
+    for where, name in ((Path, "rename"), (Path, "replace"), (store, "sync_folder")):
+        monkeypatch.setattr(where, name, refusing(getattr(where, name)))
+    ends = set()
+    for number in itertools.count(1):
+        calls["refused"] = 0
+        make(1)
+        calls.update(turn=0, refused=number)
+        try:
+            make(2)
+        except (OSError, OutputError) as refusal:
+            placed = transaction.IN_PLACE in str(refusal)
+            assert tree(tmp_path) == (new if placed else old), number
+            ends.add(placed)
+        else:
+            break
+    assert number > 3
+    assert ends == {True, False}
