@@ -117,3 +117,17 @@ def test_fields_that_stand_off_change_the_light_by_their_series_and_move_its_mid
             assert found.worst_psf == pytest.approx(psf)
     assert found.psf == pytest.approx(perfect)
     assert (found.fields, found.stitching_nm) == (3, 17.0)
+
+
+def test_sites_send_the_light_of_their_own_pillars_and_none_where_none_stands(monkeypatch):
+    monkeypatch.setattr(stitching, "designed", lambda proxy, d, wave: (0.4 + d) * np.exp(1j * d / wave))
+    size = np.array([[0.12, 0.0, 0.21], [0.0, 0.18, 0.3]], np.float32)
+    lens = SimpleNamespace(
+        diameters=SimpleNamespace(diameter_um=size), proxy=SimpleNamespace(domain_um=(0.1, 0.3)), wavelength_um=0.85
+    )
+    got = stitching._amplitude(lens, slice(0, 2), slice(1, 3))
+    want = [
+        [0.0, (0.4 + 0.21) * np.exp(0.21j / 0.85)],
+        [(0.4 + 0.18) * np.exp(0.18j / 0.85), 0.7 * np.exp(0.3j / 0.85)],
+    ]
+    assert got == pytest.approx(np.array(want), rel=1e-6)

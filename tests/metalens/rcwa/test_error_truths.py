@@ -151,3 +151,12 @@ def test_stages_of_a_wall_are_enough_where_one_more_changes_a_tenth_of_the_toler
     assert found == stages
     assert left == pytest.approx(2 * (10.0 ** (2 - stages) - 10.0 ** (1 - stages)), rel=1e-6)
     assert (left <= tolerance / 10) is (stages < 10)
+
+
+def test_shifts_are_solved_at_chebyshev_s_diameters_between_foot_and_top():
+    """A wall of 0.04 rad over 0.5 um: 0.2 um at half height, 20 nm more and less at its ends."""
+    leaning = Cell(0.4, 0.5, Index(3.5), Index(1.45), sidewall_rad=0.04)
+    half = math.tan(0.04) * 0.5
+    want = [0.2 + half * math.cos(math.pi * (n + 0.5) / 4) for n in range(4)]
+    assert anchored.node_diameters(leaning, 0.2) == pytest.approx(want, rel=1e-12)
+    assert anchored.node_diameters(CELL, 0.2) == (0.2,)
