@@ -59,7 +59,7 @@ test-peers: peers
 notebooks: setup
 	$(BIN)/python -m examples.run
 
-# The documentation, in build/site: opens from the disk, needs no network. Broken links and keys without a text stop it.
+# The documentation, in build/site: opens from the disk, needs no network. Broken links stop it; keys without a text fail a test.
 site: setup
 	$(BIN)/mkdocs build --strict --quiet
 

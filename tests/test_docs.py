@@ -13,7 +13,7 @@ import pytest
 from characterize.captures.stage import read_about
 from characterize.model import PARAMETERS
 from metalens.chain.stages import ChainFiles
-from metalens.cli import VERBS
+from metalens.cli import VERBS, main
 from metalens.commands.design import Design
 from metalens.commands.library import CellFile
 from metalens.commands.psf import Settings
@@ -74,11 +74,33 @@ def test_a_settings_page_shows_a_key_with_kind_default_and_text(name, row):
     assert row in _site().settings_page(name).splitlines()
 
 
-@pytest.mark.parametrize("name", ["CELL.toml", "PROCESS.toml", "RUN.toml", "PLAN.toml", "CHAIN.toml"])
-def test_every_settings_page_can_be_made(name):
-    page = _site().settings_page(name)
-    assert page.startswith(f"# {name}")
-    assert all(line.count("|") >= 5 for line in page.splitlines() if line.startswith("| `"))
+def test_every_key_of_every_settings_page_has_a_text():
+    for name in _site().SETTINGS:
+        page = _site().settings_page(name)
+        assert page.startswith(f"# {name}")
+        rows = [line for line in page.splitlines() if line.startswith("| `")]
+        assert rows
+        assert not [row for row in rows if not row.removesuffix("|").rpartition("|")[2].strip()], name
+
+
+def test_every_settings_file_that_texts_name_has_its_page():
+    named = {name for page in TEXTS for name in re.findall(r"\b[A-Z]{3,}\.toml\b", page.read_text(encoding="utf-8"))}
+    assert named <= set(_site().SETTINGS)
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert not [name for name in _site().SETTINGS if f"{name}: reference/{name[:-5].lower()}.md" not in nav]
+
+
+def test_the_page_of_commands_has_every_option_as_its_help_does(capsys):
+    page = _site().commands_page()
+    for verb in ("check", "capture", "psf", "scene", "evaluate optics"):
+        part = page.partition(f"## metalens {verb}\n")[2].partition("\n## ")[0]
+        told = {flag for row in re.findall(r"^\| (.*?) \|", part, re.M) for flag in re.findall(r"`(-[\w-]+)`", row)}
+        with pytest.raises(SystemExit):
+            main([*verb.split(), "--help"])
+        text = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+        heads = [line for line in text.splitlines() if re.match(r"^[│ ] ?-{1,2}[a-z]", line)]
+        shown = {flag for line in heads for flag in re.findall(r"(?<![\w-])(--?[a-z][\w-]*)", line)}
+        assert told == {flag for flag in shown if not flag.startswith("--no-")} - {"-h", "--help"}, verb
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if _blocks(p, "python")], ids=lambda p: p.stem)

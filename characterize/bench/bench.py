@@ -26,7 +26,11 @@ _TOGETHER = 4_000_000  # fine samples of the frames that are computed together
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Sensor of the virtual bench; read noise in electrons, gain in electrons a count, offset in counts."""
+    """Sensor of the virtual bench; read noise in electrons, gain in electrons a count, offset in counts.
+
+    pixel_um: pitch of the pixels. pixels: along a side of a frame. bits: of the converter. gain_e: electrons a count.
+    read_noise_e: electrons, root-mean-square. offset: counts without light. hot_share: share of hot pixels.
+    """
 
     pixel_um: float = 3.0
     pixels: int = 48
@@ -57,6 +61,7 @@ class Truth:
     depths_um: stated source depths of the frames. angles_deg: field angles along x, each taken at every depth.
     peak_e: electrons in the brightest pixel. parameter: true values by name, as of ``characterize.model.parameters``.
     diameter_noise_nm: of every pillar by itself. dark_frames, flat_frames: how many to take.
+    camera: of the bench. seed: of noise and of what is drawn.
     """
 
     depths_um: tuple[float, ...]

@@ -25,7 +25,10 @@ _DEFOCUS_WAVES = 0.5  # at the rim: below, images are those of the focus, in whi
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """An interval that the session is to give: half of the 95 % interval of a parameter, in its unit."""
+    """An interval that the session is to give: half of the 95 % interval of a parameter, in its unit.
+
+    name: of the parameter. within: half of its 95 % interval.
+    """
 
     name: str
     within: float

@@ -25,7 +25,11 @@ from metalens.ground.errors import ConfigError
 
 @dataclass(frozen=True)
 class Metrology:
-    """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma), and of how to fit."""
+    """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma), and of how to fit.
+
+    known: what was measured otherwise. free: further parameters to fit, by name. window: pixels along a side that are
+    fitted. scan_um: half of the range in which the zero of the stage is looked for; left out: chosen from the depths.
+    """
 
     known: tuple[Known, ...] = ()
     free: tuple[str, ...] = ()

@@ -107,6 +107,7 @@ class Known:
 
     sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely. Of what is never fitted
     (:data:`UNFITTED`) ``value`` is 0 and ``sigma`` says how large it may be.
+    name: of the parameter, its unit included. value: as measured, in that unit.
     """
 
     name: str

@@ -52,6 +52,9 @@ class PlanConfig:
 
     image: "true", through the field, the spectrum and the films of the device; or "uniform", one PSF a depth.
     stacks: sets of PSFs that the run computes. frames: images that it forms.
+    aperture_mm: diameter of the lens. wavelength_nm: of the design. sensor_distance_mm: from lens to sensor.
+    source_distance_mm: at which the lens is focused. led_fwhm_nm: width of the source's spectrum; 0 for one wavelength.
+    cell: of the pillars. task: what is looked at.
     """
 
     aperture_mm: float = 1.0

@@ -37,6 +37,7 @@ class TaskSetting:
     sensor: noise and exposure; its own pitch is replaced by ``pitch_um``.
     mismatch: share of the light of a pixel by which no subject of the population looks like the one that is seen.
     sensor_distance_um: of the lens.
+    pitch_um: of the sensor's pixels. seed: of the eyes.
     """
 
     scenes: int = field(default=6, metadata={"above": 0})

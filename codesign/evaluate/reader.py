@@ -42,8 +42,8 @@ SHARE = 0.9  # of the intervals
 class ReaderConfig:
     """What the reference reader sees.
 
-    frames: that it learns from, drawn from ``pool`` rendered ones at new scales; a multiple of 32. test: that judge it;
-        as many again calibrate its intervals. seed: of everything.
+    frames: that it learns from, drawn from rendered ones at new scales; a multiple of 32. pool: that are rendered.
+    test: that judge it; as many again calibrate its intervals. seed: of everything.
     pixels, pitch_um: of the sensor, square. electrons: that a white object gives in a pixel of 9 um.
     fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs cover.
     tolerance: of the true image.

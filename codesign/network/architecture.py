@@ -21,6 +21,7 @@ class Stage:
 
     channels: at width 1.
     squeeze: whether the blocks carry squeeze-and-excitation.
+    stride: of its first block. activation: after its convolutions.
     """
 
     channels: int
@@ -55,6 +56,8 @@ class Space:
     """Everything that can vary, and what stays.
 
     resolution: (least, largest) scale of the input; the search moves in steps of 0.1, training in any.
+    stem_channels: of the first convolution. stages: runs of blocks. kernels: sizes of convolutions to choose from.
+    expansions: widening inside a block. depths: blocks of a stage. widths: factors of the channels.
     """
 
     stem_channels: int = field(default=16, metadata={"above": 0})

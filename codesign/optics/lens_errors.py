@@ -44,6 +44,8 @@ class LensErrors(_Entries):  # type: ignore[misc]
     astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process spreads, in the names of
     :class:`metalens.made.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k, k) between the first k of them,
     rows one after the other; empty for none.
+    bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of the bias from axis to rim,
+    along an axis and in all directions. index: of the pillars. sidewall_deg: lean of their walls.
     """
 
     correlation: tuple[float, ...] = ()

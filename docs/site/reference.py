@@ -1,7 +1,7 @@
 """Pages that the site makes from the code: every command with its options, every settings file with its keys.
 
 An mkdocs hook (``hooks`` in mkdocs.yml). The texts come from the docstrings of the records, so that they cannot go
-stale; a key without a text is an error of the build.
+stale; a key without a text fails a test.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
+import tyro
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -56,6 +57,22 @@ def _word(kind: Any) -> str:
     return names.get(kind, getattr(kind, "__name__", str(kind)))
 
 
+def _marks(kind: Any) -> list[Any]:
+    """What is written beside a type: of tyro an alias, a place among the words, or that it is hidden."""
+    return list(typing.get_args(kind)[1:]) if typing.get_origin(kind) is typing.Annotated else []
+
+
+def _flag(name: str, kind: Any) -> str | None:
+    """The option as it is typed, with its other names; a positional word in capitals; None for what is hidden."""
+    marks = _marks(kind)
+    if any(mark == tyro.conf.Suppress[int].__metadata__[0] for mark in marks):
+        return None
+    if any(mark == tyro.conf.Positional[int].__metadata__[0] for mark in marks):
+        return f"`{name.upper()}`"
+    others = [alias for mark in marks for alias in getattr(mark, "aliases", None) or ()]
+    return ", ".join(f"`{flag}`" for flag in (f"--{name.replace('_', '-')}", *others))
+
+
 def _default(field: "dataclasses.Field[Any]") -> str:
     if field.default is not dataclasses.MISSING:
         value = field.default
@@ -70,6 +87,8 @@ def _default(field: "dataclasses.Field[Any]") -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
+        if value and dataclasses.is_dataclass(value[0]):
+            return "see its table"
         value = list(value)
     return f"`{value}`" if str(value) else '`""`'
 
@@ -125,7 +144,9 @@ def _options(verb: str, module: str) -> list[str]:
         "|---|---|---|---|",
     ]
     for field in dataclasses.fields(record):
-        flag = f"`--{field.name.replace('_', '-')}`"
+        flag = _flag(field.name, hints[field.name])
+        if flag is None:
+            continue
         row = f"| {flag} | {_word(hints[field.name])} | {_default(field)} | {told.get(field.name, '')} |"
         lines.append(row)
     return [*lines, ""]

@@ -118,7 +118,10 @@ class Furniture:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Middle of an alignment mark of the wafer, from the middle of the wafer."""
+    """Middle of an alignment mark of the wafer.
+
+    x_mm, y_mm: from the middle of the wafer.
+    """
 
     x_mm: float = field(metadata={"signed": True})
     y_mm: float = field(metadata={"signed": True})

@@ -1,4 +1,4 @@
-"""``metalens layout``: one lens to its mask, or an arrangement of lenses and cells to that of a die or wafer."""
+"""One lens to its mask, or an arrangement of lenses and cells to that of a die or wafer."""
 
 from pathlib import Path
 

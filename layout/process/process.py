@@ -23,7 +23,10 @@ LayerNumber = tuple[int, int]  # layer, datatype
 
 @dataclass(frozen=True, slots=True)
 class Zone:
-    """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand."""
+    """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand.
+
+    x_um, y_um: lower left corner. width_um, height_um: of the rectangle. name: in the report.
+    """
 
     x_um: float
     y_um: float
@@ -87,7 +90,10 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array."""
+    """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array.
+
+    pillar, aperture, marks, labels, dose, witness, fields, outline: (layer, datatype) of these shapes.
+    """
 
     pillar: LayerNumber = (1, 0)
     aperture: LayerNumber = (2, 0)
@@ -218,6 +224,7 @@ class Die:
     vernier_step_nm: by how much the pitch of the other scale, opened with the aperture, is longer: what a bar reads.
     thickness_um: of the substrate.
     label: text on the die; left out: made from the lens.
+    margin_um: around the aperture, where no size is given.
     """
 
     size_um: tuple[float, float] | None = None
@@ -246,6 +253,9 @@ class Process:
     """A fabrication process.
 
     tone: ``positive``: the drawn shapes become pillars; ``negative``: the gaps between pillars are drawn.
+    name: on report and job sheet. rules: what can be made. layers: where shapes are drawn. bias: made less drawn size.
+    etch: how widths change with the density around. exposure: spread of the dose. write_field: fields of the writer.
+    die: what stands around the lens. spread: of the process, for ``--study`` and the error budget.
     """
 
     name: str = "e-beam, a-Si on fused silica"

@@ -13,6 +13,7 @@ class Lattice:
 
     kind: square; rectangular, with ``ratio`` times the pitch along y; hexagonal, with rows sqrt(3)/2 pitches apart,
         every other one shifted by half a pitch.
+    ratio: period along y over the pitch, of a rectangular lattice.
     """
 
     kind: Literal["square", "rectangular", "hexagonal"] = "square"

@@ -12,7 +12,10 @@ from metalens.ground.errors import CellError
 
 @dataclass(frozen=True, slots=True)
 class Index:
-    """A refractive index given as plain numbers, the same at every wavelength (exp(-iwt): k >= 0 absorbs)."""
+    """A refractive index given as plain numbers, the same at every wavelength (exp(-iwt): k >= 0 absorbs).
+
+    n: real part, above 0. k: imaginary part, 0 or above.
+    """
 
     n: float
     k: float = 0.0
@@ -47,7 +50,10 @@ Material = str | Index | Blend  # a name known to metalens.materials, the path o
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """A homogeneous layer of a coating or substrate stack."""
+    """A homogeneous layer of a coating or substrate stack.
+
+    material: a name, a file, or { n, k }. thickness_um: of the layer.
+    """
 
     material: Material
     thickness_um: float

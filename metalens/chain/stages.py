@@ -20,6 +20,7 @@ class ChainFiles:
     run: of a co-design run. bench_truth, bench_metrology: hidden errors and other measurements of a virtual bench; it
         measures the lens of the run, which is then retrained for, or without a run the one of bench_design.
     budget: whether the error budget is computed.
+    bench_design: lens that the virtual bench measures, where it is not the run's or the design's.
     """
 
     cell: Path

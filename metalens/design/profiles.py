@@ -92,7 +92,10 @@ class DoubleHelix:
 
 @dataclass(frozen=True, slots=True)
 class Cubic:
-    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey 1995)."""
+    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey 1995).
+
+    strength_rad: phase at the rim of either axis.
+    """
 
     strength_rad: float = 60.0
 

@@ -9,7 +9,10 @@ from metalens.ground.errors import CellError
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A disc; its size is the diameter. hole: the disc is the opening in a film of the pillar's material."""
+    """A disc; its size is the diameter. hole: the disc is the opening in a film of the pillar's material.
+
+    kind: of the shape.
+    """
 
     hole: bool = False
     kind: Literal["circle"] = "circle"
@@ -31,6 +34,7 @@ class Ellipse:
 
     angle_rad: in the plane, from +x towards +y. grow_um moves both axes alike (not quite a parallel curve: the error
     is of second order in grow / axis).
+    hole: an opening in a film. kind: of the shape.
     """
 
     ratio: float = 1.0
@@ -55,7 +59,10 @@ class Ellipse:
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """A disc with a round hole; its size is the outer diameter. ratio: of the inner to the outer diameter."""
+    """A disc with a round hole; its size is the outer diameter. ratio: of the inner to the outer diameter.
+
+    hole: an opening in a film. kind: of the shape.
+    """
 
     ratio: float = 0.5
     hole: bool = False

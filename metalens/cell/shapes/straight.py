@@ -21,7 +21,10 @@ def _box(width_um: float, depth_um: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an opening in a film."""
+    """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an opening in a film.
+
+    kind: of the shape.
+    """
 
     angle_rad: float = 0.0
     hole: bool = False
@@ -39,7 +42,10 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
-    """Its size is the edge along x before the turn; ratio: of the other edge to it. hole: an opening in a film."""
+    """Its size is the edge along x before the turn; ratio: of the other edge to it. hole: an opening in a film.
+
+    angle_rad: in the plane, from +x towards +y. kind: of the shape.
+    """
 
     ratio: float = 1.0
     angle_rad: float = 0.0
@@ -62,7 +68,10 @@ class Rectangle:
 
 @dataclass(frozen=True, slots=True)
 class Cross:
-    """Two bars of equal length at right angles; its size is the length. ratio: of the width of a bar to its length."""
+    """Two bars of equal length at right angles; its size is the length. ratio: of the width of a bar to its length.
+
+    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of the shape.
+    """
 
     ratio: float = 1 / 3
     angle_rad: float = 0.0
@@ -89,7 +98,11 @@ class Cross:
 
 @dataclass(frozen=True, slots=True)
 class RegularPolygon:
-    """``sides`` equal edges; its size is the diameter of the circle through the corners, the first corner at +x."""
+    """``sides`` equal edges; its size is the diameter of the circle through the corners, the first corner at +x.
+
+    sides: number of edges, from 3. angle_rad: in the plane, from +x towards +y. hole: an opening in a film.
+    kind: of the shape.
+    """
 
     sides: int = 6
     angle_rad: float = 0.0
@@ -116,6 +129,7 @@ class Polygon:
     """The user's own corners (x, y), in units of the size of the pillar; any order of turning, no crossings.
 
     corners: e.g. [[-0.5, -0.3], [0.5, -0.3], [0.0, 0.6]].
+    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of the shape.
     """
 
     corners: tuple[Point, ...]
