@@ -1,15 +1,20 @@
 """The true image: frames a second beside the error that the imager states, and its preparation."""
 
+import math
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from metalens.design import Focus
-from metalens.field import Grid, Imager, Layers, Optics, SmoothWave, Window, imager
-from metalens.field.plan import neglected, spectral
+from metalens.cell import Cell, Index
+from metalens.design import Focus, profiles
+from metalens.field import Grid, Imager, Layers, Optics, PillarWave, SmoothWave, Window, imager
+from metalens.field.plan import neglected, spectral, unpolarised
 from metalens.image import Frames
+from metalens.lens import DiameterMap, Lens
+from metalens.pillars import Proxy
 from metalens.psf import Nodes, Source, spectrum
 
 FRAMES = 8
@@ -20,6 +25,7 @@ def rows() -> Iterator[Row]:
     """128² samples of 9 um, ±20° to the sides of what is rendered, a diode of 30 nm, lens of 1 mm at 2 mm, NA 0.24."""
     wave = SmoothWave(Focus(0.85, 2e3, 33e3), 500.0)
     yield points_row(wave)
+    yield from polarised_rows(wave)
     for tolerance, goal in ((1e-2, 60), (2e-3, 25)):
         start = time.perf_counter()
         made = imager(wave, GRID, spectrum=Source(850.0, 30.0), tolerance=tolerance)
@@ -53,6 +59,36 @@ def points_row(wave: SmoothWave) -> Row:
     method = "25 field points x 9 wavelengths x 21 depths"
     judge, count = "rays seen from beside", torch.get_num_threads()
     return Row("PSFs of a smooth phase", method, seconds, error, judge, threads=count, goal="3 s on two threads")
+
+
+def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
+    """The same PSFs from pillars, by one scalar and by both polarisations; errors against all six components."""
+    at = torch.stack(torch.meshgrid(*2 * [torch.linspace(-500, 500, 5, dtype=torch.float64)], indexing="ij"), -1)
+    waves = Nodes(*spectrum.gauss(*spectrum.weight(Source(850.0, 30.0)), 9), 0.0)
+    depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
+    pillars = pillar_lens(wave.focus, wave.radius_um)
+    for count in (0, 1, 3):
+        window = Window(GRID.window, GRID.step_um, components=count)
+        optics = Optics(PillarWave(pillars), Layers(), 2e3)  # nothing kept of the last row
+        seconds = fastest(lambda o=optics, w=window: spectral(o, at.flatten(0, 1), depths, waves, w), repeats=1)  # type: ignore[misc]
+        error = unpolarised(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
+        name = f"both polarisations, {count} of 6 components" if count else "one scalar"
+        method = f"{name}; 25 field points x 9 wavelengths x 21 depths"
+        judge, threads = "all six components", torch.get_num_threads()
+        yield Row("PSFs of pillars", method, seconds, error, judge, threads=threads, goal="60 s from pillars")
+
+
+def pillar_lens(focus: Focus, radius_um: float) -> Lens:
+    """A hyperbolic lens of pillars whose phase is linear in the diameter."""
+    pitch, low = 0.4, 6.0 - 3.2 * math.pi
+    x = (np.arange(2 * math.floor(radius_um / pitch) + 1) - math.floor(radius_um / pitch)) * pitch
+    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus), 2 * math.pi)
+    wanted += 2 * math.pi * np.ceil((low - wanted) / (2 * math.pi))
+    diameter = np.where(np.hypot(x, x[:, None]) <= radius_um, 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi), 0.0)
+    flat = Proxy(np.array([[6.0, 3.2 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.78, 0.92), 1e-6, 1e-6)
+    cell = Cell(pitch_um=pitch, pillar=Index(3.6), substrate=Index(1.45))
+    distance, source = focus.sensor_distance_um, focus.source_distance_um
+    return Lens(DiameterMap(diameter, pitch), cell, flat, focus.wavelength_um, distance, source, "hyperbolic")
 
 
 def frames() -> Frames:

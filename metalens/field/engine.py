@@ -10,19 +10,20 @@ from torch import Tensor
 from metalens.field import patches as cutting
 from metalens.field.forming import Imager, between_nodes, blurred, psfs_used, trimmed, with_psfs
 from metalens.field.patches import relative
-from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral
+from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
 from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Polarisation, Source
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
 OVERLAP = 4  # samples that two patches share
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
 NEGLECTED = 5  # of them at which the transform is judged
+TURNED = 3  # and the components of the field
 
 
 def imager(
@@ -34,6 +35,7 @@ def imager(
     field: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-2,
     distance_um: float | None = None,
+    polarisation: Polarisation = "auto",
     device: torch.device | str = "cpu",
 ) -> Imager:
     """Prepare a lens for frames of a grid.
@@ -45,6 +47,8 @@ def imager(
         field: (x, y) angle in rad of the middle of the grid.
         tolerance: of the image of a 1/f texture, relative L2.
         distance_um: lens to sensor, by default the design's.
+        polarisation: ``scalar``, ``vector`` (PSFs of |Ex|² + |Ey|² + |Ez|² of unpolarised light), or ``auto``: one
+            scalar where its error, ``parts["polarisation"]``, is below the tolerance.
 
     Raises:
         SceneError: wavelengths, depths or field points that no number of meets the tolerance; PropagationError: films
@@ -62,7 +66,7 @@ def imager(
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
     round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
-    plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_)
+    plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, plan)
     whole = patched(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
     made = thinned(whole, tolerance=tolerance)
@@ -150,7 +154,8 @@ def trial(grid: Grid) -> Frames:
 
 
 def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
-    """Errors at places, depths and wavelengths that no node holds: interpolation, transform; light left outside."""
+    """Errors at places, depths and wavelengths that no node holds: interpolation, transform, components of the field
+    that are left out; light left outside."""
     plan = made.plan
     draw = np.random.default_rng(7)
     pixels = torch.from_numpy(np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)).long()
@@ -170,4 +175,5 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     transform = neglected(optics, plan.waves, plan.window, (at[:NEGLECTED], depths))
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
+    found["polarisation"] = unpolarised(optics, plan.waves, plan.window, (at[:TURNED], depths))
     return {**found, "edge": edge, "outside": outside}

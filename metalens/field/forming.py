@@ -35,8 +35,10 @@ class Imager:
     grid, plan: where the scene is sampled, and where the PSFs are known.
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1. energy: (rows, columns, depths) E of each.
     patches: of the frame. transfer: of each patch's kernels, (rank, Y, X // 2 + 1).
-    parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, edge (light that the rim bends
-        out of the window, and that the transform folds back). Beside them ``outside``: light that windows leave out.
+    parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, polarisation (components of
+        the field that are left out, all but a scalar where that is within the tolerance), edge (light that the rim
+        bends out of the window, and that the transform folds back). Beside them ``outside``: light that windows
+        leave out.
     stray: light of other diffraction orders, None where the lens tells nothing of them.
     """
 

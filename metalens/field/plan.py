@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,9 +13,10 @@ from torch import Tensor
 from metalens.field import compiled
 from metalens.field.patches import dense, relative
 from metalens.field.points import Optics, Window, psfs
+from metalens.field.polarised import ALL
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Polarisation, Source
 from metalens.psf import spectrum as spectra
 
 STEPS = (24, 16, 12, 8, 6, 4)  # between depths that are tried, in 96ths of the range of 1/z
@@ -23,7 +25,14 @@ ALONG = 192  # steps of an axis of the field, on which its nodes lie
 MOST = 57  # nodes along an axis
 DENSER = (0.0, 2.0)  # by how much more the nodes lie at the rim of the field than on the axis
 ORDER = 2.5  # power of their distance by which the error falls; more would need PSFs without edges
-SHARES = {"kernels": 0.6, "field": 0.4, "depth": 0.3, "spectrum": 0.4, "transform": 0.4}  # of the tolerance; 0.97 of it
+SHARES = {  # of the tolerance; together 0.98 of it
+    "kernels": 0.6,
+    "field": 0.4,
+    "depth": 0.3,
+    "spectrum": 0.4,
+    "transform": 0.4,
+    "polarisation": 0.2,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +89,21 @@ class Plan:
 
 
 def planned(
-    optics: Optics, grid: Grid, source: Source | Nodes, middle_um: tuple[float, float], *, tolerance: float, folds: bool
+    optics: Optics,
+    grid: Grid,
+    source: Source | Nodes,
+    middle_um: tuple[float, float],
+    *,
+    tolerance: float,
+    folds: bool,
+    polarisation: Polarisation = "auto",
 ) -> Plan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
     Tried on a line across the field (at 0.6 of its half height), whose points in between judge every candidate, for
-    the nearest, the middle and the farthest depth. A whole spectrum is used from the start, coarse for the line.
+    the nearest, the middle and the farthest depth. A whole spectrum is used from the start, coarse for the line. Of the
+    field one scalar is taken where its error (:func:`unpolarised`) is below the tolerance, else as many components of
+    both polarisations as their share asks for, as ``polarisation`` says.
 
     Raises:
         SceneError: tolerance not above 0, or not met with ``MOST`` nodes along an axis.
@@ -112,6 +130,9 @@ def planned(
     depths = 1 if grid.depths_um[0] == grid.depths_um[1] else _fewest(deep, tolerance * SHARES["depth"], "depths")
     if neglected(optics, coarse, window, (_corner(middle_um, half), ends)) > tolerance * SHARES["transform"]:
         window = replace(window, curved=True)
+    some = torch.cat([_corner(middle_um, half), torch.tensor([middle_um], dtype=torch.float64)]), ends
+    if polarisation == "vector" or (polarisation == "auto" and unpolarised(optics, coarse, window, some) > tolerance):
+        window = polarised(optics, coarse, window, some, tolerance * SHARES["polarisation"])
     counts = [max(2, math.ceil((count - 1) * h / half[1]) + 1) for h in half]
     y, x = (
         m + (2 * placed(c, denser, (m, h)) / ALONG - 1) * h
@@ -169,6 +190,24 @@ def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Te
     plain = found((0.0, 0.0))
     wide = width(plain / plain.sum((-1, -2), keepdim=True)) * window.step_um
     return float((relative(found((wide * 0.6, wide * 0.8)), plain) ** 2).mean().sqrt())
+
+
+def polarised(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], tolerance: float) -> Window:
+    """The window with as few components of the field of both polarisations as image within the tolerance."""
+    tried = [replace(window, components=count) for count in range(1, ALL + 1)]
+    return next(one for one in tried if unpolarised(optics, waves, one, at) <= tolerance)
+
+
+def unpolarised(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+    """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
+    (field points, depths) against those of all components."""
+    about: dict[str, Any] = {"depths_um": at[1], "wavelength_um": float(waves.wavelengths_um[0])}
+    with torch.no_grad():
+        few, whole = (
+            light / light.sum((-1, -2), keepdim=True)
+            for light in (psfs(optics, at[0], window=one, **about) for one in (window, replace(window, components=ALL)))
+        )
+    return 0.0 if window.components == ALL else float((relative(few, whole) ** 2).mean().sqrt())
 
 
 def width(psfs: Tensor) -> float:

@@ -19,7 +19,7 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from metalens.field import compiled
+from metalens.field import compiled, polarised
 from metalens.field.rays import Paths, Rays, rays, source_paths
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
@@ -35,15 +35,20 @@ class Window:
     """Square samples around a field point: an odd count along each axis, of width ``step_um``.
 
     curved: with the flux of the second order as well, three times the work.
+    components: of Ex, Ey, Ez of both polarisations, so many of the strongest mixtures
+        (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one scalar.
     """
 
     samples: int
     step_um: float
     curved: bool = False
+    components: int = 0
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.samples % 2 == 0 or not self.step_um > 0:
             raise PropagationError(f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3")
+        if not 0 <= self.components <= polarised.ALL:
+            raise PropagationError(f"{self.components} components of the field: need 0 to {polarised.ALL}")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -93,6 +98,7 @@ class Sampling:
     harmonics: int
     beyond: float
     curved: bool
+    components: int
 
 
 def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf) -> Sampling:
@@ -101,7 +107,7 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     rim = torch.tensor(optics.wave.radius_um, dtype=torch.float64)
     edge = float(media.direction(after, rim))
     if edge > LARGEST_P * after.layers[0][0]:
-        raise PropagationError(f"aperture of NA {edge:.2f}: the image engine is scalar, up to {LARGEST_P}")
+        raise PropagationError(f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}")
     step = min(wavelength_um, finest_um) / (window.samples * window.step_um * SPARE)
     period = wavelength_um / step
     nodes = 2 * math.ceil(edge / step) + 2
@@ -111,7 +117,7 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto the last of them
     size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
     quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
-    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved)
+    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved, window.components)
 
 
 def psfs(
@@ -141,7 +147,7 @@ def psfs(
         float32 on the device of ``at_um``; differentiable in what the wave's factor is.
 
     Raises:
-        PropagationError: films thicker than the gaps, an aperture too wide for a scalar image.
+        PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
     grid = sampling(optics, window, wavelength_um, finest_um)
     ends = tuple(_to_samples(grid, window, shift, at_um.device) for shift in shift_um)
@@ -159,34 +165,51 @@ def _one(
 ) -> Tensor:
     """(depths, h, w) PSFs of one field point."""
     found, pupil = seen(optics, place, grid, wavelength_um, shift_um)
-    tangents = place / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    after = optics.layers.after(optics.distance_um, wavelength_um)
+    tangents = place / after.reduced_um
     paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
     light = leaving(pupil, paths, wavelength_um)
     tilt = math.atan(math.hypot(*tangents.tolist()))
     factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
+    pupils = None
+    if grid.components:
+        turned = polarised.factors(found, tangents, after.order[-1])
+        pupils = polarised.strongest(turned, pupil.weight, grid.components).to(torch.float32)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
     moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
-    return torch.cat([_shown(part, found, grid, ends, moves) for part in torch.split(light, few)]) / total
+    aside = (found.aside, found.aside[:, None]) if grid.curved else ()
+    parts = torch.split(light, few)
+    return torch.cat([_shown(_fluxes(part, pupils, aside, grid.size), ends, moves) for part in parts]) / total
 
 
-def _shown(light: Tensor, found: Rays, grid: Sampling, ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:
-    """(depths, h, w) transform of the light on the nodes, squared and moved to second order, on the samples."""
-    spectrum = torch.fft.fft2(light, s=(grid.size, grid.size))
-    if compiled.plain(spectrum):
-        power = torch.from_numpy(compiled.power(spectrum.numpy()))
-    else:
-        power = torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
-    plain, change = _moved(power, ends, moves[0])
+def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:
+    """(depths, h, w) light of the transforms, moved to second order, on the samples."""
+    plain, change = _moved(fluxes[0], ends, moves[0])
     shown = plain + change
-    if not grid.curved:
-        return shown
-    for j, aside in enumerate((found.aside, found.aside[:, None])):
-        other = torch.fft.fft2(light * aside.to(light.real), s=(grid.size, grid.size))
-        flux = torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)
-        shown = shown + _moved(flux, ends, moves[1 + j])[1]
+    for flux, move in zip(fluxes[1:], moves[1:], strict=True):
+        shown = shown + _moved(flux, ends, move)[1]
     return shown
+
+
+def _fluxes(light: Tensor, pupils: Tensor | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
+    """(depths, size, size) |U|² of the transforms of the light on the nodes, and with ``aside`` the flux along x and y.
+
+    pupils: (components, nodes, nodes) real factors whose light adds up; None for the scalar.
+    """
+    total: list[Tensor] = []
+    for part in [light] if pupils is None else [light * pupil for pupil in pupils]:
+        spectrum = torch.fft.fft2(part, s=(size, size))
+        if compiled.plain(spectrum):
+            found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
+        else:
+            found = [torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)]
+        for along in aside:
+            other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
+            found.append(torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag))
+        total = found if not total else [a + b for a, b in zip(total, found, strict=True)]
+    return total
 
 
 def _on_samples(power: Tensor, ends: tuple[Samples, ...]) -> tuple[Tensor, Tensor, Tensor]:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from metalens.psf.spectrum import Nodes as Nodes
     from metalens.psf.spectrum import Source as Source
     from metalens.psf.stack import psf_stack as psf_stack
+    from metalens.psf.vector import turned as turned
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -57,5 +58,6 @@ __getattr__, __dir__, __all__ = attach(
         "save": "record",
         "scalar_error": "budget",
         "spectrum": "",
+        "turned": "vector",
     },
 )

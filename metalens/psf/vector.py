@@ -23,18 +23,30 @@ def components(case: Case) -> torch.Tensor:
     b = torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
     steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
     a = torch.tensor([case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep], dtype=torch.float64)
-    both = (a[:, None, None] + b) / (1 + torch.einsum("i,iyx->yx", a, b))
+    return turned(a, b)
+
+
+def turned(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """(2 polarisations x 3 components, …) of light of amplitude 1 that a lens turns from the direction a to b.
+
+    Args:
+        a: (3,) unit vector of the light that comes. b: (3, …) of the rays that leave, both towards the sensor.
+
+    Returns:
+        x, y, z component of light polarised along x, then along y (both turned to a); squares add up to 2 / b_z.
+    """
+    both = (a.reshape(3, *[1] * (b.ndim - 1)) + b) / (1 + torch.einsum("i,i...->...", a, b))
     out = []
     for e in _polarisations(a):
-        turned = e[:, None, None] - both * torch.einsum("i,iyx->yx", e, b)
+        turned = e.reshape(3, *[1] * (b.ndim - 1)) - both * torch.einsum("i,i...->...", e, b)
         out.append(turned / torch.sqrt(b[2]))
     return torch.cat(out)
 
 
 def _polarisations(a: torch.Tensor) -> list[torch.Tensor]:
     """Two unit vectors across the direction a: x and y turned to it."""
-    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) + a
-    unit = torch.eye(3, dtype=torch.float64)[:2]
+    unit = torch.eye(3, dtype=a.dtype, device=a.device)
+    axis, unit = unit[2] + a, unit[:2]
     return [e - axis * (a @ e) / (1 + a[2]) for e in unit]
 
 

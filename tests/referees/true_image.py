@@ -8,6 +8,12 @@ scene's sample and that of a sensor's. One full transform a point: for images of
 import numpy as np
 
 
+def _rotated(e, start, end):
+    """e as the rotation of unit vectors start to end takes it: e cos + u x e + u (u·e)/(1 + cos) (Rodrigues)."""
+    unit, cosine = np.cross(start, end, axis=0), (start * end).sum(0)
+    return e * cosine + np.cross(unit, e, axis=0) + unit * (unit * e).sum(0) / (1 + cosine)
+
+
 class Referee:
     """lens: radius, sensor distance, focus of the source, all um; films behind as (index, thickness), air the rest."""
 
@@ -45,6 +51,43 @@ class Referee:
         # the wave reaches the sensor of a lattice that wraps: the caller keeps the window well inside
         return np.abs(np.fft.fftshift(out)) ** 2 / self.open.sum()
 
+    def polarised(self, place, depth, wavelength):
+        """|Ex|² + |Ey|² + |Ez|² as :meth:`intensity`, mean of both polarisations, over that on the lens.
+
+        At each point of the lens the field across the source's ray is turned with the ray to that of the phase's
+        slope, its power along z kept; behind it plane waves have Ez = -(p Ex + q Ey) / s. In air.
+        """
+        k, h, fine = 2 * np.pi / wavelength, 1e-3, self.fine
+        tx, ty = place[0] / self.distance, place[1] / self.distance
+        ax, ay = self.x + tx * depth, self.y + ty * depth
+        source = np.sqrt(ax**2 + ay**2 + depth**2)
+        a = np.stack([ax, ay, np.full_like(ax, depth)]) / source
+        slope = []
+        for dx, dy in ((h, 0), (0, h)):
+            rise = 0
+            for d in (self.distance, self.focus):
+                ends = [np.sqrt((self.x + u * dx) ** 2 + (self.y + u * dy) ** 2 + d**2) for u in (-1, 1)]
+                rise = rise + (ends[0] - ends[1]) / (2 * h)
+            slope.append(self.k0 / k * rise)
+        b = np.stack([a[0] + slope[0], a[1] + slope[1], np.zeros_like(ax)])
+        b[2] = np.sqrt(np.maximum(1 - b[0] ** 2 - b[1] ** 2, 1e-3))
+        f = np.fft.fftfreq(self.count, fine)
+        fx, fy = np.meshgrid(f, f)
+        p, q = wavelength * fx, wavelength * fy
+        runs = p**2 + q**2 < 0.998
+        s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
+        move = runs * np.exp(1j * k * self.distance * s + 2j * np.pi * (fx * place[0] + fy * place[1]))
+        scalar = self.open * np.exp(1j * (k * source + self.lens_phase()))
+        total = np.zeros_like(ax)
+        straight = np.zeros_like(a)
+        straight[2] = 1.0
+        for e in np.eye(3)[:2]:
+            out = _rotated(_rotated(e[:, None, None] + 0 * a, straight, a), a, b)
+            waves = [np.fft.fft2(np.fft.ifftshift(scalar * part / np.sqrt(b[2]))) * move for part in out[:2]]
+            waves.append(-(p * waves[0] + q * waves[1]) / s)
+            total += sum(np.abs(np.fft.fftshift(np.fft.ifft2(w))) ** 2 for w in waves) / 2
+        return total / (self.open / b[2]).sum()
+
     def sampled(self, fine, step, window):
         """(window, window) light on samples about the middle of the lattice, from a square source as large as they."""
         f = np.fft.fftfreq(self.count, self.fine)
@@ -54,8 +97,12 @@ class Referee:
         first = self.count // 2 - (window // 2) * every
         return smooth[first : first + window * every : every, first : first + window * every : every]
 
-    def image(self, light, depth, *, step, window, waves, middle=(0.0, 0.0)):
-        """(y, x) irradiance of point sources on the samples: every one with its own PSF, cos⁴ and wavelengths."""
+    def image(self, light, depth, *, step, window, waves, middle=(0.0, 0.0), psf=None):
+        """(y, x) irradiance of point sources on the samples: every one with its own PSF, cos⁴ and wavelengths.
+
+        psf: :meth:`intensity` (the scalar, if None) or :meth:`polarised`.
+        """
+        psf = psf or self.intensity
         rows, columns = light.shape
         half = window // 2
         out = np.zeros((rows + 2 * half, columns + 2 * half))
@@ -65,7 +112,7 @@ class Referee:
                 if light[i, j] == 0:
                     continue
                 place = middle[0] + (j - (columns - 1) / 2) * step, middle[1] + (i - (rows - 1) / 2) * step
-                psf = sum(w * self.sampled(self.intensity(place, depth[i, j], c), step, window) for c, w in waves)
+                seen = sum(w * self.sampled(psf(place, depth[i, j], c), step, window) for c, w in waves)
                 fall = 1 / (1 + (place[0] ** 2 + place[1] ** 2) / reduced**2) ** 2
-                out[i : i + window, j : j + window] += light[i, j] * fall * psf
+                out[i : i + window, j : j + window] += light[i, j] * fall * seen
         return out[half : half + rows, half : half + columns]

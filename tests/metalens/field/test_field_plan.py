@@ -86,6 +86,7 @@ def test_a_spectrum_takes_the_rule_that_the_next_one_confirms(monkeypatch):
 def test_a_field_folds_only_where_it_is_square(monkeypatch, samples, middle, folds):
     monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
     monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
+    monkeypatch.setattr(plan, "unpolarised", lambda *_: 0.0)
     grid = Grid(samples, 2.0, (3e3, 9e3), window=7)
     round_lens = folds or samples[0] != samples[1]
     waves = Nodes(np.array([0.85]), np.array([1.0]), 0.0)
