@@ -131,8 +131,7 @@ def planned(
     if neglected(optics, coarse, window, (_corner(middle_um, half), ends)) > tolerance * SHARES["transform"]:
         window = replace(window, curved=True)
     some = torch.cat([_corner(middle_um, half), torch.tensor([middle_um], dtype=torch.float64)]), ends
-    if polarisation != "scalar":
-        window = polarised(optics, coarse, window, some, tolerance, always=polarisation == "vector")
+    window = polarised(optics, coarse, window, some, tolerance, polarisation=polarisation)
     counts = [max(2, math.ceil((count - 1) * h / half[1]) + 1) for h in half]
     y, x = (
         m + (2 * placed(c, denser, (m, h)) / ALONG - 1) * h
@@ -193,11 +192,17 @@ def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Te
 
 
 def polarised(
-    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], tolerance: float, *, always: bool
+    optics: Optics,
+    waves: Nodes,
+    window: Window,
+    at: tuple[Tensor, Tensor],
+    tolerance: float,
+    *,
+    polarisation: Polarisation,
 ) -> Window:
-    """The window with one scalar where that images within the tolerance (unless ``always``), else with as few
-    components of the field of both polarisations as image within their share of it."""
-    if not always and unpolarised(optics, waves, window, at) <= tolerance:
+    """The window with one scalar where that images within the tolerance (``auto``), else with as few components of
+    the field of both polarisations as image within their share of it."""
+    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= tolerance):
         return window
     tried = [replace(window, components=count) for count in range(1, ALL + 1)]
     return next(one for one in tried if unpolarised(optics, waves, one, at) <= tolerance * SHARES["polarisation"])
