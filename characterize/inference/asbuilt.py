@@ -28,13 +28,13 @@ import numpy as np
 
 from characterize.model import PARAMETERS, PLACE, Setting, made, oversampling, true_depth, vector
 from metalens import lens as lenses
+from metalens import psf as psfs
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
 from metalens.made import Sensitivity, Solved
-from metalens.psf import PsfStack, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -192,7 +192,7 @@ class AsBuilt:
         """(y, x) complex transmission of every as-built pillar at normal incidence, wave-front errors included."""
         return made.pillars(self.design, self.response, self.parameters(value), modes=self.residual_modes)
 
-    def psf(self) -> PsfStack:
+    def psf(self) -> "psfs.PsfStack":
         """PSFs (angle, depth, y, x) at the true depths of the captures, as fine as the light, on the fitted window.
 
         Computed anew by each call: seconds for a lens of a millimetre.
@@ -202,10 +202,10 @@ class AsBuilt:
         depths = np.unique(np.round(true_depth(self.parameters(), setting, float(self.depth_um.mean())), 3))
         angles = tuple((float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0))
         samples = side * oversampling(self.design, self.pixel_um)
-        view = View(tuple(depths.tolist()), angles, side * self.pixel_um, samples)
+        view = psfs.View(tuple(depths.tolist()), angles, side * self.pixel_um, samples)
         return self.psf_stack(view, tolerance=1e-3)
 
-    def psf_stack(self, view: View, value: Array | None = None, *, tolerance: float = 1e-4) -> PsfStack:
+    def psf_stack(self, view: "psfs.View", value: Array | None = None, *, tolerance: float = 1e-4) -> "psfs.PsfStack":
         """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of :meth:`samples`.
 
         Windows are centred on the chief ray of the best fit. A draw's own is moved by the difference of the two

@@ -3,11 +3,28 @@
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft, special
 
 from metalens.ground.arrays import Array
+
+_LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sums:
+    """A blur that acts along each axis by itself, or a sum of such: pairs of (rows, y) and (columns, x) weights."""
+
+    pairs: tuple[tuple[Array, Array], ...]
+
+    def times(self, factor: float) -> "Sums":
+        """All weights times a factor, in their precision."""
+        return Sums(tuple((y * y.dtype.type(factor), x) for y, x in self.pairs))
+
+
+Blur = Array | Sums
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +60,60 @@ class Grid:
         rows, columns = ((p + 2 * self.margin) * self.oversample for p in (self.rows, self.columns))
         return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(columns, self.fine_um)[None]
 
-    def sample(self, intensity: Array, transfer: Array) -> Array:
+    def sample(self, intensity: Array, transfer: Blur) -> Array:
         """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
+        if isinstance(transfer, Sums):
+            return np.asarray(sum(y @ (intensity @ x.T) for y, x in transfer.pairs))
         shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
         blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
         y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
         return np.asarray(blurred[..., y, x])
+
+    def sums(self, sigma_um: float, kind: Any = float) -> tuple[Sums, Sums]:
+        """Square pixel and Gaussian blur as sums along each axis, and their derivative by ``sigma_um``: two small
+        products in place of two transforms, the same to rounding."""
+        (y, by_y), (x, by_x) = (self._along(count, sigma_um, kind) for count in (self.rows, self.columns))
+        return Sums(((y, x),)), Sums(((by_y, x), (y, by_x)))
+
+    def _along(self, pixels: int, sigma_um: float, kind: Any) -> tuple[Array, Array]:
+        """(pixels, fine samples) weights of pixel and blur along one axis, and their derivative."""
+        o, m = self.oversample, self.margin
+        count = (pixels + 2 * m) * o
+        f = fft.fftfreq(count, self.fine_um)
+        at = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
+        place = np.arange(m * o + o // 2, (m + pixels) * o, o)[:, None] - np.arange(count)
+        parts = [fft.ifft(np.sinc(f * self.pixel_um) * at * part).real for part in gauss(f, np.zeros(1), sigma_um)]
+        return parts[0][place % count].astype(kind), parts[1][place % count].astype(kind)
+
+
+def transfers(
+    grid: Grid, crosstalk_px: float, sizes_um: Array, shrink: Array, *, sized: bool, kind: Any = float
+) -> tuple[Blur, dict[str, Blur]]:
+    """Of pixel, crosstalk and the image of a round source in every frame, and derivatives by name.
+
+    Sums along the axes for a point source; else (frames, fy, fx), and by the source's diameter where that is ``sized``.
+
+    Args:
+        sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over the source's. kind: of the sums.
+    """
+    pixel_um = grid.pixel_um
+    if not sizes_um.any() and not sized:
+        blur, by_blur = grid.sums(crosstalk_px * pixel_um, kind)
+        return blur, {"crosstalk_px": by_blur.times(pixel_um)}
+    fy, fx = grid.frequencies()
+    smooth, by_sigma = gauss(fy, fx, crosstalk_px * pixel_um)
+    square = pixel(fy, fx, pixel_um)
+    shared, image = square * smooth, [disc(fy, fx, size) for size in sizes_um]
+    some = np.maximum(sizes_um, _LEAST_DISC * pixel_um)
+    seen = np.stack([disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
+    whole = np.stack([value for value, _ in image])
+    slopes: dict[str, Blur] = {
+        "crosstalk_px": square * by_sigma * pixel_um * whole,
+        "pinhole_um": shared * seen,
+        "growth": shared * np.stack([slope for _, slope in image]) * shrink[:, None, None],
+    }
+    return shared * whole, slopes
 
 
 @functools.lru_cache(maxsize=4)

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model import detector
+from characterize.model import detector, moments
 from characterize.model.glass import extra_path
 from characterize.model.kernel import turns
+from characterize.model.moments import LIT, Bases, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
@@ -40,7 +41,6 @@ GEOMETRY = (
 )
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
-_LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
 
@@ -216,51 +216,65 @@ class ForwardModel:
         phasor = np.exp(1j * phase).astype(kind) if np.iscomplexobj(phase) else turns(phase, kind)
         lens = self._pupil(x, group, bool(names))
         operators, lit = self._operators(x, group), lens[0] * phasor
-        field = operators.field(lit, self.cut)
+        coarse = operators.coarse(lit, self.cut)
+        field = operators.finer(coarse)
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
-        out: dict[str, Array] = {}
-        growth, conjugate, power = self._growth(x, group), field.conj(), np.vdot(lit, lit).real
-        for name, changed in self._changes(x, group, names, (*lens[1:], phasor, lit)):
+        by = {"bias": lens[1], **dict(zip(ANSWERING, lens[2], strict=False)), "wave": lens[3]}
+        factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
+        out = self._quick((operators, coarse), group, transfer, bases, factors)
+        conjugate, power = field.conj(), np.vdot(lit, lit).real
+        for name in factors.keys() - out.keys():
             # the part of a change that is the light itself needs no sum, nor loses digits
+            changed = bases.changed(factors[name])
             same = np.vdot(lit, changed) / power
             changed = changed - same * lit
             rate = operators.field(changed, _SLOPE_TOLERANCE)
-            rate = rate + self._by_window(name, operators, lit, float(np.linalg.norm(changed)) / math.sqrt(power))
+            if moves := factors[name].moves:
+                beside = float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
+                rate = rate + factors[name].um * operators.rates(lit, moves, _SLOPE_TOLERANCE, beside=beside)
             out[name] = self.grid.sample(2 * (conjugate * rate).real, transfer) + 2 * same.real * light
-            if name in growth and x[PLACE["pinhole_um"]] > 0:  # the source's image grows or shrinks too
-                disc = blurs["growth"] * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
-                out[name] = out[name] + self.grid.sample(intensity, disc)
+        growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
+        for name in growth.keys() & out.keys():  # the source's image grows or shrinks too
+            disc = np.asarray(blurs["growth"]) * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+            out[name] = out[name] + self.grid.sample(intensity, disc)
         for name in blurs.keys() & set(names):
             out[name] = self.grid.sample(intensity, blurs[name])
         return light, out
 
-    def _changes(
-        self, x: Array, group: _Group, names: list[str], parts: tuple[Array, ...]
-    ) -> Iterator[tuple[str, Array]]:
-        """(name, (frames, q, p) derivative of the light on the nodes) of all parameters that change it.
+    def _quick(
+        self,
+        seen: tuple[Operators, Array],
+        group: _Group,
+        blur: detector.Blur,
+        bases: Bases,
+        factors: dict[str, Factor],
+    ) -> dict[str, Array]:
+        """Derivatives that are had from those of the field: what smooth factors make of a point, on small pixels."""
+        (operators, coarse), turned = seen, seen[0].turned
+        small = bool(factors) and moments.fine_enough(self.grid, group.reduced.radius_um)
+        if turned is None or not isinstance(blur, detector.Sums) or not small:
+            return {}
 
-        parts: derivatives of the lens by bias, answering causes and wavelength; phasors, and the light itself.
-        """
-        by_bias, by_answers, by_wave, phasor, lit = parts
+        def field(base: str, light: Array) -> Array:
+            return coarse if base == LIT else operators.coarse(light, _SLOPE_TOLERANCE)
+
+        return moments.rates(turned, self.grid, blur, group.reduced.seen(), bases, field, factors)
+
+    def _factors(self, x: Array, group: _Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
+        """(name, what one unit does to the light on the nodes) of all parameters that change it."""
         for name in names:
             if name in WIDENING:
-                yield name, (by_bias * group.widening[WIDENING[name]]).astype(lit.dtype) * phasor
+                yield name, Factor("bias", group.widening[WIDENING[name]][None])
             elif name in ANSWERING:
-                yield name, by_answers[ANSWERING[name]] * phasor
+                yield name, Factor(name, np.ones_like(group.reduced.u)[None])
             elif (turning := group.turning(name)) is not None:
-                yield name, (1j * turning).astype(lit.dtype) * lit
+                yield name, Factor(LIT, 1j * turning[None])
             elif name in GEOMETRY:
-                changed = (1j * self._phase_slope(x, group, name)).astype(lit.dtype) * lit
-                yield name, changed + by_wave * phasor if name == "wavelength_nm" else changed
-
-    def _by_window(self, name: str, operators: Operators, lit: Array, beside: float) -> Array | float:
-        """Derivative of the field behind distance and wavelength's own move of the window; ``beside`` by the lens."""
-        if name not in _WINDOW:
-            return 0.0
-        rate, um = _WINDOW[name]
-        return um * operators.rates(lit, rate, _SLOPE_TOLERANCE, beside=beside / um)
+                moves, um = _WINDOW.get(name, ("", 1.0))
+                added = "wave" if name == "wavelength_nm" else ""
+                yield name, Factor(LIT, 1j * self._phase_slope(x, group, name), moves, um, added)
 
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
@@ -327,24 +341,10 @@ class ForwardModel:
         distance = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
         return {"distance_um": np.full(len(depth), 1 / distance), "stage_zero_um": -1 / depth}
 
-    def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[Array, dict[str, Array]]:
-        """(frames or 1, fy, fx) transfer of pixel, crosstalk and source disc, and its derivatives."""
-        fy, fx = self.grid.frequencies()
-        pixel = self.setting.pixel_um
-        blur, by_blur = detector.gauss(fy, fx, x[PLACE["crosstalk_px"]] * pixel)
+    def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[detector.Blur, dict[str, detector.Blur]]:
+        """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
-        square = detector.pixel(fy, fx, pixel)
-        if x[PLACE["pinhole_um"]] == 0 and "pinhole_um" not in names:
-            return (square * blur)[None], {"crosstalk_px": (square * by_blur * pixel)[None]}
-        sizes, shared = x[PLACE["pinhole_um"]] * shrink, square * blur
-        disc, by_size = (np.stack(part) for part in zip(*(detector.disc(fy, fx, size) for size in sizes), strict=True))
-        by_size = by_size * shrink[:, None, None]
-        some = np.maximum(sizes, _LEAST_DISC * pixel)
-        seen = np.stack([detector.disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
-        slopes = {
-            "crosstalk_px": square * by_blur * pixel * disc,
-            "pinhole_um": shared * seen,
-            "growth": shared * by_size,
-        }
-        return shared * disc, slopes
+        blur, source = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]]
+        kind = np.empty(0, group.reduced.kind).real.dtype
+        return detector.transfers(self.grid, blur, source * shrink, shrink, sized="pinhole_um" in names, kind=kind)

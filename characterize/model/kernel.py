@@ -70,10 +70,20 @@ class Kernel:
         of the middle direction (a, b): k times the most by which dF/dX and dF/dY differ from those of it."""
         t = np.linspace(-1, 1, _COARSE)
         Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
+        off_x, off_y = self.turning(p, q, X, Y)
+        return self.k * float(np.abs(off_y).max()), self.k * float(np.abs(off_x).max())
+
+    def turning(self, p: Array, q: Array, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
+        """(dF/dX, dF/dY) less those of the middle direction (a, b) along its own axis: the field's less its carrier."""
         a, b = _middle(self.p), _middle(self.q)
         by_x, by_y = self._steep(p, q, X, Y)
-        off_x, off_y = by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
-        return self.k * float(np.abs(off_y).max()), self.k * float(np.abs(off_x).max())
+        return by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
+
+    def moved(self, name: str, share: float) -> "Kernel":
+        """With the ``distance`` or the wavelength (``wave``) longer by a share of itself."""
+        if name == "distance":
+            return dataclasses.replace(self, distance_um=self.distance_um * (1 + share))
+        return dataclasses.replace(self, k=self.k / (1 + share))
 
     def _steep(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
         """dF/dX and dF/dY: the direction cosines seen from (X, Y)."""

@@ -8,6 +8,7 @@ sum for every smooth f.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import numpy as np
 from characterize.model import gather
 from characterize.model.kernel import Kernel, digits, factors, precision, turns
 from characterize.model.pillars import Pillars
-from characterize.model.window import MIXED, STEP, Operators, Terms, Ways, ways
+from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, Ways, turned, ways
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -102,6 +103,10 @@ class Reduced:
         tx, ty = self.bench.tangents
         return self.bench.distance_um * tx, self.bench.distance_um * ty
 
+    def seen(self) -> tuple[Array, Array, Array]:
+        """(q, p) direction cosines p and q of the nodes, and which of them meet the lens."""
+        return self.p, self.q, np.hypot(self.u, self.v) < 1
+
     def _gather(self, lens: Lens, pillars: Pillars) -> Array:
         d = lens.diameters
         x, y = d.x_um, d.y_um
@@ -175,11 +180,20 @@ class Reduced:
         inner = reach[0] - edge_um, reach[1] - edge_um
 
         def moved(name: str) -> Terms:
-            ends = [_moved(kernel, name, sign * STEP) for sign in (1, -1)]
+            ends = [kernel.moved(name, sign * STEP) for sign in (1, -1)]
             step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
-        return Operators(parts[0], parts[1], self._terms(kernel, [kernel], (1.0,), (y, x), inner), moved)
+        def bent(degree: int) -> tuple[Array, Array]:
+            k, (py, px) = kernel.k, (self.q[:, 0], self.p[0])
+            along = turned(kernel.by_y, py, axes_um[0], y, bands[0], k=k, degree=degree)
+            return along.astype(kind), turned(kernel.by_x, px, axes_um[1], x, bands[1], k=k, degree=degree).astype(kind)
+
+        few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
+        terms = self._terms(kernel, [kernel], (1.0,), (y, x), inner)
+        return Operators(
+            parts[0], parts[1], terms, moved, Turned(kernel, bands, functools.cache(bent)) if few else None
+        )
 
     def _terms(
         self,
@@ -218,13 +232,6 @@ class Reduced:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
-
-
-def _moved(kernel: Kernel, name: str, share: float) -> Kernel:
-    """With the distance or the wavelength longer by a share of itself."""
-    if name == "distance":
-        return dataclasses.replace(kernel, distance_um=kernel.distance_um * (1 + share))
-    return dataclasses.replace(kernel, k=kernel.k / (1 + share))
 
 
 def _pair(values: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.model.kernel import Kernel
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -20,6 +21,7 @@ ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
 _COARSEST = 0.2  # tolerance of a small part of a derivative
 _TAPS = range(6, 42, 2)
+_TURNED = 24  # samples that a derivative of the field is taken from
 STEP = 1e-3  # of distance and wavelength, for derivatives: paths bend over as much as they are long
 
 
@@ -60,20 +62,51 @@ class Terms:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Turned:
+    """Coarse samples to derivatives of the field: :func:`turned` along (y, x) up to a degree.
+
+    bands: (y, x) rad/um that directions are counted in; kernel: of which field.
+    """
+
+    kernel: Kernel
+    bands: tuple[float, float]
+    ways: Callable[[int], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Operators:
     """From nodes to window for one wavelength and distance: both axes, and the rest.
 
     moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its own.
+    turned: the field's derivatives; None where the window's own samples are the coarse ones.
     """
 
     y: Ways
     x: Ways
     rest: Terms
     moved: Callable[[str], Terms]
+    turned: Turned | None = None
 
     def field(self, light: Array, tolerance: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or with some left out."""
+        return self.finer(self.coarse(light, tolerance))
+
+    def coarse(self, light: Array, tolerance: float = 0.0) -> Array:
+        """As :meth:`field`, on the coarse samples."""
         return self._sum(light, ((self.y.to, self.x.to, self.rest, tolerance),))
+
+    def finer(self, coarse: Array) -> Array:
+        """(..., Y, X) on the window's samples of a field on the coarse ones."""
+        flat = coarse.reshape(-1, *coarse.shape[-2:])
+        out = np.empty((len(flat), len(self.y.fine), len(self.x.fine)), coarse.dtype)
+
+        def some(first: int, last: int) -> None:
+            for i in range(first, last):
+                np.matmul(self.y.fine @ flat[i], self.x.fine.T, out=out[i])
+
+        with threads.one_blas_thread():
+            threads.split(len(flat), some)
+        return out.reshape(*coarse.shape[:-2], *out.shape[-2:])
 
     def rates(self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or ``distance`` per um.
@@ -88,7 +121,7 @@ class Operators:
         whole = tolerance * math.hypot(*sizes, beside) / math.sqrt(len(sizes))
         some = [min(whole / max(size, 1e-300), _COARSEST) for size in sizes]
         ways = (y, self.x.to, self.rest), (self.y.to, x, self.rest), (self.y.to, self.x.to, moved)
-        return self._sum(light, tuple((*way, one) for way, one in zip(ways, some, strict=True)))
+        return self.finer(self._sum(light, tuple((*way, one) for way, one in zip(ways, some, strict=True))))
 
     def _sum(self, light: Array, ways: tuple[tuple[Array, Array, Terms, float], ...]) -> Array:
         """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X), for several (Fy, Fx, terms)."""
@@ -98,17 +131,15 @@ class Operators:
             across, amounts, window = terms.some(tolerance)
             products.append((y, (across[:, None] * x).reshape(len(across) * nx, -1).T, amounts, window))
         light = light.astype(kind, copy=False)
-        out = np.empty((*light.shape[:-2], len(self.y.fine), len(self.x.fine)), kind)
+        out = np.zeros((*light.shape[:-2], ny, nx), kind)
         flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
 
         def some(first: int, last: int) -> None:
             for i in range(first, last):
-                coarse = np.zeros((ny, nx), kind)
                 for y, x, amounts, window in products:
                     mixed = amounts @ (flat[i] @ x).reshape(len(amounts), -1, nx)
                     seen = (y @ mixed.reshape(len(mixed), -1)).reshape(ny, -1, nx)
-                    coarse += np.einsum("YrX,YrX->YX", seen, window)
-                np.matmul(self.y.fine @ coarse, self.x.fine.T, out=result[i])
+                    result[i] += np.einsum("YrX,YrX->YX", seen, window)
 
         with threads.one_blas_thread():
             threads.split(len(flat), some)
@@ -134,6 +165,32 @@ def ways(
     by_wave = -1j * turn * k / (2 * np.pi) * value  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
     carrier = [np.exp(1j * k * by(middle, places)) for places in (at_um, coarse)]
     return coarse, Ways(value, carrier[0][:, None] * weights * carrier[1].conj(), by_wave, by_distance)
+
+
+def turned(
+    by: Callable[..., Array], nodes: Array, at_um: Array, coarse_um: Array, band: float, *, k: float, degree: int
+) -> Array:
+    """(degree + 1, fine, coarse) from coarse samples to the field of light times powers of its own direction.
+
+    Of the direction from the middle one, over ``band``: between -1 and 1. Light from there turns as exp(i band t X) on
+    the window, so that a factor t^a is a derivative of the field: by the weights of least error over the band, as
+    plain interpolation is (``a`` = 0).
+    """
+    taps = min(_TURNED, len(coarse_um))
+    step = coarse_um[1] - coarse_um[0]
+    first = np.clip(np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1, 0, len(coarse_um) - taps)
+    index = first[:, None] + np.arange(taps)
+    t, share = np.polynomial.legendre.leggauss(taps + 40)
+    wave = np.exp(1j * band * t * (at_um[:, None] - coarse_um[index])[..., None])  # fine, taps, t
+    apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
+    seen = np.stack([wave @ (share / 2 * t**a) for a in range(degree + 1)])
+    found = np.linalg.solve(apart + 1e-12 * np.eye(taps), seen.reshape(-1, taps).T).T.reshape(seen.shape)
+    out = np.zeros((degree + 1, len(at_um), len(coarse_um)), complex)
+    for weights, row in zip(found, out, strict=True):
+        np.put_along_axis(row, index, weights, 1)
+    middle = (nodes[0] + nodes[-1]) / 2
+    carrier = [np.exp(1j * k * by(middle, places)) for places in (at_um, coarse_um)]
+    return np.asarray(carrier[0][:, None] * out * carrier[1].conj())
 
 
 def _resampled(at_um: Array, band: float, tolerance: float) -> tuple[Array, Array]:

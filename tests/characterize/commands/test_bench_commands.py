@@ -1,6 +1,7 @@
 """From a lens file to captures, and from captures to the as-built lens, on the command line."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -103,3 +104,14 @@ def test_bad_words_end_with_2_and_leave_nothing(bench):
     (bench / "truth.toml").write_text(TRUTH.replace("bias_nm", "bais_nm"))
     assert shoot(bench) == 2
     assert sorted(p.name for p in bench.iterdir()) == ["lens.h5", "truth.toml"]
+
+
+def test_commands_of_the_bench_and_their_help_do_without_torch():
+    """Only images of an as-built lens at other places need it."""
+    names = ("fit", "capture", "measure", "view")
+    code = (
+        "\n".join(f"import characterize.commands.{name}" for name in names)
+        + "\nimport sys\nprint('torch' in sys.modules)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["False"]

@@ -1,0 +1,204 @@
+"""Derivatives of frames by what turns or weighs light over the aperture, from derivatives of the field on the window.
+
+A factor f(x, y) on the lens is, seen from a place (X, Y) of the window, a function of the direction in which light
+comes: a polynomial sum c_ab t^a s^b in the direction cosines (t, s) from the middle one. Light times t^a s^b has the
+field's own derivative there (:func:`window.turned`), so that one field and a few of its derivatives serve all
+parameters: d|E|² = 2 Re sum c_ab conj(E) E_ab. The coefficients change little across a pixel and are put on after it.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.model.detector import Grid, Sums
+from characterize.model.kernel import Kernel
+from characterize.model.window import STEP, Turned
+from metalens.ground import legendre, threads
+from metalens.ground.arrays import Array
+
+LIT = "lit"
+_DEGREE = 5
+_PLACES = 4  # of the window along each axis where coefficients are computed
+_ACROSS = 15  # places of the lens along each axis that they are fitted to
+_MISSED = 5e-3  # of a factor, where no polynomial is close enough: its parameter is computed by itself
+_COARSE_PIXEL = 7e-3  # of the lens's radius: pixels across which coefficients change too much
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Factor:
+    """What one unit of a parameter does to the light on the nodes: (frames or 1, q, p) ``values`` times one base.
+
+    moves, um: the name by which it moves the window too (``distance`` or ``wave``), and by how much. added: another
+    base, as it is.
+    """
+
+    base: str
+    values: Array
+    moves: str = ""
+    um: float = 1.0
+    added: str = ""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Bases:
+    """Light on the nodes that factors act on: ``lit`` (frames, q, p), and ``slopes`` {name: (q, p)} of the lens, each
+    times the ``phasor`` of every frame."""
+
+    lit: Array
+    phasor: Array
+    slopes: Mapping[str, Array]
+
+    def of(self, name: str) -> Array:
+        """(frames, q, p) of one base: ``lit``, or by name."""
+        return self.lit if name == LIT else np.asarray(self.slopes[name] * self.phasor)
+
+    def share(self, name: str) -> complex:
+        """Of the light itself in a base: it needs no sum of its own, nor loses digits; 0 for ``lit``."""
+        return 0.0 if name == LIT else complex(np.vdot(self.lit, self.of(name)) / np.vdot(self.lit, self.lit).real)
+
+    def changed(self, factor: Factor) -> Array:
+        """(frames, q, p) derivative of the light on the nodes, without the window's own move."""
+        if factor.base == LIT:
+            out = factor.values.astype(self.lit.dtype) * self.lit
+        else:
+            out = (factor.values * self.slopes[factor.base]).astype(self.lit.dtype) * self.phasor
+        return np.asarray(out + self.of(factor.added) if factor.added else out)
+
+
+def fine_enough(grid: Grid, radius_um: float) -> bool:
+    """Whether pixels are small enough that coefficients do not change across one, on a lens of this radius."""
+    return grid.pixel_um < _COARSE_PIXEL * radius_um
+
+
+def rates(
+    turned: Turned,
+    grid: Grid,
+    blur: Sums,
+    lens: tuple[Array, Array, Array],
+    bases: Bases,
+    field: Callable[[str, Array], Array],
+    factors: Mapping[str, Factor],
+) -> dict[str, Array]:
+    """(frames, rows, columns) derivatives of the light by name; those that no polynomial is close to are left out.
+
+    Args:
+        lens: (q, p) direction cosines p and q of the nodes, and which of them meet the lens.
+        field: (name, (frames, q, p) light) to (frames, Y, X) coarse field.
+    """
+    tables = _tables(turned, grid, lens, factors)
+    needed = {LIT: 0}
+    for name, (degree, _) in tables.items():
+        for base, most in ((factors[name].base, degree), (factors[name].added, 0)):
+            needed[base] = max(needed.get(base, 0), most)
+    needed.pop("", None)
+    needed[LIT] = max(needed.values())
+    shares = {base: bases.share(base) for base in needed}
+    light = {base: bases.of(base) - share * bases.lit if share else bases.of(base) for base, share in shares.items()}
+    seen = _seen(turned, grid, blur, {base: field(base, part) for base, part in light.items()}, needed)
+    for base, share in shares.items():
+        if share:
+            seen[base] += share * seen[LIT][:, : seen[base].shape[1]]
+    return {name: _summed(table, factors[name], seen) for name, (_, table) in tables.items()}
+
+
+def _summed(table: Array, factor: Factor, seen: Mapping[str, Array]) -> Array:
+    images = seen[factor.base][:, : table.shape[1]]
+    out = 2 * np.einsum("fcyx,fcyx->fyx", *np.broadcast_arrays(table, images)).real
+    return np.asarray(out + 2 * seen[factor.added][:, 0].real if factor.added else out)
+
+
+def powers(degree: int) -> list[tuple[int, int]]:
+    """(a, b) of t^a s^b, the total degree rising."""
+    return [(n - b, b) for n in range(degree + 1) for b in range(n + 1)]
+
+
+def _seen(
+    turned: Turned, grid: Grid, blur: Sums, bases: Mapping[str, Array], needed: Mapping[str, int]
+) -> dict[str, Array]:
+    """{base: (frames, powers, rows, columns)} conj(E) times the derivatives of a base field, through the pixels."""
+    most = max(needed.values(), default=0)
+    y, x = turned.ways(most)
+    frames = len(bases["lit"])
+    out = {
+        base: np.empty((frames, len(powers(degree)), grid.rows, grid.columns), bases["lit"].dtype)
+        for base, degree in needed.items()
+    }
+
+    def some(first: int, last: int) -> None:
+        for i in range(first, last):
+            conjugate = (y[0] @ bases["lit"][i] @ x[0].T).conj()
+            for base, degree in needed.items():
+                across = [bases[base][i] @ along.T for along in x[: degree + 1]]
+                for n, (a, b) in enumerate(powers(degree)):
+                    out[base][i, n] = grid.sample(conjugate * (y[b] @ across[a]), blur)
+
+    with threads.one_blas_thread():
+        threads.split(frames, some)
+    return out
+
+
+def _tables(
+    turned: Turned, grid: Grid, lens: tuple[Array, Array, Array], factors: Mapping[str, Factor]
+) -> dict[str, tuple[int, Array]]:
+    """{name: (degree, (frames or 1, powers, rows, columns) coefficients)} of those factors that are polynomials."""
+    some = np.unique(np.linspace(0, len(lens[0]) - 1, _ACROSS).round().astype(int))
+    cut = np.ix_(some, some)
+    keep = lens[2][cut]
+    p, q = (part[cut][keep] for part in lens[:2])
+    ends = [(np.array([0, n - 1]) - n // 2) * grid.pixel_um for n in (grid.rows, grid.columns)]
+    Y, X = (legendre.mapped(_PLACES, *end) for end in ends)
+    to_y, to_x = (legendre.interpolation(_PLACES, np.linspace(-1, 1, n)) for n in (grid.rows, grid.columns))
+    places = [(float(a), float(b)) for a, b in itertools.product(Y, X)]
+    seen = np.stack([_directions(turned, p, q, place) for place in places])
+    shapes = np.linalg.qr(np.stack([seen[:, 0] ** a * seen[:, 1] ** b for a, b in powers(_DEGREE)], -1))
+    out = {}
+    for name, factor in factors.items():
+        values = factor.values[:, cut[0], cut[1]][:, keep].astype(complex)
+        found = _fitted(shapes, values, _moves(turned, factor, p, q, places))
+        if found is not None:
+            degree, table = found
+            square = table.reshape(_PLACES, _PLACES, *table.shape[1:])
+            out[name] = degree, np.einsum("yi,ijcf,xj->fcyx", to_y, square, to_x, optimize=True)
+    return out
+
+
+def _directions(turned: Turned, p: Array, q: Array, place: tuple[float, float]) -> tuple[Array, Array]:
+    """(t, s) of the nodes seen from a place (Y, X) of the window, each between -1 and 1."""
+    by_x, by_y = turned.kernel.turning(p, q, place[1], place[0])
+    k, (band_y, band_x) = turned.kernel.k, turned.bands
+    return k * by_x / band_x, k * by_y / band_y
+
+
+def _moves(turned: Turned, factor: Factor, p: Array, q: Array, places: list[tuple[float, float]]) -> list[Array]:
+    """What the window's own move adds at every place: derivative of the kernel's logarithm."""
+    if not factor.moves:
+        return [np.zeros(1)] * len(places)
+    ends = [turned.kernel.moved(factor.moves, sign * STEP) for sign in (1, -1)]
+    length = turned.kernel.distance_um if factor.moves == "distance" else 2 * math.pi / turned.kernel.k
+    up, down = ([_logarithm(end, p, q, place) for place in places] for end in ends)
+    return [factor.um * (a - b) / (2 * STEP * length) for a, b in zip(up, down, strict=True)]
+
+
+def _logarithm(kernel: Kernel, p: Array, q: Array, place: tuple[float, float]) -> Array:
+    path, r = kernel.path(p, q, place[1], place[0])
+    return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.distance_um / r**2))
+
+
+def _fitted(shapes: tuple[Array, Array], values: Array, moved: list[Array]) -> tuple[int, Array] | None:
+    """(degree, (places, powers, frames) coefficients) of the least degree that is close; None where none is.
+
+    shapes: orthonormal ones (places, nodes, powers), and the triangles that make them of the powers.
+    """
+    basis, triangle = shapes
+    wanted = np.stack([(values + more).T for more in moved])
+    amounts = basis.transpose(0, 2, 1) @ wanted
+    size = float(np.linalg.norm(wanted - 1j * wanted.imag.mean(1, keepdims=True)) ** 2)
+    left = float(np.linalg.norm(wanted) ** 2) - np.cumsum((np.abs(amounts) ** 2).sum((0, 2)))
+    for degree in range(_DEGREE + 1):
+        count = len(powers(degree))
+        if left[count - 1] <= _MISSED**2 * size:
+            return degree, np.linalg.solve(triangle[:, :count, :count], amounts[:, :count])
+    return None

@@ -1,0 +1,124 @@
+"""Derivatives from those of the field, beside differences of the images; and what they rest on, by itself."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.inference import leastsquares, residual
+from characterize.inference.leastsquares import Data, Settings
+from characterize.model import moments
+from characterize.model.forward import ForwardModel, Setting
+from characterize.model.parameters import PLACE, vector
+from characterize.model.window import turned
+from metalens import design, profiles
+from metalens.cell.record import Cell
+
+BAND, K = 1.7, 7.4
+SECANT = Settings(secant=True)
+VALUES = {
+    "bias_nm": 4.0, "bias_x_nm": 2.0, "height_nm": -8.0, "wavelength_nm": 0.4, "distance_um": 3.0,
+    "decentre_x_um": 0.8, "stage_zero_um": 9.0, "coma_x_rad": 0.2, "spherical_rad": 0.15, "log_gain": 9.0,
+}  # fmt: skip
+STEPS = {
+    "bias_nm": 0.1, "bias_x_nm": 0.1, "bias_r_nm": 0.1, "height_nm": 0.2, "wavelength_nm": 0.02, "distance_um": 0.05,
+    "decentre_y_um": 0.02, "tilt_x_deg": 0.01, "stage_zero_um": 0.5, "stage_scale": 1e-4, "astigmatism_rad": 0.01,
+    "coma_y_rad": 0.01, "trefoil_x_rad": 0.01, "light_x": 0.02,
+}  # fmt: skip
+
+
+def test_powers_of_the_direction_are_derivatives_of_the_field():
+    """A wave of one direction t within the band: t^a times itself, to 3e-4 with 24 samples 1.3 times as fine as needed.
+
+    With a carrier that bends over the window, as that of the middle direction does.
+    """
+    step = math.pi / BAND / 1.3
+    coarse, fine = (np.arange(44) - 21.5) * step, np.linspace(-9.3, 8.1, 37)
+    nodes = np.array([0.02, 0.1, 0.3])
+
+    def by(direction, place):
+        return 0.03 * place**2 - direction * place
+
+    ways = turned(by, nodes, fine, coarse, BAND, k=K, degree=4)
+    for t in (-0.93, 0.21, 0.77):
+
+        def wave(place, t=t):
+            return np.exp(1j * (K * by(0.16, place) + BAND * t * place))
+
+        for a, way in enumerate(ways):
+            assert np.abs(way @ wave(coarse) - t**a * wave(fine)).max() < 3e-4
+
+
+def lens():
+    """150 um wide and NA 0.1, so that pixels of 1 um are small beside it."""
+    focus = profiles.Focus(0.85, 700.0, 3000.0)
+    phase = design.phase_of(None, focus, radius_um=75.0)
+    return design.make(phase, focus, aperture_um=150.0, cell=Cell(pitch_um=0.5), proxy=b.proxy())[0]
+
+
+def test_derivatives_from_those_of_the_field_are_differences_of_images(monkeypatch):
+    """Slopes are asked to 8e-3, factors to 5e-3 of themselves; coefficients change by 1.3 % a pixel: 2e-2 in all."""
+    monkeypatch.setattr(moments, "_COARSE_PIXEL", 0.02)
+    angle = np.array([[0.0, 0.0], [0.0, 0.0], [0.02, -0.03]])
+    setting = Setting(np.array([2500.0, 3000.0, 3700.0]), angle, np.ones(3), 1.0, 40, 36)
+    model = ForwardModel(lens(), setting, b.RESPONSE)
+    x, names = vector(VALUES), list(STEPS)
+    made, rates = [], moments.rates
+
+    def counted(*given):
+        made.append(rates(*given))
+        return made[-1]
+
+    monkeypatch.setattr(moments, "rates", counted)
+    found = model.images(x, names)[1]
+    assert len(made) == 2  # one for each angle
+    assert {"bias_x_nm", "height_nm", "distance_um", "stage_zero_um", "coma_y_rad"} <= set(made[0])
+    for name, slope in zip(names, found, strict=True):
+        ends = []
+        for sign in (1, -1):
+            moved = x.copy()
+            moved[PLACE[name]] += sign * STEPS[name]
+            ends.append(model.images(moved)[0])
+        want = (ends[0] - ends[1]) / (2 * STEPS[name])
+        assert np.linalg.norm(slope - want) < 0.02 * np.linalg.norm(want), name
+
+
+def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
+    """Slopes wrong by e move an estimate by about e sigma, and its sigma by e or more where parameters go together."""
+    model = ForwardModel(
+        lens(), Setting(np.array([2500.0, 3000.0, 3700.0]), np.zeros((3, 2)), np.ones(3), 1.0, 40, 36), b.RESPONSE
+    )
+    names = (
+        "bias_nm", "bias_x_nm", "bias_r_nm", "distance_um", "decentre_x_um", "stage_zero_um", "astigmatism_rad",
+        "coma_x_rad", "spherical_rad", "log_gain", "background_e",
+    )  # fmt: skip
+    truth = vector(VALUES)
+    truth[PLACE["log_gain"]] += math.log(6000 / model.images(truth)[0].max())
+    seen = model.images(truth)[0]
+    seen = seen + np.random.default_rng(3).normal(0, np.sqrt(seen + 9))
+    everywhere = np.ones(seen.shape, bool)
+    data = Data(seen, everywhere, ~everywhere, np.full(seen.shape, 9.0), np.ones(seen.shape))
+    begin = truth[[PLACE[name] for name in names]] * np.where(np.array(names) == "log_gain", 1.0, 0.9)
+    found = []
+    for pixel in (0.02, 0.0):
+        monkeypatch.setattr(moments, "_COARSE_PIXEL", pixel)
+        found.append(leastsquares.fit(residual.problem(model, names, truth), data, begin, settings=SECANT))
+    quick, alone = found
+    sigma = np.sqrt(np.diag(alone.covariance))
+    assert not np.array_equal(quick.slopes, alone.slopes)
+    assert np.abs((quick.value - alone.value) / sigma).max() < 0.04
+    assert np.sqrt(np.diag(quick.covariance)) == pytest.approx(sigma, rel=0.04)
+
+
+def test_a_factor_that_is_no_polynomial_is_left_to_itself():
+    t, s = np.random.default_rng(2).uniform(-1, 1, (2, 90))
+    shapes = np.linalg.qr(np.stack([t**a * s**b for a, b in moments.powers(5)], -1)[None])
+    assert moments._fitted(shapes, (t > 0.13).astype(complex)[None], [np.zeros(1)]) is None
+    degree, table = moments._fitted(shapes, (0.3 + 0.7j * s)[None], [0.2j * t])
+    assert degree == 1
+    assert table[0, :, 0] == pytest.approx([0.3, 0.2j, 0.7j], abs=1e-9)  # 1, t, s
