@@ -8,6 +8,11 @@ import numpy as np
 from metalens.cell import Cell, Light, index
 from metalens.ground.errors import CellError
 
+LEAST_CONTRAST = 2.0  # of permittivities, of a pillar that is told from its surroundings
+LOW, TALL = 0.5, 16.0  # heights in half pitches
+DENSE, ORDERS = 2.0, 1.05  # waves in a pitch, in the layer and in the half-spaces
+STEEP_RAD = 1.0  # half Bloch phase
+RARER = 2.5
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 
 
@@ -28,6 +33,29 @@ class Case:
     around: complex
     bloch: float
     p: bool
+
+    @property
+    def strange(self) -> float:
+        """How unlike the cells of lenses it is.
+
+        0 for a pillar of the denser medium, lower than eight pitches and higher than a quarter of one, at most two
+        waves in a pitch, no order but zero at normal incidence, moderate angles; ``RARER`` for a disc of the rarer
+        medium; else 1.
+
+        Forms on a coarse mesh err more alike there.
+        """
+        disc, around = abs(self.disc), abs(self.around)
+        waves = math.sqrt(max(disc, around)), math.sqrt(max(self.below, self.above))
+        if disc < around:
+            return RARER
+        usual = (
+            (disc >= LEAST_CONTRAST * around or self.disc.imag > disc / 2)
+            and LOW <= self.height <= TALL
+            and self.k0 * waves[0] <= DENSE * math.pi
+            and self.k0 * waves[1] <= ORDERS * math.pi
+            and self.bloch <= STEEP_RAD
+        )
+        return 0.0 if usual else 1.0
 
 
 def film(case: Case) -> np.ndarray:

@@ -37,8 +37,8 @@ class Solution:
     matrix: (2, 2) zero-order scattering matrix, mean of both forms. spread: how far the forms are apart, half the
     difference. drift: change of the matrix per relative error of the transverse wavenumbers squared of the layer
     modes, which both forms share. grazing: change of the matrix for what the mesh misplaces cutoffs. bloch: half
-    the Bloch phase. size: wavelengths in a pitch, in the densest medium. energy: mean of both forms.
-    unknowns: of both forms.
+    the Bloch phase. size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``. energy: mean of
+    both forms. unknowns: of both forms.
     """
 
     matrix: np.ndarray
@@ -49,6 +49,7 @@ class Solution:
     grazing: float = 0.0
     bloch: float = 0.0
     size: float = 0.0
+    strange: float = 0.0
 
 
 @lru_cache(maxsize=4)
@@ -198,6 +199,7 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         grazing=max(first.grazing, second.grazing),
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
+        strange=case.strange,
     )
 
 

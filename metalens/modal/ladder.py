@@ -7,6 +7,7 @@ finer meshes; the solution knows how much it moves for it (``drift``). One guide
 may have the same wavenumber in both forms, by accident, and be wrong in both: there the difference says nothing and
 ``Choice.middle`` counts. The factors were calibrated on some seven hundred pillars (index 1.8 to 4, with and without
 absorption, up to 20 degrees, 5 to 98 % of the pitch; drawn at cutoffs and resonances, nearly touching, thin, tall)
+and some three hundred of any kind (``Case.strange``: steep light, many orders, low steps, discs of the rarer medium)
 against finer meshes; a slow test and the benchmark ``hard_cells`` hold them against pillars drawn anew. Where an order
 is near its cutoff both forms err alike, so that more than their difference is told; around a thin disc they err apart,
 and less than half of it is. On degree 5 the mean of both forms errs by a tenth of half their difference or less, at
@@ -23,8 +24,8 @@ from metalens.modal.mesh import MeshPlan
 class Choice:
     """A mesh for discs up to ``up_to`` pitches wide, and the relative error of transverse wavenumbers squared that
     both forms share on it: ``thin + wide * rho**4``, ``middle`` more for discs that are not thin, whose one guided
-    wave the forms may place alike, and ``oblique`` more off normal incidence (sharp resonances). safety, at_cutoff: in
-    place of those of the rung, where the mean of both forms is that much better than their difference."""
+    wave the forms may place alike, and ``oblique`` more off normal incidence (sharp resonances). safety, at_cutoff,
+    strange: in place of those of the rung, where the mean of both forms is that much better than their difference."""
 
     plan: MeshPlan
     up_to: float
@@ -34,6 +35,7 @@ class Choice:
     middle: float = 0.0
     safety: float | None = None
     at_cutoff: float | None = None
+    strange: float | None = None
 
     def shared(self, rho: float, bloch: float) -> float:
         """The error shared by both forms at this diameter in pitches and half Bloch phase."""
@@ -45,7 +47,8 @@ class Rung:
     """Meshes of one accuracy, thinnest disc first.
 
     safety: factor on half the difference of the forms. usual: the estimate that most pillars end with.
-    at_cutoff, thin: that factor where an order is near its cutoff, and for discs thinner than ``THIN`` pitches.
+    at_cutoff, thin, strange: that factor where an order is near its cutoff, for discs thinner than ``THIN`` pitches,
+    and for cells unlike those of lenses.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Rung:
     usual: float
     at_cutoff: float = 2.6
     thin: float = 0.35
+    strange: float = 2.5
 
     @property
     def weak(self) -> float:
@@ -80,8 +84,11 @@ class Rung:
             safety, shared = safety * GAP, shared * GAP / 2
         if found.grazing:
             safety = max(safety, self.at_cutoff if own.at_cutoff is None else own.at_cutoff)
-        elif rho < THIN:
+        elif TINY <= rho < THIN and not found.strange:
             safety, shared = min(safety, self.thin), shared * SMALL
+        if found.strange:
+            at_least = self.strange if own.strange is None else own.strange
+            safety, shared = max(safety, found.strange * at_least), shared * STRANGE
         return safety * found.spread + shared * found.drift + GRAZING * found.grazing + UNSEEN * self.usual + 1e-12
 
 
@@ -113,12 +120,19 @@ class Measured(Protocol):
         """Wavelengths in a pitch, in the densest medium of the layer."""
         ...
 
+    @property
+    def strange(self) -> float:
+        """How unlike the cells of lenses it is, 0 for these; see ``case.Case``."""
+        ...
+
 
 NARROW, GAP = 0.9, 3.0  # from this diameter in pitches, the safety factor times this, the shared error times its half
 SIZE, STEEP = 2.0, 6  # above so many waves in a pitch the shared error rises as their sixth power: what polynomials of
 # degree p get wrong of a wave goes as the 2 p-th power of its elements, and 3 is the least degree
 MIDDLE = 0.3  # above this diameter in pitches, ``Choice.middle`` counts
 THIN, SMALL = 0.25, 0.2  # below this diameter in pitches the forms err mostly apart; share of the shared error
+TINY = 0.03  # in pitches: thinner ones are too thin for that
+STRANGE = 5.0  # times the shared error, for cells unlike those of lenses
 GRAZING = 0.15  # of the change that exact cutoffs make: it bounds nothing by itself, but the forms err alike there
 UNSEEN = 0.02  # of the usual estimate: plane waves in a layer without contrast err a little that nothing shows
 BOTH = (0.7, 1.3)
@@ -132,34 +146,37 @@ RUNGS = (
     Rung(
         "coarse",
         (
-            Choice(MeshPlan(3, 3, 2, STEEPER, core=0.45), 0.7, 6e-6, 3e-5, oblique=1e-5, middle=3.5e-5),
-            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 4e-5, 7e-5, oblique=2.5e-5),
+            Choice(MeshPlan(3, 3, 2, STEEPER, core=0.45), 0.7, 6e-6, 3e-5, oblique=2e-4, middle=3.5e-5),
+            Choice(MeshPlan(3, 4, 2, STEEPER, core=0.55), 1.0, 4e-5, 7e-5, oblique=5e-5),
         ),
         1.2,
         2e-3,
         at_cutoff=4.6,
-        thin=0.3,
+        thin=0.7,
+        strange=7.0,
     ),
     Rung(
         "fair",
         (
-            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 3e-6, 5e-6, oblique=3e-6, middle=1.5e-5),
+            Choice(MeshPlan(3, 4, 3, STEEPER, core=0.6), 0.7, 3e-6, 5e-6, oblique=1e-5, middle=1.5e-5),
             Choice(MeshPlan(4, 4, 3, STEEPER, core=0.55), 1.0, 0.0, 5e-5, oblique=1e-5),
         ),
         1.2,
         4e-4,
         at_cutoff=4.6,
-        thin=0.5,
+        thin=0.6,
+        strange=7.0,
     ),
     Rung(
         "even",
         (
-            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 1e-6, 1.5e-5, oblique=2e-6, middle=2e-6),
-            Choice(GOOD, NARROW, 1.5e-7, oblique=3e-7, safety=0.3, at_cutoff=1.0),
-            Choice(GOOD, 1.0, 1.5e-7, oblique=3e-7),
+            Choice(MeshPlan(4, 4, 4, BOTH), 0.7, 1e-6, 1.5e-5, oblique=4e-6, middle=2e-6),
+            Choice(GOOD, NARROW, 1.5e-7, oblique=3e-7, safety=0.3, at_cutoff=1.0, strange=3.0),
+            Choice(GOOD, 1.0, 1.5e-7, oblique=3e-7, strange=3.0),
         ),
         0.6,
         2.5e-4,
+        strange=9.0,
     ),
     Rung(
         "good",
@@ -170,6 +187,7 @@ RUNGS = (
         ),
         0.6,
         1e-4,
+        strange=3.0,
     ),
     Rung("fine", (Choice(FINE, 1.0, 5e-8, oblique=3e-7),), 0.5, 2.5e-5),
     Rung("finer", (Choice(FINER, 1.0, 2e-8, oblique=1e-7),), 0.4, 8e-6),

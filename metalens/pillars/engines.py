@@ -36,11 +36,13 @@ def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Calla
 def smooth(
     cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str
 ) -> Callable[[float], Response]:
-    """As :func:`precise`, on one discretisation for all diameters of ``span_um``.
+    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so far as it goes.
 
     It is the least that meets the tolerance at three probes, which a curve over the span solves anyhow: answers are
-    remembered. Elsewhere the error may exceed the tolerance (it is
-    reported), but it has no jumps that a rational fit would take for resonances.
+    remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is reported), but it has no jumps that
+    a rational fit would take for resonances. Meshes of the modal method need meet it at two of the probes: beside a
+    resonance, where the error is many times that elsewhere, the next mesh takes over. The jump there is the true error
+    of the coarser mesh, some tenth of its bar.
     """
     as_built = engine == "modal" and (cell.under or cell.over or cell.sidewall_rad)
     if cell.height_um == 0 or as_built:
@@ -48,10 +50,27 @@ def smooth(
     make = _modal_levels if engine == "modal" else _rcwa_levels
     levels = [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
     probes = np.array(starts(*span_um))[PROBES].tolist()
-    for at in levels[:-1]:
-        if all(at(d).converged for d in probes):
-            return at
+    allowed = 1 if engine == "modal" else 0
+    for place, at in enumerate(levels[:-1]):
+        if _failing(at, probes, allowed) <= allowed:
+            return functools.partial(_met, at, levels[place + 1]) if engine == "modal" else at
     return levels[-1]
+
+
+def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:
+    """How many probes miss the tolerance, counted no further than one more than are allowed."""
+    failing = 0
+    for diameter_um in probes:
+        failing += not at(diameter_um).converged
+        if failing > allowed:
+            break
+    return failing
+
+
+def _met(coarse: Callable[[float], Response], fine: Callable[[float], Response], diameter_um: float) -> Response:
+    """Of the coarse mesh where it meets the tolerance at this diameter, else of the better one."""
+    found = coarse(diameter_um)
+    return found if found.converged else min(found, fine(diameter_um), key=lambda made: made.t_error)
 
 
 def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:

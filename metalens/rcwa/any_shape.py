@@ -35,7 +35,7 @@ class Jones:
     basis: ("x", "y") at normal incidence, ("s", "p") else: s across the plane of incidence, p in it.
     t, r: (2, 2); column: polarisation that comes, row: that leaves. (For r, p is taken along the same tangential
         direction as that of the light that comes.)
-    t_error: estimate of the largest |t - exact|, not below the true error; it serves for r as well.
+    t_error: estimate of the largest |t - exact| and |r - exact|, not below the true error.
     energy: (2,) power of all propagating orders, for each polarisation that comes.
     orders: harmonics of the finest truncation. converged, reason: whether the tolerance is met, and why it ended.
     earlier: (k, 2, 2) t of the up to four truncations before. A number that follows from t has as error bar, like t
@@ -112,18 +112,18 @@ def jones(
     first = _FIRST if harmonics is None else max(1, harmonics - _COMPARED)
     stages, cut = 0, 0.0
     if cell.sidewall_rad:
-        stages, cut = wall.enough(lambda count: _truncated(problem, min(last, _COARSE), count).t, tolerance)
+        stages, cut = wall.enough(lambda count: _both(_truncated(problem, min(last, _COARSE), count)), tolerance)
     history: list[Array] = []
     for reach in range(first, last + 1):
         found = _truncated(problem, reach, stages)
-        history.append(found.t)
+        history.append(_both(found))
         error = _moved(history, reach) + cut
         if len(history) > _COMPARED and error <= tolerance:
             break
     error = min(error, 2.0)
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    earlier = np.array(history[-1 - _COMPARED : -1]).reshape(-1, 2, 2)
+    earlier = np.array([both[0] for both in history[-1 - _COMPARED : -1]]).reshape(-1, 2, 2)
     return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
 
 
@@ -136,10 +136,15 @@ def _tangent(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> _Tan
     return _Tangent(kx, ky, flat, wavelength_um)
 
 
+def _both(found: Jones) -> Array:
+    """(2, 2, 2) t and r."""
+    return np.stack([found.t, found.r])
+
+
 def _moved(history: list[Array], reach: int) -> float:
     """Error of the last truncation: :func:`metalens.rcwa.solver.safety` times the farthest of the four before it."""
     before = history[-1 - _COMPARED : -1]
-    farthest = max((float(np.abs(history[-1] - t).max()) for t in before), default=1.0)
+    farthest = max((float(np.abs(history[-1] - both).max()) for both in before), default=1.0)
     return safety(reach) * farthest + _ROUNDING
 
 

@@ -92,16 +92,17 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
             break
         wide = diameter_um[left]
         found = truncated(this, wide, reach, stages)
-        history.append(found.t)
+        history.append(np.stack([found.t, found.r]))
         if len(history) <= _COMPARED and reach != ladder[-1]:
             continue
-        error = np.minimum(_blur(this, wide, reach, found.t - empty.t, _estimate(np.array(history), reach)) + cut, 2.0)
+        change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
+        error = np.minimum(_blur(this, wide, reach, change, _estimate(np.array(history), reach)) + cut, 2.0)
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
         found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
         for row, place in enumerate(chosen):
             done[int(left[place])] = _response(found, row, reach, float(error[place]), tolerance)
-        history = [t[~settled] for t in history]
+        history = [both[:, ~settled] for both in history]
         left = left[~settled]
     return [done[i] for i in range(len(diameter_um))]
 
@@ -126,7 +127,7 @@ def safety(reach: int) -> float:
 
 
 def _estimate(t: Array, reach: int) -> Array:
-    """Error of the last of the results t (rungs, d): some times the farthest of the four truncations before it.
+    """Error of the last of the results, t and r (rungs, 2, d): some times the farthest of the four truncations before.
 
     Truncation errors fall as reach^-2 and swing with the number of orders that fit across the disc; a swing takes up
     to four rungs. For 52 diameters in three cells at 8 to 16 orders, and for 86 random cells (pitch, height, index,
@@ -136,20 +137,25 @@ def _estimate(t: Array, reach: int) -> Array:
     :func:`safety`: 6 at 8 orders, 3 from 13 on.
     """
     if len(t) < 2:
-        return np.full(t.shape[1], np.inf)
-    return np.asarray(safety(reach) * np.abs(t[-1] - t[-1 - _COMPARED : -1]).max(axis=0) + _ROUNDING)
+        return np.full(t.shape[2], np.inf)
+    return np.asarray(safety(reach) * np.abs(t[-1] - t[-1 - _COMPARED : -1]).max(axis=(0, 1)) + _ROUNDING)
 
 
 def _blur(this: Case, diameter_um: Array, reach: int, change: Array, error: Array) -> Array:
     """Where the orders do not resolve the pillar, none of its effect (d,) is believed."""
-    return np.where(reach * diameter_um < this.cell.pitch_um, np.maximum(error, np.abs(change)), error)
+    return np.where(reach * diameter_um < this.cell.pitch_um, np.maximum(error, change), error)
 
 
 def wall_stages(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
     """Stages of a tilted wall and the error they leave, the same at all orders; (0, 0) where it is upright."""
     if not (len(diameter_um) and this.cell.sidewall_rad):
         return 0, 0.0
-    return wall.enough(lambda stages: truncated(this, diameter_um, _COARSE, stages).t, tolerance)
+
+    def both(stages: int) -> Array:
+        found = truncated(this, diameter_um, _COARSE, stages)
+        return np.stack([found.t, found.r])
+
+    return wall.enough(both, tolerance)
 
 
 def homogeneous(this: Case, diameter_um: Array) -> Array:

@@ -18,8 +18,8 @@ RUNG = Rung(
 )  # fmt: skip
 
 
-def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0, size=1.3):
-    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch, size=size)
+def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0, size=1.3, strange=0.0):
+    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch, size=size, strange=strange)
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,21 @@ def test_in_a_pitch_of_many_waves_the_shared_error_rises_as_their_sixth_power():
     for size, more in ((2.0, 1.0), (2.5, 1.25**6)):
         want = 1.4 * 0.02 + more * shared * 1.7 + 2e-4
         assert RUNG.error(found(size=size), 0.5) == pytest.approx(want, rel=1e-9)
+
+
+def test_discs_too_thin_to_be_told_are_given_the_whole_difference():
+    for rho, safety, share in ((0.031, 0.45, 0.2), (0.029, 1.4, 1.0)):
+        want = safety * 0.02 + share * (2e-4 + 7e-3 * rho**4) * 1.7 + 2e-4
+        assert RUNG.error(found(), rho) == pytest.approx(want, rel=1e-9)
+
+
+@pytest.mark.parametrize(("strange", "safety"), [(0.5, 1.4), (1.0, 2.5), (2.5, 6.25)])
+def test_cells_unlike_those_of_lenses_have_wider_bars_and_no_discount_for_thin_discs(strange, safety):
+    """Never less than the rung's own factor; the shared error five times."""
+    for rho in (0.2, 0.28):
+        shared = 2e-4 + 7e-3 * rho**4
+        want = safety * 0.02 + 5 * shared * 1.7 + 2e-4
+        assert RUNG.error(found(strange=strange), rho) == pytest.approx(want, rel=1e-9)
 
 
 def test_a_mesh_may_have_factors_of_its_own_in_place_of_those_of_the_rung():

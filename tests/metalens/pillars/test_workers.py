@@ -96,7 +96,7 @@ def test_no_cluster_at_the_address_is_told():
 
 
 def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
-    """A curve pays for its nodes and for the probe that a coarser mesh failed, no more."""
+    """A curve pays for its nodes and for the two probes that a coarser mesh failed, no more."""
     asked = []
 
     def levels(cell, light, largest_um, tolerance):
@@ -112,7 +112,30 @@ def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
     monkeypatch.setattr(engines, "_modal_levels", levels)
     found = workers.work(workers.curve_task(CELL, engines.Light(0.85), (0.07, 0.23), tolerance=1e-3, engine="modal"))
     failed, nodes = [d for name, d in asked if name == "coarse"], [d for name, d in asked if name != "coarse"]
-    assert len(failed) == 1
+    assert len(failed) == 2
     assert len(nodes) == len(set(nodes))
     assert set(nodes) == set(found["diameter_um"])
     assert {name for name, _ in asked} == {"coarse", "fine"}
+
+
+@pytest.mark.parametrize("finer_error", [3e-5, 5e-3])
+def test_beside_a_resonance_alone_the_next_mesh_takes_over(monkeypatch, finer_error):
+    """The largest probe fails on the coarse mesh: from there the finer one counts, where it is the better."""
+    edge, bar = 0.21, 1e-3
+
+    def levels(cell, light, largest_um, tolerance):
+        def coarse(diameter_um):
+            error = bar if diameter_um > edge else 1e-5
+            return Response(0.9 + 0j, 0.1 + 0j, error, 9, 1.0, "modal", error <= tolerance, "coarse")
+
+        def fine(diameter_um):
+            assert diameter_um > edge
+            return Response(0.9 + 0j, 0.1 + 0j, finer_error, 9, 1.0, "modal", finer_error <= tolerance, "fine")
+
+        return [coarse, fine]
+
+    monkeypatch.setattr(engines, "_modal_levels", levels)
+    at = engines.smooth(CELL, engines.Light(0.85), (0.07, 0.23), tolerance=5e-4, engine="modal")
+    assert (at(0.12).reason, at(0.12).t_error) == ("coarse", 1e-5)
+    assert at(0.22).t_error == min(bar, finer_error)
+    assert at(0.22).reason == ("fine" if finer_error < bar else "coarse")
