@@ -226,7 +226,7 @@ def test_hard_touching_pillars_on_a_mesh_of_their_own():
     for solution in (near, nearer):
         s = solution.matrix
         assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
-        assert abs(s[1, 0] - touching.t) < touching.t_error < 4e-2
+        assert abs(s[1, 0] - touching.t) < touching.t_error < 5e-2  # of t and r
     assert abs(near.matrix[1, 0] - nearer.matrix[1, 0]) < 1e-2
 
 

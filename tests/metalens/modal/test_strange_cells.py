@@ -89,7 +89,7 @@ def case(**other):
         ({"disc": 2.5}, 0.0),
         ({"disc": 2.3}, 1.0),
         ({"disc": 1.1}, RARER),
-        ({"disc": -13.0 + 8.0j}, 0.0),  # a metal
+        ({"disc": -6.0 + 4.0j}, 0.0),  # a metal
         ({"around": 9.5}, RARER),
         ({"height": 0.49}, 1.0),
         ({"height": 16.5}, 1.0),
