@@ -11,7 +11,7 @@ class Response:
     time factor exp(-iwt). For films under or over the pillar the planes are the outer faces of the films.
 
     t, r: co-polarised transmission and reflection amplitudes.
-    t_error: estimate of the larger of |t - exact| and |r - exact|, not below the true error.
+    t_error: estimate of the larger of |t - exact| and |r - exact| (``anchored``: of the first), not below it.
     orders: harmonics (RCWA) or degrees of freedom (modal) of the finest solution used.
     energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a defect if lossless).
     engine: ``rcwa``, ``modal``, ``film``, or ``anchored`` (coupled waves put right by the modal method).

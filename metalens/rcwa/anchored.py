@@ -45,7 +45,7 @@ class Anchors:
 @dataclass(frozen=True, eq=False, slots=True)
 class Shift:
     """Solution of (1) at one truncation: polynomial over the nodes, and what it leaves unexplained
-    of t and r, the larger of both, root mean square."""
+    of t, root mean square."""
 
     at: np.polynomial.Polynomial
     left: float
@@ -87,7 +87,7 @@ def solve_anchored(
             continue
         last = np.array(found[-COMPARED:])
         t, r, energy = last.mean(axis=0)
-        apart = np.abs(last[:, :2] - (t, r)).max()
+        apart = np.abs(last[:, 0] - t).max()
         error = float(apart + UNEXPLAINED * np.mean(left[-COMPARED:]) + anchors.error + cut)
         if error <= tolerance:
             break
@@ -124,7 +124,7 @@ def shifted(bare: Case, anchors: Anchors, reach: int) -> Shift:
         slope, missing = (there - here) / STEP_UM, anchors.amplitudes - here
         move = (slope.conj() * missing).sum(axis=1).real / (np.abs(slope) ** 2).sum(axis=1)
         shift = np.clip(shift + move, -MOST_UM, MOST_UM)
-    left = np.abs(anchors.amplitudes - _amplitudes(bare, anchors.diameter_um + shift, reach)).max(axis=1)
+    left = np.abs(anchors.amplitudes - _amplitudes(bare, anchors.diameter_um + shift, reach))[:, 0]
     degree = len(shift) - 1
     at = np.polynomial.Polynomial.fit(anchors.diameter_um, shift, degree) if degree else np.polynomial.Polynomial(shift)
     return Shift(at, float(np.sqrt((left**2).mean())))
