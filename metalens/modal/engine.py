@@ -263,8 +263,8 @@ def solve(
     "p", or "x" or "y" for the field along that axis of the plane of incidence.
     tolerance: of t and r; the mesh is chosen from it and refined until the estimate meets it.
 
-    Accuracy: ``t_error`` holds for r as well where the wall is upright and without films; it comes from the difference of
-        the electric and magnetic forms.
+    Accuracy: ``t_error`` holds for r as well where the wall is upright and without films; it comes from the
+        difference of the electric and magnetic forms.
 
     Raises:
         CellError, MaterialError: see ``case_of``.
