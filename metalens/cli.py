@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.ground import lock
+from metalens.ground import console, lock
 from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -89,10 +89,27 @@ _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
+    _open_streams()
     try:
-        return _main(arguments)
+        status = _main(arguments)
     except KeyboardInterrupt:  # before the verb began
-        return _refuse("interrupted before the work began", INTERRUPTED)
+        status = _refuse("interrupted before the work began", INTERRUPTED)
+    try:
+        console.flush()
+    except MetalensError as error:
+        status = _refuse(str(error))
+    return status
+
+
+def _open_streams() -> None:
+    """Streams that were closed lead nowhere: the next file would take their number, and what libraries say with it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
 
 
 def _main(arguments: Sequence[str] | None) -> int:

@@ -104,6 +104,31 @@ def test_an_interrupt_before_the_work_is_one_line_too(monkeypatch, capsys):
     assert capsys.readouterr().err == "metalens: error: interrupted before the work began\n"
 
 
+WORDS = f"{sys.executable} -m metalens info ."
+
+
+def _made(tmp_path):
+    with transaction.folder(tmp_path / "out") as draft:
+        (draft.path / "a.txt").write_text("first")
+    return tmp_path / "out"
+
+
+@pytest.mark.parametrize(
+    ("streams", "status", "told"),
+    [
+        (">&-", SUCCESS, ""),
+        ("<&- >&- 2>&-", SUCCESS, ""),
+        ("--json >/dev/full", BAD_INPUT, "metalens: error: standard output: No space left on device\n"),
+        ("| true; exit ${PIPESTATUS[0]}", SUCCESS, ""),
+    ],
+)
+def test_a_standard_stream_that_is_closed_full_or_left_is_no_traceback(tmp_path, streams, status, told):
+    """The work goes on where nobody listens; where the words cannot be written that is said."""
+    words = ["bash", "-c", f"{WORDS} {streams}"]
+    done = subprocess.run(words, cwd=_made(tmp_path), capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, told)
+
+
 def test_a_command_in_a_folder_that_was_removed_is_refused(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()

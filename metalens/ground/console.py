@@ -1,13 +1,41 @@
 """What a command shows: results as lines or JSON, progress with rate and ETA on a terminal, plain lines otherwise."""
 
+import contextlib
 import json
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from metalens.ground.errors import OutputError
+
 Item = TypeVar("Item")
+
+
+def flush(text: str = "") -> None:
+    """Write to standard output and flush it; a reader that went away (``| head``) is no failure of the work.
+
+    Raises:
+        OutputError: it cannot be written otherwise, as to a full disk.
+    """
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _silence()
+    except OSError as error:
+        _silence()
+        raise OutputError(f"standard output: {error.strerror}") from error
+
+
+def _silence() -> None:
+    """Standard output leads nowhere from here on, what it still holds included."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with contextlib.suppress(OSError, ValueError):  # one that is no file
+        os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +52,12 @@ class Console:
     def say(self, text: str) -> None:
         """One line for a person."""
         if not (self.quiet or self.json):
-            sys.stdout.write(text + "\n")
-            sys.stdout.flush()
+            flush(text + "\n")
 
     def result(self, values: dict[str, Any], text: str) -> None:
         """The outcome: ``values`` with --json, else ``text``."""
         if self.json:
-            sys.stdout.write(json.dumps(values, indent=1, default=float) + "\n")
+            flush(json.dumps(values, indent=1, default=float) + "\n")
         else:
             self.say(text)
 
