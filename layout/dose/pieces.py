@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.dose.exposure import CLEARS, PointExposure
-from layout.dose.rects import pairs_near, sums_of_boxes
+from layout.dose.rects import CORNER, pairs_near, sums_of_boxes
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
 MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
+_LEAST_STEPS = 2  # grid steps by which a piece is longer than a side that counts as a corner
 _LONGEST = 4.0  # ranges: of a piece at first
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens no longer counts
@@ -53,7 +54,7 @@ def cut(
     Args:
         boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the pillars, um.
         tolerance: of the exposure; the background changes by a fifth of it between middle and end of a side, or
-            the piece is a 64th of the range short.
+            the piece is a 64th of the range short, or as short as a side that is left out as a corner.
 
     Raises:
         ProcessError: more than 500 000 pieces.
@@ -63,7 +64,7 @@ def cut(
         return np.asarray(boxes, np.int64), np.arange(len(boxes))
     around = PointExposure(point.widths_um[wide], point.weights[wide])
     least, core = float(around.widths_um.min()), float(point.widths_um.min())
-    shortest = max(least / _SHORTEST, core / 2) / step_um
+    shortest = max(least / _SHORTEST / step_um, CORNER * core / step_um + _LEAST_STEPS)
     done: list[_Pieces] = []
     open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
     while len(open_.box):

@@ -9,7 +9,7 @@ from metalens.ground.arrays import Array
 
 _OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
 _AT_ONCE = 1_000_000  # pairs
-_CORNER = 4.0  # widths of the core: edges that short are round
+CORNER = 4.0  # widths of the core: edges that short are round
 
 
 def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
@@ -26,7 +26,7 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     same = rects.group[one] == rects.group[two]
     one, two = one[same], two[same]
     starts = np.searchsorted(one, np.arange(count + 1))
-    points, piece = _outer(boxes, starts, two, _CORNER * float(near.widths_um.min(initial=0.0)))
+    points, piece = _outer(boxes, starts, two, CORNER * float(near.widths_um.min(initial=0.0)))
     inner = np.bincount(piece, minlength=count) == 0
     at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
     of = np.concatenate([piece, np.flatnonzero(inner)])
