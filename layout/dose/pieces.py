@@ -17,7 +17,7 @@ MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
 _LEAST_STEPS = 2  # grid steps by which a piece is longer than a side that counts as a corner
-_LONGEST = 4.0  # ranges: of a piece at first
+_LONGEST = 0.5  # ranges: of a piece at first; what stands beside it has other doses, which unit doses do not show
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens no longer counts
 

@@ -117,7 +117,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     plan, content, table = written(process)
     found = survey(content, plan, table, process)
     assert found.ok, (found.worst_exposure, found.worst_nm)
-    assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 30_000
+    assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 40_000
 
 
 @pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
