@@ -17,7 +17,8 @@ MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
 _LEAST_STEPS = 2  # grid steps by which a piece is longer than a side that counts as a corner
-_LONGEST = 0.5  # ranges: of a piece at first; what stands beside it has other doses, which unit doses do not show
+_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece at first, the first that takes few: others' doses differ beside it
+_FEW_PIECES = 100_000
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens no longer counts
 
@@ -65,35 +66,55 @@ def cut(
     around = PointExposure(point.widths_um[wide], point.weights[wide])
     least, core = float(around.widths_um.min()), float(point.widths_um.min())
     shortest = max(least / _SHORTEST / step_um, CORNER * core / step_um + _LEAST_STEPS)
+    change = _SHARE * tolerance * CLEARS
+    for ranges in _LONGEST:
+        most = MOST_PIECES if ranges == _LONGEST[-1] else min(_FEW_PIECES, MOST_PIECES)
+        every = _halved(boxes, lattices, step_um, around, (shortest, ranges * least, change), most=most)
+        if every is not None:
+            order = np.argsort(every.of, kind="stable")
+            return every.box[order], every.of[order]
+    raise ProcessError(
+        f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
+        f"backscatter ranges {least:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
+    )
+
+
+def _halved(
+    boxes: Array,
+    lattices: Array,
+    step_um: float,
+    around: PointExposure,
+    limits: tuple[float, float, float],
+    *,
+    most: int,
+) -> _Pieces | None:
+    """Boxes halved until they keep the limits: shortest side in grid steps, longest in um, change of the background;
+    None where that takes more than ``most``.
+    """
+    shortest, longest_um, least_change = limits
     done: list[_Pieces] = []
     open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
     while len(open_.box):
-        count = len(open_.box) + sum(len(p.box) for p in done)
-        if count > MOST_PIECES:
-            raise ProcessError(
-                f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
-                f"backscatter ranges {least:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
-            )
-        longest = _longest(open_, lattices, step_um, around)
-        change = _change(open_, boxes, step_um, around) / (_SHARE * tolerance * CLEARS)
+        if len(open_.box) + sum(len(p.box) for p in done) > most:
+            return None
+        longest = _longest(open_, lattices, step_um, around, longest_um)
+        change = _change(open_, boxes, step_um, around) / least_change
         side = open_.box[:, 2:] - open_.box[:, :2]
         split = (side >= 2 * shortest) & ((side > longest[:, None] / step_um) | (change > 1))
         across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))  # the longer side where both need it
         done.append(open_.some(np.asarray(~split.any(1))))
         open_ = _joined([open_.some(across[:, 0]).halved(0), open_.some(across[:, 1] & ~across[:, 0]).halved(1)])
-    every = _joined(done)
-    order = np.argsort(every.of, kind="stable")
-    return every.box[order], every.of[order]
+    return _joined(done)
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
     return _Pieces(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("box", "outer", "of")))
 
 
-def _longest(pieces: _Pieces, lattices: Array, step_um: float, around: PointExposure) -> Array:
-    """(n,) largest side, um."""
+def _longest(pieces: _Pieces, lattices: Array, step_um: float, around: PointExposure, most_um: float) -> Array:
+    """(n,) largest side, um: ``most_um``, less beside a lens."""
     box = pieces.box * step_um
-    out = np.full(len(box), _LONGEST * float(around.widths_um.min()))
+    out = np.full(len(box), most_um)
     for width in np.sort(around.widths_um)[::-1].tolist():
         for left, bottom, right, top in np.asarray(lattices, float).tolist():
             x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)
