@@ -15,7 +15,7 @@ from metalens.rcwa import made, mirrors, pattern, wall
 from metalens.rcwa.conditions import direction
 from metalens.rcwa.made import check_size
 from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
-from metalens.rcwa.solver import safety
+from metalens.rcwa.solver import crowding, safety
 from metalens.rcwa.stack import Media, respond
 from metalens.rcwa.waves import Waves
 
@@ -113,11 +113,12 @@ def jones(
     stages, cut = 0, 0.0
     if cell.sidewall_rad:
         stages, cut = wall.enough(lambda count: _both(_truncated(problem, min(last, _COARSE), count)), tolerance)
+    crowded = float(crowding(cell.gap_um(size_um), cell.pitch_um))
     history: list[Array] = []
     for reach in range(first, last + 1):
         found = _truncated(problem, reach, stages)
         history.append(_both(found))
-        error = _moved(history, reach) + cut
+        error = crowded * _moved(history, reach) + cut
         if len(history) > _COMPARED and error <= tolerance:
             break
     error = min(error, 2.0)

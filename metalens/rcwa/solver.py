@@ -96,7 +96,8 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
         if len(history) <= _COMPARED and reach != ladder[-1]:
             continue
         change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
-        error = np.minimum(_blur(this, wide, reach, change, _estimate(np.array(history), reach)) + cut, 2.0)
+        estimate = crowding(this.cell.pitch_um - wide, this.cell.pitch_um) * _estimate(np.array(history), reach)
+        error = np.minimum(_blur(this, wide, reach, change, estimate) + cut, 2.0)
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
         found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
@@ -112,6 +113,7 @@ _LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
 _COMPARED = 4
 _SAFETY = 3.0  # from _ENOUGH orders on
 _MORE, _ENOUGH = 0.6, 13  # and so much more for each order below
+_CUSPS, _CROWDED = 5.0, 0.02  # more for pillars that touch, and the share of the pitch below which gaps count
 _COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
@@ -124,6 +126,15 @@ def _ladder(this: Case, harmonics: int | None) -> range:
 def safety(reach: int) -> float:
     """How many times the farthest of the four truncations before an error may be, at this many orders."""
     return _SAFETY + _MORE * max(0, _ENOUGH - reach)
+
+
+def crowding(gap_um: float | Array, pitch_um: float) -> Array:
+    """Factor on :func:`safety` for pillars that all but touch: fields between them are seen late by any order.
+
+    Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest truncation. The factor is 1 from a
+    fiftieth of the pitch on.
+    """
+    return np.asarray(1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (_CROWDED * pitch_um), 0, 1))
 
 
 def _estimate(t: Array, reach: int) -> Array:

@@ -31,6 +31,11 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
     assert any_shape._moved(both[:1], 9) == pytest.approx(5.4)
 
 
+@pytest.mark.parametrize(("gap_um", "times"), [(0.0, 6.0), (0.0019, 4.75), (0.0057, 2.25), (0.0076, 1.0), (0.1, 1.0)])
+def test_pillars_that_all_but_touch_are_trusted_less(gap_um, times):
+    assert solver.crowding(gap_um, 0.38) == pytest.approx(times, rel=1e-12)  # 1 + 5 (1 - 50 gap / pitch)
+
+
 def test_pillars_between_the_orders_are_not_believed():
     """Ten orders on 0.4 um resolve 0.04 um: below, the whole effect is in doubt, where that is more than the error."""
     this = SimpleNamespace(cell=CELL)
