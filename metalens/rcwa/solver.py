@@ -131,8 +131,8 @@ def safety(reach: int) -> float:
 def crowding(gap_um: float | Array, pitch_um: float) -> Array:
     """Factor on :func:`safety` for pillars that all but touch: fields between them are seen late by any order.
 
-    Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest truncation. The factor is 1 from a
-    fiftieth of the pitch on.
+    Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest truncation. The factor is 1
+    from a fiftieth of the pitch on.
     """
     return np.asarray(1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (_CROWDED * pitch_um), 0, 1))
 

@@ -21,11 +21,14 @@ def test_few_orders_are_trusted_less(reach, times):
 
 
 def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what_is_trusted():
-    """Two diameters; the first of six truncations, farther than all, is no longer looked at."""
+    """t of two diameters, r that tells more of the first; the first of six truncations is no longer looked at."""
     t = np.array([[9.0, 9j], [0.51, 0.3j], [0.55, 0.35j], [0.52, 0.33j], [0.5, 0.32j], [0.53, 0.31j]])
     apart = [max(0.02, 0.02, 0.01, 0.03), max(0.01, 0.04, 0.02, 0.01)]
-    assert solver._estimate(t, 9) == pytest.approx(5.4 * np.array(apart), rel=1e-9)
-    assert np.isinf(solver._estimate(t[:1], 9)).all()
+    r = np.array([[9j, 9.0], [0.2, 0.1], [0.2, 0.1], [0.25j, 0.1], [0.2, 0.1], [0.2, 0.11]])
+    apart[0] = math.hypot(0.2, 0.25)
+    amplitudes = np.stack([t, r], 1)
+    assert solver._estimate(amplitudes, 9) == pytest.approx(5.4 * np.array(apart), rel=1e-9)
+    assert np.isinf(solver._estimate(amplitudes[:1], 9)).all()
     both = [np.array([[a, 0.1], [0.2j, b]]) for a, b in t]
     assert any_shape._moved(both, 9) == pytest.approx(5.4 * 0.04, rel=1e-9)
     assert any_shape._moved(both[:1], 9) == pytest.approx(5.4)
@@ -39,7 +42,7 @@ def test_pillars_that_all_but_touch_are_trusted_less(gap_um, times):
 def test_pillars_between_the_orders_are_not_believed():
     """Ten orders on 0.4 um resolve 0.04 um: below, the whole effect is in doubt, where that is more than the error."""
     this = SimpleNamespace(cell=CELL)
-    wide, change = np.array([0.039, 0.039, 0.041]), np.array([0.2j, -0.004, 0.2])
+    wide, change = np.array([0.039, 0.039, 0.041]), np.array([0.2, 0.004, 0.2])
     error = np.array([0.01, 0.013, 0.01])
     assert solver._blur(this, wide, 10, change, error) == pytest.approx([0.2, 0.013, 0.01])
 
