@@ -107,7 +107,13 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
 
     monkeypatch.setattr(engine, "spectral", spectral)
     monkeypatch.setattr(engine, "psfs_used", psfs_used)
+
+    def unpolarised(optics, waves, window, at):
+        seen.update(turned=at)
+        return 0.0031
+
     monkeypatch.setattr(engine, "neglected", neglected)
+    monkeypatch.setattr(engine, "unpolarised", unpolarised)
     monkeypatch.setattr(engine, "sampling", lambda optics, window, wave: SimpleNamespace(beyond=0.05 * wave))
     grid = Grid((31, 44), 2.0, (3e3, 9e3), window=7)
     parts = engine._held_out(OPTICS, SimpleNamespace(plan=PLAN, grid=grid))
@@ -125,6 +131,8 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert parts["outside"] == pytest.approx(1 - float(passed.mean()), rel=1e-9)
     assert parts["spectrum"] == 0.004
     assert parts["transform"] == 0.017
+    assert parts["polarisation"] == 0.0031
+    assert seen["turned"][0].numpy() == pytest.approx(seen["at"].numpy()[: engine.TURNED])
     assert parts["edge"] == pytest.approx(0.05 * 0.82 / 2)
     few, depths = seen["few"]
     assert few.numpy() == pytest.approx(seen["at"].numpy()[:5])

@@ -10,7 +10,7 @@ from metalens.modal import engine, match
 from metalens.modal.engine import Form
 
 RNG = np.random.default_rng(77)
-CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42)
+CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42, strange=2.5)
 
 
 def matrix(scale=1.0):
@@ -35,7 +35,7 @@ def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_ne
     drift = sum(np.abs(by_q[k]) * abs(dense - q[k] ** 2) / (2 * abs(q[k])) for k in (0, 1))
     assert found.drift == pytest.approx(drift.max(), rel=1e-12)
     assert found.energy == pytest.approx(0.95)
-    assert (found.unknowns, found.grazing, found.bloch) == (440, 0.011, 0.31)
+    assert (found.unknowns, found.grazing, found.bloch, found.strange) == (440, 0.011, 0.31, 2.5)
     assert found.size == pytest.approx(1.7 * math.sqrt(abs(9.0 + 0.2j)) / math.pi, rel=1e-12)
     mean = (first.matrix + second.matrix) / 2
     assert np.abs(found.matrix - mean).max() < 0.05 * np.abs(first.matrix - second.matrix).max()  # second order
