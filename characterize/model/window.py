@@ -6,6 +6,7 @@ window's samples by the weights of least error over the band: as in any prolate 
 their number (Slepian and Pollak 1961; Knab 1979).
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -163,8 +164,7 @@ def ways(
     ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
     by_distance = 1j * k * (ends[0] - ends[1]) / (2 * step_um) * value
     by_wave = -1j * turn * k / (2 * np.pi) * value  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
-    carrier = [np.exp(1j * k * by(middle, places)) for places in (at_um, coarse)]
-    return coarse, Ways(value, carrier[0][:, None] * weights * carrier[1].conj(), by_wave, by_distance)
+    return coarse, Ways(value, _carried(weights, functools.partial(by, middle), at_um, coarse, k), by_wave, by_distance)
 
 
 def turned(
@@ -177,20 +177,29 @@ def turned(
     plain interpolation is (``a`` = 0).
     """
     taps = min(_TURNED, len(coarse_um))
-    step = coarse_um[1] - coarse_um[0]
-    first = np.clip(np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1, 0, len(coarse_um) - taps)
-    index = first[:, None] + np.arange(taps)
+    index, apart = _nearby(at_um, coarse_um, band, taps)
     t, share = np.polynomial.legendre.leggauss(taps + 40)
     wave = np.exp(1j * band * t * (at_um[:, None] - coarse_um[index])[..., None])  # fine, taps, t
-    apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
     seen = np.stack([wave @ (share / 2 * t**a) for a in range(degree + 1)])
     found = np.linalg.solve(apart + 1e-12 * np.eye(taps), seen.reshape(-1, taps).T).T.reshape(seen.shape)
     out = np.zeros((degree + 1, len(at_um), len(coarse_um)), complex)
     for weights, row in zip(found, out, strict=True):
         np.put_along_axis(row, index, weights, 1)
-    middle = (nodes[0] + nodes[-1]) / 2
-    carrier = [np.exp(1j * k * by(middle, places)) for places in (at_um, coarse_um)]
-    return np.asarray(carrier[0][:, None] * out * carrier[1].conj())
+    return _carried(out, functools.partial(by, (nodes[0] + nodes[-1]) / 2), at_um, coarse_um, k)
+
+
+def _carried(weights: Array, path: Callable[[Array], Array], at_um: Array, coarse_um: Array, k: float) -> Array:
+    """(..., fine, coarse) weights for fields that turn about ``path``, that of their middle direction."""
+    fine, coarse = (np.exp(1j * k * path(places)) for places in (at_um, coarse_um))
+    return np.asarray(fine[:, None] * weights * coarse.conj())
+
+
+def _nearby(at_um: Array, coarse_um: Array, band: float, taps: int) -> tuple[Array, Array]:
+    """(fine, taps) nearest coarse samples of every place, and what each of them tells of another: (taps, taps)."""
+    step = coarse_um[1] - coarse_um[0]
+    first = np.clip(np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1, 0, len(coarse_um) - taps)
+    apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
+    return first[:, None] + np.arange(taps), apart
 
 
 def _resampled(at_um: Array, band: float, tolerance: float) -> tuple[Array, Array]:
@@ -212,10 +221,7 @@ def _resampled(at_um: Array, band: float, tolerance: float) -> tuple[Array, Arra
 
 def _weights(at_um: Array, coarse_um: Array, band: float, taps: int) -> tuple[Array, float]:
     """(fine, coarse) weights of the nearest ``taps`` samples, least squares over an evenly filled band; rms error."""
-    step = coarse_um[1] - coarse_um[0]
-    first = np.clip(np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1, 0, len(coarse_um) - taps)
-    index = first[:, None] + np.arange(taps)
-    apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
+    index, apart = _nearby(at_um, coarse_um, band, taps)
     seen = np.sinc(band / np.pi * (at_um[:, None] - coarse_um[index]))
     found = np.linalg.solve(apart + 1e-14 * np.eye(taps), seen.T).T
     missed = 1 - 2 * (found * seen).sum(1) + np.einsum("ni,ij,nj->n", found, apart, found)

@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -205,19 +204,27 @@ def polarised(
     if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= tolerance):
         return window
     tried = [replace(window, components=count) for count in range(1, ALL + 1)]
-    return next(one for one in tried if unpolarised(optics, waves, one, at) <= tolerance * SHARES["polarisation"])
+    whole, least = _of_sum_one(optics, waves, tried[-1], at), tolerance * SHARES["polarisation"]
+    return next(one for one in tried if unpolarised(optics, waves, one, at, whole) <= least)
 
 
-def unpolarised(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+def unpolarised(
+    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], whole: Tensor | None = None
+) -> float:
     """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
-    (field points, depths) against those of all components."""
-    about: dict[str, Any] = {"depths_um": at[1], "wavelength_um": float(waves.wavelengths_um[0])}
+    (field points, depths) against those of all components, ``whole`` where they are known."""
+    if window.components == ALL:
+        return 0.0
+    few = _of_sum_one(optics, waves, window, at)
+    whole = _of_sum_one(optics, waves, replace(window, components=ALL), at) if whole is None else whole
+    return float((relative(few, whole) ** 2).mean().sqrt())
+
+
+def _of_sum_one(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> Tensor:
+    """PSFs of the first wavelength at (field points, depths)."""
     with torch.no_grad():
-        few, whole = (
-            light / light.sum((-1, -2), keepdim=True)
-            for light in (psfs(optics, at[0], window=one, **about) for one in (window, replace(window, components=ALL)))
-        )
-    return 0.0 if window.components == ALL else float((relative(few, whole) ** 2).mean().sqrt())
+        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=float(waves.wavelengths_um[0]), window=window)
+        return light / light.sum((-1, -2), keepdim=True)
 
 
 def width(psfs: Tensor) -> float:

@@ -29,6 +29,11 @@ class Truncated:
     r: Array
     energy: Array
 
+    @property
+    def both(self) -> Array:
+        """(2, d) t and r."""
+        return np.stack([self.t, self.r])
+
 
 def truncated(
     this: Case, diameter_um: Array, harmonics: int, stages: int = 0, *, moved: Moved | None = None
@@ -92,7 +97,7 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
             break
         wide = diameter_um[left]
         found = truncated(this, wide, reach, stages)
-        history.append(np.stack([found.t, found.r]))
+        history.append(found.both)
         if len(history) <= _COMPARED and reach != ladder[-1]:
             continue
         change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
@@ -161,12 +166,7 @@ def wall_stages(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, 
     """Stages of a tilted wall and the error they leave, the same at all orders; (0, 0) where it is upright."""
     if not (len(diameter_um) and this.cell.sidewall_rad):
         return 0, 0.0
-
-    def both(stages: int) -> Array:
-        found = truncated(this, diameter_um, _COARSE, stages)
-        return np.stack([found.t, found.r])
-
-    return wall.enough(both, tolerance)
+    return wall.enough(lambda stages: truncated(this, diameter_um, _COARSE, stages).both, tolerance)
 
 
 def homogeneous(this: Case, diameter_um: Array) -> Array:
