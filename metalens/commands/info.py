@@ -17,9 +17,8 @@ from metalens.ground.errors import StoreError
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
 _HDF5 = b"\x89HDF"  # first bytes
-TOLD: dict[
-    str, str
-] = {}  # kind of file: module of a package above with ``told`` and ``text``, filled by the command line
+# kind of file: module of a package above with ``told`` and ``text``, filled by the command line
+TOLD: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
