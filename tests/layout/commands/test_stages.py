@@ -12,22 +12,24 @@ from layout.process import noticed
 
 def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
     said, heard = [], threading.Event()
+    lens = plan.lattices[0]
+    share = f"{100 * 9 / lens.rows:.0f} % of the rows"
 
     def say(text):
         said.append(text)
-        heard.set()
+        if share in text:
+            heard.set()
 
-    stages = Stages(say, first_s=0.02, next_s=60.0)
+    stages = Stages(say, first_s=0.02, next_s=0.02)
     watched = stages.rows.watched(plan)
-    lens = plan.lattices[0]
     with stages("write"):
         assert np.array_equal(watched.lattices[0].source(0, 9), lens.source(0, 9))
-        assert heard.wait(10)
-    assert said[0].startswith("write: ")
-    assert f"{100 * 9 / lens.rows:.0f} % of the rows" in said[0]
-    with Stages(said.append)("short"):
+        assert heard.wait(60)  # lines from before the rows were taken may come first, without a share
+    assert all(line.startswith("write: ") for line in said)
+    count = len(said)
+    with Stages(said.append, first_s=60.0)("short"):
         pass
-    assert len(said) == 1
+    assert len(said) == count
     assert set(stages.seconds) == {"write"}
 
 
