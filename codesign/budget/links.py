@@ -85,7 +85,7 @@ def _optics(about: Bench) -> Iterator[Entry]:
         yield about.entry("glass", bare, f"{len(films)} films of the lens file taken away")
     else:
         yield Entry("glass", NONE, 0.0, 0.0, "the lens file holds no film")
-    said = "Ex, Ey, Ez of both polarisations in place of one scalar"
+    said = "flux of both polarisations through the sensor in place of one scalar"
     yield about.entry("polarisation", about.device.both_polarisations(), said)
 
 

@@ -21,7 +21,6 @@ from metalens.psf import Nodes, Source
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 ROWS = 256  # of pillars at a time
-COMPONENTS = 3  # of the field: what more of them change is a thousandth of the image up to NA 0.6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,7 +124,7 @@ class Device:
         return self._imaged(Optics(self.wave, self.layers, self.distance_um), plan)
 
     def both_polarisations(self) -> Imager:
-        """The image by Ex, Ey, Ez of both polarisations of light whose rays the lens turns; the device's own where it
+        """The image by the flux of both polarisations of light whose rays the lens turns; the device's own where it
         is that already.
 
         What they change is computed on a grid of at most 5 x 5 field points and interpolated: it is small and smooth.
@@ -138,7 +137,7 @@ class Device:
         with torch.no_grad():
             scalar, both = (
                 replace(plan, y_um=y, x_um=x, window=replace(plan.window, components=count))
-                for count in (0, COMPONENTS)
+                for count in (0, plan.window.whole)
             )
             change = node_light(optics, both).detach() - node_light(optics, scalar).detach()
             to_y, to_x = (_hats(wanted, axis).to(change) for wanted, axis in ((plan.y_um, y), (plan.x_um, x)))

@@ -12,18 +12,18 @@ from metalens.field.forming import Imager, between_nodes, blurred, psfs_used, tr
 from metalens.field.patches import relative
 from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
 from metalens.field.points import Optics, sampling
+from metalens.field.polarised import Counted
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
-from metalens.psf import Nodes, Polarisation, Source
+from metalens.psf import Nodes, Source
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
 OVERLAP = 4  # samples that two patches share
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
-NEGLECTED = 5  # of them at which the transform is judged
-TURNED = 3  # and the components of the field
+NEGLECTED = 5  # of them at which the transform and the components of the field are judged
 
 
 def imager(
@@ -35,7 +35,7 @@ def imager(
     field: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-2,
     distance_um: float | None = None,
-    polarisation: Polarisation = "auto",
+    polarisation: Counted = "auto",
     device: torch.device | str = "cpu",
 ) -> Imager:
     """Prepare a lens for frames of a grid.
@@ -47,8 +47,9 @@ def imager(
         field: (x, y) angle in rad of the middle of the grid.
         tolerance: of the image of a 1/f texture, relative L2.
         distance_um: lens to sensor, by default the design's.
-        polarisation: ``scalar``, ``vector`` (PSFs of |Ex|² + |Ey|² + |Ez|² of unpolarised light), or ``auto``: one
-            scalar where its error, ``parts["polarisation"]``, is below the tolerance.
+        polarisation: ``flux`` (of unpolarised light through the sensor's plane, which a pixel counts), ``scalar``,
+            ``auto``: one scalar where its error, ``parts["polarisation"]``, is below the tolerance, else the flux, or
+            ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
 
     Raises:
         SceneError: wavelengths, depths or field points that no number of meets the tolerance; PropagationError: films
@@ -172,8 +173,9 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     with torch.no_grad():
         got = psfs_used(made, pixels, depths)
     nodes = float((relative(got.cpu().double(), true.double()) ** 2).mean().sqrt())
-    transform = neglected(optics, plan.waves, plan.window, (at[:NEGLECTED], depths))
+    few = at[:NEGLECTED], depths
+    transform = neglected(optics, plan.waves, plan.window, few)
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
-    found["polarisation"] = unpolarised(optics, plan.waves, plan.window, (at[:TURNED], depths))
+    found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
     return {**found, "edge": edge, "outside": outside}

@@ -12,10 +12,10 @@ from torch import Tensor
 from metalens.field import compiled
 from metalens.field.patches import dense, relative
 from metalens.field.points import Optics, Window, psfs
-from metalens.field.polarised import ALL
+from metalens.field.polarised import Counted
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
-from metalens.psf import Nodes, Polarisation, Source
+from metalens.psf import Nodes, Source
 from metalens.psf import spectrum as spectra
 
 STEPS = (24, 16, 12, 8, 6, 4)  # between depths that are tried, in 96ths of the range of 1/z
@@ -95,7 +95,7 @@ def planned(
     *,
     tolerance: float,
     folds: bool,
-    polarisation: Polarisation = "auto",
+    polarisation: Counted = "auto",
 ) -> Plan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
@@ -197,13 +197,14 @@ def polarised(
     at: tuple[Tensor, Tensor],
     tolerance: float,
     *,
-    polarisation: Polarisation,
+    polarisation: Counted,
 ) -> Window:
     """The window with one scalar where that images within the tolerance (``auto``), else with as few components of
-    the field of both polarisations as image within their share of it."""
+    the fields of both polarisations as image within their share of it."""
+    window = replace(window, flux=polarisation != "vector")
     if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= tolerance):
         return window
-    tried = [replace(window, components=count) for count in range(1, ALL + 1)]
+    tried = [replace(window, components=count) for count in range(1, window.whole + 1)]
     whole, least = _of_sum_one(optics, waves, tried[-1], at), tolerance * SHARES["polarisation"]
     return next(one for one in tried if unpolarised(optics, waves, one, at, whole) <= least)
 
@@ -213,10 +214,10 @@ def unpolarised(
 ) -> float:
     """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
     (field points, depths) against those of all components, ``whole`` where they are known."""
-    if window.components == ALL:
+    if window.components == window.whole:
         return 0.0
     few = _of_sum_one(optics, waves, window, at)
-    whole = _of_sum_one(optics, waves, replace(window, components=ALL), at) if whole is None else whole
+    whole = _of_sum_one(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
     return float((relative(few, whole) ** 2).mean().sqrt())
 
 

@@ -35,20 +35,27 @@ class Window:
     """Square samples around a field point: an odd count along each axis, of width ``step_um``.
 
     curved: with the flux of the second order as well, three times the work.
-    components: of Ex, Ey, Ez of both polarisations, so many of the strongest mixtures
+    components: of the fields of both polarisations, so many of the strongest mixtures
         (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one scalar.
+    flux: whether those give the flux through the sensor's plane, which a pixel counts, or |Ex|² + |Ey|² + |Ez|².
     """
 
     samples: int
     step_um: float
     curved: bool = False
     components: int = 0
+    flux: bool = True
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.samples % 2 == 0 or not self.step_um > 0:
             raise PropagationError(f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3")
-        if not 0 <= self.components <= polarised.ALL:
-            raise PropagationError(f"{self.components} components of the field: need 0 to {polarised.ALL}")
+        if not 0 <= self.components <= self.whole:
+            raise PropagationError(f"{self.components} components of the field: need 0 to {self.whole}")
+
+    @property
+    def whole(self) -> int:
+        """Components that leave nothing out."""
+        return polarised.OF_FLUX if self.flux else polarised.OF_ENERGY
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,6 +106,7 @@ class Sampling:
     beyond: float
     curved: bool
     components: int
+    flux: bool
 
 
 def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf) -> Sampling:
@@ -117,7 +125,7 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto the last of them
     size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
     quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
-    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved, window.components)
+    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved, window.components, window.flux)
 
 
 def psfs(
@@ -172,16 +180,16 @@ def _one(
     tilt = math.atan(math.hypot(*tangents.tolist()))
     factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
-    pupils = None
+    mixed = None
     if grid.components:
-        turned = polarised.factors(found, tangents, after.order[-1])
-        pupils = polarised.strongest(turned, pupil.weight, grid.components).to(torch.float32)
+        fields = polarised.factors(found, tangents, after.order[-1], flux=grid.flux)
+        mixed = polarised.strongest(fields, pupil.weight, grid.components)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
     moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
     aside = (found.aside, found.aside[:, None]) if grid.curved else ()
     parts = torch.split(light, few)
-    return torch.cat([_shown(_fluxes(part, pupils, aside, grid.size), ends, moves) for part in parts]) / total
+    return torch.cat([_shown(_fluxes(part, mixed, aside, grid.size), ends, moves) for part in parts]) / total
 
 
 def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:
@@ -193,13 +201,15 @@ def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor])
     return shown
 
 
-def _fluxes(light: Tensor, pupils: Tensor | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
+def _fluxes(light: Tensor, mixed: polarised.Mixed | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
     """(depths, size, size) |U|² of the transforms of the light on the nodes, and with ``aside`` the flux along x and y.
 
-    pupils: (components, nodes, nodes) real factors whose light adds up; None for the scalar.
+    mixed: whose light adds up; None for the scalar.
     """
     total: list[Tensor] = []
-    for part in [light] if pupils is None else [light * pupil for pupil in pupils]:
+    pupils = [(1.0, None)] if mixed is None else zip(mixed.signs, mixed.pupils.to(torch.float32), strict=True)
+    for sign, pupil in pupils:
+        part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
         if compiled.plain(spectrum):
             found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
@@ -208,7 +218,7 @@ def _fluxes(light: Tensor, pupils: Tensor | None, aside: tuple[Tensor, ...], siz
         for along in aside:
             other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
             found.append(torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag))
-        total = found if not total else [a + b for a, b in zip(total, found, strict=True)]
+        total = found if not total else [a + sign * b for a, b in zip(total, found, strict=True)]
     return total
 
 

@@ -52,10 +52,21 @@ class Referee:
         return np.abs(np.fft.fftshift(out)) ** 2 / self.open.sum()
 
     def polarised(self, place, depth, wavelength):
-        """|Ex|² + |Ey|² + |Ez|² as :meth:`intensity`, mean of both polarisations, over that on the lens.
+        """|Ex|² + |Ey|² + |Ez|² as :meth:`intensity`, mean of both polarisations, over that on the lens."""
+        electric, _, level = self._fields(place, depth, wavelength)
+        return sum((np.abs(part) ** 2).sum(0) for part in electric) / 2 / level
+
+    def flux(self, place, depth, wavelength):
+        """Re(Ex Hy* - Ey Hx*) as :meth:`intensity`, mean of both polarisations, over the power along z on the lens."""
+        electric, magnetic, _ = self._fields(place, depth, wavelength)
+        total = sum((e[0] * h[1].conj() - e[1] * h[0].conj()).real for e, h in zip(electric, magnetic, strict=True))
+        return total / 2 / self.open.sum()
+
+    def _fields(self, place, depth, wavelength):
+        """E and H of both polarisations on the fine lattice about `place`, and |E|² on the lens.
 
         At each point of the lens the field across the source's ray is turned with the ray to that of the phase's
-        slope, its power along z kept; behind it plane waves have Ez = -(p Ex + q Ey) / s. In air.
+        slope, its power along z kept; behind it plane waves have Ez = -(p Ex + q Ey) / s and H = (p, q, s) x E. In air.
         """
         k, h, fine = 2 * np.pi / wavelength, 1e-3, self.fine
         tx, ty = place[0] / self.distance, place[1] / self.distance
@@ -78,15 +89,17 @@ class Referee:
         s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
         move = runs * np.exp(1j * k * self.distance * s + 2j * np.pi * (fx * place[0] + fy * place[1]))
         scalar = self.open * np.exp(1j * (k * source + self.lens_phase()))
-        total = np.zeros_like(ax)
+        electric, magnetic = [], []
         straight = np.zeros_like(a)
         straight[2] = 1.0
         for e in np.eye(3)[:2]:
             out = _rotated(_rotated(e[:, None, None] + 0 * a, straight, a), a, b)
             waves = [np.fft.fft2(np.fft.ifftshift(scalar * part / np.sqrt(b[2]))) * move for part in out[:2]]
             waves.append(-(p * waves[0] + q * waves[1]) / s)
-            total += sum(np.abs(np.fft.fftshift(np.fft.ifft2(w))) ** 2 for w in waves) / 2
-        return total / (self.open / b[2]).sum()
+            turned = [q * waves[2] - s * waves[1], s * waves[0] - p * waves[2]]
+            electric.append(np.stack([np.fft.fftshift(np.fft.ifft2(w)) for w in waves]))
+            magnetic.append(np.stack([np.fft.fftshift(np.fft.ifft2(w)) for w in turned]))
+        return electric, magnetic, (self.open / b[2]).sum()
 
     def sampled(self, fine, step, window):
         """(window, window) light on samples about the middle of the lattice, from a square source as large as they."""
@@ -100,7 +113,7 @@ class Referee:
     def image(self, light, depth, *, step, window, waves, middle=(0.0, 0.0), psf=None):
         """(y, x) irradiance of point sources on the samples: every one with its own PSF, cos⁴ and wavelengths.
 
-        psf: :meth:`intensity` (the scalar, if None) or :meth:`polarised`.
+        psf: :meth:`intensity` (the scalar, if None), :meth:`polarised` or :meth:`flux`.
         """
         psf = psf or self.intensity
         rows, columns = light.shape
