@@ -62,7 +62,7 @@ def points_row(wave: SmoothWave) -> Row:
 
 
 def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
-    """The same PSFs from pillars, by one scalar and by the flux of both polarisations; errors against all components."""
+    """The same PSFs from pillars, by one scalar and by the flux of both polarisations; against all components."""
     at = torch.stack(torch.meshgrid(*2 * [torch.linspace(-500, 500, 5, dtype=torch.float64)], indexing="ij"), -1)
     waves = Nodes(*spectrum.gauss(*spectrum.weight(Source(850.0, 30.0)), 9), 0.0)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
