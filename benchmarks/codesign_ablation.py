@@ -21,7 +21,8 @@ from benchmarks import keep_line, kept_lines
 from benchmarks.codesign_report import ROOT, ratio
 from codesign.batches.scenes import TEST
 from codesign.train import ambiguity, assess, evolution, finish, run
-from codesign.train.run import Part, RunConfig
+from codesign.train.run import RunConfig
+from codesign.train.words import Part
 from metalens.ground import config, store
 
 LINES = "ablation.jsonl"

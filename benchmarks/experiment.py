@@ -21,7 +21,8 @@ import torch
 from benchmarks import Row
 from benchmarks.loop_runs import Recipe, finished
 from codesign.adapt import train as retraining
-from codesign.evaluate.gaze_experiment import ExperimentConfig, Points, experiment
+from codesign.evaluate.gaze_experiment import experiment
+from codesign.evaluate.shown import ExperimentConfig, Points
 from metalens.ground import store
 
 RESULT = Path(__file__).parent / "results" / "experiment_study.json"

@@ -34,7 +34,8 @@ from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.estimate import Options, fit
 from characterize.model.parameters import PARAMETERS, Known, vector
 from codesign.adapt import train as retraining
-from codesign.adapt.train import Held, Lenses, RetrainConfig, Source
+from codesign.adapt.settings import RetrainConfig
+from codesign.adapt.train import Held, Lenses, Source
 from codesign.optics import stack as trained
 from codesign.optics.built import OF_LENS, MadeLens, psf_error
 from codesign.optics.stack import Stack

@@ -28,7 +28,7 @@ from characterize.model.parameters import Known
 from codesign.adapt import correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
-from codesign.adapt.train import RetrainConfig
+from codesign.adapt.settings import RetrainConfig
 from codesign.optics import built
 from metalens import lens as lenses
 from metalens.cli import main

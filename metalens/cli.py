@@ -1,8 +1,9 @@
 """The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails its own check, 2 on bad input.
 
 A verb lives beside its stage, as a frozen dataclass of its options and a function ``run(options) -> int``; only
-the verb that is asked for is imported. A module with a table ``PARTS`` in place of them has verbs of its own; its
-``part_of(word)`` may name the one that a path is meant for.
+the verb that is asked for is imported. Options may lie apart from the work, in a module that names that of ``run`` as
+``WORK``, so that help needs neither torch nor time. A module with a table ``PARTS`` in place of them has verbs of its
+own; its ``part_of(word)`` may name the one that a path is meant for.
 """
 
 import atexit
@@ -22,7 +23,7 @@ from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nea
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
-# verb: (module that holds ``Options`` and ``run``, one line of help)
+# verb: (module that holds ``Options``, and ``run`` or the name of the module that has it, ``WORK``; one line of help)
 VERBS: dict[str, tuple[str, str]] = {
     "library": (
         "metalens.commands.library",
@@ -38,26 +39,29 @@ VERBS: dict[str, tuple[str, str]] = {
         "lens.h5 or asbuilt.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
     "export": ("metalens.commands.export", "lens.h5 -> NPZ, MATLAB or Zemax grid phase for other programs"),
-    "scene": ("codesign.commands.scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
+    "scene": ("codesign.commands.options.scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
     "evaluate": ("codesign.commands.evaluate", "optics and more: the paper's tables and figures for your own files"),
     "layout": ("layout.commands.layout", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
     "check": ("layout.commands.check", "MASK.gds|oas + PROCESS.toml -> design rules on a mask made anywhere"),
     "capture": (
-        "characterize.commands.capture",
+        "characterize.commands.capture_options",
         "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",
     ),
     "measure": (
         "characterize.commands.measure",
         "CAPTURES or MICROGRAPH -> MTF, Strehl, spot sizes; or every pillar's diameter and a bias table",
     ),
-    "fit": ("characterize.commands.fit", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
-    "codesign": ("codesign.commands.codesign", "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together"),
+    "fit": ("characterize.commands.fit_options", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
+    "codesign": (
+        "codesign.commands.options.codesign",
+        "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together",
+    ),
     "retrain": (
-        "codesign.commands.retrain",
+        "codesign.commands.options.retrain",
         "RUN_DIR + asbuilt.h5 -> network for the lens as built, the next mask",
     ),
-    "budget": ("codesign.commands.budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
-    "plan": ("codesign.commands.plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
+    "budget": ("codesign.commands.options.budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
+    "plan": ("codesign.commands.options.plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
     "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
     "view": ("metalens.commands.view", "one self-contained page to explore any artefact"),
     "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
@@ -241,7 +245,8 @@ def _dispatch(verb: str, words: list[str]) -> int:
     if verb == "info":
         module.TOLD.update(TOLD)
     options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
-    return int(module.run(options))
+    work = importlib.import_module(getattr(module, "WORK", module.__name__))
+    return int(work.run(options))
 
 
 def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:

@@ -8,10 +8,13 @@ import importlib
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from metalens import cli
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("metalens", "layout", "characterize", "codesign")
@@ -278,6 +281,49 @@ def test_help_loads_neither_numpy_nor_torch():
         "with contextlib.redirect_stdout(io.StringIO()):\n    main(['--help'])"
     )
     assert not _loaded(code) & {"numpy", "torch", "tyro", "matplotlib"}
+
+
+EXTRAS = {  # what only some commands need
+    *(
+        "torch",
+        "nlopt",
+        "cv2",
+        "tifffile",
+        "colour",
+        "safetensors",
+        "build123d",
+        "ezdxf",
+        "OCP",
+        "astropy",
+        "distributed",
+    ),
+    *("mitsuba", "onnx", "onnxruntime"),
+}
+
+
+def test_the_help_of_every_command_needs_no_extra():
+    """Each in turn, in a process where importing one of them fails; the options are in what is shown."""
+    verbs = [[verb] for verb, (module, _) in cli.VERBS.items() if not hasattr(importlib.import_module(module), "PARTS")]
+    verbs += [["evaluate", part] for part in importlib.import_module(cli.VERBS["evaluate"][0]).PARTS]
+    code = textwrap.dedent(
+        f"""
+        import contextlib, io, sys
+        class Missing:
+            def find_spec(self, name, path=None, target=None):
+                if name.partition(".")[0] in {EXTRAS}:
+                    raise ModuleNotFoundError(name, name=name)
+        sys.meta_path.insert(0, Missing())
+        from metalens.cli import main
+        for words in {verbs}:
+            with contextlib.redirect_stdout(io.StringIO()) as shown:
+                try:
+                    main([*words, "--help"])
+                except SystemExit as end:
+                    assert end.code == 0, words
+            assert "--json" in shown.getvalue(), words
+        """
+    )
+    assert _loaded(code)
 
 
 def test_test_files_have_unique_names():

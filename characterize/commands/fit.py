@@ -8,17 +8,15 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
 from characterize.bench import Truth
 from characterize.captures import capture as captures
 from characterize.commands import report
+from characterize.commands.fit_options import Options
 from characterize.inference import AsBuilt, asbuilt, fit
 from characterize.inference import Options as FitOptions
 from characterize.model import Known
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
-from metalens.commands import Common, Output
 from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 
@@ -35,29 +33,6 @@ class Metrology:
     free: tuple[str, ...] = ()
     window: int = field(default=48, metadata={"above": 0})
     scan_um: float | None = field(default=None, metadata={"above": 0})
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens fit``: either --design or --pupil.
-
-    Attributes:
-        capture: folder, or TIFF, PNG or HDF5 stack.
-        design: lens file of the metalens that was captured.
-        metrology: TOML of other measurements (``[[known]]`` name, value, sigma) and of what to fit beyond the usual.
-        pupil: TOML of what is known of a generic lens (numerical_aperture, wavelength_um, pixel_um, step_um ...).
-        truth: TOML of a virtual bench (that of ``capture --truth``): its hidden values are drawn in the report.
-        insist: write a result that fails its checks too (exit 1, problems listed).
-        output: file to write; a report lies beside it as .html.
-    """
-
-    capture: tyro.conf.Positional[Path]
-    output: Output
-    design: Path | None = None
-    metrology: Path | None = None
-    pupil: Path | None = None
-    truth: Path | None = None
-    insist: bool = False
 
 
 def run(options: Options) -> int:

@@ -10,16 +10,16 @@ if TYPE_CHECKING:
     from codesign.adapt import sure as sure
     from codesign.adapt import train as train
     from codesign.adapt.reading import bootstrap as bootstrap
+    from codesign.adapt.settings import RetrainConfig as RetrainConfig
     from codesign.adapt.source import Source as Source
     from codesign.adapt.train import Lenses as Lenses
-    from codesign.adapt.train import RetrainConfig as RetrainConfig
     from codesign.adapt.train import network as network
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Lenses": "train",
-        "RetrainConfig": "train",
+        "RetrainConfig": "settings",
         "Source": "source",
         "bootstrap": "reading",
         "correction": "",

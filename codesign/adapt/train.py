@@ -16,6 +16,7 @@ from characterize.bench import Truth
 from characterize.inference import AsBuilt
 from codesign.adapt import reading
 from codesign.adapt.reading import Accuracy
+from codesign.adapt.settings import RetrainConfig
 from codesign.adapt.source import Source, architecture_of, check_lens, load, rows_of
 from codesign.batches import TEST
 from codesign.network import Supernet, recalibrate
@@ -31,33 +32,10 @@ from codesign.train import (
     checkpoint,
     model,
 )
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.ground.errors import TrainingError
 
 APART = 7919  # between the seeds of retrainings: no step of one is a step of another
 JOBS = ("nominal", "retrained", "known")  # networks that are trained on: for the design, the fit, and the truth
-
-
-@dataclass(frozen=True, slots=True)
-class RetrainConfig:
-    """How to train on.
-
-    steps: of the inner loop; its batch and loss weights are those of the run. rate: largest learning rate.
-    draws: lenses from the posterior that training sees; judge: other ones that judge it where the truth is not known.
-    test_batches: frames that judge, in batches of the run. seed: of draws, frames and noise.
-    budget_mmacs: which network of the run; 0 for the one of the largest budget.
-    """
-
-    steps: int = 200
-    rate: float = 1.5e-3
-    draws: int = 8
-    judge: int = 4
-    test_batches: int = 16
-    seed: int = 0
-    budget_mmacs: float = 0.0
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.draws, self.judge, self.test_batches) < 1 or not self.rate > 0:
-            raise ConfigError(f"{self}: need steps, draws, judge and test_batches of 1 or more, and a rate above 0")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -5,58 +5,23 @@ Links that are done are kept beside the output (NAME.resume): after an interrupt
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
 from codesign.budget import MEASURED, Entry, Given, Journal, bench
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
-from codesign.evaluate import ExperimentConfig
+from codesign.commands.options.budget import Options
 from codesign.optics import Numerics
 from metalens import __version__, lens, library
-from metalens.commands import Common, Output
 from metalens.ground import config, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.reading import reader
 from metalens.made import of_process
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens budget``.
-
-    Attributes:
-        lens: lens.h5.
-        output: budget.h5 to write; a report lies beside it as .html.
-        library: library.h5 that the lens was made from: parts solver and proxy.
-        process: PROCESS.toml: adds mask grid and process spread.
-        asbuilt: asbuilt.h5 of the same lens: adds the calibration uncertainty.
-        run: RUN_DIR of a co-design run: its network reads the frames of the virtual experiment, and the sum is held
-            against the error measured on them.
-        frames: subjects, stimuli, slippage states, calibration: those of the experiment.
-        led_fwhm_nm: width of the diode; 0 for that of the run.
-        depths: number of PSFs over depth. wavelengths: over the diode's line.
-        tolerance: of the PSF engine. kernels: of the kernels that images are formed with.
-    """
-
-    lens: tyro.conf.Positional[Path]
-    output: Output = Path("budget.h5")
-    library: Path | None = None
-    process: Path | None = None
-    asbuilt: Path | None = None
-    run: Path | None = None
-    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=lambda: ExperimentConfig(subjects=5))
-    led_fwhm_nm: float = 0.0
-    depths: int = 24
-    wavelengths: int = 3
-    tolerance: float = 1e-4
-    kernels: float = 3e-3
 
 
 def run(options: Options) -> int:

@@ -2,22 +2,22 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from safetensors.torch import save_file
 
 from codesign.batches import parallel
+from codesign.commands.options.codesign import Options
 from codesign.network import Baseline, Subnet
 from codesign.optics import formed
 from codesign.optics import stack as trained
 from codesign.train import (
     Journal,
     Model,
-    Place,
+    Part,
     Record,
     Run,
     RunConfig,
@@ -30,36 +30,12 @@ from codesign.train import (
 )
 from codesign.train import run as runs
 from metalens import design, lens, library
-from metalens.commands import Common, Output
 from metalens.ground import config, report, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.image import sensor as camera
 
 CHECKPOINT, LOG, SETTINGS, RESULT = "checkpoint.safetensors", "log.jsonl", "run.toml", "result.json"
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens codesign``.
-
-    Attributes:
-        config: RUN.toml.
-        output: folder of the run.
-        resume: go on from the folder's checkpoint, bit for bit.
-        freeze: parts that stay as they start, beside those of the config: the ablations.
-        device: of the network; auto takes a GPU where there is one. Scenes and optics stay on the processor.
-        export: write every budget's network as ONNX too (opset 17), for frames of the sensor's pixels.
-        events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
-    """
-
-    config: tyro.conf.Positional[Path]
-    output: Output = Path("run")
-    resume: bool = False
-    freeze: tuple[runs.Part, ...] = ()
-    device: Place = "auto"
-    export: bool = False
-    events: bool = False
 
 
 def run(options: Options) -> int:
@@ -156,7 +132,7 @@ def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     return 0
 
 
-def _frozen(settings: RunConfig, parts: tuple[runs.Part, ...]) -> RunConfig:
+def _frozen(settings: RunConfig, parts: tuple[Part, ...]) -> RunConfig:
     both = tuple(sorted({*settings.run.frozen, *parts}))
     return replace(settings, run=replace(settings.run, frozen=both))
 

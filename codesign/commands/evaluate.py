@@ -5,17 +5,17 @@
 
 from pathlib import Path
 
-# sub-verb: (module that holds ``Options`` and ``run``, one line of help)
+# sub-verb: (module that holds ``Options`` and names that of ``run``, one line of help)
 PARTS: dict[str, tuple[str, str]] = {
     "optics": (
-        "codesign.commands.evaluate_optics",
+        "codesign.commands.options.optics",
         "LENS... -> axial information, PSF slices and scene sensitivity of lenses (Tables 1 and 3, Figs. 5 and 7)",
     ),
     "experiment": (
-        "codesign.commands.experiment",
+        "codesign.commands.options.experiment",
         "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 9 to 11)",
     ),
-    "paper": ("codesign.commands.paper", "RUN_DIR... -> every table and figure of the paper beside ours"),
+    "paper": ("codesign.commands.options.paper", "RUN_DIR... -> every table and figure of the paper beside ours"),
 }
 
 

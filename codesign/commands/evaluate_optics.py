@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 
+from codesign.commands.options.optics import Options
 from codesign.evaluate import ReaderConfig, Scenes, Setting, judged, reader
 from codesign.evaluate import optics as evaluate_optics
 from codesign.evaluate import plots as evaluate_plots
@@ -17,7 +17,6 @@ from codesign.evaluate import tables as evaluate_tables
 from codesign.eye import states_at
 from metalens import design
 from metalens import lens as lenses
-from metalens.commands import Common, Output
 from metalens.design import Focus
 from metalens.design.free_form import Fisher, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
@@ -38,29 +37,6 @@ class Settings:
     axial: Setting = field(default_factory=Setting)
     scenes: Scenes = field(default_factory=Scenes)
     reader: ReaderConfig = field(default_factory=ReaderConfig)
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens evaluate optics``.
-
-    Attributes:
-        lenses: lens files; the first is what the others are compared with.
-        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
-        config: OPTICS.toml with the tables [axial], [scenes] and [reader]; without it the defaults.
-        scenes: number of scenes, in place of the one in the settings.
-        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
-            and at the aperture of the first lens; tuned on axis for the finest binning.
-        reader: train the reference reader behind every lens and print what it reads: depth of windows, slippage, with
-            calibrated intervals; some minutes a lens, the same numbers every time.
-    """
-
-    lenses: tyro.conf.Positional[tuple[Path, ...]]
-    output: Output = Path("optics")
-    config: Path | None = None
-    scenes: int | None = None
-    baselines: bool = False
-    reader: bool = False
 
 
 def run(options: Options) -> int:

@@ -2,41 +2,22 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 
 from codesign.adapt import bootstrap
 from codesign.adapt import train as retraining
+from codesign.commands.options.experiment import Options
 from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
 from codesign.optics import formed
-from metalens.commands import Common, Output
 from metalens.ground import report, store
 from metalens.ground.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
 PLACED = {"random": "drawn at random", "spread": "spread over the field"}
 GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-range"}
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens evaluate experiment``.
-
-    Attributes:
-        runs: folders of finished runs of one geometry; the first is compared with each of the others.
-        output: folder for experiment.json, samples.png, ambiguity.png, errors.png and report.html.
-        names: of the runs; by default their folders'.
-        settings: subjects, stimuli, slippage states, calibration.
-    """
-
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    output: Output = Path("experiment")
-    names: tuple[str, ...] = ()
-    settings: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=ExperimentConfig)
 
 
 def run(options: Options) -> int:

@@ -2,44 +2,21 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-
-import tyro
 
 from codesign.adapt import train as retraining
 from codesign.commands import evaluate_optics as command_evaluate_optics
 from codesign.commands import experiment as command_experiment
+from codesign.commands.options import experiment as experiment_options
+from codesign.commands.options import optics as optics_options
+from codesign.commands.options.paper import Options
 from codesign.evaluate import ROLES, ExperimentConfig, Line, Measured, paper, paper_runs
-from metalens.commands import Common, Output
 from metalens.ground import report, store
 from metalens.ground.errors import ConfigError
 
 JSON, PAGE, GAZE = "paper.json", "report.html", "gaze.json"
 DIM_DB = 15.0
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens evaluate paper``.
-
-    Attributes:
-        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
-            far as there are; without any, the claims are listed with the commands that measure them.
-        others: further finished runs: other networks (Table 2), runs with one part frozen (Fig. 8b); each run's
-            result.json tells which it is.
-        output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
-        subjects: of the experiment.
-        scenes: of Table 1.
-        measure: measure what is not in the folder yet; without it only what is there is used.
-    """
-
-    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    others: tuple[Path, ...] = ()
-    output: Output = Path("paper")
-    subjects: int = 20
-    scenes: int = 24
-    measure: bool = True
 
 
 def run(options: Options) -> int:
@@ -93,14 +70,14 @@ def _measure(options: Options, folder: Path) -> None:
     for name, settings in (("experiment", config), ("dim", replace(config, snr_db=DIM_DB))):
         if not (folder / name / "experiment.json").is_file():
             options.console.say(f"measuring: {name}")
-            asked = command_experiment.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
+            asked = experiment_options.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
             command_experiment.run(asked)
     _measure_gaze(options, folder / GAZE)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
         order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
         lenses = tuple(_named(folder, name, path) for name, path in order)
-        optics = command_evaluate_optics.Options(
+        optics = optics_options.Options(
             lenses=lenses, output=folder / "optics", scenes=options.scenes, quiet=True, force=True
         )
         command_evaluate_optics.run(optics)

@@ -6,39 +6,17 @@ What is measured is kept beside the output (NAME.resume): after an interruption 
 import json
 import math
 import re
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-
-import tyro
 
 from codesign.adapt import train as retraining
 from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, total
-from codesign.evaluate import ExperimentConfig
+from codesign.commands.options.plan import Options
 from metalens import __version__
-from metalens.commands import Common, Output
 from metalens.ground import config, report, store
 from metalens.ground.errors import ConfigError
 
 UNITS = {"deg": math.pi / 180, "arcmin": math.pi / 10_800, "mrad": 1e-3, "rad": 1.0}
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens plan``.
-
-    Attributes:
-        gaze_error: the goal, with its unit: 1deg, 50arcmin, 20mrad; of the whole error, from pillar to answered gaze.
-        run: RUN_DIR of a co-design run: its reader is part of the floor; without one the floor is that of the person.
-        frames: that the floor is measured on: subjects, stimuli, calibration, as those of the experiment.
-        config: PLAN.toml of the lens and the run; left out: a 1 mm lens, 200 sets of PSFs, 10 000 true images.
-        output: folder for cell.toml, psf.toml, run.toml, process.toml, plan.json and report.html.
-    """
-
-    gaze_error: str
-    config: Path | None = None
-    run: Path | None = None
-    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=lambda: ExperimentConfig(subjects=5))
-    output: Output = Path("plan")
 
 
 def angle_rad(text: str) -> float:

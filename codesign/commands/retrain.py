@@ -1,11 +1,10 @@
 """RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and the next mask's correction."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from safetensors.torch import save_file
 
 from characterize.bench import Truth
@@ -14,42 +13,17 @@ from codesign.adapt import Lenses, RetrainConfig, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.sure import judge
+from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
 from codesign.train import Record, RunConfig, Trainer, checkpoint
 from metalens import __version__, lens
-from metalens.commands import Common, Output
 from metalens.ground import config, store
 from metalens.ground.errors import TrainingError
 from metalens.ground.transaction import Draft
 from metalens.made import Bias
 
 LOG, RECIPE, RESULT = "log.jsonl", "retrain.toml", "result.json"
-
-
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens retrain``.
-
-    Attributes:
-        run_dir: folder of a finished ``metalens codesign``.
-        asbuilt: what ``metalens fit`` made of captures of the run's lens.h5.
-        output: folder for the retrained network, result.json, bias.toml, lens_corrected.h5 and report.html.
-        truth: TOML of the virtual bench; then the true lens judges, and a network is trained with it known.
-        process: PROCESS.toml that the mask was drawn with; its bias table is the one to be corrected.
-        settings: how to train on.
-        resume: go on from the folder's checkpoints, bit for bit.
-        insist: use a fit that failed its own checks.
-    """
-
-    run_dir: tyro.conf.Positional[Path]
-    asbuilt: Annotated[Path, tyro.conf.arg(aliases=["--optics"])]
-    output: Output
-    truth: Path | None = None
-    process: Path | None = None
-    settings: tyro.conf.OmitArgPrefixes[RetrainConfig] = field(default_factory=RetrainConfig)
-    resume: bool = False
-    insist: bool = False
 
 
 @dataclass(frozen=True, slots=True)

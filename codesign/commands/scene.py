@@ -1,17 +1,16 @@
 """SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
 from codesign.batches import varied, worn
+from codesign.commands.options.scene import Options
 from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks
 from codesign.referee import pathtraced
-from metalens.commands import Common, Output
 from metalens.ground import config, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import Provenance
@@ -77,26 +76,9 @@ class Scene:
         return replace(varied(self.variety), gaze_x_rad=x, gaze_y_rad=y, slip_um=slip, scale=self.scale)
 
 
-@dataclass(frozen=True)
-class Options(Common):
-    """Options of ``metalens scene``.
-
-    Attributes:
-        config: SCENE.toml; without it the defaults.
-        output: folder for scene.h5, layers.h5, sheet.png and labels.csv.
-        referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
-            referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
-    """
-
-    config: tyro.conf.Positional[Path | None] = None
-    output: Output = Path("scene")
-    referee: bool = False
-    settings: tyro.conf.Suppress[Scene] = field(default_factory=Scene)
-
-
 def run(options: Options) -> int:
     """Render, write and show."""
-    settings = options.settings if options.config is None else config.load(options.config, Scene)
+    settings = Scene() if options.config is None else config.load(options.config, Scene)
     if options.referee:
         pathtraced.start()
     folder = options.output

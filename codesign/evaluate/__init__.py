@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from codesign.evaluate import tables as tables
     from codesign.evaluate.gaze_experiment import AXIAL as AXIAL
     from codesign.evaluate.gaze_experiment import LATERAL as LATERAL
-    from codesign.evaluate.gaze_experiment import ExperimentConfig as ExperimentConfig
     from codesign.evaluate.gaze_experiment import Result as Result
     from codesign.evaluate.gaze_experiment import experiment as experiment
     from codesign.evaluate.optics import Scenes as Scenes
@@ -25,15 +24,18 @@ if TYPE_CHECKING:
     from codesign.evaluate.paper import Measured as Measured
     from codesign.evaluate.reader import ReaderConfig as ReaderConfig
     from codesign.evaluate.reader import judged as judged
+    from codesign.evaluate.shown import ExperimentConfig as ExperimentConfig
+    from codesign.evaluate.shown import Points as Points
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "AXIAL": "gaze_experiment",
-        "ExperimentConfig": "gaze_experiment",
+        "ExperimentConfig": "shown",
         "LATERAL": "gaze_experiment",
         "Line": "paper",
         "Measured": "paper",
+        "Points": "shown",
         "ROLES": "paper",
         "ReaderConfig": "reader",
         "Result": "gaze_experiment",

@@ -7,7 +7,8 @@ import torch
 
 from codesign.adapt import Source, network
 from codesign.batches import EXPERIMENT
-from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentConfig, Result, ready, states_of, through
+from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Result, ready, states_of, through
+from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import render
 from metalens.ground import report
 

@@ -16,6 +16,7 @@ import torch
 
 from codesign.adapt import Source, network
 from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
+from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
 from codesign.gaze import PersonalGaze, angle_deg, personal
@@ -28,61 +29,6 @@ from metalens.image import Imager, UniformImager, low_snr
 
 AXIAL, LATERAL = "axial", "lateral"
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
-Points = Literal["random", "spread"]
-
-
-@dataclass(frozen=True, slots=True)
-class ExperimentConfig:
-    """What is shown to whom, and how gaze is calibrated.
-
-    subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that they span.
-    axial_mm, lateral_mm: slippage states beside the origin, along z and x.
-    share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
-        at random or spread over the field, as a calibration screen would show them.
-    hidden: neurons of the regressor. fixation_deg: standard deviation of where a subject really looks.
-    image: "true", what the device shows, whatever the run was trained on; "trained", the image that the run knows.
-    pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
-    snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
-    """
-
-    subjects: int = 20
-    grid: tuple[int, int] = (7, 7)
-    field_deg: tuple[float, float] = (35.0, 25.0)
-    axial_mm: tuple[float, ...] = (-5.0, -2.5, 2.5, 5.0)
-    lateral_mm: tuple[float, ...] = (-2.5, -5.0)
-    share: float = 0.2
-    points: Points = "random"
-    hidden: int = 10
-    fixation_deg: float = 0.3
-    pupil_sd: float = 0.05
-    seed: int = 0
-    snr_db: float | None = None
-    image: Literal["true", "trained"] = "true"
-
-    def __post_init__(self) -> None:
-        points = self.grid[0] * self.grid[1]
-        if self.subjects < 1 or min(self.grid) < 2 or not 3 <= round(self.share * points) < points:
-            raise ConfigError(
-                f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
-                "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
-            )
-
-    @property
-    def stimuli_deg(self) -> Array:
-        """(points, 2) direction of every stimulus, x and y (down)."""
-        x, y = (np.linspace(-f / 2, f / 2, n) for f, n in zip(self.field_deg, self.grid, strict=True))
-        return np.stack([g.ravel() for g in np.meshgrid(x, y)], 1)
-
-    @property
-    def slips_mm(self) -> Array:
-        """(states, 3): the origin, the lateral and the axial ones."""
-        lateral = [(x, 0.0, 0.0) for x in self.lateral_mm]
-        return np.array([(0.0, 0.0, 0.0), *lateral, *((0.0, 0.0, z) for z in self.axial_mm)])
-
-    @property
-    def frames(self) -> int:
-        """Of all subjects."""
-        return self.subjects * len(self.stimuli_deg) * len(self.slips_mm)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

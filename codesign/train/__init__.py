@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from codesign.train.inner import Trainer as Trainer
     from codesign.train.inner import model as model
     from codesign.train.journal import Journal as Journal
-    from codesign.train.placement import Place as Place
     from codesign.train.placement import device_of as device_of
     from codesign.train.placement import place as place
     from codesign.train.run import Run as Run
     from codesign.train.run import RunConfig as RunConfig
+    from codesign.train.words import Part as Part
+    from codesign.train.words import Place as Place
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -38,7 +39,8 @@ __getattr__, __dir__, __all__ = attach(
         "InnerConfig": "inner",
         "Journal": "journal",
         "Model": "inner",
-        "Place": "placement",
+        "Part": "words",
+        "Place": "words",
         "Record": "inner",
         "Run": "run",
         "RunConfig": "run",

@@ -6,16 +6,15 @@ to rounding, not to the bit.
 """
 
 import os
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from codesign.network import Prediction
 from codesign.train.inner import Trainer
+from codesign.train.words import Place
 from metalens.ground.errors import ConfigError
-
-Place = Literal["auto", "cpu", "cuda"]
 
 
 def device_of(wanted: Place) -> torch.device:

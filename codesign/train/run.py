@@ -17,12 +17,12 @@ from codesign.train import assess, checkpoint, evolution
 from codesign.train.evolution import Candidate, Plan, Search
 from codesign.train.formation import network_macs
 from codesign.train.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
+from codesign.train.words import Part
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
 from metalens.image import Sensor
 
 Preset = Literal["smoke", "laptop", "paper"]
-Part = Literal["optics", "pitch", "architecture"]
 
 
 @dataclass(frozen=True, slots=True)

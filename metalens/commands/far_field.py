@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,9 @@ from metalens.ground import config, store
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Figure, KeyFigure, Section, Table, canvas, png, write
-from metalens.psf import FarField
+
+if TYPE_CHECKING:
+    from metalens.psf import FarField
 
 TAKES = (
     "lens",
@@ -74,7 +76,7 @@ def asked(options: Any, made: lens.Lens) -> Asked:
     return Asked(tuple(zip(along_x, along_y, strict=True)), sources[0], waves[0], samples)
 
 
-def compute(made: lens.Lens, wanted: Asked, console: Console) -> list[FarField]:
+def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"]:
     """One far field a direction of incidence; of pillars of two sizes the light along x that the lens is for."""
     directions = console.track(wanted.angles_deg, total=len(wanted.angles_deg), label="directions")
     return [
@@ -89,7 +91,7 @@ def compute(made: lens.Lens, wanted: Asked, console: Console) -> list[FarField]:
     ]
 
 
-def save(path: Path, source: Path, wanted: Asked, found: list[FarField], *, page: bool) -> None:
+def save(path: Path, source: Path, wanted: Asked, found: list["FarField"], *, page: bool) -> None:
     """The file of kind ``far-field``, its picture beside it, and with ``page`` its report."""
     arrays = {
         "share": np.stack([one.share for one in found]).astype(np.float32),
@@ -112,7 +114,7 @@ def save(path: Path, source: Path, wanted: Asked, found: list[FarField], *, page
         _report(path.with_suffix(".html"), wanted, found, image)
 
 
-def values(wanted: Asked, found: list[FarField]) -> dict[str, Any]:
+def values(wanted: Asked, found: list["FarField"]) -> dict[str, Any]:
     """Numbers for programs."""
     fields = []
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
@@ -132,7 +134,7 @@ def values(wanted: Asked, found: list[FarField]) -> dict[str, Any]:
     return {"beam_sine": first.beam_sine, "beam_holds": first.beam_holds, "steepest": first.steepest, "fields": fields}
 
 
-def text(target: Path, wanted: Asked, found: list[FarField]) -> str:
+def text(target: Path, wanted: Asked, found: list["FarField"]) -> str:
     """Lines for people."""
     source = "plane waves" if math.isinf(wanted.source_mm) else f"a source at {wanted.source_mm:g} mm"
     lines = [f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {max(o.error for o in found):.1g}"]
@@ -151,7 +153,7 @@ def text(target: Path, wanted: Asked, found: list[FarField]) -> str:
     return "\n".join([*lines, f"  {_counted(found[0])}"])
 
 
-def _counted(one: FarField) -> str:
+def _counted(one: "FarField") -> str:
     limit = "" if one.steepest >= 1 else f"; the lattice tells directions up to a sine of {one.steepest:.3f}"
     return (
         f"a beam is the light within a sine of {one.beam_sine:.2g} of its middle ({one.beam_holds:.0%} of an ideal "
@@ -159,13 +161,13 @@ def _counted(one: FarField) -> str:
     )
 
 
-def _cone(one: FarField, part: float) -> float | None:
+def _cone(one: "FarField", part: float) -> float | None:
     """Angle about the axis in deg that holds a part of the transmitted light; None where none does."""
     sine = one.within_sine(part)
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
-def picture(wanted: Asked, found: list[FarField]) -> bytes:
+def picture(wanted: Asked, found: list["FarField"]) -> bytes:
     """Light over direction cosines on a logarithmic scale (above), and within cones about the axis (below)."""
     from matplotlib.colors import LogNorm
 
@@ -186,7 +188,7 @@ def picture(wanted: Asked, found: list[FarField]) -> bytes:
     return png(figure)
 
 
-def _report(path: Path, wanted: Asked, found: list[FarField], image: bytes) -> None:
+def _report(path: Path, wanted: Asked, found: list["FarField"], image: bytes) -> None:
     rows = [
         [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
         for (x, y), one in zip(wanted.angles_deg, found, strict=True)

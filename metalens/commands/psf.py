@@ -21,7 +21,6 @@ from metalens.ground.errors import ConfigError
 from metalens.ground.report import Figure, KeyFigure, Section, Table, write
 from metalens.ground.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
-from metalens.psf import plots as psf_plots
 
 # by kind of file, the module whose ``load`` gives a :class:`Built`; filled by the command line
 SOURCES: dict[str, str] = {}
@@ -152,7 +151,7 @@ class Built(Protocol):
     def design(self) -> lens.Lens:
         """What was to be made."""
 
-    def psf_stack(self, view: psf.View, *, tolerance: float) -> psf.PsfStack:
+    def psf_stack(self, view: "psf.View", *, tolerance: float) -> psf.PsfStack:
         """PSFs (angle, depth, y, x)."""
 
 
@@ -167,6 +166,8 @@ def _read(path: Path) -> tuple[lens.Lens, Built | None]:
 
 def _make(options: Options, settings: Settings, made: lens.Lens, built: Built | None, path: Path) -> psf.PsfStack:
     """Compute, write, draw."""
+    from metalens.psf import plots as psf_plots
+
     stack = _of_design(options.lens, settings, made) if built is None else _of_made(options.lens, settings, built)
     psf_export.write(path, stack)
     pictures = psf_plots.pictures(stack)

@@ -165,7 +165,7 @@ class Settings:
         return replace(self, depths_mm=depths_mm, window_um=reach.window_um(made, tuple(ends), airy=AIRY))
 
     @property
-    def view(self) -> psf.View:
+    def view(self) -> "psf.View":
         """Depths, angles, window and source in um and rad.
 
         Raises:
@@ -187,7 +187,7 @@ class Settings:
         )
 
     @property
-    def source(self) -> psf.Extent | None:
+    def source(self) -> "psf.Extent | None":
         """Size and shape of the source, None for a point."""
         if not (self.source_um or self.source_deg):
             return None

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
-    from metalens.psf.extended import SourceShape as SourceShape
-    from metalens.psf.of_lens import Polarisation as Polarisation
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import aperture as aperture
     from metalens.psf.of_lens import from_lens as from_lens
     from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
+    from metalens.psf.record import Polarisation as Polarisation
     from metalens.psf.record import PsfStack as PsfStack
+    from metalens.psf.record import SourceShape as SourceShape
     from metalens.psf.record import load as load
     from metalens.psf.record import save as save
     from metalens.psf.spectrum import Nodes as Nodes
@@ -41,10 +41,10 @@ __getattr__, __dir__, __all__ = attach(
         "FarField": "directions",
         "LeftOut": "budget",
         "Nodes": "spectrum",
-        "Polarisation": "of_lens",
+        "Polarisation": "record",
         "PsfStack": "record",
         "Source": "spectrum",
-        "SourceShape": "extended",
+        "SourceShape": "record",
         "View": "of_lens",
         "aperture": "of_lens",
         "export": "",

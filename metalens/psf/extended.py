@@ -11,7 +11,7 @@ standard deviation of w, what is left out is D seen through |∇ŵ|/(2πσ); the
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -24,8 +24,8 @@ from metalens.ground.errors import PropagationError
 from metalens.lens import media
 from metalens.propagate import Case
 from metalens.psf.cells import MOST, nyquist_um
+from metalens.psf.record import SourceShape
 
-SourceShape = Literal["disc", "square", "gaussian"]
 GUARD = 12  # steps of Nyquist's around what the source blurs in: light that is cut there rings
 SIGMA = {"disc": 1 / 4, "square": 1 / math.sqrt(12), "gaussian": 1 / math.sqrt(8 * math.log(2))}  # of the size
 REACH = {"disc": 0.5, "square": 0.5, "gaussian": 4 * SIGMA["gaussian"]}

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,11 +14,10 @@ from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
 from metalens.psf.budget import Budget, LeftOut, scalar_error, with_model, worst
 from metalens.psf.extended import Extent
-from metalens.psf.record import PsfStack
+from metalens.psf.record import Polarisation, PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
 
-Polarisation = Literal["scalar", "vector", "auto"]
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 

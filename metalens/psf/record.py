@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.propagate import axis
 from metalens.psf.budget import Budget
+
+Polarisation = Literal["scalar", "vector", "auto"]
+SourceShape = Literal["disc", "square", "gaussian"]
 
 
 @functools.lru_cache(maxsize=1)

@@ -18,7 +18,8 @@ from characterize.model.parameters import Known
 from codesign.adapt import reading
 from codesign.adapt import train as retraining
 from codesign.adapt.reading import Accuracy
-from codesign.adapt.train import Outcome, RetrainConfig
+from codesign.adapt.settings import RetrainConfig
+from codesign.adapt.train import Outcome
 from codesign.optics import formed
 from codesign.optics.built import MadeLens
 from codesign.optics.stack import Stack

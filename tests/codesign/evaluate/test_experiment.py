@@ -15,7 +15,8 @@ import made_lens as m
 from codesign.adapt import train as retraining
 from codesign.commands import experiment as command
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentConfig, Trial
+from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
+from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.gaze import personal, regressor

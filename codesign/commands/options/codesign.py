@@ -1,0 +1,34 @@
+"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from codesign.train import Part, Place
+from metalens.commands import Common, Output
+
+WORK = "codesign.commands.codesign"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens codesign``.
+
+    Attributes:
+        config: RUN.toml.
+        output: folder of the run.
+        resume: go on from the folder's checkpoint, bit for bit.
+        freeze: parts that stay as they start, beside those of the config: the ablations.
+        device: of the network; auto takes a GPU where there is one. Scenes and optics stay on the processor.
+        export: write every budget's network as ONNX too (opset 17), for frames of the sensor's pixels.
+        events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
+    """
+
+    config: tyro.conf.Positional[Path]
+    output: Output = Path("run")
+    resume: bool = False
+    freeze: tuple[Part, ...] = ()
+    device: Place = "auto"
+    export: bool = False
+    events: bool = False

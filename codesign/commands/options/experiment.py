@@ -1,0 +1,28 @@
+"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each run's lens and network (Sec. 5)."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from codesign.evaluate import ExperimentConfig
+from metalens.commands import Common, Output
+
+WORK = "codesign.commands.experiment"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate experiment``.
+
+    Attributes:
+        runs: folders of finished runs of one geometry; the first is compared with each of the others.
+        output: folder for experiment.json, samples.png, ambiguity.png, errors.png and report.html.
+        names: of the runs; by default their folders'.
+        settings: subjects, stimuli, slippage states, calibration.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    output: Output = Path("experiment")
+    names: tuple[str, ...] = ()
+    settings: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=ExperimentConfig)

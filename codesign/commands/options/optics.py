@@ -1,0 +1,33 @@
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from metalens.commands import Common, Output
+
+WORK = "codesign.commands.evaluate_optics"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate optics``.
+
+    Attributes:
+        lenses: lens files; the first is what the others are compared with.
+        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
+        config: OPTICS.toml with the tables [axial], [scenes] and [reader]; without it the defaults.
+        scenes: number of scenes, in place of the one in the settings.
+        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
+            and at the aperture of the first lens; tuned on axis for the finest binning.
+        reader: train the reference reader behind every lens and print what it reads: depth of windows, slippage, with
+            calibrated intervals; some minutes a lens, the same numbers every time.
+    """
+
+    lenses: tyro.conf.Positional[tuple[Path, ...]]
+    output: Output = Path("optics")
+    config: Path | None = None
+    scenes: int | None = None
+    baselines: bool = False
+    reader: bool = False

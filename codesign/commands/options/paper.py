@@ -1,0 +1,33 @@
+"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from metalens.commands import Common, Output
+
+WORK = "codesign.commands.paper"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens evaluate paper``.
+
+    Attributes:
+        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
+            far as there are; without any, the claims are listed with the commands that measure them.
+        others: further finished runs: other networks (Table 2), runs with one part frozen (Fig. 8b); each run's
+            result.json tells which it is.
+        output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
+        subjects: of the experiment.
+        scenes: of Table 1.
+        measure: measure what is not in the folder yet; without it only what is there is used.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    others: tuple[Path, ...] = ()
+    output: Output = Path("paper")
+    subjects: int = 20
+    scenes: int = 24
+    measure: bool = True

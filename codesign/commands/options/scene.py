@@ -1,0 +1,26 @@
+"""SCENE.toml to rendered eyes: a contact sheet, depth layers, masks and labels."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from metalens.commands import Common, Output
+
+WORK = "codesign.commands.scene"
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Options of ``metalens scene``.
+
+    Attributes:
+        config: SCENE.toml; without it the defaults.
+        output: folder for scene.h5, layers.h5, sheet.png and labels.csv.
+        referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
+            referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
+    """
+
+    config: tyro.conf.Positional[Path | None] = None
+    output: Output = Path("scene")
+    referee: bool = False
