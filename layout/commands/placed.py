@@ -11,7 +11,7 @@ from layout.commands import make
 from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.stages import Stages
-from layout.files import MaskContent, flat, verify
+from layout.files import MaskContent, hierarchy, verify
 from layout.mask import build
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
@@ -102,7 +102,7 @@ def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
         raise MaskFileError(f"{path}: no such file; need a GDSII or OASIS mask")
     most = foreign.most_of(path)
     content = read(path, most)
-    flat.refuse_beyond(content, most)
+    hierarchy.refuse_beyond(content, most)
     made = parts.of_file(
         name, path, content, work.process, cell=record.cell, relative_dose=record.relative_dose, keep_top=keep
     )

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from layout.commands.check import read
-from layout.files import MaskContent, doses, flat
+from layout.files import MaskContent, doses, flat, hierarchy
 from layout.process import LayerNumber
 from layout.rules import foreign
 from layout.shapes import polygon
@@ -31,7 +31,7 @@ def panels(path: Path) -> list[Panel]:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
     most = foreign.most_of(found)
     content = read(found, most)
-    flat.refuse_beyond(content, most)
+    hierarchy.refuse_beyond(content, most)
     table = found.with_name("doses.csv")
     dose = doses.read(table) if table.is_file() else {}
     groups = flat.alike(content, lambda shape: (shape.cell, shape.layer))

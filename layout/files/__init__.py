@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from layout.files import dxf as dxf
     from layout.files import flat as flat
     from layout.files import handover as handover
+    from layout.files import hierarchy as hierarchy
     from layout.files import paths as paths
     from layout.files import squares as squares
     from layout.files import verify as verify
@@ -58,6 +59,7 @@ __getattr__, __dir__, __all__ = attach(
         "flat": "",
         "forget": "content",
         "handover": "",
+        "hierarchy": "",
         "mapped": "content",
         "paths": "",
         "placements": "read_loops",

@@ -89,6 +89,18 @@ class CellContent:
             raise MaskFileError(f"cell {self.name!r}: of its placements only the sums were kept; read all of them")
         return self.placed
 
+    def counts(self) -> Array:
+        """(children,) how often each of ``placed.children`` is placed; of sums too."""
+        if self.sums is not None:
+            return self.sums.count
+        return np.bincount(self.placed.child, minlength=len(self.placed.children))
+
+    @property
+    def taken(self) -> int:
+        """Shapes that are taken up for each copy: its own; 1 for a cell that holds nothing at all."""
+        own = sum(map(len, self.polygons.values())) + sum(map(len, self.circles.values()))
+        return own or int(not self.placed.children)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MaskContent:

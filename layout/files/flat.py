@@ -83,40 +83,6 @@ def alike(content: MaskContent, key: Callable[[Shapes], Hashable]) -> dict[Hasha
     return found
 
 
-def refuse_beyond(content: MaskContent, most: int) -> None:
-    """Count what the hierarchy would draw when taken apart, by products alone.
-
-    Raises:
-        MaskFileError: more than ``most`` shapes (placements that draw nothing count as one), with the number; a cell
-            that places itself or is missing.
-    """
-    known: dict[str, int] = {}
-    for name in content.cells:  # those below no top cell too: they place each other
-        _number(content, name, known, ())
-    total = sum(known[top] for top in content.tops)
-    if total > most:
-        raise MaskFileError(
-            f"the mask draws {total:,} shapes when its arrays are taken apart, at most {most:,} are taken "
-            "(metalens check --most-shapes sets another limit, at some 150 bytes of memory for each)"
-        )
-
-
-def _number(content: MaskContent, name: str, known: dict[str, int], above: tuple[str, ...]) -> int:
-    if name in known:
-        return known[name]
-    if name not in content.cells:
-        raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
-    if name in above or len(above) > _DEEPEST:
-        raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
-    cell = content.cells[name]
-    total = sum(map(len, cell.polygons.values())) + sum(map(len, cell.circles.values()))
-    placed = cell.kept()
-    for child, count in zip(placed.children, np.bincount(placed.child, minlength=len(placed.children)), strict=True):
-        total += int(count) * max(1, _number(content, child, known, (*above, name)))
-    known[name] = total
-    return total
-
-
 def circle(x: int, y: int, radius: int) -> Array:
     """(64, 2) corners of a polygon of the area of a circle, on whole units."""
     angle = 2 * np.pi * (np.arange(_CIRCLE) + 0.5) / _CIRCLE

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import MaskContent, flat
+from layout.files import MaskContent, flat, hierarchy
 from layout.process import Rules, compiled
 from layout.rules import edges as facing
 from layout.rules import near
@@ -72,7 +72,7 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
     """
     if not content.tops:
         raise MaskFileError("the mask has no top cell: its cells place each other in a circle")
-    flat.refuse_beyond(content, most)
+    hierarchy.refuse_beyond(content, most)
     report = DrcReport.empty(content, rules)
     for number, layer in _layers(content, skip):
         report.pillars += len(layer.kind)

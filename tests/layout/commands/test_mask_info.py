@@ -2,9 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from layout.files import QUARTERS, Assembly, CellContent, Copies
+from layout.gdsii import assemble as gdsii_assemble
 from layout.gdsii import write as gdsii_write
+from layout.oasis import assemble as oasis_assemble
 from layout.oasis import write as oasis_write
 from metalens.cli import BAD_INPUT, SUCCESS, main
 
@@ -51,3 +55,38 @@ def test_a_mask_cut_short_is_refused_by_name(make_plan, tmp_path, capsys):
     assert str(path) in capsys.readouterr().err
     assert main(["info", str(tmp_path / "none.oas")]) == BAD_INPUT
     assert "none.oas: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ending", ["oas", "gds"])
+def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
+    """Arrays of arrays of arrays: the numbers are products, far beyond what could be taken apart."""
+    box = np.array([[0, 0], [130, 0], [130, 70]])
+    dot, bar = (CellContent(name, {(7, n): [box] * (n + 1)}) for n, name in enumerate(("DOT", "BAR")))
+    lens, die, wafer = (CellContent(name) for name in ("LENS", "DIE", "WAFER"))
+    steps = {"across": (300, 0), "up": (0, 310)}
+    copies = {
+        "LENS": (Copies("DOT", 0, 0, columns=600, rows=700, **steps), Copies("BAR", 5, 9, QUARTERS[3])),
+        "DIE": (Copies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps), Copies("BAR", 0, 0, rows=3, up=(0, 9))),
+        "WAFER": (Copies("DIE", -7, 0, columns=210, rows=330, **steps), Copies("LENS", 0, 0)),
+    }
+    cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
+    write = oasis_assemble.write if ending == "oas" else gdsii_assemble.write
+    write(Assembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
+    assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
+    told = json.loads(capsys.readouterr().out)
+    lenses = 210 * 330 * 40 * 50 + 1
+    found = {number: entry["shapes"] for number, entry in told["layers"].items()}
+    assert found == {"7/0": lenses * 600 * 700, "7/1": 2 * (lenses + 210 * 330 * 3)}
+    assert told["tops"] == ["WAFER"]
+
+
+def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
+    """A cell of each top, one that holds only another, and one that is empty; no layer but those that are drawn."""
+    box = np.array([[0, 0], [130, 0], [130, 70]])
+    cells = [CellContent("A", {(7, 0): [box]}), CellContent("EMPTY"), CellContent("ONE"), CellContent("TWO")]
+    copies = {"ONE": (Copies("A", 0, 0), Copies("EMPTY", 0, 0, rows=9, up=(0, 5))), "TWO": (Copies("A", 3, 4),) * 3}
+    gdsii_assemble.write(Assembly("L", {cell.name: cell for cell in cells}, copies), tmp_path / "w.gds")
+    assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS
+    told = json.loads(capsys.readouterr().out)
+    assert told["layers"] == {"7/0": {"name": "", "shapes": 4}}
+    assert sorted(told["tops"]) == ["ONE", "TWO"]

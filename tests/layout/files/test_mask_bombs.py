@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.commands import check
-from layout.files import flat
+from layout.files import hierarchy
 from layout.gdsii import bytes as gds
 from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis
@@ -128,9 +128,9 @@ def test_the_number_of_shapes_is_the_product_of_the_arrays():
     content = gdsii_read.parse(
         np.frombuffer(gdsii(structure("B", array("A", 9, 8)), structure("TOP", array("B", 7, 3))), np.uint8)
     )
-    flat.refuse_beyond(content, 9 * 8 * 7 * 3)
+    hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3)
     with pytest.raises(MaskFileError, match=r"1,512 shapes.*at most 1,511"):
-        flat.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
+        hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
 
 
 def test_shapes_on_each_other_are_refused_before_they_are_paired():
