@@ -1,7 +1,6 @@
 """What is placed: the content of a lens's mask or of a file made elsewhere, its doses, and boxes around its shapes."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,8 +17,7 @@ from metalens.ground.errors import MaskFileError
 UNIT_NM = 1.0
 PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
 _WHOLE = 1e-6
-_TILES = 64  # squares of a lattice, each way; slices of a polygon at most
-_SLICE = 5000  # units
+_TILES = 64  # squares of a lattice, each way
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,7 +63,7 @@ def of_plan(
     every = list(boxes[PILLARS])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
-            some = [box for shape in shapes for box in _pieces(np.asarray(shape, np.int64))]
+            some = [box for shape in shapes for box in rectilinear.covering(np.asarray(shape, np.int64))]
             every += some
             if figure.name not in UNDRAWN:
                 boxes[APERTURE if layer[0] == process.layers.aperture[0] else PILLARS] += some
@@ -215,26 +213,6 @@ def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
     return found
 
 
-def _pieces(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of slices 5 um high or more."""
-    step = np.roll(shape, -1, axis=0) - shape
-    if not (step != 0).all(1).any():
-        return rectilinear.rectangles(shape)
-    low, high = int(shape[:, 1].min()), int(shape[:, 1].max())
-    ends = np.linspace(low, high, min(_TILES, max(1, (high - low) // _SLICE)) + 1)
-    start = shape.astype(float)
-    y0, y1 = start[:, 1], start[:, 1] + step[:, 1]
-    steep = np.where(step[:, 1] == 0, 1, step[:, 1])
-    made = []
-    for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-        inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
-        along = [np.clip((y - y0) / steep, 0, 1) for y in (bottom, top)]
-        along = [np.where(step[:, 1] == 0, whole, t) for whole, t in zip((0.0, 1.0), along, strict=True)]
-        x = np.concatenate([(start[:, 0] + t * step[:, 0])[inside] for t in along])
-        made.append([math.floor(x.min()), math.floor(bottom), math.ceil(x.max()), math.ceil(top)])
-    return np.array(made, np.int64)
-
-
 def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, Array]:
     """Boxes of all shapes below ``top`` by exposure; layers that no exposure of ours knows by their number."""
     layers = process.layers
@@ -242,7 +220,7 @@ def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, A
     ours |= {n[0]: PILLARS for n in (layers.pillar, layers.marks, layers.labels, layers.dose, layers.witness)}
     found: dict[str, list[Array]] = {}
     for stack in flat.stacks(content, top):
-        pieces = np.concatenate([_pieces(outline) for outline in stack.outlines])
+        pieces = np.concatenate([rectilinear.covering(outline) for outline in stack.outlines])
         places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
         every = (pieces[None] + places[:, None]).reshape(-1, 4)
         found.setdefault(ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []).append(every)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from layout.files import CellContent, MaskContent, mapped
+from layout.files import CellContent, MaskContent, hierarchy, mapped
 from layout.gdsii import bytes as gdsii_bytes
 from layout.gdsii import read as gdsii_read
 from layout.oasis import Cursor
@@ -70,11 +70,10 @@ def _any(content: MaskContent) -> Iterator[Finding]:
             if child not in content.cells:
                 yield Finding(-1, f"cell {cell.name!r} places {child!r}, which the file does not hold")
         yield from _shapes(cell)
-    if len(content.tops) == 1:
-        try:
-            content.counts(content.tops[0])
-        except MaskFileError as error:
-            yield Finding(-1, str(error))
+    try:
+        hierarchy.ordered(content)
+    except MaskFileError as error:
+        yield Finding(-1, str(error))
 
 
 def _shapes(cell: CellContent) -> Iterator[Finding]:

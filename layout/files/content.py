@@ -23,16 +23,31 @@ class Turn:
     mirrored: bool = False
     scale: float = 1.0
 
+    @property
+    def quarter(self) -> bool:
+        """Whether lengths and right angles stay as they are: no scale, and quarter turns alone."""
+        return self.scale == 1 and self.angle_deg % 90 == 0
+
+    @property
+    def back(self) -> "Turn":
+        """The turn that undoes this one."""
+        return Turn(self.angle_deg if self.mirrored else -self.angle_deg % 360, self.mirrored, 1 / self.scale)
+
     def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Points turned; exact for quarter turns without a scale, else rounded to whole units."""
         if self.mirrored:
             y = -y
-        if self.scale == 1 and self.angle_deg % 90 == 0:
+        if self.quarter:
             for _ in range(int(self.angle_deg // 90) & 3):
                 x, y = -y, x
             return x, y
         c, s = (self.scale * f(math.radians(self.angle_deg)) for f in (math.cos, math.sin))
         return np.rint(c * x - s * y).astype(np.int64), np.rint(s * x + c * y).astype(np.int64)
+
+    def boxes(self, boxes: Array) -> Array:
+        """(n, 4) left, bottom, right, top of boxes that are turned by quarters."""
+        x, y = self.apply(boxes[:, [0, 2]], boxes[:, [1, 3]])
+        return np.column_stack([x.min(1), y.min(1), x.max(1), y.max(1)])
 
     def after(self, inner: "Turn") -> "Turn":
         """The turn that equals ``inner`` followed by this one."""

@@ -1,6 +1,6 @@
 """The shapes of a mask with the hierarchy taken apart: each different polygon once, with all its places."""
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from metalens.ground.errors import MaskFileError
 
 _DEEPEST = 64
 _CIRCLE = 64  # corners of a true circle
+NONE: Set[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,20 +44,24 @@ class Stack:
     y: Array
 
 
-def shapes(content: MaskContent, top: str) -> Iterator[Shapes]:
+def shapes(content: MaskContent, top: str, *, whole: Set[str] = NONE) -> Iterator[Shapes]:
     """Every polygon below ``top``; true circles as polygons of 64 corners of their area.
+
+    whole: cells that are not taken apart, and left out, where they stand upright or turned by quarters.
 
     Raises:
         MaskFileError: a cell that places itself or is missing, a place beyond 32 bits.
     """
-    for stack in stacks(content, top):
+    for stack in stacks(content, top, whole=whole):
         for outline in stack.outlines:
             yield Shapes(stack.cell, stack.layer, outline, stack.x, stack.y)
 
 
-def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
+def stacks(content: MaskContent, top: str, *, whole: Set[str] = NONE) -> Iterator[Stack]:
     """As :func:`shapes`, polygons of a cell that have equally many corners together."""
-    for name, x, y, turn in _cells(content, top, (0, 0), QUARTERS[0], ()):
+    for name, x, y, turn, is_whole in _cells(content, top, (0, 0), QUARTERS[0], (), whole):
+        if is_whole:
+            continue
         cell = content.cells[name]
         drawn = {layer: list(polygons) for layer, polygons in cell.polygons.items()}
         for layer, circles in cell.circles.items():
@@ -69,15 +74,30 @@ def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
                 yield Stack(name, layer, _turned(np.stack(group).astype(np.int64), turn), x, y)
 
 
-def alike(content: MaskContent, key: Callable[[Shapes], Hashable]) -> dict[Hashable, list[Shapes]]:
+def places(content: MaskContent, top: str, whole: Set[str]) -> Iterator[tuple[str, Turn, Array, Array]]:
+    """(cell, turn, x, y) of the cells that :func:`shapes` leaves out."""
+    for name, x, y, turn, is_whole in _cells(content, top, (0, 0), QUARTERS[0], (), whole):
+        if is_whole:
+            yield name, turn, x, y
+
+
+def alike(
+    content: MaskContent,
+    key: Callable[[Shapes], Hashable],
+    *,
+    tops: Sequence[str] | None = None,
+    whole: Set[str] = NONE,
+) -> dict[Hashable, list[Shapes]]:
     """Shapes below all top cells by ``key`` and outline, wherever in the hierarchy they are placed; None: passed over.
+
+    tops: cells in place of the top cells. whole: as in :func:`shapes`.
 
     Raises:
         MaskFileError: as :func:`shapes`.
     """
     found: dict[Hashable, list[Shapes]] = {}
-    for top in content.tops:
-        for shape in shapes(content, top):
+    for top in content.tops if tops is None else tops:
+        for shape in shapes(content, top, whole=whole):
             if (own := key(shape)) is not None:
                 found.setdefault((own, np.ascontiguousarray(shape.outline).tobytes()), []).append(shape)
     return found
@@ -100,14 +120,19 @@ def _turned(outlines: Array, turn: Turn) -> Array:
 
 
 def _cells(
-    content: MaskContent, name: str, at: tuple[int, int], turn: Turn, above: tuple[str, ...]
-) -> Iterator[tuple[str, Array, Array, Turn]]:
-    """(cell, x, y, turn) of every cell below ``name`` and of itself, equal ones together where they are leaves."""
+    content: MaskContent, name: str, at: tuple[int, int], turn: Turn, above: tuple[str, ...], whole: Set[str]
+) -> Iterator[tuple[str, Array, Array, Turn, bool]]:
+    """(cell, x, y, turn, whether it is kept whole) of every cell below ``name`` and of itself.
+
+    Equal ones come together where they are leaves or whole.
+
+    Below a cell that is turned by no quarter nothing is whole.
+    """
     if name not in content.cells:
         raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
     if name in above or len(above) > _DEEPEST:
         raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
-    yield name, np.array([at[0]]), np.array([at[1]]), turn
+    yield name, np.array([at[0]]), np.array([at[1]]), turn, False
     placed = content.cells[name].kept()
     if not len(placed.child):
         return
@@ -117,6 +142,7 @@ def _cells(
     if max(px.max(), py.max(), -px.min(), -py.min()) > 2**31 - 1:
         raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
     px, py = px.astype(np.int32), py.astype(np.int32)
+    below = whole if turn.quarter else NONE
     small: type[np.integer[Any]] = np.uint16 if len(placed.children) * len(placed.turns) < 1 << 16 else np.int64
     key = np.asarray(placed.child, small) * len(placed.turns) + np.asarray(placed.turn, small)
     order = np.argsort(key, kind="stable")
@@ -125,8 +151,9 @@ def _cells(
     kinds = key[first]
     for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
         child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])
-        if child in content.cells and not len(content.cells[child].kept().child):
-            yield child, px[some], py[some], inner
+        kept = child in below and inner.quarter
+        if kept or (child in content.cells and not len(content.cells[child].kept().child)):
+            yield child, px[some], py[some], inner, kept
         else:
             for i in some.tolist():
-                yield from _cells(content, child, (int(px[i]), int(py[i])), inner, (*above, name))
+                yield from _cells(content, child, (int(px[i]), int(py[i])), inner, (*above, name), below)

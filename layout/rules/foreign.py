@@ -4,18 +4,22 @@ Shapes that touch are one shape, as a writer exposes them. Convex ones that stan
 polygon, those that can be near each other found by sorting their places; all others edge against edge.
 """
 
+import dataclasses
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from layout.files import MaskContent, flat, hierarchy
+from layout.files import MaskContent, Turn
 from layout.process import Rules, compiled
+from layout.rules import copies, near, nested
 from layout.rules import edges as facing
-from layout.rules import near
-from layout.rules.report import DrcReport, Violation
+from layout.rules import layer as layers
+from layout.rules.layer import Layer
+from layout.rules.report import MOST_SHOWN, DrcReport, Violation
 from layout.shapes import convex, region
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
@@ -26,34 +30,6 @@ _AT_ONCE = 1 << 18  # shapes that are held to the grid at once
 _ROUNDED = 1e-6  # of a step of a grid that is no whole number of units
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Layer:
-    """Shapes of one layer number: different outlines, and (n,) int32 which each is, with its place x, y."""
-
-    outlines: list[Array]
-    cells: list[str]
-    kind: Array
-    x: Array
-    y: Array
-
-    @property
-    def discs(self) -> near.Discs:
-        """Circles around the shapes, about the middles of their boxes."""
-        middle = np.array([(o.min(0) + o.max(0)) / 2 for o in self.outlines])
-        reach = np.array([np.hypot(*(o - m).T).max() for o, m in zip(self.outlines, middle, strict=True)])
-        return near.Discs(self.x, self.y, self.kind, middle, reach)
-
-    def points(self, n: int) -> Array:
-        """(m, 2) corners of shape ``n``."""
-        return np.asarray(self.outlines[self.kind[n]] + np.array([self.x[n], self.y[n]], np.int64))
-
-    def box(self, *members: int) -> tuple[int, int, int, int]:
-        """Left, bottom, right, top of some shapes."""
-        corners = np.concatenate([self.points(n) for n in members])
-        (left, bottom), (right, top) = corners.min(0).tolist(), corners.max(0).tolist()
-        return left, bottom, right, top
-
-
 def most_of(path: Path) -> int:
     """Shapes that a mask file is taken apart to, where its user sets no other limit."""
     return MOST_SHAPES + _EACH_BYTE * path.stat().st_size
@@ -61,6 +37,9 @@ def most_of(path: Path) -> int:
 
 def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most: int = MOST_SHAPES) -> DrcReport:
     """Gap, feature and grid of every shape below the top cells, each layer number (all its datatypes) by itself.
+
+    Large cells that are placed again and again are looked at once, but for what stands near other shapes: a wafer of
+    one die takes little more than the die, and every copy is counted.
 
     Args:
         skip: layer numbers that are not drawn in the resist (outlines, write fields).
@@ -72,60 +51,54 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
     """
     if not content.tops:
         raise MaskFileError("the mask has no top cell: its cells place each other in a circle")
-    hierarchy.refuse_beyond(content, most)
+    parts = copies.found(content)
+    copies.refuse_beyond(parts, content, most)
+    parts = copies.with_places(parts, content)
     report = DrcReport.empty(content, rules)
-    for number, layer in _layers(content, skip):
-        report.pillars += len(layer.kind)
-        _off_grid(layer, rules, content.unit_nm, report)
-        _check_layer(layer, rules, report, f"layer {number}")
+    step, gap = (v / content.unit_nm for v in (rules.grid_nm, rules.minimum_gap_nm))
+    whole, offsets = parts.times.keys() - {copies.ROOT}, parts.offsets(step)
+    groups = {name: layers.groups(content, parts.tops(content, name), skip, whole) for name in parts.times}
+    for number in sorted({number for some in groups.values() for number in some}):
+        drawn = {name: layers.gathered(some.pop(number)) for name, some in groups.items() if number in some}
+        for name, layer in nested.separate(parts, drawn, gap, most):
+            report.pillars += len(layer.kind) * parts.times[name]
+            own = DrcReport.empty(content, rules)
+            _check_layer(layer, rules, own, f"layer {number}")
+            _copied(report, own, parts.times[name], name, partial(parts.copies, name, MOST_SHOWN))
+            for offset, times in offsets[name].items():
+                own = DrcReport.empty(content, rules)
+                _off_grid(layer, rules, own, offset)
+                _copied(report, own, times, name, partial(parts.copies, name, MOST_SHOWN, step=step, offset=offset))
     return report
 
 
-def _layers(content: MaskContent, skip: Sequence[int]) -> Iterator[tuple[int, _Layer]]:
-    """(layer number, its shapes), rising."""
-    found: dict[int, list[list[flat.Shapes]]] = {}
-    for group in flat.alike(content, lambda s: None if s.layer[0] in skip else s.layer[0]).values():
-        found.setdefault(group[0].layer[0], []).append(group)
-    for number in sorted(found):
-        yield number, _layer(found.pop(number))
+def _copied(
+    report: DrcReport, own: DrcReport, times: int, name: str, places: Callable[[], list[tuple[Turn, int, int]]]
+) -> None:
+    """Enter what was found of a cell for all its copies; it is listed for the first of them, as far as lists go."""
+    for rule, count in own.counts.items():
+        report.counts[rule] += times * count
+    report.minimum_gap_nm = min(report.minimum_gap_nm, own.minimum_gap_nm)
+    report.minimum_feature_nm = min(report.minimum_feature_nm, own.minimum_feature_nm)
+    shown = Counter(v.rule for v in report.violations)
+    said = f"; in each of {times:,} copies of {name}" if name != copies.ROOT else ""
+    for turn, x, y in places() if own.violations else []:
+        listed = [v for v in own.violations if shown[v.rule] < MOST_SHOWN]
+        if not listed:
+            return
+        boxes = turn.boxes(np.array([v.box for v in listed])) + np.array([x, y, x, y])
+        for found, box in zip(listed, boxes.tolist(), strict=True):
+            shown[found.rule] += 1
+            if shown[found.rule] <= MOST_SHOWN:
+                report.violations.append(dataclasses.replace(found, box=tuple(box), text=found.text + said))
 
 
-def _layer(groups: list[list[flat.Shapes]]) -> _Layer:
-    """All of them, those of one outline together; they are let go on the way."""
-    outlines = [_plain(np.asarray(group[0].outline, np.int64)) for group in groups]
-    cells = [group[0].cell for group in groups]
-    total, at = sum(len(shape.x) for group in groups for shape in group), 0
-    kind, x, y = (np.empty(total, np.int32) for _ in range(3))
-    for number, group in enumerate(groups):
-        while group:
-            shape = group.pop()
-            some = slice(at, at + len(shape.x))
-            kind[some], x[some], y[some] = number, shape.x, shape.y
-            at = some.stop
-    return _Layer(outlines, cells, kind, x, y)
-
-
-def _plain(points: Array) -> Array:
-    """Corners without repeats and without those on a straight line."""
-    points = points[(points != np.roll(points, 1, axis=0)).any(1)]
-    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
-    return np.asarray(points[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]])
-
-
-def _is_convex(points: Array) -> bool:
-    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
-    if (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).min() <= 0:
-        return False
-    turned = np.unwrap(np.arctan2(after[:, 1], after[:, 0]))
-    return bool(turned[-1] - turned[0] < 2 * math.pi)
-
-
-def _check_layer(layer: _Layer, rules: Rules, report: DrcReport, name: str) -> None:
+def _check_layer(layer: Layer, rules: Rules, report: DrcReport, name: str) -> None:
     gap = rules.minimum_gap_nm / report.unit_nm
     one, two = near.pairs(layer.discs, gap)
-    apart = _distances(layer, one, two)
+    apart = layer.distances(one, two)
     touch = apart <= 0
-    alone = np.array([_is_convex(o) for o in layer.outlines])[layer.kind]
+    alone = np.array([layers.is_convex(o) for o in layer.outlines])[layer.kind]
     alone[one[touch]] = alone[two[touch]] = False
     _features(layer, alone, rules, report)
     both = alone[one] & alone[two] & (apart < gap - 1e-9)
@@ -154,27 +127,7 @@ def _joined(members: Array, one: Array, two: Array) -> list[list[int]]:
     return [some.tolist() for some in np.split(members[order], starts[1:])]
 
 
-def _distances(layer: _Layer, one: Array, two: Array) -> Array:
-    """(n,) between shapes, of hulls where they are not convex: 0 and below where they touch or meet."""
-    hulls = [o if _is_convex(o) else _hull(o) for o in layer.outlines]
-    moves = (layer.x[two].astype(np.int64) - layer.x[one], layer.y[two].astype(np.int64) - layer.y[one])
-    keys = zip(layer.kind[one].tolist(), layer.kind[two].tolist(), *(m.tolist() for m in moves), strict=True)
-    known: dict[tuple[int, int, int, int], float] = {}
-    apart = np.empty(len(one))
-    for n, key in enumerate(keys):
-        if key not in known:
-            known[key] = convex.gap(hulls[key[0]], hulls[key[1]], key[2], key[3])
-        apart[n] = known[key]
-    return apart
-
-
-def _hull(points: Array) -> Array:
-    from scipy.spatial import ConvexHull
-
-    return np.asarray(points[ConvexHull(points).vertices])
-
-
-def _features(layer: _Layer, alone: Array, rules: Rules, report: DrcReport) -> None:
+def _features(layer: Layer, alone: Array, rules: Rules, report: DrcReport) -> None:
     """Widths of convex shapes that stand alone."""
     for kind in np.flatnonzero(counted(layer.kind, alone, np.zeros(len(layer.outlines), np.int64))).tolist():
         width = convex.width(layer.outlines[kind]) * report.unit_nm
@@ -194,17 +147,15 @@ def counted(kind: Array, alone: Array, out: Array) -> Array:
     return out
 
 
-def _by_edges(
-    layer: _Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str
-) -> None:
+def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str) -> None:
     """Groups of shapes that are not convex or touch, as merged contours, with the convex shapes beside them."""
     lines, owner = [], []
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
-        whole = len(shapes) == 1 and _is_convex(shapes[0])
-        contours = [_plain(c) for c in (shapes if whole else region.union(shapes))]
+        whole = len(shapes) == 1 and layers.is_convex(shapes[0])
+        contours = [layers.plain(c) for c in (shapes if whole else region.union(shapes))]
         for contour in contours:
-            known = _is_convex(contour) and (whole or not _holds(contour, contours))
+            known = layers.is_convex(contour) and (whole or not _holds(contour, contours))
             if known and number < len(groups):
                 _narrow(contour, rules, report, name)
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
@@ -242,16 +193,16 @@ def _narrow(contour: Array, rules: Rules, report: DrcReport, name: str) -> None:
         report.add("feature", 1, Violation("feature", box, width, rules.minimum_feature_nm, f"shape of {name}"))
 
 
-def _off_grid(layer: _Layer, rules: Rules, unit_nm: float, report: DrcReport) -> None:
-    """Corners that do not lie on the grid of the process."""
-    step = rules.grid_nm / unit_nm
+def _off_grid(layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offset) -> None:
+    """Corners that do not lie on the grid of the process, which the cell lies off by ``offset``."""
+    step = rules.grid_nm / report.unit_nm
     if step == 1:
         return
     whole = step == round(step)
     bad = [_residue(outline, step) for outline in layer.outlines]
     for first in range(0, len(layer.kind), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        kind, place = layer.kind[some], np.column_stack([layer.x[some], layer.y[some]])
+        kind, place = layer.kind[some], np.column_stack([layer.x[some], layer.y[some]]) + np.array(offset)
         off = np.mod(place + np.array([r if r is not None else (0.0, 0.0) for r in bad])[kind], step)
         apart = (np.minimum(off, step - off) > (0 if whole else _ROUNDED)).any(1)
         apart |= np.array([r is None for r in bad])[kind]

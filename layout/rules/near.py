@@ -34,22 +34,34 @@ class Discs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Group:
-    """Shapes of like size by square. order: (n,) their numbers, in the order of the squares; widest: largest reach."""
+    """Shapes of like size by square. order: (n,) their numbers, in the order of the squares; widest: largest reach.
+
+    seeks: pairs with them are wanted.
+    """
 
     order: Array
     squares: Squares
     widest: float
+    seeks: bool
 
 
-def pairs(discs: Discs, gap: float) -> tuple[Array, Array]:
+def pairs(discs: Discs, gap: float, *, beside: Array | None = None) -> tuple[Array, Array]:
     """(m,) first and second of all pairs whose circles are nearer than ``gap``, each once.
+
+    beside: (kinds,) bool: only pairs with one of these kinds at least. None: all pairs.
 
     Raises:
         MaskFileError: more than 4e6 pairs.
     """
     sized = np.floor(np.log2(np.maximum(discs.reach, 1)) / _OCTAVES).astype(np.int64)
     used = np.bincount(discs.kind, minlength=len(sized)) > 0
-    groups = [_group(discs, sized == size, gap) for size in np.unique(sized[used])]
+    wanted = np.ones(len(sized), bool) if beside is None else beside
+    groups = [
+        _group(discs, (sized == size) & used & (wanted == mark), gap, seeks=mark)
+        for size in np.unique(sized[used])
+        for mark in (False, True)
+        if ((sized == size) & used & (wanted == mark)).any()
+    ]
     ones, twos, total = [], [], 0
     for one, two in _found(discs, groups, gap):
         total += len(one)
@@ -64,22 +76,23 @@ def pairs(discs: Discs, gap: float) -> tuple[Array, Array]:
     return np.concatenate([nothing, *ones]), np.concatenate([nothing, *twos])
 
 
-def _group(discs: Discs, kinds: Array, gap: float) -> _Group:
+def _group(discs: Discs, kinds: Array, gap: float, *, seeks: bool) -> _Group:
     members = np.flatnonzero(kinds[discs.kind]).astype(np.int32)
     widest = float(discs.reach[kinds].max())
     x, y, kind = (v[members] for v in (discs.x, discs.y, discs.kind))
     squares = Squares.of(x, y, 2 * widest + gap, kind=kind, middle=discs.middle)
-    return _Group(members[squares.order], squares, widest)
+    return _Group(members[squares.order], squares, widest, seeks)
 
 
 def _found(discs: Discs, groups: list[_Group], gap: float) -> Iterator[tuple[Array, Array]]:
-    """Pairs within each group, and of each with all smaller ones."""
+    """Pairs within each group, and of each with all before it, that are not larger."""
     shapes = (discs.x, discs.y, discs.kind, discs.middle, discs.reach)
     out = np.empty((2, _AT_ONCE), np.int32)
     for n, one in enumerate(groups):
         own: tuple[Any, ...] = (one.order, one.squares.key, one.squares.columns)
-        yield from _collected(partial(_within, *own, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
-        for two in groups[:n]:
+        if one.seeks:
+            yield from _collected(partial(_within, *own, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
+        for two in (some for some in groups[:n] if one.seeks or some.seeks):
             s = two.squares
             other: tuple[Any, ...] = (one.order, two.order, s.key, s.left, s.bottom, s.side, s.columns, two.widest)
             yield from _collected(partial(_across, *other, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]

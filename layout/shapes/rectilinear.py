@@ -1,11 +1,15 @@
 """Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
 
 import itertools
+import math
 
 import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
+
+_SLICES = 64  # of a polygon, at most
+_SLICE = 5000  # units
 
 
 def rectangles(points: Array) -> Array:
@@ -26,6 +30,26 @@ def rectangles(points: Array) -> Array:
         cut = np.sort(x[(low <= bottom) & (high >= top)])
         found += [(left, bottom, right, top) for left, right in zip(cut[::2].tolist(), cut[1::2].tolist(), strict=True)]
     return np.array(found, np.int64).reshape(-1, 4)
+
+
+def covering(shape: Array) -> Array:
+    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of slices 5 um high or more."""
+    step = np.roll(shape, -1, axis=0) - shape
+    if not (step != 0).all(1).any():
+        return rectangles(shape)
+    low, high = int(shape[:, 1].min()), int(shape[:, 1].max())
+    ends = np.linspace(low, high, min(_SLICES, max(1, (high - low) // _SLICE)) + 1)
+    start = shape.astype(float)
+    y0, y1 = start[:, 1], start[:, 1] + step[:, 1]
+    steep = np.where(step[:, 1] == 0, 1, step[:, 1])
+    made = []
+    for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
+        along = [np.clip((y - y0) / steep, 0, 1) for y in (bottom, top)]
+        along = [np.where(step[:, 1] == 0, whole, t) for whole, t in zip((0.0, 1.0), along, strict=True)]
+        x = np.concatenate([(start[:, 0] + t * step[:, 0])[inside] for t in along])
+        made.append([math.floor(x.min()), math.floor(bottom), math.ceil(x.max()), math.ceil(top)])
+    return np.array(made, np.int64)
 
 
 def cut(boxes: Array, side: float, grid: int) -> tuple[Array, Array]:

@@ -66,7 +66,10 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
     steps = {"across": (300, 0), "up": (0, 310)}
     copies = {
         "LENS": (Copies("DOT", 0, 0, columns=600, rows=700, **steps), Copies("BAR", 5, 9, QUARTERS[3])),
-        "DIE": (Copies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps), Copies("BAR", 0, 0, rows=3, up=(0, 9))),
+        "DIE": (
+            Copies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
+            Copies("BAR", 0, 0, rows=3, up=(0, 9)),
+        ),
         "WAFER": (Copies("DIE", -7, 0, columns=210, rows=330, **steps), Copies("LENS", 0, 0)),
     }
     cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
