@@ -8,6 +8,7 @@ from scipy import fft, optimize
 
 from characterize.inference.leastsquares import Data
 from characterize.model import PLACE, ForwardModel, vector
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
@@ -100,18 +101,20 @@ class _Frames:
 
     def scanned(self, start: Array, zeros: Array, distances_um: Array | None = None) -> tuple[Array, float]:
         """Parameters at the best stage zero (and distance) for frames as stated or end to end; likeness there."""
-        best, found = -math.inf, start
-        for distance in start[PLACE["distance_um"], None] if distances_um is None else distances_um:
-            for zero in zeros:
-                x = start.copy()
-                x[PLACE["stage_zero_um"]], x[PLACE["distance_um"]] = zero, distance
-                expected = _expected(self.rough, x, self.clipped)
-                stated = _mean_likeness(self.light, expected, self.noise)
-                turned_round = _mean_likeness(self.light[self.back], expected, self.noise[self.back])
-                score = max(stated, turned_round - _TWIN)
-                if score > best:
-                    best, found = score, x
-        return found, best
+        distances = start[PLACE["distance_um"], None] if distances_um is None else distances_um
+        places = np.repeat(start[None], len(distances) * len(zeros), 0)
+        places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
+            part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
+        )
+        scores = threads.each(self._score, places)
+        best = int(np.argmax(np.nan_to_num(scores, nan=-math.inf)))
+        return places[best], scores[best]
+
+    def _score(self, x: Array) -> float:
+        """Likeness at some parameters, of frames as stated or, by ``_TWIN`` less, end to end."""
+        expected = _expected(self.rough, x, self.clipped)
+        stated = _mean_likeness(self.light, expected, self.noise)
+        return max(stated, _mean_likeness(self.light[self.back], expected, self.noise[self.back]) - _TWIN)
 
 
 def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:

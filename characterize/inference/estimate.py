@@ -25,6 +25,7 @@ from characterize.model import (
     thinplate,
     vector,
 )
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitRefused
 from metalens.lens import Lens
@@ -65,7 +66,11 @@ def fit(
         FitError: refused, with the cause: another lens, a model that cannot explain the frames, a parameter at its
             bound, no convergence.
     """
-    options = options or Options()
+    with threads.one_blas_thread():  # matrices are small: a second thread of BLAS takes a core to wait on
+        return _fit(capture, lens, options or Options(), response)
+
+
+def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity | None) -> AsBuilt:
     capture, frames = merged(capture, clean(capture))
     setting, window = setting_of(capture, options.window)
     check_depths(setting.depth_um, lens)

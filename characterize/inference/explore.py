@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,12 +16,14 @@ from characterize.inference.posterior import Profile, Valley
 from characterize.inference.search import Task, distinct, mirrored, refine
 from characterize.inference.walk import Walk
 from characterize.model import ForwardModel
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 REACH = posterior.REACH
 _RESTARTS = 2
 _LOST, _LOWER = 3.0, 0.5  # sigma of bend from which on a parameter is walked; misfit below the mode that is followed
 _OF_THE_BENCH = ("log_gain", "background")
+_BESIDE = 8  # profiles side by side, whatever the number of cores; the next ones know the slopes that these met
 _POINTS = 61  # of the curve of a walk
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
 
@@ -93,16 +97,16 @@ def _profiles(
 
     By the walk where there is one and what is left is straight with the walked parameter held, else by descents.
     """
-    level, found = posterior.REACH**2 * max(1.0, mode.chi2_per_dof), {}
+    found: dict[str, Profile] = {}
     places = [one.value[np.argmin(one.rise)] for one in walks.values() if one.rise.min() < -_LOWER]
-    for i, name in enumerate(task.names):
-        if name.startswith(_OF_THE_BENCH):
-            continue
-        by = next((w for w in walks.values() if i == w.index or valley.bend(i, w.index) < posterior.BENT), None)
-        if by is not None:
-            found[name] = _along(by, i, mode, float(valley.sigma[i]), level)
-        else:
-            found[name], better = posterior.profile(valley, i, level=level)
+    named = [i for i, name in enumerate(task.names) if not name.startswith(_OF_THE_BENCH)]
+    for first in range(0, len(named), _BESIDE):
+        some = [(i, copy.copy(valley)) for i in named[first : first + _BESIDE]]
+        ends = threads.each(functools.partial(_profile, mode, walks), some)
+        known = len(valley.met)
+        valley.met += tuple(itertools.chain.from_iterable(part.met[known:] for _, part in some))
+        for (i, _), (one, better) in zip(some, ends, strict=True):
+            found[task.names[i]] = one
             places += [] if better is None else [better]
         if places and followed:
             other = refine(task, places[0])
@@ -110,6 +114,16 @@ def _profiles(
                 return found, other
             places, followed = [], False
     return found, None
+
+
+def _profile(mode: Solution, walks: Mapping[str, Walk], one: tuple[int, Valley]) -> tuple[Profile, Array | None]:
+    """Of a parameter, by its place among the others; second: a place below the mode, if one was met."""
+    i, valley = one
+    level = posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
+    by = next((w for w in walks.values() if i == w.index or valley.bend(i, w.index) < posterior.BENT), None)
+    if by is not None:
+        return _along(by, i, mode, float(valley.sigma[i]), level), None
+    return posterior.profile(valley, i, level=level)
 
 
 def _along(one: Walk, i: int, mode: Solution, sigma: float, level: float) -> Profile:
@@ -269,12 +283,14 @@ def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> floa
         x[dark] = 0.0
         return np.asarray(images(x, False)[0])
 
-    mean, total = light(best), 0.0
-    for x in values:
+    mean = light(best)
+
+    def away(x: Array) -> float:
         one = light(x)
         one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
-        total += float(((one - mean) ** 2).sum())
-    return float(np.sqrt(total / len(values) / (mean**2).sum()))
+        return float(((one - mean) ** 2).sum())
+
+    return float(np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum()))
 
 
 def between(model: ForwardModel) -> ForwardModel:
@@ -300,19 +316,22 @@ def left_out(task: Task, mode: Solution) -> float:
     if n < 4:
         return float("nan")
     order = np.argsort(task.model.setting.depth_um, kind="stable")
-    total, count = 0.0, 0
-    for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
-        seen, hidden = np.sort(seen), np.sort(hidden)
-        images = residual.problem(task.model.only(seen), task.names, task.start)
-        known = mode.image[seen], mode.slopes[:, seen]
-        valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
-        value, _ = valley.descend(mode.value, rounds=6)
-        rest = task.data.planes(hidden)
-        image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
-        keep = rest.usable & ~rest.saturated
-        slopes = mode.slopes[:, hidden][:, keep]
-        known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
-        variance = rest.variance(image)[keep] + known_e2
-        total += float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum())
-        count += int(keep.sum())
-    return total / max(count, 1)
+    halves = [(np.sort(seen), np.sort(hidden)) for seen, hidden in itertools.permutations((order[::2], order[1::2]))]
+    total, count = np.sum(threads.each(functools.partial(_unseen, task, mode), halves), 0)
+    return float(total / max(count, 1))
+
+
+def _unseen(task: Task, mode: Solution, part: tuple[Array, Array]) -> tuple[float, int]:
+    """(chi-square, pixels) of the second frames by what the first say."""
+    seen, hidden = part
+    images = residual.problem(task.model.only(seen), task.names, task.start)
+    known = mode.image[seen], mode.slopes[:, seen]
+    valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
+    value, _ = valley.descend(mode.value, rounds=6)
+    rest = task.data.planes(hidden)
+    image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
+    keep = rest.usable & ~rest.saturated
+    slopes = mode.slopes[:, hidden][:, keep]
+    known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
+    variance = rest.variance(image)[keep] + known_e2
+    return float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()), int(keep.sum())

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference.leastsquares import Data, Model, Prior
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 REACH = 1.959964  # of a 95 % interval, in sigma
@@ -56,6 +57,7 @@ class Valley:
     """The misfit about a mode: -2 ln posterior less a constant, with the noise held.
 
     known: image and Jacobian at the mode, where they have been computed.
+    met: ways from the mode to where slopes were computed, and how they change on them; a copy goes on with its own.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class Valley:
         values, vectors = np.linalg.eigh(curvature / np.outer(size, size))
         self.covariance = (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(size, size)
         self._sigmas = (vectors * np.sqrt(np.maximum(values, 0))).T * size
-        self._met: list[tuple[Array, Array]] = []
+        self.met: tuple[tuple[Array, Array], ...] = ()
         self._beside: dict[int, list[Spot] | None] = {}
 
     @property
@@ -199,7 +201,7 @@ class Valley:
         the residual at ``x`` (``rest``, where it is known) to ``_HOLDS`` sigma (trapezium rule).
         """
         slopes, way = self.slopes, x - self.mode
-        for place, change in self._met:
+        for place, change in self.met:
             along, reach = self._sigmas @ place, self._sigmas @ way
             share = float(np.clip(along @ reach / max(float(along @ along), 1e-300), 0.0, 1.5))
             slopes, way = slopes + share * change, way - share * place
@@ -210,7 +212,7 @@ class Valley:
             return slopes
         image, jacobian = self._model(x, True)
         exact = self._columns(image, np.asarray(jacobian))
-        self._met.append((way, exact - slopes))
+        self.met += ((way, exact - slopes),)
         return exact
 
     def _columns(self, image: Array, jacobian: Array) -> Array:
@@ -318,14 +320,14 @@ def _onwards(here: Spot, i: int, gone: float, roots: tuple[float, float]) -> Arr
 def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Array:
     """(count, p) draws of the posterior around its modes, each mode as often as its share of the probability."""
     rng = np.random.default_rng(seed)
-    share = shares(valleys)
-    out = []
-    for k in rng.choice(len(valleys), count, p=share):
-        valley = valleys[k]
-        shift = rng.standard_normal(len(valley.bottom))
+    chosen = [valleys[k] for k in rng.choice(len(valleys), count, p=shares(valleys))]
+
+    def one(of: tuple[Valley, Array]) -> Array:
+        valley, shift = of
         start = valley.inside(valley.mode - valley.covariance @ (valley.slopes.T @ shift))
-        out.append(valley.descend(start, shift=shift, rounds=4, least=0.1)[0])
-    return np.array(out)
+        return valley.descend(start, shift=shift, rounds=4, least=0.1)[0]
+
+    return np.array(threads.each(one, [(valley, rng.standard_normal(len(valley.bottom))) for valley in chosen]))
 
 
 def shares(valleys: Sequence[Valley]) -> Array:

@@ -11,6 +11,7 @@ from characterize.inference.arrange import Arrangement
 from characterize.inference.constrained import Ball
 from characterize.inference.leastsquares import Data, Prior, Settings, Solution
 from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 
@@ -154,9 +155,12 @@ def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     waves = Ball(np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]), WAVES_RAD)
     short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
     part, seen = task.problem(few), task.data.planes(few)
-    opened = [with_values(x, _opened(task, x)) for x in begins]
-    tries = [leastsquares.fit(part, seen, x[place], prior=task.prior, settings=short) for x in opened]
-    return sorted(tries, key=lambda t: t.merit)
+
+    def one(begin: Array) -> Solution:
+        opened = with_values(begin, _opened(task, begin))
+        return leastsquares.fit(part, seen, opened[place], prior=task.prior, settings=short)
+
+    return sorted(threads.each(one, begins), key=lambda t: t.merit)
 
 
 def _long(task: Task, value: Array) -> Solution:

@@ -6,6 +6,8 @@ Gaussian about their own place it is drawn from, two valleys or more as they com
 """
 
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ from scipy import interpolate
 from characterize.inference import leastsquares
 from characterize.inference.leastsquares import Data, Model, Prior, Settings, Solution
 from characterize.inference.search import Task, distinct, few_frames, followed
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 WALKED = ("bias_nm",)
@@ -154,7 +157,8 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
         best, few = kept[0], few_frames(task.model.setting)
         part, step = (task.problem(few), task.data.planes(few)), _WIDEST * _wide(task, best, i)
         here = dataclasses.replace(best, merit=_misfit(task, part, best.value), slopes=best.slopes[:, few])
-        sides = [_side(task, part, here, i, end, step=step, settings=_FAR) for end in _ends(task, best, i)]
+        side = functools.partial(_side, task, part, here, i, step=step, settings=_FAR)
+        sides = threads.each(side, _ends(task, best, i))
         seen = Walk.of(task, [*sides[0], *sides[1], here], i)
         begins = [seen.value[k] for k in seen.minima() if seen.value[k, i] != best.value[i]]
         kept = distinct([*kept, *followed(task, best, begins[:_VALLEYS])])
@@ -178,8 +182,9 @@ def walk(task: Task, modes: Sequence[Solution], name: str, *, widened: float = 1
         if stops and Walk.of(task, stops, i).passes(mode.value):  # as finely about this one as about the first
             low, high = max(low, mode.value[i] - 2 * step), min(high, mode.value[i] + 2 * step)
         stops.append(mode)
-        for end in (low, high):
-            stops += _side(task, part, mode, i, end, step=step, settings=_NEAR, most=lows[0].merit + shown)
+        most = lows[0].merit + shown
+        side = functools.partial(_side, task, part, mode, i, step=step, settings=_NEAR, most=most)
+        stops += itertools.chain.from_iterable(threads.each(side, (low, high)))
     return Walk.of(task, stops, i, least=lows[0].merit, shown=shown)
 
 

@@ -10,6 +10,7 @@ sum for every smooth f.
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,7 @@ from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path, source_path
 from metalens.lens import Lens
 
+_KEPT = 12  # operators: of a place that each of some threads is at
 _BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when the low-rank terms are chosen
 
 
@@ -61,6 +63,7 @@ class Reduced:
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
+        self._changing = threading.Lock()  # several fits may ask at once
         self._directions(depths_um)
         self.gathered = self._gather(lens, pillars).astype(self.kind)
         self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
@@ -155,14 +158,17 @@ class Reduced:
         """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples.
 
         edge_um: width of a rim of the window where a tenfold error is allowed, since only its blur is seen.
-        The last few are kept: most steps of a search move neither.
+        The last few are kept: an image is often followed by its derivatives.
         """
         key = wavelength_um, distance_um, *(float(part) for axis in axes_um for part in (len(axis), axis[0]))
-        if key not in self._operators:
-            if len(self._operators) >= 6:
-                self._operators.pop(next(iter(self._operators)))
-            self._operators[key] = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
-        return self._operators[key]
+        found = self._operators.get(key)
+        if found is None:
+            found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
+            with self._changing:
+                self._operators[key] = found
+                while len(self._operators) > _KEPT:
+                    self._operators.pop(next(iter(self._operators)))
+        return found
 
     def _operators_of(
         self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array], edge_um: float

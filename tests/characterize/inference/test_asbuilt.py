@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
@@ -36,6 +37,17 @@ def model():
 @pytest.fixture(scope="module")
 def fitted():
     return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
+
+
+def test_a_fit_is_the_same_bytes_for_any_number_of_threads(fitted):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3 if before == 1 else 1)
+    try:
+        other = characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
+    finally:
+        torch.set_num_threads(before)
+    for name in ("value", "covariance", "low", "high", "draws", "predicted"):
+        assert np.array_equal(getattr(other, name), getattr(fitted, name)), name
 
 
 def against_all_pillars(model, **more):

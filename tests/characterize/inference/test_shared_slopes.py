@@ -65,10 +65,10 @@ def test_slopes_taken_over_are_near_those_computed(about):
 
     first = exact(end) - exact(one.mode)
     assert np.linalg.norm(first, 2) > 0.2  # of sigma by sigma: worth a Jacobian
-    one._met = [(end - one.mode, one._columns(*images(end, True)) - one.slopes)]
+    one.met = ((end - one.mode, one._columns(*images(end, True)) - one.slopes),)
     half = one.mode + 1.5 * one.along(i)
     left = one.slopes_at(half) @ np.linalg.cholesky(one.covariance) - exact(half)
-    assert len(one._met) == 1  # taken over, not computed
+    assert len(one.met) == 1  # taken over, not computed
     assert np.linalg.norm(left, 2) < 0.2 * np.linalg.norm(first, 2)
 
 

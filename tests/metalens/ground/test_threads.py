@@ -1,8 +1,10 @@
 """Compiled loops use the threads that are theirs, with torch and without it."""
 
+import _thread
 import os
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from metalens.ground import threads
 # a mask shop has no torch: a lens is designed and its focus checked all the same
 WITHOUT_TORCH = """
 import sys
+import threading
 sys.modules["torch"] = None
 import numpy as np
 from metalens.cell import Cell, Index
@@ -72,5 +75,57 @@ def test_parts_that_stay_apart_have_one_thread_of_torch_each_and_give_them_back(
         with pytest.raises(ArithmeticError, match="of a part"):
             threads.apart(11, broken)
         assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.fixture
+def three():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("three")
+def test_items_side_by_side_come_back_in_order_and_split_into_one_part_each():
+    together, parts = threading.Barrier(3), []
+
+    def work(item):
+        together.wait(60)  # none ends before all three have begun
+        threads.split(5, lambda start, stop: parts.append((start, stop)))
+        return item**2
+
+    assert threads.each(work, iter([7, 3, 5])) == [49, 9, 25]
+    assert parts == [(0, 5)] * 3
+    assert threads.threads() == 3
+
+
+@pytest.mark.usefixtures("three")
+@pytest.mark.parametrize("cause", [ArithmeticError, KeyboardInterrupt])
+def test_a_failure_or_an_interrupt_stops_what_is_beside_it_at_its_next_part(cause):
+    """The others would go on for ever; what had not begun never does."""
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        if item == 0 and cause is KeyboardInterrupt:
+            _thread.interrupt_main()  # as a signal does
+        elif item == 0:
+            raise cause
+        while True:
+            threads.split(1, lambda *_: None)
+
+    with pytest.raises(cause):
+        threads.each(work, range(40))
+    assert set(begun) <= {0, 1, 2, 3}
+    assert threads.each(str, [4, 2]) == ["4", "2"]
+
+
+def test_one_thread_does_one_item_after_another():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        assert threads.each(lambda _: threading.current_thread(), range(2)) == [threading.current_thread()] * 2
     finally:
         torch.set_num_threads(before)
