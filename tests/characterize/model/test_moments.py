@@ -12,7 +12,8 @@ import bench_lens as b
 
 from characterize.inference import leastsquares, residual
 from characterize.inference.leastsquares import Data, Settings
-from characterize.model import moments
+from characterize.model import forward, moments
+from characterize.model.detector import Grid
 from characterize.model.forward import ForwardModel, Setting
 from characterize.model.parameters import PLACE, vector
 from characterize.model.window import turned
@@ -86,6 +87,19 @@ def test_derivatives_from_those_of_the_field_are_differences_of_images(monkeypat
             ends.append(model.images(moved)[0])
         want = (ends[0] - ends[1]) / (2 * STEPS[name])
         assert np.linalg.norm(slope - want) < 0.02 * np.linalg.norm(want), name
+
+
+def test_pixels_are_small_while_coefficients_change_less_across_one_than_slopes_are_asked_to():
+    """A pixel off, the middle of the lens is seen from another direction: by its sine, over that of the rim."""
+    radius, distance = 510.0, 1030.0
+
+    def changed(pixel):
+        return pixel / math.hypot(pixel, distance) / (radius / math.hypot(radius, distance))
+
+    pixels = np.linspace(0.5, 12.0, 400)
+    small = [moments.fine_enough(Grid(32, 32, pixel, 4, 4), radius) for pixel in pixels]
+    most = max(changed(pixel) for pixel, one in zip(pixels, small, strict=True) if one)
+    assert 0.7 * forward._SLOPE_TOLERANCE < most < forward._SLOPE_TOLERANCE
 
 
 def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):

@@ -82,3 +82,24 @@ def test_noise_is_the_robust_scatter_of_steps_about_their_median():
     planes = np.array([50 + 5.0 * k + (-1) ** k * chequer for k in range(6)])
     by_noise = 1.4826 * 4 / math.sqrt(2) * math.sqrt(planes.size) / math.sqrt(((planes - 30) ** 2).sum())
     assert check.missed(math.hypot(by_noise, 0.03), data(planes), 30.0) == pytest.approx(0.03, rel=1e-9)
+
+
+@pytest.mark.parametrize(("wider", "said"), [(1.08, ""), (1.25, "doubted"), (1.6, "refused")])
+def test_a_spot_predicted_too_wide_is_doubted_from_a_quarter_on_and_refused_from_a_half(wider, said):
+    """Gaussian spots of widths 1 and q overlap by 2q / (1 + q²): at its best brightness one misses |1 - q²| / (1 + q²).
+
+    So does a wavelength or an aperture that is wrong by as much: 8 % is what right optics miss, 50 % are wrong ones.
+    """
+    y, x = np.mgrid[-24:25, -24:25]
+
+    def spot(width):
+        return np.exp(-((x - 0.3) ** 2 + (y + 0.2) ** 2) / (2 * width**2))
+
+    planes = np.stack([spot(3.5)] * 5)  # too few for an order
+    other = spot(3.5 * wider)
+    told = np.stack([other * (other * spot(3.5)).sum() / (other**2).sum()] * 5)
+    score = agree(told, data(planes), 0.0)
+    share = check.missed(score.nrmse, data(planes), 0.0)
+    assert share == pytest.approx((wider**2 - 1) / (wider**2 + 1), rel=1e-3)
+    assert any("misses" in words for words in check.problems(data(planes), score.ncc, share, "")) == (said == "refused")
+    assert any("misses" in words for words in check.doubts(share, "")) == (said == "doubted")
