@@ -39,6 +39,7 @@ def fitted():
     return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
 
 
+@pytest.mark.slow
 def test_a_fit_is_the_same_bytes_for_any_number_of_threads(fitted):
     before = torch.get_num_threads()
     torch.set_num_threads(3 if before == 1 else 1)

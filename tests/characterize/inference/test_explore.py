@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from characterize.inference import explore, posterior, residual
+from characterize.inference import explore, leastsquares, posterior, residual
 from characterize.inference.leastsquares import Data, Prior
 from characterize.model import MODES, PLACE, prior_rad
 from characterize.model.forward import Setting
@@ -154,3 +155,37 @@ def test_misfit_of_hidden_frames_is_capped_at_six_sigma():
     )
     got = residual._misfit(lambda x, jacobian: (image, None), data, np.zeros(1))
     assert got == pytest.approx((1 + 9 + 81) / (2.3 + 40 / 1.6) + 36, rel=1e-12)
+
+
+class Bent(Straight):
+    """As :class:`Straight`, the first parameter by x + 0.2 x²; other slopes hold at its ends than at the mode."""
+
+    def images(self, x, names=None):
+        values = np.array([x[PLACE[name]] for name in NAMED])
+        image = self.bright + np.tensordot(values + 0.2 * values**2, self.pictures, 1)
+        slopes = (1 + 0.4 * values)[:, None, None, None] * self.pictures
+        return image, None if names is None else np.stack([slopes[NAMED.index(n)] for n in names])
+
+
+@pytest.mark.parametrize("beside", [1, 8])
+def test_profiles_and_draws_are_the_same_bytes_for_any_number_of_threads(monkeypatch, beside):
+    monkeypatch.setattr(explore, "_BESIDE", beside)
+    model = Bent(30 + RNG.uniform(size=(5, 8, 9)), RNG.normal(size=(3, 5, 8, 9)))
+    seen = model.bright + RNG.normal(0, 9.0, model.bright.shape)
+    everywhere = np.ones(seen.shape, bool)
+    about = task(model, Data(seen, everywhere, ~everywhere, np.full(seen.shape, 81.0), np.full(seen.shape, 1e15)))
+    images = residual.problem(model, NAMED, START)
+    mode = leastsquares.fit(images, about.data, np.zeros(3), prior=about.prior)
+    before, found = torch.get_num_threads(), []
+    for count in (1, 3):
+        one = posterior.Valley(images, about.data, mode.value, about.prior)
+        torch.set_num_threads(count)
+        try:
+            profiles, _ = explore._profiles(about, one, mode, {}, followed=False)
+            drawn = posterior.draws([one], 7)
+        finally:
+            torch.set_num_threads(before)
+        assert not profiles["bias_nm"].parabolic
+        assert one.met
+        found.append([*(part for each in profiles.values() for part in (each.value, each.rise)), drawn])
+    assert all(np.array_equal(*pair) for pair in zip(*found, strict=True))
