@@ -15,7 +15,7 @@ from metalens.rcwa import made, mirrors, pattern, wall
 from metalens.rcwa.conditions import direction
 from metalens.rcwa.made import check_size
 from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
-from metalens.rcwa.solver import crowding, safety
+from metalens.rcwa.solver import MOST_COMPARED, compared, crowding, safety
 from metalens.rcwa.stack import Media, respond
 from metalens.rcwa.waves import Waves
 
@@ -38,8 +38,8 @@ class Jones:
     t_error: estimate of the largest |t - exact| and |r - exact|, not below the true error.
     energy: (2,) power of all propagating orders, for each polarisation that comes.
     orders: harmonics of the finest truncation. converged, reason: whether the tolerance is met, and why it ended.
-    earlier: (k, 2, 2) t of the up to four truncations before. A number that follows from t has as error bar, like t
-        itself, ``SAFETY`` times its farthest change over them.
+    earlier: (k, 2, 2) t of the up to six truncations before, the first of them again where fewer are looked at. A
+        number that follows from t has as error bar, like t itself, ``SAFETY`` times its farthest change over them.
     """
 
     basis: tuple[str, str]
@@ -95,8 +95,9 @@ def jones(
         angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of incidence, from +x to +y.
         harmonics: fix the largest truncation instead (orders as on a square lattice of the same area).
 
-    Accuracy: ``t_error`` is 3 (from 13 orders on) to 7 times the farthest of the four truncations before the last, and
-        what the collocation of a tilted wall leaves. Corners and high contrast converge slowly: 1e-2 is usual.
+    Accuracy: ``t_error`` is 3 (from 13 orders on) to 7 times the farthest of the four truncations before the last (six
+        where pillar or gap is narrow), and what the collocation of a tilted wall leaves. Corners and high contrast
+        converge slowly: 1e-2 is usual.
 
     Raises:
         CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order.
@@ -109,22 +110,25 @@ def jones(
     classes = _classes(cell, size_um, light)
     problem = _Problem(cell, size_um, light, media, classes)
     last = _LAST[min(len(operations) for operations in classes)] if harmonics is None else harmonics
-    first = _FIRST if harmonics is None else max(1, harmonics - _COMPARED)
+    gap = cell.gap_um(size_um)
+    before = int(compared(min(gap, cell.outline(size_um).narrowest_um) / cell.pitch_um))
+    first = _FIRST + _COMPARED - before if harmonics is None else max(1, harmonics - before)
     stages, cut = 0, 0.0
     if cell.sidewall_rad:
         stages, cut = wall.enough(lambda count: _both(_truncated(problem, min(last, _COARSE), count)), tolerance)
-    crowded = float(crowding(cell.gap_um(size_um), cell.pitch_um))
+    crowded = float(crowding(gap, cell.pitch_um))
     history: list[Array] = []
     for reach in range(first, last + 1):
         found = _truncated(problem, reach, stages)
         history.append(_both(found))
-        error = crowded * _moved(history, reach) + cut
-        if len(history) > _COMPARED and error <= tolerance:
+        error = crowded * _moved(history, reach, before) + cut
+        if len(history) > before and error <= tolerance:
             break
     error = min(error, 2.0)
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    earlier = np.array([both[0] for both in history[-1 - _COMPARED : -1]]).reshape(-1, 2, 2)
+    looked_at = [both[0] for both in history[-1 - before : -1]]
+    earlier = np.array(looked_at[:1] * (MOST_COMPARED - before) + looked_at).reshape(-1, 2, 2)
     return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
 
 
@@ -142,10 +146,10 @@ def _both(found: Jones) -> Array:
     return np.stack([found.t, found.r])
 
 
-def _moved(history: list[Array], reach: int) -> float:
-    """Error of the last truncation: :func:`metalens.rcwa.solver.safety` times the farthest of the four before it."""
-    before = history[-1 - _COMPARED : -1]
-    farthest = max((float(np.abs(history[-1] - both).max()) for both in before), default=1.0)
+def _moved(history: list[Array], reach: int, before: int) -> float:
+    """Error of the last truncation: :func:`metalens.rcwa.solver.safety` times the farthest of those before it."""
+    earlier = history[-1 - before : -1]
+    farthest = max((float(np.abs(history[-1] - both).max()) for both in earlier), default=1.0)
     return safety(reach) * farthest + _ROUNDING
 
 

@@ -90,7 +90,10 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
     done = {int(i): _exact(empty, rounding) for i in np.flatnonzero(homogeneous(this, diameter_um))}
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
     stages, cut = wall_stages(this, diameter_um[left], tolerance)
-    ladder = _ladder(this, harmonics)
+    share = diameter_um / this.cell.pitch_um
+    lags = compared(np.minimum(share, 1 - share))
+    before = int(lags[left].max(initial=_COMPARED))
+    ladder = _ladder(this, harmonics, before)
     history: list[Array] = []
     for reach in ladder:
         if not len(left):
@@ -98,10 +101,11 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
         wide = diameter_um[left]
         found = truncated(this, wide, reach, stages)
         history.append(found.both)
-        if len(history) <= _COMPARED and reach != ladder[-1]:
+        if len(history) <= before and reach != ladder[-1]:
             continue
         change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
-        estimate = crowding(this.cell.pitch_um - wide, this.cell.pitch_um) * _estimate(np.array(history), reach)
+        crowded = crowding(this.cell.pitch_um - wide, this.cell.pitch_um)
+        estimate = crowded * _estimate(np.array(history), reach, lags[left])
         error = np.minimum(_blur(this, wide, reach, change, estimate) + cut, 2.0)
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
@@ -115,21 +119,33 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
 
 _FIRST = 4  # orders of the first truncation, too few for any use but to see t move
 _LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
-_COMPARED = 4
+_COMPARED, MOST_COMPARED = 4, 6  # truncations before, that an error looks at
+_SWING = 0.75  # of the swing of truncations with the number of orders in the narrowest width
 _SAFETY = 3.0  # from _ENOUGH orders on
 _MORE, _ENOUGH = 0.6, 13  # and so much more for each order below
 _CUSPS, _CROWDED = 5.0, 0.02  # more for pillars that touch, and the share of the pitch below which gaps count
 _COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
-def _ladder(this: Case, harmonics: int | None) -> range:
+def _ladder(this: Case, harmonics: int | None, before: int) -> range:
+    """Truncations to try; the first that may be the last one has ``before`` below it."""
     if harmonics is None:
-        return range(_FIRST, _LAST[this.symmetry] + 1)
-    return range(max(harmonics - _COMPARED, 1), harmonics + 1)
+        return range(_FIRST + _COMPARED - before, _LAST[this.symmetry] + 1)
+    return range(max(harmonics - before, 1), harmonics + 1)
+
+
+def compared(width: float | Array) -> Array:
+    """How many truncations before the last are looked at, by the narrower of pillar and gap (in pitches): 4 to 6.
+
+    Errors swing with the orders that fit into it, once in 1 / width of them. Of discs of 0.1 to 0.2 pitches, and of
+    gaps so narrow, four truncations see a part of a swing alone: at 8 to 11 orders the error was up to 8.5 times the
+    farthest of four (5 of 380 above its bar), and up to twice the farthest of so many.
+    """
+    return np.clip(np.ceil(_SWING / np.maximum(width, 1e-9)), _COMPARED, MOST_COMPARED).astype(int)
 
 
 def safety(reach: int) -> float:
-    """How many times the farthest of the four truncations before an error may be, at this many orders."""
+    """How many times the farthest of the truncations before an error may be, at this many orders."""
     return _SAFETY + _MORE * max(0, _ENOUGH - reach)
 
 
@@ -142,19 +158,21 @@ def crowding(gap_um: float | Array, pitch_um: float) -> Array:
     return np.asarray(1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (_CROWDED * pitch_um), 0, 1))
 
 
-def _estimate(t: Array, reach: int) -> Array:
-    """Error of the last of the results, t and r (rungs, 2, d): some times the farthest of the four truncations before.
+def _estimate(t: Array, reach: int, lags: Array) -> Array:
+    """Error of the last of the results, t and r (rungs, 2, d): some times the farthest of the truncations before.
 
-    Truncation errors fall as reach^-2 and swing with the number of orders that fit across the disc; a swing takes up
-    to four rungs. For 52 diameters in three cells at 8 to 16 orders, and for 86 random cells (pitch, height, index,
-    absorption, wavelength, diameter), the true error was 0.4 of the farthest distance in the median and 2.7 of it at
-    most. With few orders it is more: up to 4.8 of it below 8, and with a factor of 3 at 8 to 10 orders 3 of 200 cells
-    (``python -m benchmarks engines``) lay apart from the modal method by up to 1.5 times both bars. Hence
-    :func:`safety`: 6 at 8 orders, 3 from 13 on.
+    lags: (d,) how many, see :func:`compared`. Truncation errors fall as reach^-2 and swing with the number of orders
+    that fit across the disc; a swing takes up to four rungs where nothing is narrow. For 52 diameters in three cells
+    at 8 to 16 orders, and for 86 random cells (pitch, height, index, absorption, wavelength, diameter), the true error
+    was 0.4 of the farthest distance in the median and 2.7 of it at most. With few orders it is more: up to 4.8 of it
+    below 8, and with a factor of 3 at 8 to 10 orders 3 of 200 cells (``python -m benchmarks engines``) lay apart from
+    the modal method by up to 1.5 times both bars. Hence :func:`safety`: 6 at 8 orders, 3 from 13 on.
     """
     if len(t) < 2:
         return np.full(t.shape[2], np.inf)
-    return np.asarray(safety(reach) * np.abs(t[-1] - t[-1 - _COMPARED : -1]).max(axis=(0, 1)) + _ROUNDING)
+    moved = np.abs(t[-1] - t[:-1]).max(axis=1)
+    age = np.arange(len(moved), 0, -1)[:, None]
+    return np.asarray(safety(reach) * np.where(age <= lags, moved, 0.0).max(axis=0) + _ROUNDING)
 
 
 def _blur(this: Case, diameter_um: Array, reach: int, change: Array, error: Array) -> Array:

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from metalens import rcwa
 from metalens.cell import Cell, Index, Light
 from metalens.rcwa import anchored, any_shape, solver, wall
 from metalens.rcwa.anchored import Anchors
+from metalens.rcwa.conditions import case
 from metalens.rcwa.solver import Truncated
 
 CELL = Cell(0.4, 0.5, Index(3.5), Index(1.45))
@@ -27,16 +29,50 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
     r = np.array([[9j, 9.0], [0.2, 0.1], [0.2, 0.1], [0.25j, 0.1], [0.2, 0.1], [0.2, 0.11]])
     apart[0] = math.hypot(0.2, 0.25)
     amplitudes = np.stack([t, r], 1)
-    assert solver._estimate(amplitudes, 9) == pytest.approx(5.4 * np.array(apart), rel=1e-9)
-    assert np.isinf(solver._estimate(amplitudes[:1], 9)).all()
+    assert solver._estimate(amplitudes, 9, np.array([4, 4])) == pytest.approx(5.4 * np.array(apart), rel=1e-9)
+    narrow = 9.0 - 0.11  # r of the second diameter, whose five before are looked at
+    assert solver._estimate(amplitudes, 9, np.array([4, 5])) == pytest.approx([5.4 * apart[0], 5.4 * narrow], rel=1e-9)
+    assert np.isinf(solver._estimate(amplitudes[:1], 9, np.array([4, 4]))).all()
     both = [np.array([[a, 0.1], [0.2j, b]]) for a, b in t]
-    assert any_shape._moved(both, 9) == pytest.approx(5.4 * 0.04, rel=1e-9)
-    assert any_shape._moved(both[:1], 9) == pytest.approx(5.4)
+    assert any_shape._moved(both, 9, 4) == pytest.approx(5.4 * 0.04, rel=1e-9)
+    assert any_shape._moved(both, 9, 5) == pytest.approx(5.4 * (9.0 - 0.31), rel=1e-9)
+    assert any_shape._moved(both[:1], 9, 4) == pytest.approx(5.4)
 
 
 @pytest.mark.parametrize(("gap_um", "times"), [(0.0, 6.0), (0.0019, 4.75), (0.0057, 2.25), (0.0076, 1.0), (0.1, 1.0)])
 def test_pillars_that_all_but_touch_are_trusted_less(gap_um, times):
     assert solver.crowding(gap_um, 0.38) == pytest.approx(times, rel=1e-12)  # 1 + 5 (1 - 50 gap / pitch)
+
+
+@pytest.mark.parametrize(("width", "count"), [(0.5, 4), (0.188, 4), (0.187, 5), (0.151, 5), (0.149, 6), (0.0, 6)])
+def test_narrow_pillars_and_gaps_are_looked_at_over_three_quarters_of_a_swing(width, count):
+    """0.75 / width of the truncations before the last, four at least and six at most."""
+    assert solver.compared(width) == count
+
+
+SLOW = [  # cell, diameter, wavelength, orders; t and r of the modal method (mesh "fine", to 1e-5)
+    (
+        Cell(0.364240498, 0.56218211, Index(2.6709832118), Index(1.59601762), Index(1.03038054), Index(1.22127794)),
+        (0.05667532322, 0.88152546244, 10),
+        (0.25171071 - 0.96567561j, 0.04740791 - 0.0431836j),
+    ),
+    (
+        Cell(0.282190657, 4.459343876, Index(1.4867993058), Index(1.54079380), Index(1.66267354), Index(1.18593744)),
+        (0.25124168475, 0.77757768238, 8),
+        (0.57821583 - 0.80551312j, 0.09097735 + 0.09240233j),
+    ),
+]
+
+
+@pytest.mark.parametrize(("cell", "asked", "exact"), SLOW, ids=["thin disc", "narrow gap"])
+def test_bars_hold_where_truncations_swing_slowly(cell, asked, exact):
+    """Discs of 0.156 pitches, gaps of 0.11: over four truncations t and r move less than a sixth of what is left."""
+    found = rcwa.solve(cell, asked[0], asked[1], harmonics=asked[2])
+    error = max(abs(found.t - exact[0]), abs(found.r - exact[1]))
+    this = case(cell, Light(asked[1]))
+    four = [solver.truncated(this, np.array([asked[0]]), n).both for n in range(asked[2] - 4, asked[2] + 1)]
+    assert error > solver.safety(asked[2]) * max(np.abs(four[-1] - one).max() for one in four[:-1])
+    assert error + 2e-5 < found.t_error
 
 
 def test_pillars_between_the_orders_are_not_believed():
