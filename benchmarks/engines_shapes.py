@@ -29,7 +29,7 @@ HARMONICS = {4: 9, 2: 8, 1: 7}  # of ours, by the last truncation that it would 
 TERMS = (49, 97)  # of fmmax
 FACTOR = 3.0
 STEPS = (3, 6)  # of a tilted wall
-PIXELS, FINE, RASTER = 72, 4, 1e-3  # and what the raster may leave
+PIXELS, FINE, RASTER = 72, (55, 34), 1e-3  # and what the raster may leave
 HEXAGONAL, WIDE, FLAT = Lattice("hexagonal"), Lattice("rectangular", 1.3), Lattice("rectangular", 0.8)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.55)))
 
@@ -149,16 +149,18 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
 
 def raster(cell: Cell, size_um: float, grow_um: float) -> Array:
     """Share of every pixel of the primitive cell, pitch 1, that the section covers: from the definitions of shapes."""
-    count = PIXELS * FINE
-    i, j = (np.indices((count, count)) + 0.5) / count
+    count, generator = FINE
+    k = np.arange(count)  # points of a pixel: a lattice of rank 1, no two in a row or column
+    i = (np.arange(PIXELS)[:, None, None] + (k + 0.5) / count) / PIXELS
+    j = (np.arange(PIXELS)[:, None] + (generator * k % count + 0.5) / count) / PIXELS
     u, v = primitive(cell.lattice)
     x, y = (i * u[axis] + j * v[axis] for axis in (0, 1))
-    inside = np.zeros((count, count), bool)
+    inside = np.zeros((PIXELS, PIXELS, count), bool)
     size, grow = size_um / cell.pitch_um, grow_um / cell.pitch_um
     for a in (-1, 0):  # sites at the corners; no section reaches further
         for b in (-1, 0):
             inside |= within(cell.shape, size, grow, x + a * u[0] + b * v[0], y + a * u[1] + b * v[1])
-    return inside.reshape(PIXELS, FINE, PIXELS, FINE).mean(axis=(1, 3))
+    return np.asarray(inside.mean(axis=2))
 
 
 def primitive(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
