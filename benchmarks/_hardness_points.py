@@ -3,7 +3,9 @@
 The command runs once. Before each operation what lies on the disk is copied: such a copy is what a kill leaves there.
 Where the command goes on after the moment, its process is split in two, and the new one goes on in the copy, which a
 mount of its own puts in the place of the folder. So a command of minutes is struck at all its operations in little
-more than its own time. Linux alone, for a user who may mount.
+more than its own time. A process that was split has but one thread: where the command has others, which it would wait
+for for ever, it is run anew and struck there, some of those operations in each sweep. Linux alone, for a user who may
+mount.
 """
 
 import errno
@@ -13,6 +15,7 @@ import os
 import random
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -30,6 +33,7 @@ REFUSALS = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 SHARES = {"torn": 0.25, "signal": 1.0, "refused": 1.0, "full": 0.25, "second": 0.25}  # of the operations
 DEAREST = 0.6  # seconds of work that any trial may take; dearer ones come as seldom as they take longer
 PATIENCE = 120.0
+ANEW, LEAST_ANEW = 40.0, 6  # seconds of runs of their own in a sweep, and the least number of them
 _DISK = 16 << 20
 Answer = dict[str, Any]
 Strike = tuple[str, str, Callable[[], object], int]  # kind, how, what is done, bytes left of the disk (-1: all)
@@ -51,6 +55,7 @@ class Sweep:
     found: dict[str, tuple[str, str]] = field(default_factory=dict)
     seen: dict[str, list[str]] = field(default_factory=dict)
     chance: random.Random = field(default_factory=random.Random)
+    threaded: list[int] = field(default_factory=list)
 
     def run(self) -> None:
         """Do them all."""
@@ -71,10 +76,28 @@ class Sweep:
         end = child.wait()
         if self.bench.which(self.verb) != 1 or end.status not in (0, 1):
             self.found["the run itself"] = "kills", f"{end.status}, {end.told[-300:]}"
+        self._anew()
         self.bench.clear(output)
 
+    def _anew(self) -> None:
+        """Strike a run of its own at some of the operations at which the command had threads."""
+        words, output = VERBS[self.verb]
+        most = max(LEAST_ANEW, int(ANEW / self.bench.seconds[self.verb]))
+        for at in self.chance.sample(self.threaded, min(most, len(self.threaded))):
+            self.bench.clear(output)
+            if not self.fresh:
+                self.bench.restore(self.verb)
+            number = self.chance.choice((*SIGNALS, signal.SIGKILL))
+            strike = commands.at(at, commands.signalled(number))
+            end = self.bench.begin(words.format(1) + " --force" * (not self.fresh), strike).wait()
+            told = {"kind": "kills", "how": number.name, "place": str(self.bench.folder), "at": f"{at} with threads"}
+            self._answer(told | {"status": end.status, "told": end.told})
+
     def _answer(self, told: Answer) -> Answer:
-        """Judge a trial, or begin one of two writers."""
+        """Judge a trial, or begin one of two writers; note an operation at which there are threads."""
+        if told["kind"] == "threads":
+            self.threaded.append(told["number"])
+            return {}
         here = replace(self.bench, folder=Path(told["place"]), found=[])
         if told["kind"] == "begin":
             return self._second(here)
@@ -181,6 +204,9 @@ class Tracer:
         """Trials in which the command goes on; none where a process that is split off could not."""
         pipe = bool(operation.arguments) and isinstance(operation.arguments[0], int)
         if operation.event == "os.fork" or pipe or _removes():  # its pipe has another end; a folder's number is told
+            return
+        if threading.active_count() > 1:
+            self._asked({"kind": "threads", "number": operation.number})
             return
         times = self.bench.times[self.verb]
         left = times[-1] - times[min(operation.number, len(times)) - 1]
