@@ -258,8 +258,8 @@ def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
 
 
 _INTERRUPTED = """
-An interrupted command leaves what stood at its output. library, budget, plan and evaluate paper go on with the same
-command, codesign, retrain and demo with --resume; all others begin anew.
+An interrupted command leaves what stood at its output. library, study, budget, plan and evaluate paper go on with the
+same command, codesign, retrain and demo with --resume; all others begin anew.
 """
 
 

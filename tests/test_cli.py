@@ -33,7 +33,7 @@ def work(module):
 
 
 def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
-    """Those with --resume, those that keep a journal beside their output; psf, fit and study say that they do not."""
+    """Those with --resume, those that keep a journal beside their output; psf and fit say that they do not."""
     said = " ".join(run("--help").stdout.split())
     modules = {verb: importlib.import_module(where) for verb, (where, _) in cli.VERBS.items()}
     parts = modules["evaluate"].PARTS
@@ -45,10 +45,10 @@ def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
     }
     assert with_option == {"codesign", "retrain", "demo"}
     journals = {verb for verb, module in modules.items() if '".resume"' in work(module)}
-    assert journals == {"library", "budget", "plan"}
-    assert "library, budget, plan and evaluate paper go on with the same command" in said
+    assert journals == {"library", "study", "budget", "plan"}
+    assert "library, study, budget, plan and evaluate paper go on with the same command" in said
     assert "codesign, retrain and demo with --resume; all others begin anew" in said
-    for verb in ("fit", "psf", "study"):
+    for verb in ("fit", "psf"):
         assert "An interruption leaves what stood at the output" in modules[verb].__doc__
 
 

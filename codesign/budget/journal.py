@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import store
+from metalens.ground import manifest, store
 
 
 class Journal:
@@ -13,18 +13,17 @@ class Journal:
 
     The first line names the work; a file of other work is started afresh, a line that was cut short is dropped.
 
-    path: None keeps nothing. title: all that the parts follow from.
+    path: None keeps nothing. title: all that the parts follow from, the version first.
+
+    Raises:
+        StoreError: a file that is no journal stands there.
     """
 
     def __init__(self, path: Path | None = None, title: str = "") -> None:
         self._path, self._known = path, dict[str, Any]()
         if path is None:
             return
-        lines, head = store.whole_lines(path), json.dumps(title)
-        if lines and lines[0] == head:
-            self._known = dict(found for line in lines[1:] if (found := _part(line)))
-        else:
-            store.write_text(path, head + "\n")
+        self._known = dict(found for line in manifest.journal(path, json.dumps(title)) if (found := _part(line)))
 
     def part(self, name: str, work: Callable[[], Any]) -> Any:
         """What ``work`` returns, or returned in an earlier run: numbers, words, lists."""

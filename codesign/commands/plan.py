@@ -15,6 +15,7 @@ from codesign.commands.options.plan import Options
 from metalens import __version__
 from metalens.ground import config, report, store
 from metalens.ground.errors import ConfigError
+from metalens.pillars import workers
 
 UNITS = {"deg": math.pi / 180, "arcmin": math.pi / 10_800, "mrad": 1e-3, "rad": 1.0}
 
@@ -52,7 +53,9 @@ def run(options: Options) -> int:
         least = floor.floor(rig, run, options.frames, fwhm_nm=wanted.led_fwhm_nm)
         floor.allowance_rad(goal, least)
         chain = Chain(wanted, options.console.say)
-        journal = Journal(target.with_name(target.name + ".resume"), f"{__version__}\n{config.dumps(wanted)}")
+        read = {str(file): store.sha256(file) for file in workers.material_files(wanted.cell)}
+        title = f"{__version__}\n{config.dumps(wanted)}{read}"
+        journal = Journal(target.with_name(target.name + ".resume"), title)
         measured = plan.pilot(chain, journal, floor=least)
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)

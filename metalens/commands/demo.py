@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,10 +57,12 @@ def run(options: Options) -> int:
     wanted = chain.shipped() if options.config is None else chain.load(options.config)
     source = None if options.config is None else options.config.parent
     with options.claim_work(options.output, keep=(OUTCOMES,), resume=options.resume) as draft:
-        folder, before = draft.path, _settings(draft.path)
+        folder = draft.path
+        with tempfile.TemporaryDirectory() as aside:  # nothing of other settings gets beside what is done
+            chain.lay_out(Path(aside), wanted, source, aperture_mm=options.aperture_mm)
+            if (folder / OUTCOMES).is_file() and _settings(folder) != _settings(Path(aside)):
+                raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
         files = chain.lay_out(folder, wanted, source, aperture_mm=options.aperture_mm)
-        if before and before != _settings(folder):
-            raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
         outcomes: list[Outcome] = []
         for outcome in _chain(folder, files):
             outcomes.append(outcome)
@@ -105,10 +108,11 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
 
 
 def _done(path: Path) -> Iterator[tuple[tuple[str, ...], tuple[int, dict[str, Any], float]]]:
-    """Stages that an earlier run finished, by their words."""
+    """Stages that an earlier run finished, by their words; one whose line is damaged is done again."""
     for line in store.whole_lines(path):
-        words, status, values, seconds = json.loads(line)
-        yield tuple(words), (status, values, seconds)
+        with contextlib.suppress(ValueError, TypeError, RecursionError):
+            words, status, values, seconds = json.loads(line)
+            yield tuple(words), (int(status), dict(values), float(seconds))
 
 
 def _write(folder: Path, outcomes: list[Outcome]) -> None:

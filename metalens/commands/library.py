@@ -11,12 +11,12 @@ import numpy as np
 import tyro
 
 from metalens import library
-from metalens.cell import Blend, Cell
+from metalens.cell import Cell
 from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, store
 from metalens.ground.errors import DomainError
-from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, axes, converted
+from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, axes, converted, workers
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars.circular import Turned
 
@@ -77,12 +77,7 @@ def run(options: Options) -> int:
 
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     """Hashes of the config and of the material tables that the cell names."""
-    names = (cell.pillar, cell.substrate, cell.cover, cell.between, *(f.material for f in (*cell.under, *cell.over)))
-    plain = [part for name in names for part in ((name.base, name.other) if isinstance(name, Blend) else (name,))]
-    tables = [
-        Path(name) for name in plain if isinstance(name, str) and name.lower().endswith((".csv", ".yml", ".yaml"))
-    ]
-    return {file.name: store.sha256(file) for file in (path, *tables)}
+    return {file.name: store.sha256(file) for file in (path, *workers.material_files(cell))}
 
 
 def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:

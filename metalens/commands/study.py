@@ -1,6 +1,6 @@
 """Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure.
 
-An interruption leaves what stood at the output; the same command begins anew.
+Cells that are solved are kept beside the output (NAME.resume): after an interruption the same command goes on.
 """
 
 import importlib
@@ -13,7 +13,7 @@ import tyro
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config
 from metalens.ground.units import nm
-from metalens.pillars import Study, study_plots
+from metalens.pillars import Journal, Study, study_plots
 from metalens.pillars import study as cell_study
 
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
@@ -27,7 +27,8 @@ class Options(Distributed):
         config: STUDY.toml with pitches, heights, wavelengths, material or cell, and limits; the project's own without.
         process: PROCESS.toml whose printable pillars and gaps, the strictest of all pitches and heights, take the place
             of min_diameter_um and min_gap_um (worked out for round pillars).
-        output: folder for README.md, cell_study.json and cell_study.png.
+        output: folder for README.md, cell_study.json and cell_study.png; NAME.resume beside it keeps solved cells until
+            it is complete.
     """
 
     config: tyro.conf.Positional[Path | None] = None
@@ -44,8 +45,10 @@ def run(options: Options) -> int:
         given += f" --process {options.process.name}"
     command = f"metalens study{given} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.workers():
-        verdicts = cell_study.run(study, options.console)
+        journal = Journal(options.output.with_name(options.output.name + ".resume"), study)
+        verdicts = cell_study.run(study, options.console, journal=journal)
         study_plots.write_study(draft.path, study, verdicts, command=command)
+    journal.finish()
     best = cell_study.choice(study, verdicts)
     values = {"pitch_um": best and best[0], "height_um": best and best[1], "cells": len(verdicts)}
     text = "no cell covers a full turn at all wavelengths"

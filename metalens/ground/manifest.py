@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from metalens.ground.errors import StoreError
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
 _LARGEST = 1 << 26  # bytes of a manifest
 _HEAD, _TAIL = 4096, 64
+_TITLE = re.compile(rb'\[?"[0-9]|$')  # of a journal; nothing: it was just begun
 # first bytes of a file, and what ours has soon after or at its end
 _MARKS = (
     (b"\x89PNG", b"Software\0metalens"),
@@ -117,6 +119,25 @@ def foreign(path: Path) -> str:
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return "" if _is_our_tiff(path) else "was not made by metalens"
     return "" if store.kind_of(path) else "was not made by metalens"
+
+
+def journal(path: Path, title: str) -> list[str]:
+    """Whole lines of the journal of a piece of work after its title, its first; other work's is begun afresh.
+
+    title: one line of JSON, a text or a list, that begins with the version.
+
+    Raises:
+        StoreError: a file that is no journal stands there.
+    """
+    lines = store.whole_lines(path)
+    if lines and lines[0] == title:
+        return lines[1:]
+    if path.is_dir() or (path.is_file() and not _TITLE.match(path.read_bytes()[:64])):
+        raise StoreError(
+            f"{path} is in the way of what is kept for an interruption, and no journal of metalens; move it"
+        )
+    store.write_text(path, title + "\n")
+    return []
 
 
 def _foreign_folder(path: Path) -> str:

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from metalens.pillars.record import Sweep as Sweep
     from metalens.pillars.study import Study as Study
     from metalens.pillars.study_plots import library_figure as library_figure
-    from metalens.pillars.sweep import Journal as Journal
+    from metalens.pillars.workers import Journal as Journal
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "study_plots": "",
         "DEFAULT_CELL": "record",
-        "Journal": "sweep",
+        "Journal": "workers",
         "PillarLibrary": "record",
         "Proxy": "proxy",
         "ProxyFit": "fit",

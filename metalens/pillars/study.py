@@ -16,6 +16,7 @@ from metalens.pillars import engines, workers
 from metalens.pillars.curve import Curve, Nodes
 from metalens.pillars.record import PLAIN
 from metalens.pillars.stretch import REACH
+from metalens.pillars.workers import Journal
 
 TURN = 2 * math.pi
 SAMPLES = 600
@@ -98,8 +99,11 @@ class Verdict:
     pillar: str
 
 
-def run(study: Study, console: Console | None = None) -> list[Verdict]:
+def run(study: Study, console: Console | None = None, *, journal: Journal | None = None) -> list[Verdict]:
     """Verdicts on every combination, wavelength by wavelength, then on the chosen cell with other materials.
+
+    Args:
+        journal: of the curves that an interrupted run has solved; the verdicts are the same.
 
     Raises:
         CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none.
@@ -108,23 +112,25 @@ def run(study: Study, console: Console | None = None) -> list[Verdict]:
         check_subwavelength(study.made(pitch, study.heights_um[0]), wavelength)
     shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
     cases = [(study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes]
-    verdicts = _judged(study, cases, console or Console(quiet=True))
+    journal = journal or Journal(None)
+    verdicts = _judged(study, cases, journal, console or Console(quiet=True))
     best = choice(study, verdicts)
     if best is None:
         return verdicts
     cells = [study.made(*best, other) for other in study.others]
-    return verdicts + _judged(study, [(c, w) for c in cells for w in study.wavelengths_um], Console(quiet=True))
+    others = [(cell, wavelength) for cell in cells for wavelength in study.wavelengths_um]
+    return verdicts + _judged(study, others, journal, Console(quiet=True))
 
 
-def _judged(study: Study, cases: list[tuple[Cell, float]], console: Console) -> list[Verdict]:
+def _judged(study: Study, cases: list[tuple[Cell, float]], journal: Journal, console: Console) -> list[Verdict]:
     """One rational curve t(D) a case, on all cores."""
     tasks = []
     for cell, wavelength in cases:
         span = _span(study, cell)
         engine = engines.choose(cell)
         tasks.append(workers.curve_task(cell, Light(wavelength), span, tolerance=study.tolerance, engine=engine))
-    found = dict(console.track(workers.run(tasks), total=len(tasks), label="cells"))
-    return [judge(study, *case, curve_of(found[i], study.tolerance)) for i, case in enumerate(cases)]
+    found = journal.run(tasks, console, "cells")
+    return [judge(study, *case, curve_of(one, study.tolerance)) for case, one in zip(cases, found, strict=True)]
 
 
 def _span(study: Study, cell: Cell) -> tuple[float, float]:

@@ -2,15 +2,13 @@
 
 import dataclasses
 import functools
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 
-from metalens import __version__
 from metalens.cell import Cell, Light
-from metalens.ground import config, store
+from metalens.ground import config
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.store import Provenance
@@ -19,7 +17,7 @@ from metalens.pillars import engines, few_nodes, workers
 from metalens.pillars.curve import Curve, Nodes
 from metalens.pillars.few_nodes import Rows
 from metalens.pillars.record import PillarLibrary, Sweep, check
-from metalens.pillars.workers import Result, Task
+from metalens.pillars.workers import Journal, Result, Task
 
 AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where diameters are added
 FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
@@ -179,53 +177,3 @@ def _library(
         *effort,
         provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
     )
-
-
-def _entry(line: str) -> tuple[str, Result] | None:
-    """(task, result) of a line of a journal; None for one that is damaged: its task is done again."""
-    try:
-        task, result = json.loads(line)
-        listed = [np.array(result[name]) for name in ("diameter_um", "t", "r", "error", "energy")]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return (str(task), result) if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,) else None
-
-
-class Journal:
-    """Finished tasks as JSON lines beside the output, so that an interrupted sweep goes on where it stopped.
-
-    The first line names the sweep; a file of another sweep is started afresh, a line cut short is dropped.
-    """
-
-    def __init__(self, path: Path | None, cell: Cell, sweep: Sweep) -> None:
-        self._path = path
-        self._title = json.dumps([__version__, config.dumps(cell), config.dumps(sweep)])
-        self._known: dict[str, Result] = {}
-        if path is None:
-            return
-        lines = store.whole_lines(path)
-        if lines and lines[0] == self._title:
-            self._known = dict(filter(None, map(_entry, lines[1:])))
-        else:
-            store.write_text(path, self._title + "\n")
-
-    def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
-        """Results of the tasks in order; those in the journal are not computed again."""
-        keys = [json.dumps(task, sort_keys=True) for task in tasks]
-        left = [i for i, key in enumerate(keys) if key not in self._known]
-        if left and len(left) < len(tasks):
-            console.say(f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before")
-        stream = workers.run([tasks[i] for i in left])
-        for i, result in console.track(stream, total=len(left), label=label):
-            self._keep(keys[left[i]], result)
-        return [self._known[key] for key in keys]
-
-    def _keep(self, key: str, result: Result) -> None:
-        self._known[key] = result
-        if self._path is not None:
-            store.append_line(self._path, json.dumps([key, result]))
-
-    def finish(self) -> None:
-        """The sweep is complete: its journal is no longer needed."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)

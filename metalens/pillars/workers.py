@@ -1,10 +1,17 @@
-"""Tasks of sweeps, as JSON types alone, so that a journal can keep them: solves of one curve or of some diameters."""
+"""Tasks of sweeps, solves of one curve or of some diameters, as JSON types alone; the journal that keeps those done."""
 
+import dataclasses
+import json
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
-from metalens.cell import Cell, Light, Response
-from metalens.ground import config, executor
+import numpy as np
+
+from metalens import __version__
+from metalens.cell import Cell, Light, Response, materials
+from metalens.ground import config, executor, manifest, store
+from metalens.ground.console import Console
 from metalens.pillars import curve as reduced
 from metalens.pillars.engines import precise, smooth
 
@@ -78,3 +85,69 @@ def _listed(diameters_um: Iterable[float], made: list[Response]) -> Result:
         "error": [m.t_error for m in made],
         "energy": [m.energy for m in made],
     }
+
+
+def material_files(of: object) -> Iterator[Path]:
+    """Files that the materials anywhere in a record (a cell, a film, a tuple of names) are read from."""
+    if isinstance(of, str):
+        if of not in materials.NAMES and Path(of).is_file():
+            yield Path(of)
+    elif dataclasses.is_dataclass(of):
+        for field in dataclasses.fields(of):
+            yield from material_files(getattr(of, field.name))
+    elif isinstance(of, tuple):
+        for part in of:
+            yield from material_files(part)
+
+
+def _entry(line: str) -> tuple[str, Result] | None:
+    """(task, result) of a line of a journal; None for one that is damaged: its task is done again."""
+    try:
+        task, result = json.loads(line)
+        listed = [np.array(result[name]) for name in ("diameter_um", "t", "r", "error", "energy")]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return (str(task), result) if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,) else None
+
+
+class Journal:
+    """Finished tasks as JSON lines beside the output, so that interrupted work goes on where it stopped.
+
+    The first line names the work: its settings and what the files of its materials hold. The journal of other work is
+    begun afresh, a line that is damaged or cut short is dropped.
+
+    Args:
+        path: None keeps nothing. about: records of settings that the tasks follow from.
+
+    Raises:
+        StoreError: a file that is no journal stands there.
+    """
+
+    def __init__(self, path: Path | None, *about: Any) -> None:
+        self._path = path
+        self._known: dict[str, Result] = {}
+        if path is not None:
+            read = {str(file): store.sha256(file) for file in material_files(about)}
+            title = json.dumps([__version__, *map(config.dumps, about), read])
+            self._known = dict(filter(None, map(_entry, manifest.journal(path, title))))
+
+    def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
+        """Results of the tasks in order; those in the journal are not computed again."""
+        keys = [json.dumps(task, sort_keys=True) for task in tasks]
+        left = [i for i, key in enumerate(keys) if key not in self._known]
+        if left and len(left) < len(tasks):
+            console.say(f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before")
+        stream = run([tasks[i] for i in left])
+        for i, result in console.track(stream, total=len(left), label=label):
+            self._keep(keys[left[i]], result)
+        return [self._known[key] for key in keys]
+
+    def _keep(self, key: str, result: Result) -> None:
+        self._known[key] = result
+        if self._path is not None:
+            store.append_line(self._path, json.dumps([key, result]))
+
+    def finish(self) -> None:
+        """The work is complete: its journal is no longer needed."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

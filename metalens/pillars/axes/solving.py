@@ -16,7 +16,7 @@ from metalens.pillars import workers
 from metalens.pillars.axes.between import surface
 from metalens.pillars.axes.record import AxesLibrary, check, sized, swaps
 from metalens.pillars.record import Sweep
-from metalens.pillars.sweep import Journal
+from metalens.pillars.workers import Journal
 
 FIRST, MOST, ADDED = 7, 19, 2  # nodes along an axis: to begin with, at most, and more a round
 COARSEST = 5  # orders of the truncation

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from codesign.budget import Entry, Journal, links
+from metalens.ground.errors import StoreError
 
 
 def parts(path, title, *, until=99):
@@ -24,13 +25,13 @@ def parts(path, title, *, until=99):
 
 def test_cut_twice_in_the_middle_of_a_line_it_goes_on(tmp_path):
     path = tmp_path / "out.resume"
-    whole, _ = parts(None, "a")
+    whole, _ = parts(None, "0.1 a")
     for until in (1, 2):
         with pytest.raises(KeyboardInterrupt):
-            parts(path, "a", until=until)
+            parts(path, "0.1 a", until=until)
         with open(path, "ab") as file:
             file.write(b'["part 2", [0.1, [1')  # what a kill leaves of the next line
-    found, computed = parts(path, "a")
+    found, computed = parts(path, "0.1 a")
     assert computed == [2]
     assert repr(found) == repr(whole)
     assert not path.exists()
@@ -39,11 +40,11 @@ def test_cut_twice_in_the_middle_of_a_line_it_goes_on(tmp_path):
 def test_the_journal_of_other_work_and_damaged_lines_are_not_read(tmp_path):
     path = tmp_path / "out.resume"
     with pytest.raises(KeyboardInterrupt):
-        parts(path, "a", until=2)
+        parts(path, "0.1 a", until=2)
     path.write_text(path.read_text().replace('["part 0"', "[[[["))
     with pytest.raises(KeyboardInterrupt):
-        parts(path, "a", until=0)
-    assert parts(path, "b")[1] == [0, 1, 2]
+        parts(path, "0.1 a", until=0)
+    assert parts(path, "0.2 b")[1] == [0, 1, 2]
 
 
 def test_links_of_a_budget_are_computed_once(tmp_path, monkeypatch):
@@ -66,9 +67,17 @@ def test_links_of_a_budget_are_computed_once(tmp_path, monkeypatch):
     for name in names:
         monkeypatch.setattr(links, name, link(name, dies=name == "_spread"))
     with pytest.raises(KeyboardInterrupt):
-        list(links.entries(About, Journal(tmp_path / "j", "t")))
+        list(links.entries(About, Journal(tmp_path / "j", "0.1")))
     monkeypatch.setattr(links, "_spread", link("_spread"))
-    found = list(links.entries(About, Journal(tmp_path / "j", "t")))
+    found = list(links.entries(About, Journal(tmp_path / "j", "0.1")))
     assert calls == [*names[:6], *names[5:]]
     assert [entry.link for entry in found] == [*names, "all links"]
     assert found[-1].gaze_rad == pytest.approx(math.sqrt(8) * 1e-3 / 7, rel=1e-12)
+
+
+def test_a_file_of_the_user_is_no_journal_and_stays(tmp_path):
+    path = tmp_path / "out.resume"
+    path.write_text("my notes\n")
+    with pytest.raises(StoreError, match="no journal of metalens"):
+        Journal(path, "0.1 a")
+    assert path.read_text() == "my notes\n"

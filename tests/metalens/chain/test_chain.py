@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -104,3 +105,41 @@ def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         list(demo._chain(tmp_path, chain.shipped()))
     assert not (tmp_path / demo.OUTCOMES).exists()
+
+
+def begun(tmp_path, monkeypatch):
+    """A chain that was interrupted at its third stage; the words of all stages that are begun from then on."""
+    seen = []
+
+    def run(words):
+        seen.append(words[0])
+        sys.stdout.write(json.dumps({"of": words[0]}))
+        return 130 if len(seen) == 3 else 0
+
+    monkeypatch.setattr(demo, "run_verb", run)
+    monkeypatch.setattr(demo, "_write", lambda folder, outcomes: None)
+    with pytest.raises(KeyboardInterrupt):
+        demo.run(demo.Options(tmp_path / "out", quiet=True))
+    assert seen == ["library", "design", "psf"]
+    seen[:] = ["-"] * 3
+    return seen
+
+
+def test_settings_that_differ_are_refused_at_every_resume(tmp_path, monkeypatch):
+    """The first refusal once left the new settings in the folder: the second resume went on to a mixture."""
+    seen = begun(tmp_path, monkeypatch)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="begun with other settings"):
+            demo.run(demo.Options(tmp_path / "out", aperture_mm=0.37, resume=True, quiet=True))
+    assert len(seen) == 3
+    assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
+    assert seen[3] == "psf"
+
+
+def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch):
+    seen = begun(tmp_path, monkeypatch)
+    path = tmp_path / "out.unfinished" / demo.OUTCOMES
+    first, second = path.read_text().splitlines()
+    path.write_text(f"{first[: len(first) // 2]}\n{second}\n")
+    assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
+    assert seen[3:5] == ["library", "psf"]

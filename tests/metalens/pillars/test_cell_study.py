@@ -6,9 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from metalens.ground.errors import CellError, ConfigError
+from metalens import cli
+from metalens.ground.console import Console
+from metalens.ground.errors import CellError, ConfigError, StoreError
 from metalens.pillars import study as cell_study
-from metalens.pillars import study_plots
+from metalens.pillars import study_plots, workers
 from metalens.pillars.study import Study
 
 SMALL = Study(pitches_um=(0.30, 0.40), heights_um=(0.7,), wavelengths_um=(0.85,), tolerance=1e-2)
@@ -75,3 +77,78 @@ def test_pitch_without_room_is_refused():
 def test_pitches_above_cutoff_are_refused_and_named():
     with pytest.raises(CellError, match=r"pitch 0.7 um at 0.85 um: diffraction orders"):
         cell_study.run(Study(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,)))
+
+
+TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"
+
+
+def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
+    """After one of two cells the user presses Ctrl-C, and a kill cuts the line that follows; that cell is not solved
+    again, and the folder is that of a run that nobody stopped."""
+    (tmp_path / "study.toml").write_text(TWO)
+    monkeypatch.chdir(tmp_path)
+    solved, answers = [], {}
+
+    def run(tasks):  # in this process, each once
+        for i, task in enumerate(tasks):
+            key = json.dumps(task)
+            answers[key] = answers.get(key) or workers.work(task)
+            yield i, answers[key]
+
+    def stopped(tasks):
+        yield next(run(tasks))
+        raise KeyboardInterrupt
+
+    def counted(tasks):
+        solved.append(len(tasks))
+        return run(tasks)
+
+    monkeypatch.setattr(workers, "run", stopped)
+    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.INTERRUPTED
+    assert not (tmp_path / "out").exists()
+    journal = tmp_path / "out.resume"
+    assert len(journal.read_text().splitlines()) == 2
+    with open(journal, "ab") as file:
+        file.write(b'["cut sho')
+    monkeypatch.setattr(workers, "run", counted)
+    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
+    assert solved == [1, 1]  # the other cell, and the chosen one of another material
+    assert not journal.exists()
+    (tmp_path / "whole").mkdir()
+    assert cli.main(["study", "study.toml", "-o", "whole/out", "--quiet"]) == cli.SUCCESS
+    for name in ("README.md", "cell_study.json", "cell_study.png"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / "out" / name).read_bytes()
+
+
+def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(tmp_path, monkeypatch):
+    """What was solved for a table of n that has been edited since does not get into the result."""
+    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
+    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
+    study, solved = Study(pillar=str(table)), []
+
+    def told(tasks):
+        solved.append(tasks)
+        for i, _ in enumerate(tasks):
+            yield i, {"diameter_um": [0.1], "t": [[1.0, 0.5]], "r": [[0.0, 0.1]], "error": [0.2], "energy": [1.0]}
+
+    def done(settings):
+        solved.clear()
+        workers.Journal(path, settings).run([{"kind": "curve"}], Console(quiet=True), "cells")
+        return any(solved)
+
+    monkeypatch.setattr(workers, "run", told)
+    assert [done(study), done(study)] == [True, False]
+    assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [True, True]
+    table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.55,0\n")
+    assert [done(study), done(study)] == [True, False]
+
+
+def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
+    path = tmp_path / "out.resume"
+    title = workers.Journal(path, SMALL) and path.read_text()
+    path.write_text(title + '["task", {"diameter_um": [0.1]}]\n')
+    assert workers.Journal(path, SMALL)._known == {}
+    path.write_text("pages of a thesis\n")
+    with pytest.raises(StoreError, match=r"out\.resume is in the way.*no journal of metalens"):
+        workers.Journal(path, SMALL)
+    assert path.read_text() == "pages of a thesis\n"

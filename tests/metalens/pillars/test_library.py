@@ -99,7 +99,7 @@ def test_an_interrupted_sweep_goes_on_to_the_same_bytes(made, tmp_path):
 
 def test_a_journal_of_another_sweep_is_not_used(tmp_path):
     journal = tmp_path / "library.h5.resume"
-    journal.write_text('["another"]\n["task", {}]\n')
+    journal.write_text('["0.0.9", "another"]\n["task", {}]\n')
     small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12))
     assert library.sweep(DEFAULT_CELL, small, checkpoint=journal).t.shape[-1] == 20
 
