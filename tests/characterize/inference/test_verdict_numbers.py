@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from characterize.captures import Gain
 from characterize.inference import verdict
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.missing import Unstated
@@ -80,3 +81,26 @@ def test_an_interval_is_that_of_the_profile_or_1_96_sigma_and_draws_follow_the_c
     again = AsBuilt.samples(fitted, 16, seed=3)
     _, counts = np.unique(again[:, 0], return_counts=True)
     assert sorted(counts) == [2, 2, 2, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("skewness", [0.085, 0.115])
+def test_light_is_too_little_where_counts_of_the_brightest_pixel_are_skew_by_a_tenth(skewness):
+    """Intervals take counts for Gaussian; a Poisson count of mean m has skewness 1/sqrt(m): a tenth at 100."""
+    peak = skewness**-2.0
+    assert stats.poisson(peak).stats("s") == pytest.approx(skewness, rel=1e-9)
+    image = np.full((2, 7, 8), 23.0)  # background of the frames, which is no light of the lens
+    image[1, 4, 3] += peak
+    one = SimpleNamespace(converged=True, image=image, residual_sigma=np.ones(image.shape), chi2_per_dof=1.0,
+                          value=np.zeros(2))  # fmt: skip
+    found = verdict.problems(("bias_nm", "coma_x_rad"), one, Gain(1.3, 0.01, 2.0))
+    assert [words.startswith("too little light") for words in found] == [True] * (skewness > 0.1)
+
+
+@pytest.mark.parametrize(("waves", "refused"), [(0.6, False), (1.3, True)])
+def test_a_wave_front_that_leaves_less_than_half_the_peak_is_no_tolerance(waves, refused):
+    """Maréchal: a phase of w rad rms leaves exp(-w²) of the peak: 70 % at 0.6 rad, 18 % at 1.3 rad."""
+    one = SimpleNamespace(converged=True, image=900 * np.eye(9)[None], residual_sigma=np.ones((1, 9, 9)),
+                          chi2_per_dof=1.0, value=waves * np.array([0.6, 9.0, -0.8]))  # fmt: skip
+    found = verdict.problems(("coma_x_rad", "bias_nm", "spherical_rad"), one, Gain(1.3, 0.01, 2.0))
+    assert [words.startswith("aberrations of") for words in found] == [True] * refused
+    assert (np.exp(-(waves**2)) < 0.5) == refused

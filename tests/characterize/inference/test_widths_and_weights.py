@@ -54,6 +54,16 @@ def test_saturation_is_blamed_for_what_is_wrong_and_for_nothing_else(monkeypatch
     assert f"a phase of {1.01 * residual.MOST_RAD:.2f} rad rms is left" in estimate._problems(task, None, None)[-1]
 
 
+@pytest.mark.parametrize(("left_rad", "refused"), [(0.5, False), (0.75, True)])
+def test_a_phase_that_nobody_explains_may_cost_a_third_of_the_peak_and_no_more(monkeypatch, left_rad, refused):
+    """Maréchal: a phase of w rad rms leaves exp(-w²) of the peak, 78 % of it at 0.5 rad and 57 % at 0.75."""
+    monkeypatch.setattr(verdict, "problems", lambda *_: [])
+    model = SimpleNamespace(modes=left_rad * np.array([0.28, -0.96]))
+    task = SimpleNamespace(names=(), data=SimpleNamespace(saturated=np.zeros((1, 4, 5), bool)), model=model)
+    assert ["no parameter explains" in words for words in estimate._problems(task, None, None)] == [True] * refused
+    assert (math.exp(-(left_rad**2)) < 2 / 3) == refused
+
+
 @pytest.mark.parametrize(("chi2", "spread"), [(4.0, 4.0), (0.6, 1.0), (1.7, 1.7)])
 def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spread):
     """(c r)² / (c c) / chi-square a pixel, never scored up; far residuals count as 6, dark pixels not at all."""
