@@ -108,7 +108,8 @@ def _check_layer(layer: Layer, rules: Rules, report: DrcReport, name: str) -> No
         report.add("gap", 1, Violation("gap", layer.box(a, b), value, rules.minimum_gap_nm, text))
     least = apart[both].min(initial=math.inf) * report.unit_nm  # of pairs further apart only some were looked at
     report.minimum_gap_nm = min(report.minimum_gap_nm, float(least))
-    beside = np.unique(np.concatenate([one[alone[one] & ~alone[two]], two[alone[two] & ~alone[one]]]))
+    close = apart < gap
+    beside = np.unique(np.concatenate([one[close & alone[one] & ~alone[two]], two[close & alone[two] & ~alone[one]]]))
     other = np.flatnonzero(~alone)
     if len(other):
         _by_edges(layer, _joined(other, one[touch], two[touch]), beside, rules, report, name)
@@ -149,7 +150,7 @@ def counted(kind: Array, alone: Array, out: Array) -> Array:
 
 def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str) -> None:
     """Groups of shapes that are not convex or touch, as merged contours, with the convex shapes beside them."""
-    lines, owner = [], []
+    lines, owner, lone = [], [], []
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
         whole = len(shapes) == 1 and layers.is_convex(shapes[0])
@@ -160,9 +161,12 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
                 _narrow(contour, rules, report, name)
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
             owner.append(np.full(len(contour), facing.KNOWN if known else number))
-    edge, shape = np.concatenate(lines), np.concatenate(owner)
+            lone.append(np.full(len(contour), number >= len(groups)))
+    edge, shape, measured = np.concatenate(lines), np.concatenate(owner), np.concatenate(lone)
     feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
     for a, b, kind, away in facing.facing(edge, shape, feature, gap).tolist():
+        if measured[int(a)] and measured[int(b)]:  # two convex shapes that stand alone
+            continue
         corners = np.concatenate([edge[int(a)].reshape(2, 2), edge[int(b)].reshape(2, 2)])
         box = (*corners.min(0).tolist(), *corners.max(0).tolist())
         rule, limit = ("feature", rules.minimum_feature_nm) if kind == facing.WIDTH else ("gap", rules.minimum_gap_nm)

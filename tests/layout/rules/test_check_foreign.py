@@ -201,3 +201,22 @@ def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(tmp_
     report = foreign.check(read(path), Rules(minimum_gap_nm=most, minimum_feature_nm=most))
     own = [min(np.floor(v + 1e-9), most) for v in (report.minimum_gap_nm, report.minimum_feature_nm)]
     assert own == [klayout_least(region.space_check, most), klayout_least(region.width_check, most)]
+
+
+def test_two_convex_shapes_beside_a_mark_are_one_pair(tmp_path):
+    """Two pillars 33 nm apart, both 51 nm beside an angle: three gaps, as KLayout finds pairs of shapes."""
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    shapes = [
+        db.Polygon([db.Point(*p) for p in [(0, 0), (2000, 0), (2000, 300), (300, 300), (300, 900), (0, 900)]]),
+        db.Polygon(db.Box(500, 351, 700, 551)),
+        db.Polygon(db.Box(733, 351, 940, 561)),
+    ]
+    for shape in shapes:
+        top.shapes(layer).insert(shape)
+    path = tmp_path / "m.gds"
+    made.write(str(path))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
+    theirs = [pairs_of_klayout([shapes[i], shapes[j]], 70) for i, j in ((0, 1), (0, 2), (1, 2))]
+    assert report.counts["gap"] == sum(map(len, theirs)) == 3
+    assert sorted(round(v.value, 6) for v in report.violations) == [33, 51, 51]
