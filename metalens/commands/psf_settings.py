@@ -38,8 +38,8 @@ class Settings:
         filter, sensor).
     wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add. weights: of each; none for equal.
     tolerance: relative L2 error of the PSFs.
-    polarisation: ``scalar``, ``vector`` (Ex, Ey, Ez of both polarisations), or ``auto``: the scalar where its error is
-        below the tolerance.
+    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in NA), ``vector`` (Ex, Ey, Ez of
+        both polarisations, squares added), or ``auto``: the scalar where its distance to that is below the tolerance.
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
     light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean of the two, where they are
         focused from and to the same distances (any light, for other lenses).

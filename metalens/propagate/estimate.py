@@ -31,6 +31,10 @@ DEPTHS = 8
 NEAR = 9  # samples on a side of the neighbourhood whose light draws points to a sample
 WORK, FEWEST = 1e7, 32  # nodes times points above which fewer points are looked at, and the fewest
 SAFETY = 1.7
+# of the error of intensities, the least that is left of it once they are normalised; and where fewer than one in
+# ``EVERY`` points are looked at, whose Σδ is mostly scatter of the halo: of rough lenses the rest came out negative,
+# which left a sixth of the error
+NORMALISED, SPARSE = 0.03, 0.5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -82,12 +86,18 @@ def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
     direct = _direct_light(windows, depths, points[0]) / energy[:, None]
     difference = direct - np.take_along_axis(normalised, points, 1)
     noise = sum(2 * s.weight * s.noise**2 * (1 / energy).sum() for s in windows[0])
-    total = square_error(normalised, points, chance, difference) + float(noise)
+    least = NORMALISED if points.shape[1] >= mean.size // EVERY else SPARSE
+    total = square_error(normalised, points, chance, difference, least) + float(noise)
     return float(SAFETY * np.sqrt(total / _squares(normalised).sum()))
 
 
-def square_error(normalised: Array, points: Array, chance: Array, difference: Array) -> float:
-    """Unbiased estimate of Σ (δ/S - (I/S)·Σδ/S)² from samples of ``difference`` = δ/S (depth, n) at drawn pixels."""
+def square_error(
+    normalised: Array, points: Array, chance: Array, difference: Array, least: float = NORMALISED
+) -> float:
+    """Unbiased estimate of Σ (δ/S - (I/S)·Σδ/S)² from samples of ``difference`` = δ/S (depth, n) at drawn pixels.
+
+    least: share of Σ (δ/S)² below which the rest, products of sums of few points, is taken for chance.
+    """
     value = np.take_along_axis(normalised, points, 1).astype(float)
     a, b, d = difference**2 / chance, value * difference / chance, difference / chance
     n, power = points.shape[1], _squares(normalised)
@@ -96,7 +106,7 @@ def square_error(normalised: Array, points: Array, chance: Array, difference: Ar
     pairs = n * (n - 1)
     cross = (b.sum(1) * d.sum(1) - (b * d).sum(1)) / pairs
     common = (d.sum(1) ** 2 - (d**2).sum(1)) / pairs
-    return max(float((a.mean(1) - 2 * cross + common * power).sum()), 0.03 * float(a.mean(1).sum()))
+    return max(float((a.mean(1) - 2 * cross + common * power).sum()), least * float(a.mean(1).sum()))
 
 
 def _squares(normalised: Array) -> Array:

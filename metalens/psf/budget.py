@@ -111,26 +111,38 @@ def with_model(
     incidence_rad: float,
     has_angles: bool,
     ghost: float,
+    uneven: float = 0.0,
     left_out: LeftOut = ROUGH,
 ) -> Budget:
     """The budget with what the model of a lens leaves out.
 
     Args:
-        aperture: sin of the largest angle between a ray and the lens' axis at the sensor.
+        aperture: half the spread in sin θ of the rays to the sensor. uneven: as in :func:`scalar_error`.
         vector: whether both polarisations were computed. has_angles: whether the pillars answer at the light's angle.
     """
     return replace(
         budget,
-        polarisation=0.0 if vector else scalar_error(aperture),
+        polarisation=0.0 if vector else scalar_error(aperture, uneven),
         neighbours=_difference(_scalar(aperture, left_out.neighbours), _scalar(aperture)),
         angle=0.0 if has_angles else min(1.0, left_out.angle * math.sin(incidence_rad) ** 2),
         glass=ghost,
     )
 
 
-def scalar_error(aperture: float) -> float:
-    """Relative L2 difference between the scalar PSF and that of both polarisations, perfect lens of this aperture."""
-    return _difference(_scalar(aperture), _vectorial(aperture))
+def scalar_error(aperture: float, uneven: float = 0.0) -> float:
+    """Relative L2 difference between the scalar PSF and |E|² of both polarisations.
+
+    In focus it is that of a perfect lens of this aperture. Out of it rays fall apart, and the scalar's power is weighed
+    by 1/cos θ alone: the difference is how uneven that is over the aperture. Light from the side and aberrated light
+    have of both and lie below the two together (36 of 36 lenses drawn, NA 0.1 to 0.6, up to 25 degrees: 0.25 to 0.87).
+
+    A pixel counts flux, which has no 1/cos θ: the scalar is that to 7e-5 at NA 0.24 and 4e-3 at NA 0.6
+    (:mod:`metalens.field.polarised`).
+
+    Args:
+        uneven: standard deviation of 1/cos θ over the aperture, over its mean (:func:`metalens.psf.of_lens.uneven`).
+    """
+    return math.hypot(_difference(_scalar(aperture), _vectorial(aperture)), uneven)
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:

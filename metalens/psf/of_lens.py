@@ -18,6 +18,7 @@ from metalens.psf.record import Polarisation, PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
 
+RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: 1e-6 of it at NA 0.6 and 25 degrees
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 
@@ -117,6 +118,7 @@ def _budget(
     return with_model(
         dataclasses.replace(made, spectrum=nodes.error),
         aperture=aperture(lens, angle),
+        uneven=uneven(lens, angle),
         vector=vector,
         incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
         has_angles=lens.proxy.max_angle_rad > 0,
@@ -134,7 +136,7 @@ def _vectorial(lens: Lens, angle: tuple[float, float], polarisation: Polarisatio
             )
         return False
     if polarisation == "auto":
-        return scalar_error(aperture(lens, angle)) > tolerance
+        return scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance
     return polarisation == "vector"
 
 
@@ -146,6 +148,19 @@ def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     edges = centre + np.array([-1.0, 1.0]) * (lens.diameters.radius_um + lens.diameters.pitch_um / 2)
     p = np.sign(edges) * media.direction(after, np.abs(edges))
     return float((p[1] - p[0]) / 2 / after.order[-1])
+
+
+def uneven(lens: Lens, angle_rad: tuple[float, float]) -> float:
+    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the chief ray's place on the sensor."""
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    centre = float(media.reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))))
+    node, share = np.polynomial.legendre.leggauss(RINGS)
+    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt((node + 1) / 2)[:, None]
+    turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
+    p = media.direction(after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn)))
+    weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)
+    mean = share @ weight.mean(1) / 2
+    return float(np.sqrt(share @ ((weight - mean) ** 2).mean(1) / 2) / mean)
 
 
 def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:

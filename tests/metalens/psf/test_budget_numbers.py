@@ -75,10 +75,11 @@ def test_the_models_own_terms_are_integrals_over_the_aperture():
     vector = parts[0] ** 2 + 2 * parts[1] ** 2 + parts[2] ** 2
     want = apart(plain**2, vector, radius)
     assert budget.scalar_error(aperture) == pytest.approx(want, rel=1e-6)
+    assert budget.scalar_error(aperture, 0.3) == pytest.approx(math.hypot(want, 0.3), rel=1e-6)
     made = budget.with_model(
-        Budget(0.01), aperture=aperture, vector=False, incidence_rad=0.2, has_angles=False, ghost=0.07
+        Budget(0.01), aperture=aperture, vector=False, incidence_rad=0.2, has_angles=False, ghost=0.07, uneven=0.04
     )
-    assert made.polarisation == pytest.approx(want, rel=1e-6)
+    assert made.polarisation == pytest.approx(math.hypot(want, 0.04), rel=1e-6)
     assert made.neighbours == pytest.approx(apart(np.abs(crowd) ** 2, plain**2, radius), rel=1e-6)
     assert made.angle == pytest.approx(2.5 * math.sin(0.2) ** 2, rel=1e-12)
     assert (made.glass, made.numerical) == (0.07, 0.01)
