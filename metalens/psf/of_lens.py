@@ -18,7 +18,7 @@ from metalens.psf.record import Polarisation, PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
 
-RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: 1e-6 of it at NA 0.6 and 25 degrees
+RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 
