@@ -129,6 +129,8 @@ def _counts(content: MaskContent, name: str) -> tuple[dict[str, int], dict[str, 
 def with_places(parts: Parts, content: MaskContent) -> Parts:
     """The same with the copies that each cell holds."""
     whole = parts.times.keys() - {ROOT}
+    if not whole:
+        return Parts(parts.times, {ROOT: []}, parts.apart)
     placed = {
         name: [Copies(*one) for top in parts.tops(content, name) for one in flat.places(content, top, whole)]
         for name in parts.times

@@ -58,6 +58,17 @@ class Layer:
             apart[n] = known[key]
         return apart
 
+    @property
+    def around(self) -> Array:
+        """(1, 4) left, bottom, right, top of all shapes together; (0, 4) where there are none."""
+        if not len(self.kind):
+            return np.empty((0, 4), np.int64)
+        low, high = (np.array([f(o, 0) for o in self.outlines], np.int64) for f in (np.min, np.max))
+        places = (self.x, self.y)
+        ends = [np.min(v + low[self.kind, n]) for n, v in enumerate(places)]
+        ends += [np.max(v + high[self.kind, n]) for n, v in enumerate(places)]
+        return np.array([ends], np.int64)
+
     def only(self, members: Array) -> "Layer":
         """Some of the shapes: (n,) bool or numbers."""
         return Layer(self.outlines, self.cells, self.kind[members], self.x[members], self.y[members])

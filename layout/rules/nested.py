@@ -5,7 +5,7 @@ stays further than the gap from all that is drawn around every copy of the cell 
 once. The others are drawn in the cells that hold the copies, and checked there or, by the same rule, further up.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ from layout.shapes import polygon, rectilinear
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
+_AT_ONCE = 1 << 18  # shapes whose boxes are looked at together
 _SQUARES = 1024  # each way, in which a cell is marked where others are near it
 
 
@@ -59,6 +60,9 @@ def separate(parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int) ->
     Raises:
         MaskFileError: more than these, or shapes beyond 32 bits.
     """
+    if len(parts.times) == 1:  # nothing is placed again and again
+        yield from drawn.items()
+        return
     every = {name: [drawn.get(name, EMPTY)] for name in parts.times}
     work = _Work(parts, max(gap, 1.0), most, every, sum(len(layer.kind) for layer in drawn.values()))
     for name in reversed(parts.times):
@@ -81,7 +85,7 @@ def _around(work: _Work, name: str) -> None:
     own = np.array([some.turn.boxes(work.box[some.child][None])[0] for some in copies]).reshape(-1, 4)
     boxes = own.astype(np.int64)[which] + np.column_stack([x, y, x, y])
     work.held[name] = _Held(copies, which, x, y, boxes)
-    every = np.concatenate([boxes, work.drawn[name][0].boxes()])
+    every = np.concatenate([boxes, work.drawn[name][0].around])
     if len(every):
         work.box[name] = np.concatenate([every[:, :2].min(0), every[:, 2:].max(0)])
 
@@ -151,7 +155,8 @@ def _taken_out(work: _Work, name: str) -> Layer:
     if not met or not len(layer.kind):
         return layer
     boxes = np.unique(np.concatenate(met), axis=0) + work.gap * np.array([-1, -1, 1, 1])
-    hit = _marked(layer.boxes(), boxes, work.box[name])
+    marked = _marked(boxes, work.box[name])
+    hit = np.concatenate([marked(layer.boxes(slice(n, n + _AT_ONCE))) for n in range(0, len(layer.kind), _AT_ONCE)])
     if not hit.any():
         return layer
     taken = _with_their_groups(layer, hit, work.gap)
@@ -187,18 +192,23 @@ def _with_their_groups(layer: Layer, hit: Array, gap: float) -> Array:
     return np.asarray(groups[label])
 
 
-def _marked(shapes: Array, boxes: Array, around: Array) -> Array:
-    """(n,) whether shapes (n, 4) share a square of a raster over ``around`` with any of the boxes (m, 4)."""
+def _marked(boxes: Array, around: Array) -> Callable[[Array], Array]:
+    """Tells (n,) whether shapes (n, 4) share a square of a raster over ``around`` with any of the boxes (m, 4)."""
     side = max(float((around[2:] - around[:2]).max()) / _SQUARES, 1.0)
-    own, others = ((some - around[[0, 1] * 2]) // side for some in (shapes, boxes))
-    marked = np.zeros((_SQUARES + 2, _SQUARES + 2), np.int32)
-    outside = (others[:, 2:] < 0).any(1) | (others[:, :2] > _SQUARES).any(1)
-    for left, bottom, right, top in np.clip(others[~outside], 0, _SQUARES).astype(np.int64).tolist():
-        marked[left + 1 : right + 2, bottom + 1 : top + 2] = 1
-    sums = marked.cumsum(0, dtype=np.int64).cumsum(1)
-    left, bottom, right, top = np.clip(own, 0, _SQUARES).astype(np.int64).T
-    held = sums[right + 1, top + 1] - sums[left, top + 1] - sums[right + 1, bottom] + sums[left, bottom]
-    return np.asarray(held > 0)
+    first = around[[0, 1] * 2]
+    squares = (boxes - first) // side
+    outside = (squares[:, 2:] < 0).any(1) | (squares[:, :2] > _SQUARES).any(1)
+    held = np.zeros((_SQUARES + 2, _SQUARES + 2), np.int32)
+    for left, bottom, right, top in np.clip(squares[~outside], 0, _SQUARES).astype(np.int64).tolist():
+        held[left + 1 : right + 2, bottom + 1 : top + 2] = 1
+    sums = held.cumsum(0, dtype=np.int64).cumsum(1)
+
+    def marked(shapes: Array) -> Array:
+        left, bottom, right, top = np.clip((shapes - first) // side, 0, _SQUARES).astype(np.int64).T
+        found = sums[right + 1, top + 1] - sums[left, top + 1] - sums[right + 1, bottom] + sums[left, bottom]
+        return np.asarray(found > 0)
+
+    return marked
 
 
 def _touch(one: Array, two: Array, gap: float) -> Array:
