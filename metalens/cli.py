@@ -124,12 +124,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a locale of ASCII alone
     if not words or words[0] in ("-h", "--help"):
-        sys.stdout.write(_help(VERBS) + _INTERRUPTED)
+        console.flush(_help(VERBS) + _INTERRUPTED)
         return SUCCESS if words else BAD_INPUT
     if words[0] == "--version":
         from metalens import __version__
 
-        sys.stdout.write(f"metalens {__version__}\n")
+        console.flush(f"metalens {__version__}\n")
         return SUCCESS
     if words[0] not in VERBS:
         return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
@@ -229,7 +229,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
     parts: dict[str, tuple[str, str]] = getattr(module, "PARTS", {})
     if parts:
         if not words or words[0] in ("-h", "--help"):
-            sys.stdout.write(_help(parts, f"metalens {verb}"))
+            console.flush(_help(parts, f"metalens {verb}"))
             return SUCCESS if words else BAD_INPUT
         meant = words[0] if words[0] in parts else module.part_of(words[0])
         if meant is None:
@@ -244,7 +244,11 @@ def _dispatch(verb: str, words: list[str]) -> int:
         module.VIEWS.update(VIEWS)
     if verb == "info":
         module.TOLD.update(TOLD)
-    options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
+    try:
+        options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
+    except BrokenPipeError:  # whoever was shown the help went away
+        console.silence()
+        return SUCCESS
     work = importlib.import_module(getattr(module, "WORK", module.__name__))
     return int(work.run(options))
 

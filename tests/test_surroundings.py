@@ -1,5 +1,6 @@
 """A read-only installation without a home, a lost terminal, an ASCII locale, a folder with its manifest."""
 
+import errno
 import json
 import os
 import signal
@@ -12,7 +13,8 @@ import pytest
 
 from metalens import cli
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.ground import transaction
+from metalens.ground import lock, transaction
+from metalens.ground.errors import OutputError
 
 ROOT = Path(__file__).parents[1]
 
@@ -164,3 +166,38 @@ def test_info_shows_what_a_folder_holds_and_refuses_a_changed_one(tmp_path, caps
     (tmp_path / "out" / "a.txt").write_text("other")
     assert main(["info", str(tmp_path / "out")]) == BAD_INPUT
     assert "SHA-256 differs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "evaluate --help", "info --help"])
+def test_help_that_nobody_reads_to_its_end_is_no_error(words):
+    line = f"{sys.executable} -m metalens {words} | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (SUCCESS, "")
+
+
+@pytest.mark.parametrize("words", ["info", "export", "psf", "check", "layout", "view", "evaluate optics", "budget"])
+def test_a_pipe_in_place_of_an_artefact_is_refused_not_waited_for(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe.h5")
+    output = [] if words == "info" else ["-o", {"export": "a.mat", "view": "a.html"}.get(words, "a.h5")]
+    assert main([*words.split(), "pipe.h5", *output]) == BAD_INPUT
+    assert "pipe.h5: no plain file (a pipe or a device)" in capsys.readouterr().err
+    assert os.listdir() == ["pipe.h5"]
+
+
+def test_an_output_that_cannot_be_made_is_named_with_the_cause(tmp_path, monkeypatch, capsys):
+    """Not the lock beside it: its user never heard of that."""
+    monkeypatch.chdir(tmp_path)
+
+    def refused(path, target):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    (tmp_path / "library.h5").touch()
+    inside = tmp_path / "library.h5" / "out.h5"
+    for target, found in (
+        (tmp_path / "out.h5", "out.h5: folder .* cannot be written .Read-only file system"),
+        (inside, "out.h5: folder .*library.h5 is a file: give another name"),
+    ):
+        monkeypatch.setattr(lock, "_taken", refused)
+        with pytest.raises(OutputError, match=found), transaction.file(target):
+            pass

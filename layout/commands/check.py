@@ -16,6 +16,7 @@ from layout.oasis import read as oasis_read
 from layout.process import process as processes
 from layout.rules import DrcReport, foreign, markers, told
 from metalens.commands import Common, MaybeOutput
+from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
 
 
@@ -46,7 +47,7 @@ def run(options: Options) -> int:
     """Check the mask; exit 1 where a rule is broken."""
     process = processes.Process() if options.process is None else processes.load(options.process)
     if not options.mask.is_file():
-        raise MaskFileError(f"{options.mask}: no such file; need a GDSII or OASIS mask")
+        raise MaskFileError(f"{options.mask}: {reading.absent(options.mask)}; need a GDSII or OASIS mask")
     output = options.claim(options.output) if options.output is not None else contextlib.nullcontext()
     with output as draft:
         most = foreign.most_of(options.mask) if options.most_shapes is None else options.most_shapes

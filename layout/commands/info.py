@@ -5,6 +5,7 @@ from typing import Any
 
 from layout.commands.check import read
 from layout.files import hierarchy
+from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
 
 
@@ -16,7 +17,7 @@ def told(path: Path) -> dict[str, Any]:
             of the file allows.
     """
     if not path.is_file():
-        raise MaskFileError(f"{path}: no such file")
+        raise MaskFileError(f"{path}: {reading.absent(path)}")
     content = read(path)
     counts = hierarchy.shapes(content)
     layers = {

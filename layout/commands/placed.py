@@ -17,6 +17,7 @@ from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from layout.rules import DrcReport, Violation, check, foreign
 from metalens import lens as lenses
+from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
 from metalens.lens import Lens
 
@@ -99,7 +100,7 @@ def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
     """A cell of a file, or all of a file that takes the others."""
     path, keep = work.beside(record.file), isinstance(record, Into)
     if not path.is_file():
-        raise MaskFileError(f"{path}: no such file; need a GDSII or OASIS mask")
+        raise MaskFileError(f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask")
     most = foreign.most_of(path)
     content = read(path, most)
     hierarchy.refuse_beyond(content, most)

@@ -42,7 +42,9 @@ def read(shape: PhaseMap) -> Samples:
     """
     path = shape.file
     if not path.is_file():
-        raise LensError(f"{path}: no such file; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)")
+        raise LensError(
+            f"{path}: {reading.absent(path)}; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)"
+        )
     ending = path.suffix.lower()
     if ending == ".dat":
         samples = _zemax(path, shape.pitch_um)

@@ -24,13 +24,13 @@ def flush(text: str = "") -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
     except BrokenPipeError:
-        _silence()
+        silence()
     except OSError as error:
-        _silence()
+        silence()
         raise OutputError(f"standard output: {error.strerror}") from error
 
 
-def _silence() -> None:
+def silence() -> None:
     """Standard output leads nowhere from here on, what it still holds included."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     with contextlib.suppress(OSError, ValueError):  # one that is no file

@@ -111,7 +111,10 @@ def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
         with h5py.File(path, "r") as file:
             return work(file)
 
-    size = os.path.getsize(path) if os.path.isfile(path) else 0
+    plain = os.path.isfile(path)
+    if os.path.exists(path) and not (plain or os.path.isdir(path)):  # a pipe that nobody writes to would be waited for
+        raise StoreError(f"{path}: {absent(Path(path))}")
+    size = os.path.getsize(path) if plain else 0
     _probe(path, lambda: opened(read if size <= _WHOLE else _read_through), _ROOM + _DENSEST * size)
     made: Made = opened(read)
     return made
@@ -184,6 +187,15 @@ def _read_through(file: Any) -> None:
 
     visit("/", file)
     file.visititems(visit)
+
+
+def absent(path: Path) -> str:
+    """What is wrong with a path that is no plain file, in words."""
+    if path.is_dir():
+        return "a folder"
+    if path.exists():
+        return "no plain file (a pipe or a device), in which a reader could go back and forth"
+    return "no such file"
 
 
 _FOREIGN = {  # first bytes of what is often given in place of an artefact, in words

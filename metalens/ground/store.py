@@ -189,7 +189,7 @@ def load(path: str | Path, kind: str | None = None, *, version: int = 1, without
     """
     path = Path(path)
     if not path.is_file():
-        raise StoreError(f"{path}: no such file; need a {kind or 'toolchain'} file")
+        raise StoreError(f"{path}: {reading.absent(path)}; need a {kind or 'toolchain'} file")
     try:
         return reading.survived(path, lambda file: _read(path, file, kind, version, without))
     except StoreError:

@@ -143,10 +143,11 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
         if terms.parents:
             held.enter_context(lock.parents(target))
         if not target.parent.is_dir():
-            raise OutputError(f"{target}: folder {target.parent} does not exist; make it or give another name")
+            how = "is a file: give" if target.parent.exists() else "does not exist; make it or give"
+            raise OutputError(f"{target}: folder {target.parent} {how} another name")
         try:
             held.enter_context(lock.held(target))
-        except PermissionError as error:
+        except OSError as error:
             raise OutputError(f"{target}: folder {target.parent} cannot be written ({error.strerror})") from error
         for left in target.parent.glob(f".{_plain(target.name)}.part-*"):
             _recover(left, target)

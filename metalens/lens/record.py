@@ -161,6 +161,8 @@ def streamed(path: str | Path) -> Lens:
 
     What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray`` gives all of them.
     """
+    if not Path(path).is_file():  # told by the loader; a pipe would be waited for
+        return load(path)
     large = False
     with contextlib.suppress(*store.DAMAGE), h5py.File(path, "r") as file:  # damage is told by the loader
         large = file[_NAME].nbytes > MOST_HELD_BYTES
