@@ -12,7 +12,7 @@ LEAST_CONTRAST = 2.0  # of permittivities, of a pillar that is told from its sur
 LOW, TALL = 0.5, 16.0  # heights in half pitches
 DENSE, ORDERS = 2.0, 1.05  # waves in a pitch, in the layer and in the half-spaces
 STEEP_RAD = 1.0  # half Bloch phase
-RARER = 2.5
+RARER = 3.0
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 
 

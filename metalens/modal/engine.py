@@ -12,7 +12,7 @@ from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
-from metalens.modal.case import Case, case_of, film
+from metalens.modal.case import RARER, Case, case_of, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import RUNGS, Rung, first_rung
@@ -27,6 +27,7 @@ QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
+STEP = 2.0  # times the change from the rung before, for discs of the rarer medium
 MOST = 8  # and of the others at most so many, the least decaying
 
 
@@ -228,11 +229,20 @@ class Climb:
 
 
 def climb(case: Case, tolerance: float) -> Climb:
-    """The cheapest rung of the ladder that meets the tolerance, by its own estimate."""
+    """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
+
+    Sharp resonances of a disc of the rarer medium converge slowly, and both forms may lie together by accident: there
+    the rung before is solved too, and ``STEP`` times the change from it counts where it is more.
+    """
     best: Climb | None = None
-    for rung in RUNGS[first_rung(tolerance) :]:
+    before: np.ndarray | None = None
+    first, compares = first_rung(tolerance), case.strange >= RARER
+    for rung in RUNGS[max(0, first - compares) :]:
         solution = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
         error = rung.error(solution, case.rho)
+        if compares:
+            error = max(error, 1.0 if before is None else STEP * float(np.abs(solution.matrix - before).max()))
+            before = solution.matrix
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"
             return Climb(solution, rung, error, True, reason)

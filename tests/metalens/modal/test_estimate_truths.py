@@ -70,6 +70,28 @@ def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_leas
     assert engine.climb(CASE, 0.5).solution == "a"
 
 
+def test_discs_of_the_rarer_medium_are_judged_by_the_mesh_before_too(monkeypatch):
+    """It is solved even where the tolerance asks for the next; twice the change counts where it is above the bar."""
+    made = {"a": (0.3, 0.50), "b": (1e-3, 0.52), "c": (0.05, 0.521), "d": (2e-3, 0.5212)}
+
+    def rung(name):
+        choice = SimpleNamespace(plan=name)
+        return SimpleNamespace(name=name, choice=lambda rho: choice, weak=0.0, error=lambda one, rho: made[one.name][0])
+
+    def evaluate(case, plan, *, weak):
+        return SimpleNamespace(name=plan, matrix=np.array([[0.1j, made[plan][1]], [made[plan][1], 0.1]]))
+
+    monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in made))
+    monkeypatch.setattr(engine, "first_rung", lambda tolerance: 1 if tolerance > 3e-3 else 2)
+    monkeypatch.setattr(engine, "evaluate", evaluate)
+    hole = SimpleNamespace(**{**vars(CASE), "strange": 3.0})
+    for tolerance, name, error in ((0.041, "b", 0.04), (0.039, "d", 2e-3), (2e-3, "d", 2e-3), (1e-9, "d", 2e-3)):
+        found = engine.climb(hole, tolerance)
+        assert found.solution.name == name
+        assert found.error == pytest.approx(error, rel=1e-9)
+        assert found.converged == (error <= tolerance)
+
+
 def test_half_spaces_admit_modes_as_plane_waves_of_their_own_kind():
     """i kz and i k0² eps / kz of the electric form, i kz / eps and i k0² / kz of the magnetic one."""
     te, tm = np.array([0.3, 9.0]), np.array([1.1, 5.0, 2.25 * 1.7**2])
