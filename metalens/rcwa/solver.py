@@ -139,9 +139,12 @@ def compared(width: float | Array) -> Array:
 
     Errors swing with the orders that fit into it, once in 1 / width of them. Of discs of 0.1 to 0.2 pitches, and of
     gaps so narrow, four truncations see a part of a swing alone: at 8 to 11 orders the error was up to 8.5 times the
-    farthest of four (5 of 380 above its bar), and up to twice the farthest of so many.
+    farthest of four (5 of 380 above its bar), and up to twice the farthest of so many. Below a fiftieth of the pitch
+    :func:`crowding` stands for it, and discs so thin are not resolved.
     """
-    return np.clip(np.ceil(_SWING / np.maximum(width, 1e-9)), _COMPARED, MOST_COMPARED).astype(int)
+    width = np.asarray(width)
+    swing = np.clip(np.ceil(_SWING / np.maximum(width, _CROWDED)), _COMPARED, MOST_COMPARED)
+    return np.where(width < _CROWDED, _COMPARED, swing).astype(int)
 
 
 def safety(reach: int) -> float:
