@@ -197,7 +197,8 @@ def _label(process: Process, unit: Units, die: Box, default: str) -> tuple[tuple
     words = process.die.label or default
     inset = unit(process.die.street_um + CLEAR_UM)
     room = die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * CLEAR_UM))
-    square = min(unit(5.0), room // max(1, 6 * len(words)) // unit.grid * unit.grid)
+    even = 2 * unit.grid  # halves of a square join letters
+    square = min(unit(5.0), room // max(1, 6 * len(words))) // even * even
     if square < unit(0.5):
         raise ProcessError(f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um")
     long = font.width(words, square)

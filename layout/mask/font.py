@@ -1,5 +1,10 @@
-"""Letters of 5 x 7 squares for labels: rectangles only, so that any writer draws them exactly."""
+"""Letters of 5 x 7 squares for labels: rectangles only, so that any writer draws them exactly.
 
+Where two squares of a letter meet at a corner alone, two quarter squares beside it join them: no width of a letter and
+no gap in it is 0. Nothing lies on another, which a writer would expose twice.
+"""
+
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -28,7 +33,7 @@ def text(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
     """Rectangles of a line of text, small letters as capitals.
 
     Args:
-        x, y: lower left corner; square: side of one square of the letters, all in database units.
+        x, y: lower left corner; square: side of one square of the letters, even; all in database units.
 
     Raises:
         ProcessError: a character that the font does not hold.
@@ -45,11 +50,29 @@ def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
     for n, letter in enumerate(words.upper()):
         if letter not in _GLYPHS:
             raise ProcessError(f"label {words!r}: no {letter!r} in the font; use letters, digits and {_others()}")
-        for row, bits in enumerate(bytes.fromhex(_GLYPHS[letter])):
+        rows = bytes.fromhex(_GLYPHS[letter])
+        for row, bits in enumerate(rows):
             bottom = y + (6 - row) * square
             for first, end in _runs(bits):
-                left, right = x + (n * 6 + first) * square, x + (n * 6 + end) * square
-                yield np.array([[left, bottom], [right, bottom], [right, bottom + square], [left, bottom + square]])
+                yield _box(x + (n * 6 + first) * square, bottom, (end - first) * square, square)
+        for row, (above, below) in enumerate(itertools.pairwise(rows)):
+            for column, rises in _joints(above, below):
+                left, at, half = x + (n * 6 + column) * square, y + (6 - row) * square, square // 2
+                yield _box(left - half * rises, at, half, half)
+                yield _box(left - half * (not rises), at - half, half, half)
+
+
+def _box(left: int, bottom: int, wide: int, high: int) -> Array:
+    return np.array([[left, bottom], [left + wide, bottom], [left + wide, bottom + high], [left, bottom + high]])
+
+
+def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
+    """Columns at whose left end two rows meet at a corner alone, and whether the upper square is the right one."""
+    for column in range(1, 5):
+        left, right = 5 - column, 4 - column
+        upper, lower = ((bits >> left & 1, bits >> right & 1) for bits in (above, below))
+        if {upper, lower} == {(0, 1), (1, 0)}:
+            yield column, upper == (0, 1)
 
 
 def _runs(bits: int) -> Iterator[tuple[int, int]]:

@@ -40,8 +40,8 @@ def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         return work(item)
 
     with ThreadPoolExecutor(count, thread_name_prefix="metalens-beside") as pool, one_blas_thread():
-        jobs = [pool.submit(alone, item) for item in items]
         try:
+            jobs = [pool.submit(alone, item) for item in items]
             return [job.result() for job in jobs]
         except BaseException:
             stop.set()

@@ -36,3 +36,17 @@ def test_a_line_of_text_stands_where_it_is_asked_for(x, y):
     assert x + 60 < every[:, 0].max() <= x + 110
     home = np.concatenate(font.text("LI", x=0, y=0, square=10))
     assert np.array_equal(every - [x, y], home)
+
+
+def test_squares_of_a_letter_meet_along_edges_and_none_lies_on_another():
+    """On a grid of quarter squares: no two filled cells meet at a corner alone, none is filled twice."""
+    words = "".join(font._GLYPHS)
+    filled = np.zeros((60, 20 + 24 * len(words)), int)
+    for box in font.text(words, x=8, y=12, square=4):
+        (left, bottom), (right, top) = box.min(0), box.max(0)
+        filled[bottom:top, left:right] += 1
+    assert filled.max() == 1
+    a, b, c, d = filled[1:, :-1], filled[1:, 1:], filled[:-1, :-1], filled[:-1, 1:]
+    assert not np.any((a == d) & (b == c) & (a != b))
+    squares = sum(int(rows, 16).bit_count() for rows in font._GLYPHS.values())
+    assert filled.sum() > 16 * squares  # and no square of a letter is lost
