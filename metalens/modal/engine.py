@@ -12,7 +12,7 @@ from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
-from metalens.modal.case import RARER, Case, case_of, film
+from metalens.modal.case import Case, case_of, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import RUNGS, Rung, first_rung
@@ -27,7 +27,7 @@ QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
-STEP = 2.0  # times the change from the rung before, for discs of the rarer medium
+COMPARED, STEP = 2, 2.0  # rungs before, and times the change from them: for cells unlike those of lenses
 MOST = 8  # and of the others at most so many, the least decaying
 
 
@@ -231,18 +231,22 @@ class Climb:
 def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
 
-    Sharp resonances of a disc of the rarer medium converge slowly, and both forms may lie together by accident: there
-    the rung before is solved too, and ``STEP`` times the change from it counts where it is more.
+    At sharp resonances both forms may lie together by accident, far from the truth: guided modes of a thin layer of low
+    contrast, pillars that carry many waves, discs of the rarer medium. So for cells unlike those of lenses the two
+    rungs before are solved too, of which the coarsest mesh is none, and ``STEP`` times the farther change from them
+    counts.
     """
     best: Climb | None = None
-    before: np.ndarray | None = None
-    first, compares = first_rung(tolerance), case.strange >= RARER
-    for rung in RUNGS[max(0, first - compares) :]:
+    before: list[np.ndarray] = []
+    compared = COMPARED if case.strange > 0 else 0
+    first = first_rung(tolerance)
+    for rung in RUNGS[max(first - compared, 1) if compared else first :]:
         solution = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
         error = rung.error(solution, case.rho)
-        if compares:
-            error = max(error, 1.0 if before is None else STEP * float(np.abs(solution.matrix - before).max()))
-            before = solution.matrix
+        if compared:
+            changes = [float(np.abs(solution.matrix - one).max()) for one in before[-compared:]]
+            error = max(error, STEP * max(changes) if len(changes) == compared else 1.0)
+            before.append(solution.matrix)
         if error <= tolerance:
             reason = f"the {rung.name} mesh meets the tolerance"
             return Climb(solution, rung, error, True, reason)

@@ -63,16 +63,21 @@ def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_leas
     monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in errors))
     monkeypatch.setattr(engine, "first_rung", lambda tolerance: 0)
     monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
-    met = engine.climb(CASE, 0.02)
+    usual = SimpleNamespace(**{**vars(CASE), "strange": 0.0})
+    met = engine.climb(usual, 0.02)
     assert (met.solution, met.error, met.converged) == ("b", 0.02, True)
-    missed = engine.climb(CASE, 0.01)
+    missed = engine.climb(usual, 0.01)
     assert (missed.solution, missed.error, missed.converged) == ("b", 0.02, False)
-    assert engine.climb(CASE, 0.5).solution == "a"
+    assert engine.climb(usual, 0.5).solution == "a"
 
 
-def test_discs_of_the_rarer_medium_are_judged_by_the_mesh_before_too(monkeypatch):
-    """It is solved even where the tolerance asks for the next; twice the change counts where it is above the bar."""
-    made = {"a": (0.3, 0.50), "b": (1e-3, 0.52), "c": (0.05, 0.521), "d": (2e-3, 0.5212)}
+@pytest.mark.parametrize("strange", [1.0, 3.0])
+def test_cells_unlike_those_of_lenses_are_judged_by_two_meshes_before_too(monkeypatch, strange):
+    """Never by the coarsest; twice the farther change counts where it is above the bar."""
+    bars = {"a": 1e-3, "b": 1e-3, "c": 1e-3, "d": 2e-3, "e": 0.03, "f": 1e-3}
+    made = {
+        name: (bar, t) for (name, bar), t in zip(bars.items(), (0.5, 0.52, 0.55, 0.545, 0.546, 0.5461), strict=True)
+    }
 
     def rung(name):
         choice = SimpleNamespace(plan=name)
@@ -82,10 +87,11 @@ def test_discs_of_the_rarer_medium_are_judged_by_the_mesh_before_too(monkeypatch
         return SimpleNamespace(name=plan, matrix=np.array([[0.1j, made[plan][1]], [made[plan][1], 0.1]]))
 
     monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in made))
-    monkeypatch.setattr(engine, "first_rung", lambda tolerance: 1 if tolerance > 3e-3 else 2)
+    monkeypatch.setattr(engine, "first_rung", lambda tolerance: 0 if tolerance > 3e-3 else 4)
     monkeypatch.setattr(engine, "evaluate", evaluate)
-    hole = SimpleNamespace(**{**vars(CASE), "strange": 3.0})
-    for tolerance, name, error in ((0.041, "b", 0.04), (0.039, "d", 2e-3), (2e-3, "d", 2e-3), (1e-9, "d", 2e-3)):
+    hole = SimpleNamespace(**{**vars(CASE), "strange": strange})
+    # d: 2 (0.545 - 0.52); e: its own; f: 2 (0.5461 - 0.545). From the fifth rung on c, d and e come before
+    for tolerance, name, error in ((0.051, "d", 0.05), (0.049, "e", 0.03), (0.02, "f", 2.2e-3), (1e-3, "f", 2.2e-3)):
         found = engine.climb(hole, tolerance)
         assert found.solution.name == name
         assert found.error == pytest.approx(error, rel=1e-9)

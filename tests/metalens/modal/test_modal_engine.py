@@ -232,6 +232,16 @@ def test_hard_touching_pillars_on_a_mesh_of_their_own():
     assert abs(near.matrix[1, 0] - nearer.matrix[1, 0]) < 1e-2
 
 
+def test_hard_guided_mode_of_a_thin_layer_of_low_contrast():
+    """A sharp resonance: on the coarsest mesh both forms lie 1e-3 apart, and 0.08 from what coupled waves say."""
+    layer = Cell(0.9505, 0.1774, Index(2.2762), Index(1.7968), Index(1.6359), Index(1.9933))
+    waves = rcwa.solve(layer, 0.1899, 0.86503351, harmonics=13)
+    got = modal.solve(layer, 0.1899, 0.86503351, tolerance=1e-2)
+    assert waves.t_error < 4e-3
+    assert max(abs(got.t - waves.t), abs(got.r - waves.r)) < got.t_error + waves.t_error
+    assert got.t_error < 0.1
+
+
 @pytest.mark.parametrize("short", [1e-4, 1e-8, 0.0])
 def test_hard_substrate_order_at_cutoff(short):
     got = modal.solve(cell(), 0.2, 0.4 * 1.4525 / (1 - short))
