@@ -13,8 +13,8 @@ seeds 1327 of 1328 bars of the two coarse meshes held, the nearest at 0.73 of it
 median is at a sixteenth: the factors are those of the tail. The one that did not (1.00) and a hole whose mesh "good"
 was six times off are sharp resonances of a disc of the rarer medium; a guided mode of a thin layer of low contrast was
 32 times off (seed 8641 of ``engines``, 3 of 3400 cells). ``engine.climb`` judges cells unlike those of lenses by the
-mesh before. Where an order is near its cutoff both forms err alike, so that more than their difference is told; around
-a thin disc they err apart, and less than half of it is. On degree 5 the mean of both forms errs by a tenth of half
+two meshes before. Where an order is near its cutoff both forms err alike, so that more than their difference is told;
+around a thin disc they err apart, and less than half of it is. On degree 5 the mean of both forms errs by a tenth of half
 their difference or less, at cutoffs too, but for discs whose gap is narrow.
 """
 
