@@ -14,8 +14,8 @@ median is at a sixteenth: the factors are those of the tail. The one that did no
 was six times off are sharp resonances of a disc of the rarer medium; a guided mode of a thin layer of low contrast was
 32 times off (seed 8641 of ``engines``, 3 of 3400 cells). ``engine.climb`` judges cells unlike those of lenses by the
 two meshes before. Where an order is near its cutoff both forms err alike, so that more than their difference is told;
-around a thin disc they err apart, and less than half of it is. On degree 5 the mean of both forms errs by a tenth of half
-their difference or less, at cutoffs too, but for discs whose gap is narrow.
+around a thin disc they err apart, and less than half of it is. On degree 5 the mean of both forms errs by a tenth of
+half their difference or less, at cutoffs too, but for discs whose gap is narrow.
 """
 
 from dataclasses import dataclass
