@@ -12,12 +12,12 @@ import functools
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from benchmarks import Row
+from benchmarks.shaped_cells import Drawn, fitting
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
@@ -32,17 +32,6 @@ STEPS = (3, 6)  # of a tilted wall
 PIXELS, FINE, RASTER = 72, (55, 34), 1e-3  # and what the raster may leave
 HEXAGONAL, WIDE, FLAT = Lattice("hexagonal"), Lattice("rectangular", 1.3), Lattice("rectangular", 0.8)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.55)))
-
-
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """A cell, its size and a plane wave."""
-
-    cell: Cell
-    size_um: float
-    wavelength_um: float
-    angle_rad: float = 0.0
-    azimuth_rad: float = 0.0
 
 
 Shaped = Callable[[np.random.Generator], Any]
@@ -62,7 +51,9 @@ def _kind(
         wavelength = pitch * cell.substrate.n / rng.uniform(0.4, 1.3)  # type: ignore[union-attr]
         angle = 0.0 if light == "normal" else float(rng.uniform(0.03, 1.0))
         azimuth = float(rng.uniform(-3.1, 3.1) if light == "any" else rng.integers(4) * math.pi / 2)
-        return Drawn(cell, _fitting(cell, pitch * rng.uniform(0.2, 0.9)), wavelength, angle, azimuth if angle else 0.0)
+        return Drawn(
+            cell, fitting(cell, pitch * rng.uniform(0.2, 0.9), 0.03), wavelength, angle, azimuth if angle else 0.0
+        )
 
     return draw
 
@@ -98,15 +89,6 @@ def _cell(
     tilt = {"sidewall_rad": float(rng.uniform(-0.06, 0.12))} if tilted else {}
     height = pitch * (rng.uniform(0.3, 1.0) if tilted else 2 ** rng.uniform(-4, 2))
     return Cell(pitch, height, **about, shape=shape, lattice=lattice, **tilt)
-
-
-def _fitting(cell: Cell, size_um: float, gap: float = 0.03) -> float:
-    """The size, or a smaller one whose widest section leaves a gap, over the pitch."""
-    tilt = abs(math.tan(cell.sidewall_rad)) * cell.height_um
-    grow = max(layer.grow_um + 2 * layer.coat_um for layer in cell.sections) + tilt
-    while cell.gap_um(size_um, grow_um=max(grow, 0.0)) < gap * cell.pitch_um:
-        size_um *= 0.95
-    return size_um
 
 
 def _turned(rng: np.random.Generator) -> float:
@@ -295,10 +277,9 @@ def _amplitudes(eps: float, sine: float, along: Array, oblique: bool) -> Array:
 
 def shares(one: Drawn) -> tuple[float, float, float]:
     """|difference| over the sum of both bars, the largest of t and r; both bars."""
-    where = {"angle_rad": one.angle_rad, "azimuth_rad": one.azimuth_rad}
-    most = rcwa.most_harmonics(one.cell, one.size_um, **where)
+    most = rcwa.most_harmonics(one.cell, one.size_um, angle_rad=one.angle_rad, azimuth_rad=one.azimuth_rad)
     harmonics = HARMONICS[{15: 4, 10: 2, 7: 1}[most]]
-    ours = rcwa.jones(one.cell, one.size_um, one.wavelength_um, **where, harmonics=harmonics)
+    ours = one.jones(harmonics=harmonics)
     tilted = bool(one.cell.sidewall_rad)
     rough, fine = (fmmax_both(one, n, STEPS[0]) for n in TERMS)
     bar = RASTER + FACTOR * float(np.abs(fine - rough).max())

@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,12 @@ class Drawn:
     size_um: float
     wavelength_um: float
     angle_rad: float = 0.0
+    azimuth_rad: float = 0.0
+
+    def jones(self, **how: Any) -> rcwa.Jones:
+        """By coupled waves; how: tolerance or harmonics."""
+        light = {"angle_rad": self.angle_rad, "azimuth_rad": self.azimuth_rad}
+        return rcwa.jones(self.cell, self.size_um, self.wavelength_um, **light, **how)
 
 
 def _about(rng: np.random.Generator, n: tuple[float, float] = (1.9, 3.7), k: float = 0.0) -> dict[str, Index]:
@@ -52,7 +59,7 @@ def _plain(shape: Callable[[np.random.Generator], object], **more: object) -> Ca
     def draw(rng: np.random.Generator) -> Drawn:
         pitch = rng.uniform(0.25, 0.45)
         cell = Cell(pitch, rng.uniform(0.3, 1.0), **_about(rng), shape=shape(rng), **more)  # type: ignore[arg-type]
-        return Drawn(cell, _fitting(cell, pitch * rng.uniform(0.25, 0.85)), _longer(cell, rng))
+        return Drawn(cell, fitting(cell, pitch * rng.uniform(0.25, 0.85)), _longer(cell, rng))
 
     return draw
 
@@ -63,9 +70,10 @@ def _longer(cell: Cell, rng: np.random.Generator) -> float:
     return float(most * cell.pitch_um / cell.lattice.least_order * rng.uniform(1.08, 1.8))
 
 
-def _fitting(cell: Cell, size_um: float, gap: float = 0.04) -> float:
-    """The size, or a smaller one whose sections leave a gap, over the pitch."""
-    grow = max(layer.grow_um + 2 * layer.coat_um for layer in cell.sections)
+def fitting(cell: Cell, size_um: float, gap: float = 0.04) -> float:
+    """The size, or a smaller one whose widest section leaves a gap, over the pitch."""
+    tilt = abs(math.tan(cell.sidewall_rad)) * cell.height_um
+    grow = max(layer.grow_um + 2 * layer.coat_um for layer in cell.sections) + tilt
     while cell.gap_um(size_um, grow_um=max(grow, 0.0)) < gap * cell.pitch_um:
         size_um *= 0.95
     return size_um
@@ -82,7 +90,7 @@ def _layered(rng: np.random.Generator) -> Drawn:
     )
     shape = rng.choice(np.array([Circle(), Square(), Rectangle(0.7)], dtype=object))
     cell = Cell(pitch, sum(heights), **_about(rng), shape=shape, layers=layers)
-    return Drawn(cell, _fitting(cell, pitch * rng.uniform(0.35, 0.7)), _longer(cell, rng))
+    return Drawn(cell, fitting(cell, pitch * rng.uniform(0.35, 0.7)), _longer(cell, rng))
 
 
 def _touching(rng: np.random.Generator) -> Drawn:
@@ -154,7 +162,7 @@ def draws(kind: str, count: int, seed: int) -> list[Drawn]:
     while len(found) < count:
         one = KINDS[kind](rng)
         try:
-            rcwa.jones(one.cell, one.size_um, one.wavelength_um, angle_rad=one.angle_rad, harmonics=1)
+            one.jones(harmonics=1)
         except CellError:
             continue
         found.append(one)
@@ -164,7 +172,7 @@ def draws(kind: str, count: int, seed: int) -> list[Drawn]:
 def referee(one: Drawn) -> tuple[Array, float]:
     """t of finer truncations, and its doubt."""
     last = FINEST[2 if one.angle_rad else 4]
-    found = rcwa.jones(one.cell, one.size_um, one.wavelength_um, angle_rad=one.angle_rad, harmonics=last)
+    found = one.jones(harmonics=last)
     t = np.concatenate([found.earlier, found.t[None]])[-LAST:]
     return t.mean(axis=0), float(np.abs(t - t.mean(axis=0)).max())
 
@@ -173,7 +181,7 @@ def judged(kind: str, count: int, seed: int) -> Row:
     """One row: bars below the error, and the median of bar over error."""
     ratios = []
     for one in draws(kind, count, seed):
-        got = rcwa.jones(one.cell, one.size_um, one.wavelength_um, angle_rad=one.angle_rad, tolerance=TOLERANCE)
+        got = one.jones(tolerance=TOLERANCE)
         want, doubt = referee(one)
         ratios.append((got.t_error + doubt) / max(float(np.abs(got.t - want).max()), 1e-12))
     below = int(np.count_nonzero(np.array(ratios) < 1))

@@ -8,6 +8,7 @@ from layout.arrange import apart, joined, seen
 from layout.commands.placed import Work
 from layout.files import Assembly
 from layout.rules import told
+from layout.shapes import rectilinear
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, KeyFigure, Section, Table
@@ -95,8 +96,7 @@ def _wafer(work: Work, box: Array) -> bytes:
     if size is None or dies is None:
         return b""
     figure, ax = report.canvas(size=(6.4, 6.2))
-    left, bottom, right, top = (box / joined.PER_UM / 1e3).tolist()
-    corner = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    corner = rectilinear.corners(box / joined.PER_UM / 1e3)
     ax.add_collection(
         PolyCollection(
             list(dies.place_um[:, None] / 1e3 + corner), facecolors="#1f6feb55", edgecolors="#355070", linewidths=0.4

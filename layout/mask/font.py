@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
@@ -63,7 +64,7 @@ def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
 
 
 def _box(left: int, bottom: int, wide: int, high: int) -> Array:
-    return np.array([[left, bottom], [left + wide, bottom], [left + wide, bottom + high], [left, bottom + high]])
+    return rectilinear.corners(np.array([left, bottom, left + wide, bottom + high]))
 
 
 def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
