@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.inference.leastsquares import Data, Model, Prior
+from characterize.inference.leastsquares import Data, Model, Prior, Settings
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -25,7 +25,7 @@ PARABOLIC = (0.85, 1.18)  # end of an interval over that of the parabola
 DRAWS = 96
 _HOLDS = 0.4  # sigma by which slopes put together may miss what the images are from the mode on
 _CLOSE, _ROUNDS, _CHECKS, _SOLVES = 0.08, 5, 4, 5
-_HUBER = 6.0
+_HUBER = Settings().huber
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,0 +1,34 @@
+"""Accuracy that is asked for: more digits where the tolerance is tighter; slopes of a lens of one diameter."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.model import kernel, pillar_slopes
+
+
+@pytest.mark.parametrize(("tolerance", "more"), [(5e-4 / math.e**2, 2.0), (5e-7, math.log(1e3)), (5e-3, 0.0)])
+def test_digits_are_counted_from_five_ten_thousandths_of_the_field(tolerance, more):
+    assert kernel.digits(tolerance) == pytest.approx(more, abs=1e-12)
+
+
+def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):
+    """Within a nanometre to either side, where the answer of a smooth pillar is its value and its slope."""
+    only, asked = 0.1731, []
+
+    def exact(cell, diameter_um, wavelength_um, wanted, table):
+        asked.append(diameter_um)
+        return [2.3 + 1j + 40 * (diameter_um - only), 5j, -1.7]
+
+    monkeypatch.setattr(pillar_slopes, "_upright", lambda cell: False)
+    monkeypatch.setattr(pillar_slopes, "_exact", exact)
+    diameters = np.where(np.eye(5) > 0, 0.0, only)
+    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=diameters), cell=None, wavelength_um=0.85)
+    found = pillar_slopes._solve(lens, 1e-4, ())
+    assert only - 1.0001e-3 < min(asked) < only < max(asked) < only + 1.0001e-3
+    assert (found.low_um, found.high_um) == pytest.approx((only - 1e-3, only + 1e-3), abs=1e-9)
+    assert found.center_um == pytest.approx(only, abs=1e-9)
+    assert found.coefficients[:, 0] == pytest.approx([2.3 + 1j, 5j, -1.7])
+    assert found.coefficients[0, 1] == pytest.approx(40, rel=1e-6)
