@@ -9,6 +9,9 @@ WIDTH, SPACE = 0, 1
 KNOWN = -1  # shape number of contours whose widths are measured elsewhere
 _TRIES = 400  # parts of two edges that are looked at, nearest first, where others stand between them
 _SHORTEST = 1 / 16  # of the rule: parts so short are not halved
+# start of each strip among its edges, their numbers, how far along x they go up to each; of each edge its lowest strip;
+# bottom and height of the strips
+Strips = tuple[Array, Array, Array, Array, float, float]
 _NEAR = 1e-7  # units: a line that ends that near to an edge does not cross it
 
 
@@ -24,12 +27,13 @@ def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
     Edges that share a corner face nowhere; of any other pair the parts count that lie before each other and see each
     other: through the inside for a width, through the outside for a space.
     """
+    edges = np.asarray(edges, float)
     order = np.argsort(np.minimum(edges[:, 0], edges[:, 2]), kind="stable")
-    reach = np.maximum.accumulate(np.maximum(edges[order, 0], edges[order, 2]).astype(float))
-    room = 1 << 12
+    edges, shape, room = edges[order], np.asarray(shape[order], np.int64), 1 << 12
+    strips = _strips(edges, max(feature, gap))
     while True:
         found = np.empty((room, 4))
-        count = _sweep(np.asarray(edges[order], float), np.asarray(shape[order], np.int64), reach, feature, gap, found)
+        count = _sweep(edges, shape, strips, feature, gap, found)
         if count < room:
             break
         room *= 4
@@ -38,36 +42,86 @@ def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
     return found
 
 
+def _strips(edges: Array, most: float) -> Strips:
+    """Edges, sorted along x, in strips along x in which each keeps its order: some three places for each edge."""
+    low, high = edges[:, 1::2].min(1), edges[:, 1::2].max(1)
+    bottom, extent = float(low.min(initial=0)), float(np.ptp(edges[:, 1::2])) if len(edges) else 0.0
+    height = max(most, float((high - low).mean()) if len(edges) else 0.0, extent / (4 * len(edges) + 1024))
+    first, last = ((v - bottom) // height for v in (low, high))
+    first, last = first.astype(np.int64), last.astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(_counted(first, last, np.zeros(int(last.max(initial=0)) + 1, np.int64)))])
+    member, reach = np.empty(start[-1], np.int64), np.empty(start[-1])
+    _filled(edges, first, last, start[:-1].copy(), start, member, reach)
+    return start, member, reach, first, bottom, height
+
+
 @compiled
-def _sweep(edges: Array, shape: Array, reach: Array, feature: float, gap: float, found: Array) -> int:
+def _counted(first: Array, last: Array, out: Array) -> Array:
+    for k in range(first.shape[0]):
+        for strip in range(first[k], last[k] + 1):
+            out[strip] += 1
+    return out
+
+
+@compiled
+def _filled(edges: Array, first: Array, last: Array, at: Array, start: Array, member: Array, reach: Array) -> None:
+    """``reach``: how far along x the edges of a strip go up to each of them."""
+    for k in range(edges.shape[0]):
+        right = max(edges[k, 0], edges[k, 2])
+        for strip in range(first[k], last[k] + 1):
+            n = at[strip]
+            member[n] = k
+            reach[n] = right if n == start[strip] else max(right, reach[n - 1])
+            at[strip] += 1
+
+
+@compiled
+def _strip_of(y: float, strips: Strips) -> int:
+    """Number of the strip at a height; one of those that there are."""
+    return min(max(int((y - strips[4]) // strips[5]), 0), strips[0].shape[0] - 2)
+
+
+@compiled
+def _sweep(edges: Array, shape: Array, strips: Strips, feature: float, gap: float, found: Array) -> int:
     """Fill ``found``; the number of pairs, or its length where it is full."""
     count, most = 0, max(feature, gap)
+    start, member, _, first, _, _ = strips
     for i in range(edges.shape[0]):
         right = max(edges[i, 0], edges[i, 2]) + most
         low, high = min(edges[i, 1], edges[i, 3]) - most, max(edges[i, 1], edges[i, 3]) + most
-        for j in range(i + 1, edges.shape[0]):
-            if min(edges[j, 0], edges[j, 2]) > right:
-                break
-            if min(edges[j, 1], edges[j, 3]) > high or max(edges[j, 1], edges[j, 3]) < low:
-                continue
-            along = (edges[i, 2] - edges[i, 0]) * (edges[j, 2] - edges[j, 0])
-            if along + (edges[i, 3] - edges[i, 1]) * (edges[j, 3] - edges[j, 1]) >= 0:
-                continue
-            for kind in range(2):
-                limit = feature if kind == 0 else gap
-                if kind == 0 and (shape[i] != shape[j] or shape[i] == KNOWN):
+        lowest = _strip_of(low, strips)
+        for strip in range(lowest, _strip_of(high, strips) + 1):
+            some = member[start[strip] : start[strip + 1]]
+            for n in range(np.searchsorted(some, i + 1), some.shape[0]):
+                j = some[n]
+                if min(edges[j, 0], edges[j, 2]) > right:
+                    break
+                if strip != max(lowest, first[j]):  # seen in a strip below
                     continue
-                away = _seen(i, j, edges, reach, 1.0 if kind == 0 else -1.0, limit)
-                if away > 0:
-                    if count == found.shape[0]:
-                        return count
-                    found[count, 0], found[count, 1], found[count, 2], found[count, 3] = i, j, kind, away
-                    count += 1
+                if min(edges[j, 1], edges[j, 3]) > high or max(edges[j, 1], edges[j, 3]) < low:
+                    continue
+                if not _opposite(edges[i], edges[j]):
+                    continue
+                for kind in range(2):
+                    if kind == 0 and (shape[i] != shape[j] or shape[i] == KNOWN):
+                        continue
+                    away = _seen(i, j, edges, strips, 1.0 if kind == 0 else -1.0, feature if kind == 0 else gap)
+                    if away > 0:
+                        if count == found.shape[0]:
+                            return count
+                        found[count, 0], found[count, 1], found[count, 2], found[count, 3] = i, j, kind, away
+                        count += 1
     return count
 
 
 @compiled
-def _seen(i: int, j: int, edges: Array, reach: Array, side: float, limit: float) -> float:
+def _opposite(one: Array, two: Array) -> bool:
+    """Whether two edges run against each other."""
+    return bool((one[2] - one[0]) * (two[2] - two[0]) + (one[3] - one[1]) * (two[3] - two[1]) < 0)
+
+
+@compiled
+def _seen(i: int, j: int, edges: Array, strips: Strips, side: float, limit: float) -> float:
     """Distance of the parts of two edges that lie before each other, to the left (side 1) or right (-1), and see each
     other; -1 where none does, or none nearer than ``limit``.
     """
@@ -79,7 +133,7 @@ def _seen(i: int, j: int, edges: Array, reach: Array, side: float, limit: float)
     pair[8] = _nearest(pair, line)
     if not 0 < pair[8] < limit - 1e-9:
         return -1.0
-    if _is_free(line, i, j, edges, reach, side):
+    if _is_free(line, i, j, edges, strips, side):
         return float(pair[8])
     parts = np.empty((3 * _TRIES + 4, 9))
     count = _halves(pair, limit, parts, 0)
@@ -89,7 +143,7 @@ def _seen(i: int, j: int, edges: Array, reach: Array, side: float, limit: float)
         best = np.argmin(parts[:count, 8])
         pair[:] = parts[best]
         _nearest(pair, line)
-        if _is_free(line, i, j, edges, reach, side):
+        if _is_free(line, i, j, edges, strips, side):
             return float(pair[8])
         parts[best] = parts[count - 1]
         count = _halves(pair, limit, parts, count - 1)
@@ -133,30 +187,43 @@ def _nearest(pair: Array, line: Array) -> float:
 
 
 @compiled
-def _is_free(line: Array, i: int, j: int, edges: Array, reach: Array, side: float) -> bool:
+def _is_free(line: Array, i: int, j: int, edges: Array, strips: Strips, side: float) -> bool:
     """Whether a line between edges ``i`` and ``j`` crosses no other, and leaves corners on the wanted side."""
     low, high = min(line[0], line[2]), max(line[0], line[2])
     bottom, top = min(line[1], line[3]), max(line[1], line[3])
     corners, numbers = np.zeros((2, 4)), np.zeros(4, np.int64)  # directions into and out of the corner at each end
-    for k in range(np.searchsorted(reach, low), edges.shape[0]):
-        e = edges[k]
-        if min(e[0], e[2]) > high:
-            break
-        if max(e[0], e[2]) < low or min(e[1], e[3]) > top or max(e[1], e[3]) < bottom:
-            continue
-        for end in range(2):
-            for tip in range(2):
-                if e[2 - 2 * tip] == line[2 * end] and e[3 - 2 * tip] == line[2 * end + 1]:
-                    corners[end, 2 * tip], corners[end, 2 * tip + 1] = e[2] - e[0], e[3] - e[1]
-                    numbers[2 * end + tip] += 1
-        if k not in (i, j) and _cross(line, e):
-            return False
+    start, member, reach, first, _, _ = strips
+    lowest = _strip_of(bottom, strips)
+    for strip in range(lowest, _strip_of(top, strips) + 1):
+        begin, end = start[strip], start[strip + 1]
+        for n in range(begin + np.searchsorted(reach[begin:end], low), end):
+            k = member[n]
+            e = edges[k]
+            if min(e[0], e[2]) > high:
+                break
+            if strip != max(lowest, first[k]):  # seen in a strip below
+                continue
+            if max(e[0], e[2]) < low or min(e[1], e[3]) > top or max(e[1], e[3]) < bottom:
+                continue
+            _at_ends(e, line, corners, numbers)
+            if k not in (i, j) and _cross(line, e):
+                return False
     for end in range(2):
         if numbers[2 * end] == 1 and numbers[2 * end + 1] == 1:
             away = 1.0 if end == 0 else -1.0
             if not _leaves(corners[end], away * (line[2] - line[0]), away * (line[3] - line[1]), side):
                 return False
     return True
+
+
+@compiled
+def _at_ends(e: Array, line: Array, corners: Array, numbers: Array) -> None:
+    """Enter an edge that leads into or out of an end of the line: its direction, and that there is one."""
+    for end in range(2):
+        for tip in range(2):
+            if e[2 - 2 * tip] == line[2 * end] and e[3 - 2 * tip] == line[2 * end + 1]:
+                corners[end, 2 * tip], corners[end, 2 * tip + 1] = e[2] - e[0], e[3] - e[1]
+                numbers[2 * end + tip] += 1
 
 
 @compiled

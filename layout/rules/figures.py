@@ -5,7 +5,8 @@ import numpy as np
 from layout.mask import UNDRAWN, MaskPlan, tone
 from layout.process import Rules
 from layout.rules import edges as facing
-from layout.rules.report import DrcReport, Violation
+from layout.rules.entered import entered
+from layout.rules.report import DrcReport
 from layout.shapes import region
 from metalens.ground.arrays import Array
 
@@ -51,12 +52,4 @@ def _facing(
     edge, unit = np.concatenate(lines), report.unit_nm
     shape = np.zeros(len(edge), np.int64)  # holes belong to what is around them
     found = facing.facing(edge, shape, limits[0] / unit, limits[1] / unit)
-    for a, b, kind, away in found.tolist():
-        corners = np.concatenate([edge[int(a)].reshape(2, 2), edge[int(b)].reshape(2, 2)])
-        box = (*corners.min(0).tolist(), *corners.max(0).tolist())
-        which = 0 if kind == facing.WIDTH else 1
-        report.add(rules[which], 1, Violation(rules[which], box, away * unit, limits[which], text))
-        if rules[which] == "feature":
-            report.minimum_feature_nm = min(report.minimum_feature_nm, away * unit)
-        else:
-            report.minimum_gap_nm = min(report.minimum_gap_nm, away * unit)
+    entered(report, edge, found, ((rules[0], limits[0]), (rules[1], limits[1])), text)

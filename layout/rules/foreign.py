@@ -1,13 +1,13 @@
 """Rules on a mask made anywhere: pillars at any place and turn, shapes of any outline, checked layer by layer.
 
 Shapes that touch are one shape, as a writer exposes them. Convex ones that stand alone are measured polygon to
-polygon, those that can be near each other found by sorting their places; all others edge against edge.
+polygon, wherever they stand, those that can be near each other found by sorting their places; all others edge against
+edge.
 """
 
 import dataclasses
 import math
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from layout.process import Rules, compiled
 from layout.rules import copies, near, nested
 from layout.rules import edges as facing
 from layout.rules import layer as layers
+from layout.rules.entered import entered
 from layout.rules.layer import Layer
 from layout.rules.report import MOST_SHOWN, DrcReport, Violation
 from layout.shapes import convex, region
@@ -80,39 +81,75 @@ def _copied(
         report.counts[rule] += times * count
     report.minimum_gap_nm = min(report.minimum_gap_nm, own.minimum_gap_nm)
     report.minimum_feature_nm = min(report.minimum_feature_nm, own.minimum_feature_nm)
-    shown = Counter(v.rule for v in report.violations)
     said = f"; in each of {times:,} copies of {name}" if name != copies.ROOT else ""
     for turn, x, y in places() if own.violations else []:
-        listed = [v for v in own.violations if shown[v.rule] < MOST_SHOWN]
+        listed = [v for v in own.violations if report.has_room(v.rule)]
         if not listed:
             return
         boxes = turn.boxes(np.array([v.box for v in listed])) + np.array([x, y, x, y])
         for found, box in zip(listed, boxes.tolist(), strict=True):
-            shown[found.rule] += 1
-            if shown[found.rule] <= MOST_SHOWN:
-                report.violations.append(dataclasses.replace(found, box=tuple(box), text=found.text + said))
+            report.add(found.rule, 0, dataclasses.replace(found, box=tuple(box), text=found.text + said))
 
 
 def _check_layer(layer: Layer, rules: Rules, report: DrcReport, name: str) -> None:
     gap = rules.minimum_gap_nm / report.unit_nm
     one, two = near.pairs(layer.discs, gap)
-    apart = layer.distances(one, two)
-    touch = apart <= 0
+    apart = layer.distances(one, two, gap)
+    touch, close = apart <= 0, apart < gap - 1e-9
     alone = np.array([layers.is_convex(o) for o in layer.outlines])[layer.kind]
     alone[one[touch]] = alone[two[touch]] = False
     _features(layer, alone, rules, report)
-    both = alone[one] & alone[two] & (apart < gap - 1e-9)
-    for a, b, value in zip(one[both].tolist(), two[both].tolist(), apart[both].tolist(), strict=True):
-        text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
-        value *= report.unit_nm
-        report.add("gap", 1, Violation("gap", layer.box(a, b), value, rules.minimum_gap_nm, text))
-    least = apart[both].min(initial=math.inf) * report.unit_nm  # of pairs further apart only some were looked at
-    report.minimum_gap_nm = min(report.minimum_gap_nm, float(least))
-    close = apart < gap
-    beside = np.unique(np.concatenate([one[close & alone[one] & ~alone[two]], two[close & alone[two] & ~alone[one]]]))
+    both = alone[one] & alone[two] & close
+    _too_near(layer, (one[both], two[both], apart[both]), rules, report, name)
     other = np.flatnonzero(~alone)
     if len(other):
-        _by_edges(layer, _joined(other, one[touch], two[touch]), beside, rules, report, name)
+        groups = _joined(other, one[touch], two[touch])
+        beside = alone[one] != alone[two]
+        _beside(layer, alone, groups, (one[beside & close], two[beside & close], apart[beside & close]), rules, report)
+        hiding = np.concatenate([one[beside & (apart < gap)], two[beside & (apart < gap)]])
+        _by_edges(layer, groups, np.unique(hiding[alone[hiding]]), rules, report, name)
+
+
+def _too_near(layer: Layer, pairs: tuple[Array, Array, Array], rules: Rules, report: DrcReport, name: str) -> None:
+    """Pairs of convex shapes that stand alone: first, second, distance."""
+    value = pairs[2] * report.unit_nm
+
+    def shown() -> Iterator[Violation]:
+        for a, b, apart in zip(pairs[0].tolist(), pairs[1].tolist(), value.tolist(), strict=True):
+            text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
+            yield Violation("gap", layer.box(a, b), apart, rules.minimum_gap_nm, text)
+
+    report.add_all("gap", len(value), shown())
+    report.minimum_gap_nm = min(report.minimum_gap_nm, float(value.min(initial=math.inf)))
+
+
+def _beside(
+    layer: Layer,
+    alone: Array,
+    groups: list[list[int]],
+    pairs: tuple[Array, Array, Array],
+    rules: Rules,
+    report: DrcReport,
+) -> None:
+    """Convex shapes that stand alone, near others: each with each group is one gap, of its nearest shape."""
+    group = np.zeros(len(layer.kind), np.int64)
+    for number, members in enumerate(groups):
+        group[members] = number
+    own, other = np.where(alone[pairs[0]], pairs[:2], pairs[1::-1])
+    order = np.lexsort((pairs[2], group[other], own))
+    own, other, apart = own[order], other[order], pairs[2][order] * report.unit_nm
+    new = (np.diff(own, prepend=-1) != 0) | (np.diff(group[other], prepend=-1) != 0)
+
+    def shown() -> Iterator[Violation]:
+        for a, b, value in zip(own[new].tolist(), other[new].tolist(), apart[new].tolist(), strict=True):
+            left, bottom, right, top = layer.box(a)
+            room = math.ceil(value / report.unit_nm)
+            text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}"
+            box = left - room, bottom - room, right + room, top + room
+            yield Violation("gap", box, value, rules.minimum_gap_nm, text)
+
+    report.add_all("gap", int(new.sum()), shown())
+    report.minimum_gap_nm = min(report.minimum_gap_nm, float(apart.min(initial=math.inf)))
 
 
 def _joined(members: Array, one: Array, two: Array) -> list[list[int]]:
@@ -134,9 +171,13 @@ def _features(layer: Layer, alone: Array, rules: Rules, report: DrcReport) -> No
         width = convex.width(layer.outlines[kind]) * report.unit_nm
         report.minimum_feature_nm = min(report.minimum_feature_nm, width)
         if width < rules.minimum_feature_nm - 1e-9:
-            for n in np.flatnonzero((layer.kind == kind) & alone).tolist():
-                text = layer.cells[kind]
-                report.add("feature", 1, Violation("feature", layer.box(n), width, rules.minimum_feature_nm, text))
+            some = np.flatnonzero((layer.kind == kind) & alone)
+            report.add_all("feature", len(some), _narrow_ones(layer, some, width, rules.minimum_feature_nm))
+
+
+def _narrow_ones(layer: Layer, some: Array, width: float, limit: float) -> Iterator[Violation]:
+    for n in some.tolist():
+        yield Violation("feature", layer.box(n), width, limit, layer.cells[layer.kind[n]])
 
 
 @compiled
@@ -149,8 +190,8 @@ def counted(kind: Array, alone: Array, out: Array) -> Array:
 
 
 def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str) -> None:
-    """Groups of shapes that are not convex or touch, as merged contours, with the convex shapes beside them."""
-    lines, owner, lone = [], [], []
+    """Groups of shapes that are not convex or touch, as merged contours; the convex shapes beside them hide edges."""
+    lines, owner, hiding = [], [], []
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
         whole = len(shapes) == 1 and layers.is_convex(shapes[0])
@@ -161,21 +202,13 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
                 _narrow(contour, rules, report, name)
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
             owner.append(np.full(len(contour), facing.KNOWN if known else number))
-            lone.append(np.full(len(contour), number >= len(groups)))
-    edge, shape, measured = np.concatenate(lines), np.concatenate(owner), np.concatenate(lone)
+            hiding.append(np.full(len(contour), number >= len(groups)))
+    edge, shape, hides = np.concatenate(lines), np.concatenate(owner), np.concatenate(hiding)
     feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
-    for a, b, kind, away in facing.facing(edge, shape, feature, gap).tolist():
-        if measured[int(a)] and measured[int(b)]:  # two convex shapes that stand alone
-            continue
-        corners = np.concatenate([edge[int(a)].reshape(2, 2), edge[int(b)].reshape(2, 2)])
-        box = (*corners.min(0).tolist(), *corners.max(0).tolist())
-        rule, limit = ("feature", rules.minimum_feature_nm) if kind == facing.WIDTH else ("gap", rules.minimum_gap_nm)
-        value = away * report.unit_nm
-        report.add(rule, 1, Violation(rule, box, value, limit, f"edges of {name}"))
-        if kind == facing.WIDTH:
-            report.minimum_feature_nm = min(report.minimum_feature_nm, value)
-        else:
-            report.minimum_gap_nm = min(report.minimum_gap_nm, value)
+    found = facing.facing(edge, shape, feature, gap)
+    found = found[~hides[found[:, :2].astype(np.int64)].any(1)]
+    limits = ("feature", rules.minimum_feature_nm), ("gap", rules.minimum_gap_nm)
+    entered(report, edge, found, limits, f"edges of {name}")
 
 
 def _holds(contour: Array, others: list[Array]) -> bool:
@@ -210,9 +243,9 @@ def _off_grid(layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offs
         off = np.mod(place + np.array([r if r is not None else (0.0, 0.0) for r in bad])[kind], step)
         apart = (np.minimum(off, step - off) > (0 if whole else _ROUNDED)).any(1)
         apart |= np.array([r is None for r in bad])[kind]
-        for n in (np.flatnonzero(apart) + first).tolist():
-            violation = Violation("off-grid", layer.box(n), 0.0, float(rules.grid_nm), layer.cells[layer.kind[n]])
-            report.add("off-grid", 1, violation)
+        found, limit = np.flatnonzero(apart) + first, float(rules.grid_nm)
+        shown = (Violation("off-grid", layer.box(n), 0.0, limit, layer.cells[layer.kind[n]]) for n in found.tolist())
+        report.add_all("off-grid", len(found), shown)
 
 
 def _residue(outline: Array, step: float) -> tuple[float, float] | None:

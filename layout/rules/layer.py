@@ -8,7 +8,7 @@ import numpy as np
 
 from layout.files import MaskContent, Turn, flat
 from layout.rules import near
-from layout.shapes import convex
+from layout.shapes.apart import apart
 from metalens.ground.arrays import Array
 
 
@@ -45,18 +45,10 @@ class Layer:
         place = np.column_stack([self.x[members], self.y[members]]).astype(np.int64)
         return np.asarray(own[self.kind[members]] + np.hstack([place, place]))
 
-    def distances(self, one: Array, two: Array) -> Array:
-        """(n,) between shapes, of hulls where they are not convex: 0 and below where they touch or meet."""
-        hulls = [o if is_convex(o) else _hull(o) for o in self.outlines]
-        moves = (self.x[two].astype(np.int64) - self.x[one], self.y[two].astype(np.int64) - self.y[one])
-        keys = zip(self.kind[one].tolist(), self.kind[two].tolist(), *(m.tolist() for m in moves), strict=True)
-        known: dict[tuple[int, int, int, int], float] = {}
-        apart = np.empty(len(one))
-        for n, key in enumerate(keys):
-            if key not in known:
-                known[key] = convex.gap(hulls[key[0]], hulls[key[1]], key[2], key[3])
-            apart[n] = known[key]
-        return apart
+    def distances(self, one: Array, two: Array, most: float) -> Array:
+        """(n,) between shapes: 0 where they touch or overlap, ``most`` where they are further apart."""
+        moved = (self.x[two].astype(np.int64) - self.x[one], self.y[two].astype(np.int64) - self.y[one])
+        return apart(self.outlines, (self.kind[one], self.kind[two]), moved, most=most)
 
     @property
     def around(self) -> Array:
@@ -148,9 +140,3 @@ def is_convex(points: Array) -> bool:
         return False
     turned = np.unwrap(np.arctan2(after[:, 1], after[:, 0]))
     return bool(turned[-1] - turned[0] < 2 * math.pi)
-
-
-def _hull(points: Array) -> Array:
-    from scipy.spatial import ConvexHull
-
-    return np.asarray(points[ConvexHull(points).vertices])

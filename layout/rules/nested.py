@@ -183,7 +183,7 @@ def _with_their_groups(layer: Layer, hit: Array, gap: float) -> Array:
     one, two = near.pairs(layer.discs, gap)
     close = _touch(layer.boxes(one), layer.boxes(two), gap)
     one, two = one[close], two[close]
-    close = layer.distances(one, two) < gap
+    close = layer.distances(one, two, gap) < gap
     one, two = one[close], two[close]
     graph = coo_matrix((np.ones(len(one), np.int8), (one, two)), (len(hit), len(hit)))
     count, label = connected_components(graph, directed=False)

@@ -1,7 +1,8 @@
 """What a design-rule check found."""
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -66,6 +67,7 @@ class DrcReport:
     maximum_density: float = 0.0
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RULES, 0))
     violations: list[Violation] = field(default_factory=list)
+    _listed: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RULES, 0))
 
     @classmethod
     def empty(cls, plan: HasUnit, rules: Rules) -> "DrcReport":
@@ -94,11 +96,20 @@ class DrcReport:
         found |= {"minimum_foot_gap_nm": self.minimum_foot_gap_nm}
         return {name: value if math.isfinite(value) else None for name, value in found.items()}
 
+    def has_room(self, rule: str) -> bool:
+        """Whether another violation of a rule would be listed."""
+        return self._listed[rule] < MOST_SHOWN
+
     def add(self, rule: str, count: int, violation: Violation | None) -> None:
         """Count violations; list one."""
+        self.add_all(rule, count, () if violation is None else (violation,))
+
+    def add_all(self, rule: str, count: int, shown: Iterable[Violation]) -> None:
+        """Count violations; list the first of them, as many as lists hold: no more of ``shown`` are made."""
         self.counts[rule] += count
-        if violation is not None and sum(v.rule == rule for v in self.violations[-MOST_SHOWN:]) < MOST_SHOWN:
-            self.violations.append(violation)
+        before = len(self.violations)
+        self.violations += itertools.islice(shown, MOST_SHOWN - self._listed[rule])
+        self._listed[rule] += len(self.violations) - before
 
     @property
     def summary(self) -> str:

@@ -220,3 +220,29 @@ def test_two_convex_shapes_beside_a_mark_are_one_pair(tmp_path):
     theirs = [pairs_of_klayout([shapes[i], shapes[j]], 70) for i, j in ((0, 1), (0, 2), (1, 2))]
     assert report.counts["gap"] == sum(map(len, theirs)) == 3
     assert sorted(round(v.value, 6) for v in report.violations) == [33, 51, 51]
+
+
+def test_pillars_within_the_hull_of_an_angle_are_one_gap_each_as_far_as_polygons_are(tmp_path):
+    """Round pillars 31 and 58 nm from an angle, one 40 nm from another, a square on it: pairs as KLayout finds them."""
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
+    disc = np.rint(73 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
+    r = int(disc.max())
+    angled = db.Polygon([db.Point(*p) for p in [(0, 0), (4000, 0), (4000, 300), (300, 300), (300, 3000), (0, 3000)]])
+    places = [(900, 300 + r + 31), (300 + r + 58, 900), (900 + 2 * r + 40, 300 + r + 31)]
+    shapes = [
+        angled,
+        db.Polygon(db.Box(2500, 300, 2700, 500)),
+        *(db.Polygon([db.Point(int(p), int(q)) for p, q in disc + at]) for at in places),
+    ]
+    for shape in shapes:
+        top.shapes(layer).insert(shape)
+    path = tmp_path / "m.gds"
+    made.write(str(path))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
+    assert sorted(round(v.value, 6) for v in report.violations if v.rule == "gap") == [31, 31, 40, 58]
+    theirs = [pairs_of_klayout([shapes[i], shapes[j]], 70) for i, j in ((0, 2), (0, 3), (0, 4), (2, 4))]
+    assert report.counts["gap"] == sum(map(len, theirs)) == 4
+    boxes = {v.value: v.box for v in report.violations if "angle" not in v.text}
+    assert boxes[58] == (300, 900 - r - 58, 300 + 2 * r + 2 * 58, 900 + r + 58)  # the pillar and as far around
