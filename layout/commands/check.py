@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from layout.commands.validate import Finding, validate
-from layout.files import MaskContent, mapped
+from layout.files import MaskContent, hierarchy, mapped
 from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis_bytes
 from layout.oasis import read as oasis_read
@@ -53,7 +53,7 @@ def run(options: Options) -> int:
         most = foreign.most_of(options.mask) if options.most_shapes is None else options.most_shapes
         content = read(options.mask, most)
         skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
-        found = foreign.check(content, process.rules, skip=skip, most=most)
+        found = foreign.check(content, process.rules, skip=skip, negative=_negative(content, process), most=most)
         if draft is not None:
             markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
         form = validate(options.mask, content) if options.strict else []
@@ -61,6 +61,13 @@ def run(options: Options) -> int:
     values = _values(found) | ({"form": [finding.text for finding in form]} if options.strict else {})
     options.console.result(values, _text(options.mask, found, form) + told)
     return 0 if found.ok and not form else 1
+
+
+def _negative(content: MaskContent, process: processes.Process) -> set[int]:
+    """Layer numbers whose clear areas stay: with tone ``negative`` all but the openings of the aperture."""
+    if process.tone == "positive":
+        return set()
+    return {number for number, _ in hierarchy.shapes(content)} - {process.layers.aperture[0]}
 
 
 def read(path: Path, most: int | None = None, *, keep: int | None = None) -> MaskContent:

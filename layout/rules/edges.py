@@ -15,12 +15,13 @@ Strips = tuple[Array, Array, Array, Array, float, float]
 _NEAR = 1e-7  # units: a line that ends that near to an edge does not cross it
 
 
-def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
+def facing(edges: Array, shape: Array, feature: float, gap: float, *, hole: Array | None = None) -> Array:
     """(n, 4) pairs of edges that face each other too near: first edge, second edge, kind, distance.
 
     Args:
         edges: (m, 4) x, y to x, y, the inside to the left. shape: (m,) which polygon each belongs to; of ``KNOWN`` no
             widths are measured.
+        hole: (m,) numbers from 0 on of holes in which no spaces are measured, -1 elsewhere. None: in all they are.
         feature: least width (edges of one shape that face through its inside). gap: least space (through the outside,
             of one shape or two).
 
@@ -31,9 +32,10 @@ def facing(edges: Array, shape: Array, feature: float, gap: float) -> Array:
     order = np.argsort(np.minimum(edges[:, 0], edges[:, 2]), kind="stable")
     edges, shape, room = edges[order], np.asarray(shape[order], np.int64), 1 << 12
     strips = _strips(edges, max(feature, gap))
+    hole = np.full(len(edges), -1) if hole is None else hole[order]
     while True:
         found = np.empty((room, 4))
-        count = _sweep(edges, shape, strips, feature, gap, found)
+        count = _sweep(edges, shape, hole, strips, feature, gap, found)
         if count < room:
             break
         room *= 4
@@ -78,11 +80,11 @@ def _filled(edges: Array, first: Array, last: Array, at: Array, start: Array, me
 @compiled
 def _strip_of(y: float, strips: Strips) -> int:
     """Number of the strip at a height; one of those that there are."""
-    return min(max(int((y - strips[4]) // strips[5]), 0), strips[0].shape[0] - 2)
+    return int(min(max((y - strips[4]) // strips[5], 0), strips[0].shape[0] - 2))
 
 
 @compiled
-def _sweep(edges: Array, shape: Array, strips: Strips, feature: float, gap: float, found: Array) -> int:
+def _sweep(edges: Array, shape: Array, hole: Array, strips: Strips, feature: float, gap: float, found: Array) -> int:
     """Fill ``found``; the number of pairs, or its length where it is full."""
     count, most = 0, max(feature, gap)
     start, member, _, first, _, _ = strips
@@ -104,6 +106,8 @@ def _sweep(edges: Array, shape: Array, strips: Strips, feature: float, gap: floa
                     continue
                 for kind in range(2):
                     if kind == 0 and (shape[i] != shape[j] or shape[i] == KNOWN):
+                        continue
+                    if kind == 1 and hole[i] >= 0 and hole[i] == hole[j]:
                         continue
                     away = _seen(i, j, edges, strips, 1.0 if kind == 0 else -1.0, feature if kind == 0 else gap)
                     if away > 0:

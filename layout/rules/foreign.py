@@ -7,7 +7,7 @@ edge.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from metalens.ground.errors import MaskFileError
 MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
 _EACH_BYTE = 4  # more of them for each byte: our densest masks, pillars of few sizes as OASIS arrays, hold 3.8
 _AT_ONCE = 1 << 18  # shapes that are held to the grid at once
+_CLEAR = -1  # number of all layers together whose clear areas stay
 _ROUNDED = 1e-6  # of a step of a grid that is no whole number of units
 
 
@@ -36,7 +37,14 @@ def most_of(path: Path) -> int:
     return MOST_SHAPES + _EACH_BYTE * path.stat().st_size
 
 
-def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most: int = MOST_SHAPES) -> DrcReport:
+def check(
+    content: MaskContent,
+    rules: Rules,
+    *,
+    skip: Sequence[int] = (),
+    negative: Collection[int] = (),
+    most: int = MOST_SHAPES,
+) -> DrcReport:
     """Gap, feature and grid of every shape below the top cells, each layer number (all its datatypes) by itself.
 
     Large cells that are placed again and again are looked at once, but for what stands near other shapes: a wafer of
@@ -44,6 +52,8 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
 
     Args:
         skip: layer numbers that are not drawn in the resist (outlines, write fields).
+        negative: layer numbers that are exposed together, and what they leave empty stays: it is held to the least
+            feature, what they draw to the least gap.
         most: shapes that are taken apart.
 
     Raises:
@@ -56,21 +66,30 @@ def check(content: MaskContent, rules: Rules, *, skip: Sequence[int] = (), most:
     copies.refuse_beyond(parts, content, most)
     parts = copies.with_places(parts, content)
     report = DrcReport.empty(content, rules)
-    step, gap = (v / content.unit_nm for v in (rules.grid_nm, rules.minimum_gap_nm))
+    step = rules.grid_nm / content.unit_nm
     whole, offsets = parts.times.keys() - {copies.ROOT}, parts.offsets(step)
-    groups = {name: layers.groups(content, parts.tops(content, name), skip, whole) for name in parts.times}
+    number_of = {number: _CLEAR for number in negative}
+    groups = {name: layers.groups(content, parts.tops(content, name), skip, whole, number_of) for name in parts.times}
     for number in sorted({number for some in groups.values() for number in some}):
         drawn = {name: layers.gathered(some.pop(number)) for name, some in groups.items() if number in some}
-        for name, layer in nested.separate(parts, drawn, gap, most):
+        held = _exchanged(rules) if number == _CLEAR else rules
+        said = f"layer {number}" if number != _CLEAR else "what is drawn"
+        for name, layer in nested.separate(parts, drawn, held.minimum_gap_nm / content.unit_nm, most):
             report.pillars += len(layer.kind) * parts.times[name]
-            own = DrcReport.empty(content, rules)
-            _check_layer(layer, rules, own, f"layer {number}")
+            own = DrcReport.empty(content, held)
+            _check_layer(layer, held, own, said)
+            own = own.exchanged() if number == _CLEAR else own
             _copied(report, own, parts.times[name], name, partial(parts.copies, name, MOST_SHOWN))
             for offset, times in offsets[name].items():
                 own = DrcReport.empty(content, rules)
                 _off_grid(layer, rules, own, offset)
                 _copied(report, own, times, name, partial(parts.copies, name, MOST_SHOWN, step=step, offset=offset))
     return report
+
+
+def _exchanged(rules: Rules) -> Rules:
+    """Limits of what is drawn, where what is not drawn stays."""
+    return dataclasses.replace(rules, minimum_gap_nm=rules.minimum_feature_nm, minimum_feature_nm=rules.minimum_gap_nm)
 
 
 def _copied(
@@ -191,7 +210,10 @@ def counted(kind: Array, alone: Array, out: Array) -> Array:
 
 def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str) -> None:
     """Groups of shapes that are not convex or touch, as merged contours; the convex shapes beside them hide edges."""
-    lines, owner, hiding = [], [], []
+    lines: list[Array] = []
+    owner: list[Array] = []
+    hiding: list[Array] = []
+    within: list[Array] = []
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
         whole = len(shapes) == 1 and layers.is_convex(shapes[0])
@@ -200,12 +222,16 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
             known = layers.is_convex(contour) and (whole or not _holds(contour, contours))
             if known and number < len(groups):
                 _narrow(contour, rules, report, name)
+            open_ = layers.is_convex(contour[::-1])
+            if open_:
+                _narrow(contour[::-1], rules, report, name, hole=True)
+            within.append(np.full(len(contour), len(within) if open_ else -1))
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
             owner.append(np.full(len(contour), facing.KNOWN if known else number))
             hiding.append(np.full(len(contour), number >= len(groups)))
     edge, shape, hides = np.concatenate(lines), np.concatenate(owner), np.concatenate(hiding)
     feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
-    found = facing.facing(edge, shape, feature, gap)
+    found = facing.facing(edge, shape, feature, gap, hole=np.concatenate(within))
     found = found[~hides[found[:, :2].astype(np.int64)].any(1)]
     limits = ("feature", rules.minimum_feature_nm), ("gap", rules.minimum_gap_nm)
     entered(report, edge, found, limits, f"edges of {name}")
@@ -221,13 +247,17 @@ def _holds(contour: Array, others: list[Array]) -> bool:
     return False
 
 
-def _narrow(contour: Array, rules: Rules, report: DrcReport, name: str) -> None:
-    """Width of a convex contour that shapes have together."""
+def _narrow(contour: Array, rules: Rules, report: DrcReport, name: str, *, hole: bool = False) -> None:
+    """Width of a convex contour that shapes have together, or of a convex hole in them, which is a gap."""
     width = convex.width(contour) * report.unit_nm
-    report.minimum_feature_nm = min(report.minimum_feature_nm, width)
-    if width < rules.minimum_feature_nm - 1e-9:
+    rule, limit = ("gap", rules.minimum_gap_nm) if hole else ("feature", rules.minimum_feature_nm)
+    if hole:
+        report.minimum_gap_nm = min(report.minimum_gap_nm, width) if width < limit - 1e-9 else report.minimum_gap_nm
+    else:
+        report.minimum_feature_nm = min(report.minimum_feature_nm, width)
+    if width < limit - 1e-9:
         box = (*contour.min(0).tolist(), *contour.max(0).tolist())
-        report.add("feature", 1, Violation("feature", box, width, rules.minimum_feature_nm, f"shape of {name}"))
+        report.add(rule, 1, Violation(rule, box, width, limit, f"{'hole' if hole else 'shape'} of {name}"))
 
 
 def _off_grid(layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offset) -> None:

@@ -1,14 +1,15 @@
 """Shapes of one layer number of a mask made anywhere: different outlines once, and where each stands."""
 
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from layout.files import MaskContent, Turn, flat
 from layout.rules import near
-from layout.shapes.apart import apart
+from layout.rules.apart import apart
 from metalens.ground.arrays import Array
 
 
@@ -102,12 +103,24 @@ def joined(some: Sequence[Layer]) -> Layer:
 Groups = dict[int, list[list[flat.Shapes]]]
 
 
-def groups(content: MaskContent, tops: Sequence[str], skip: Sequence[int], whole: Set[str]) -> Groups:
-    """{layer number: shapes below ``tops``, those of one outline together}, without cells that are kept ``whole``."""
+def groups(
+    content: MaskContent,
+    tops: Sequence[str],
+    skip: Sequence[int],
+    whole: Set[str],
+    number_of: Mapping[int, int] = MappingProxyType({}),
+) -> Groups:
+    """{layer number: shapes below ``tops``, those of one outline together}, without cells that are kept ``whole``.
+
+    number_of: layer numbers that count as another.
+    """
     found: Groups = {}
-    held = flat.alike(content, lambda s: None if s.layer[0] in skip else s.layer[0], tops=tops, whole=whole)
-    for group in held.values():
-        found.setdefault(group[0].layer[0], []).append(group)
+
+    def number(shape: flat.Shapes) -> int | None:
+        return None if shape.layer[0] in skip else number_of.get(shape.layer[0], shape.layer[0])
+
+    for group in flat.alike(content, number, tops=tops, whole=whole).values():
+        found.setdefault(number_of.get(group[0].layer[0], group[0].layer[0]), []).append(group)
     return found
 
 

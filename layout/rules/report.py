@@ -1,5 +1,6 @@
 """What a design-rule check found."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping
@@ -110,6 +111,19 @@ class DrcReport:
         before = len(self.violations)
         self.violations += itertools.islice(shown, MOST_SHOWN - self._listed[rule])
         self._listed[rule] += len(self.violations) - before
+
+    def exchanged(self) -> "DrcReport":
+        """The report with gaps as features and features as gaps, of a mask whose clear areas stay."""
+        name = {"gap": "feature", "feature": "gap"}
+        other = dataclasses.replace(
+            self,
+            minimum_gap_nm=self.minimum_feature_nm,
+            minimum_feature_nm=self.minimum_gap_nm,
+            counts={rule: self.counts[name.get(rule, rule)] for rule in RULES},
+            violations=[dataclasses.replace(v, rule=name.get(v.rule, v.rule)) for v in self.violations],
+        )
+        other._listed = {rule: self._listed[name.get(rule, rule)] for rule in RULES}
+        return other
 
     @property
     def summary(self) -> str:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
-    from layout.shapes import apart as apart
     from layout.shapes import convex as convex
     from layout.shapes import polygon as polygon
     from layout.shapes import rectilinear as rectilinear
@@ -14,7 +13,6 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "apart": "",
         "convex": "",
         "rectilinear": "",
         "region": "",

@@ -5,10 +5,15 @@ import json
 import numpy as np
 import pytest
 
+import layout
 from layout.commands.check import read
+from layout.mask import build
+from layout.process import process as processes
 from layout.process.process import Rules
+from layout.rules import check as drc
 from layout.rules import foreign
 from metalens import cli
+from metalens.lens import DiameterMap
 
 db = pytest.importorskip("klayout.db")
 
@@ -246,3 +251,41 @@ def test_pillars_within_the_hull_of_an_angle_are_one_gap_each_as_far_as_polygons
     assert report.counts["gap"] == sum(map(len, theirs)) == 4
     boxes = {v.value: v.box for v in report.violations if "angle" not in v.text}
     assert boxes[58] == (300, 900 - r - 58, 300 + 2 * r + 2 * 58, 900 + r + 58)  # the pillar and as far around
+
+
+def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
+    """Not as its chords: KLayout's projection of edges that face each other says the same."""
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
+    plate = db.Region(db.Box(0, 0, 2300, 1900))
+    for x, y, radius in ((500, 600, 41), (1400, 700, 47), (900, 1300, 60)):
+        corners = np.rint(radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int) + np.array([x, y])
+        plate -= db.Region(db.Polygon([db.Point(int(p), int(q)) for p, q in corners]))
+    top.shapes(layer).insert(plate)
+    path = tmp_path / "m.gds"
+    made.write(str(path))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=90, minimum_feature_nm=90))
+    assert report.counts["gap"] == 1
+    assert report.counts["feature"] == 0
+    assert plate.notch_check(int(report.minimum_gap_nm), False, db.Region.Projection, 2.0).is_empty()
+    assert not plate.notch_check(int(report.minimum_gap_nm) + 2, False, db.Region.Projection, 2.0).is_empty()
+    assert report.violations[0].box == (459, 559, 541, 641)
+
+
+def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(tmp_path, capsys):
+    """Pillars too thin are clear areas too small: as many as the plan has; walls between pillars are wide enough."""
+    rng = np.random.default_rng(11)
+    size = rng.uniform(0.095, 0.25, (13, 17))
+    size[3:5, 4:9] = 0.0
+    process = tmp_path / "p.toml"
+    process.write_text('tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 20\n')
+    rules = processes.load(process)
+    plan = build.prepare(DiameterMap(size, 0.3), rules, furniture="none").plan
+    layout.write_oasis(plan, tmp_path / "m.oas")
+    planned = drc.check(plan, rules.rules)
+    assert cli.main(["check", str(tmp_path / "m.oas"), "--process", str(process), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["violations"]["feature"] == planned.counts["feature"] > 20
+    assert found["violations"]["gap"] == planned.counts["gap"] == 0
+    assert found["minimum_feature_nm"] == pytest.approx(planned.minimum_feature_nm)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from layout.rules.apart import apart
 from layout.shapes import convex
-from layout.shapes.apart import apart
 
 ANGLE = np.array([(0, 0), (900, 0), (900, 100), (120, 100), (120, 700), (0, 700)])
 HOLE = [(800, 500), (800, 200), (200, 200), (200, 800), (800, 800), (800, 500)]  # cut in along y = 500
