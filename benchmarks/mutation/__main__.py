@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.mutation import rules, table
 from benchmarks.mutation.graph import Graph
-from benchmarks.mutation.reach import PACKAGES, Reach, Seen, compiled, digest, home
+from benchmarks.mutation.reach import PACKAGES, Reach, Seen, at_import, compiled, digest, home
 from benchmarks.mutation.runner import Bench, copy_of, load_libraries
 from benchmarks.mutation.server import Server
 
@@ -99,7 +99,8 @@ class Worker:
         mutant, budget_s = task
         module = mutant.path.removesuffix(".py").replace("/", ".")
         source = mutant.applied((ROOT / mutant.path).read_text(encoding="utf-8"))
-        loops = home(ROOT / mutant.path, mutant.line)[0] in compiled(ROOT / mutant.path)
+        path = ROOT / mutant.path
+        loops = home(path, mutant.line)[0] in compiled(path) | at_import(path)
         if cls.near:
             return cls._judged_near(mutant, module, source, loops)
         tests = cls.reach.tests(ROOT, mutant.path, mutant.line, budget_s)

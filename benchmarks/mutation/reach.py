@@ -178,6 +178,28 @@ def compiled(path: Path) -> set[str]:
 
 
 @functools.cache
+def at_import(path: Path) -> set[str]:
+    """Functions that run while their module is read, called by its own lines: a change in memory comes too late."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    bodies = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    open_ = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
+    found: set[str] = set()
+    while open_:
+        names = {node.func.id for node in _called(open_.pop()) if isinstance(node.func, ast.Name)}
+        open_ += [bodies[name] for name in names & bodies.keys() - found]
+        found |= names & bodies.keys()
+    return found
+
+
+def _called(top: ast.AST) -> Iterator[ast.Call]:
+    """Calls in a statement or a function, without those in functions inside it."""
+    for node in ast.iter_child_nodes(top):
+        if not isinstance(node, (ast.FunctionDef, ast.Lambda)):
+            yield from (node,) if isinstance(node, ast.Call) else ()
+            yield from _called(node)
+
+
+@functools.cache
 def callers(root: Path, name: str) -> set[tuple[str, str]]:
     """(path, function) of the interpreted functions that lead to a compiled one, by their words."""
     names, found = {name}, set()

@@ -63,9 +63,7 @@ def ambiguous(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
     Raises:
         SceneError: the ranges of ``scenes`` hold hardly any pair.
     """
-    found = ambiguity_pairs(
-        pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion, tolerance_px=0.1
-    )
+    found = ambiguity_pairs(pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion)
     joined = States(
         *(torch.stack([getattr(found.first, n), getattr(found.second, n)], 1).flatten(0, 1) for n in States.__slots__)
     )

@@ -86,6 +86,18 @@ def test_compiled_loops_are_not_changed_in_memory(tree):
     assert "metalens.loops" in Graph(tree).compiled
 
 
+def test_what_runs_while_a_module_is_read_is_not_changed_in_memory(tree):
+    """Called by the module's own lines, or by what these call; not by what only stands in a function or a lambda."""
+    path = tree / "metalens" / "rows.py"
+    path.write_text(
+        "def row(x):\n    return inner(x)\n\n\ndef inner(x):\n    return x + 1\n\n\n"
+        "def later(x):\n    return other(x)\n\n\ndef other(x):\n    return x\n\n\n"
+        "class Box:\n    width = own(3)\n\n    def height(self):\n        return other(2)\n\n\n"
+        "def own(x):\n    return x\n\n\nROWS = (row(2), *(row(i) for i in range(2)))\nLATER = lambda: later(1)\n"
+    )
+    assert reach.at_import(path) == {"row", "inner", "own"}
+
+
 def test_changed_functions_run_their_new_code_in_memory(tree):
     path = str(tree / "metalens" / "numbers_of.py")
     spec = importlib.util.spec_from_file_location("numbers_of", path)

@@ -21,12 +21,17 @@ LIGHT = np.ones((1, COUNT)) + 0.05 * np.sin(np.arange(COUNT) / 700)  # nearly ev
 
 
 def stated_over_true(monkeypatch, draw, wrong, size):
-    """What is stated of a window with errors of ``size`` times the light at ``wrong`` samples, over the truth."""
+    """What is stated of a window with errors of ``size`` times the light at ``wrong`` samples, and the truth."""
     off = np.zeros((1, COUNT))
     at = draw.choice(COUNT, wrong, replace=False)
     off[0, at] = draw.choice([-1.0, 1.0], wrong) * size * LIGHT[0, at]
     seen = LIGHT + off
-    monkeypatch.setattr(estimate, "_direct_light", lambda windows, depths, points: seen[:, points])
+
+    def direct(windows, depths, points):
+        assert 1 / 48 < len(points) / COUNT < 1 / 24  # an estimate costs a thirtieth of a plain sum of the window
+        return seen[:, points]
+
+    monkeypatch.setattr(estimate, "_direct_light", direct)
     one = estimate.Sample(CASE, 1.0, np.zeros((5, 6), complex), 0.0, 1)
     stated = estimate.relative_error([[one]], [LIGHT.reshape(1, SIDE, SIDE).copy()])
     return stated, float(np.linalg.norm(off) / np.linalg.norm(LIGHT))

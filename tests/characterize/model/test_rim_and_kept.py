@@ -1,0 +1,68 @@
+"""What the rim of a window costs and saves, and how many places of a fit keep their operators."""
+
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.inference import explore
+from characterize.model.pillars import Change, Pillars
+from characterize.model.reduced import Bench, Reduced
+from metalens import design, profiles
+from metalens.cell.record import Cell
+
+AXIS = np.linspace(-12, 12, 49)
+INSIDE = np.ix_(np.abs(AXIS) <= 7, np.abs(AXIS) <= 7)
+
+
+@pytest.fixture(scope="module")
+def lens():
+    focus = profiles.Focus(0.85, 9.2, 138.0)
+    phase = design.phase_of(None, focus, radius_um=4.6)
+    return design.make(phase, focus, aperture_um=9.2, cell=Cell(pitch_um=0.4), proxy=b.proxy())[0]
+
+
+@pytest.mark.parametrize("tolerance", [3e-3, 1e-3])
+def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_fifth_of_the_terms(lens, tolerance):
+    """Root mean squares over the field's, against 1e-7; the rest of the window keeps to the tolerance."""
+    pillars = Pillars(lens, b.RESPONSE)
+    made = {}
+    for name, (edge, asked) in {"best": (0.0, 1e-7), "plain": (0.0, tolerance), "rim": (5.0, tolerance)}.items():
+        bench = Bench(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
+        reduced = Reduced(lens, pillars, bench, window_um=24.0, depths_um=np.array([100.0, 170.0]), tolerance=asked)
+        found = reduced.operators(
+            wavelength_um=0.85, distance_um=lens.sensor_distance_um, axes_um=(AXIS, AXIS), edge_um=edge
+        )
+        light = np.tensordot(pillars.coefficients(Change())[0], reduced.gathered, 1)
+        made[name] = found.field(light), found.rest.window.shape[1]
+    best, whole = made["best"][0], np.sqrt((np.abs(made["best"][0]) ** 2).mean())
+    rim = np.ones(best.shape, bool)
+    rim[INSIDE] = False
+    for name, most in (("plain", 1.0), ("rim", 2.0)):
+        field = made[name][0]
+        off = np.abs(field * np.vdot(field, best) / np.abs(np.vdot(field, best)) - best) / whole
+        assert np.sqrt((off[INSIDE] ** 2).mean()) < tolerance
+        assert np.sqrt((off[rim] ** 2).mean()) < most * tolerance
+    assert made["rim"][1] < 0.82 * made["plain"][1]
+
+
+def test_profiles_side_by_side_find_their_operators_again_and_older_places_let_go_of_theirs():
+    """An image and then its derivatives at each place: made once; of a few megabytes each at most sixteen are held."""
+    reduced, made = object.__new__(Reduced), []
+    reduced._operators, reduced._changing = {}, threading.Lock()
+    reduced._operators_of = lambda wavelength_um, distance_um, axes_um, edge_um: made.append(distance_um) or distance_um
+    places = [900.0 + 0.37 * k for k in range(explore._BESIDE)]
+    for _ in range(2):
+        for place in places:
+            found = reduced.operators(wavelength_um=0.85, distance_um=place, axes_um=(AXIS, AXIS))
+            assert found == place
+    assert made == places
+    for k in range(40):
+        reduced.operators(wavelength_um=0.85, distance_um=1000.0 + k, axes_um=(AXIS, AXIS))
+    assert len(reduced._operators) <= 16
+    assert len(made) == len(places) + 40

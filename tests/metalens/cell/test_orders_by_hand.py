@@ -1,0 +1,29 @@
+"""Orders of lattices that are no squares, by every order's own wave vector."""
+
+import math
+
+import pytest
+
+from metalens.cell.lattice import Lattice
+from metalens.cell.orders import propagating
+from metalens.cell.record import Cell, Index
+
+
+@pytest.mark.parametrize("lattice", [Lattice("rectangular", 1.63), Lattice("rectangular", 0.71), Lattice("hexagonal")])
+@pytest.mark.parametrize(("angle_rad", "azimuth_rad"), [(0.0, 0.0), (0.31, 0.83), (-0.44, 2.2)])
+def test_orders_are_those_whose_wave_vector_fits_the_medium(lattice, angle_rad, azimuth_rad):
+    """|k0 sin(angle) + m 2π/Px + n 2π/Py| <= n k0, all m and n tried; of a centred rectangle m + n is even."""
+    pitch, wavelength = 0.93, 0.85
+    cell = Cell(pitch, pillar=Index(3.1), substrate=Index(1.47), lattice=lattice)
+    side_y = {"hexagonal": math.sqrt(3), "rectangular": lattice.ratio}[lattice.kind] * pitch
+    want = set()
+    for side, index in (("substrate", 1.47), ("cover", 1.0)):
+        for m in range(-9, 10):
+            for n in range(-9, 10):
+                x = math.sin(angle_rad) * math.cos(azimuth_rad) + m * wavelength / pitch
+                y = math.sin(angle_rad) * math.sin(azimuth_rad) + n * wavelength / side_y
+                if x * x + y * y <= index**2 and (lattice.kind != "hexagonal" or (m + n) % 2 == 0):
+                    want.add((side, m, n))
+    found = propagating(cell, wavelength, angle_rad=angle_rad, azimuth_rad=azimuth_rad)
+    assert {(one.side, one.m, one.n) for one in found} == want
+    assert len(found) == len(want) > 2
