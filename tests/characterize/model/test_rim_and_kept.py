@@ -27,12 +27,10 @@ def lens():
     return design.make(phase, focus, aperture_um=9.2, cell=Cell(pitch_um=0.4), proxy=b.proxy())[0]
 
 
-@pytest.mark.parametrize("tolerance", [3e-3, 1e-3])
-def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_fifth_of_the_terms(lens, tolerance):
-    """Root mean squares over the field's, against 1e-7; the rest of the window keeps to the tolerance."""
-    pillars = Pillars(lens, b.RESPONSE)
-    made = {}
-    for name, (edge, asked) in {"best": (0.0, 1e-7), "plain": (0.0, tolerance), "rim": (5.0, tolerance)}.items():
+def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_fifth_of_the_terms(lens):
+    """Root mean squares over the field's, against a field of 1e-5; the rest of the window keeps to the tolerance."""
+    pillars, tolerance, made = Pillars(lens, b.RESPONSE), 1e-3, {}
+    for name, (edge, asked) in {"best": (0.0, 1e-5), "plain": (0.0, tolerance), "rim": (5.0, tolerance)}.items():
         bench = Bench(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
         reduced = Reduced(lens, pillars, bench, window_um=24.0, depths_um=np.array([100.0, 170.0]), tolerance=asked)
         found = reduced.operators(
