@@ -30,15 +30,18 @@ class Graph:
         return own | {home for name in own for home in self._uses(self.modules[name])}
 
     def related(self, module: str, seconds: dict[str, float], budget_s: float) -> list[str]:
-        """Test files that reach ``module``, within a budget: its own folder's, then nearest, quickest (shortest)."""
+        """Test files that reach ``module``, within a budget: of its name, importing it and speaking of it most often
+        (its folder counts for three times), nearest, quickest (shortest)."""
         folder = self.modules[module].relative_to(self.root).parent
         stem = self.modules[module].stem
 
-        def order(test: Path) -> tuple[bool, bool, int, float, int]:
+        def order(test: Path) -> tuple[bool, int, int, float, int]:
             own = self.root / "tests" / folder == test.parent
             named = re.search(rf"(^|_){stem}(_|$)", test.stem) is not None
-            distance = self._reach[test][module]
-            return not (own and named), not own, distance, seconds.get(self._name(test), 1.0), test.stat().st_size
+            near = self._reach[test][module]
+            spoken = len(re.findall(rf"\b{stem}\b", test.read_text(encoding="utf-8"))) if near == 1 else 0
+            spent = seconds.get(self._name(test), 1.0)
+            return not (own and named), -(spoken + 3 * own), near, spent, test.stat().st_size
 
         chosen, spent = [], 0.0
         for test in sorted((t for t in self.tests if module in self._reach[t]), key=order):
