@@ -129,20 +129,25 @@ def _without_dents(eighth: Array) -> Array:
 
 def _refine(eighth: Array, diameter: float) -> Array:
     """Move vertices by whole steps to the least cost: all combinations for few vertices, else pairs in turn."""
-    moves = _moves(len(eighth), bool(eighth[-1, 0] == eighth[-1, 1]))
-    cost = float(_cost(eighth[None], diameter)[0])
+    diagonal = bool(eighth[-1, 0] == eighth[-1, 1])
+    moves = _moves(len(eighth), diagonal)
+    here = eighth[..., None]
+    cost = float(_cost(here, diameter)[0]) if _sound(here, diagonal)[0] else math.inf
     for _ in range(12):
-        costs = _cost(eighth + moves, diameter)
-        best = int(costs.argmin())
-        if costs[best] >= cost - 1e-12:
+        trials = here + moves
+        costs = _cost(trials, diameter)
+        better = np.flatnonzero(costs < cost - 1e-12)
+        better = better[_sound(trials[..., better], diagonal)]
+        if not len(better):
             break
-        cost, eighth = float(costs[best]), eighth + moves[best]
-    return eighth
+        best = better[costs[better].argmin()]
+        cost, here = float(costs[best]), trials[..., best : best + 1]
+    return np.asarray(here[..., 0])
 
 
 @functools.lru_cache(maxsize=64)
 def _moves(count: int, diagonal: bool) -> Array:
-    """(t, count, 2) trial moves; the last vertex stays on the diagonal where it stands on it."""
+    """(count, 2, t) trial moves; the last vertex stays on the diagonal where it stands on it."""
     free = 2 * count - diagonal
     if free <= 8:
         steps = np.arange(-2, 3) if free <= 4 else np.arange(-1, 2)
@@ -153,26 +158,32 @@ def _moves(count: int, diagonal: bool) -> Array:
         flat = np.concatenate([single, single[first] + single[second]])
     if diagonal:
         flat = np.concatenate([flat, flat[:, -1:]], axis=1)
-    return np.ascontiguousarray(flat.reshape(-1, count, 2))
+    return np.ascontiguousarray(np.moveaxis(flat.reshape(-1, count, 2), 0, -1))
 
 
 def _cost(eighths: Array, diameter: float) -> Array:
-    """(t,) cost of (t, m, 2) trials: area errors beyond 0.05 % first, then the mean square of the edge error."""
-    x, y = eighths[..., 0].astype(float), eighths[..., 1].astype(float)
-    middle = (x[:, -1:] + y[:, -1:]) / 2
-    px, py = np.concatenate([x[:, :1], x, middle], axis=1), np.concatenate([0 * middle, y, middle], axis=1)
-    area = 4 * (px[:, :-1] * py[:, 1:] - px[:, 1:] * py[:, :-1]).sum(1) / (math.pi * diameter**2 / 4) - 1
-    lean = 1 + 3.3 / (8 * x.shape[1]) ** 2  # vertices of an equal-area polygon stand outside the circle
-    spread = ((np.hypot(x, y) - diameter / 2 * lean) ** 2).mean(1)
-    cost = np.maximum(np.abs(area) / 5e-4 - 1, 0) ** 2 * 4 + np.abs(area) * 100 + spread
-    on_diagonal = bool(x[0, -1] == y[0, -1])
-    after = slice(-2, -1) if on_diagonal and x.shape[1] > 1 else slice(-1, None)  # whose mirror image comes next
-    dx = np.diff(np.concatenate([x[:, :1], x, y[:, after]], axis=1), axis=1)
-    dy = np.diff(np.concatenate([-y[:, :1], y, x[:, after]], axis=1), axis=1)
-    bent = (dx[:, :-1] * dy[:, 1:] - dx[:, 1:] * dy[:, :-1] < 0).any(1)
-    crossed = y[:, -1] > x[:, -1] if on_diagonal else y[:, -1] >= x[:, -1]
-    wrong = bent | crossed | ((dx == 0) & (dy == 0))[:, :-1].any(1) | (y[:, 0] < 1) | (dx > 0).any(1) | (dy < 0).any(1)
-    return np.asarray(np.where(wrong, np.inf, cost))
+    """(t,) cost of (m, 2, t) trials: area errors beyond 0.05 % first, then the mean square of the edge error."""
+    x, y = eighths[:, 0].astype(float), eighths[:, 1].astype(float)
+    middle = (x[-1] + y[-1]) / 2
+    eighth = x[0] * y[0] + (x[-1] - y[-1]) * middle  # twice the area, from the x axis to the diagonal
+    for k in range(len(x) - 1):
+        eighth += x[k] * y[k + 1] - x[k + 1] * y[k]
+    area = 4 * eighth / (math.pi * diameter**2 / 4) - 1
+    lean = 1 + 3.3 / (8 * len(x)) ** 2  # vertices of an equal-area polygon stand outside the circle
+    spread = ((np.hypot(x, y) - diameter / 2 * lean) ** 2).mean(0)
+    return np.asarray(np.maximum(np.abs(area) / 5e-4 - 1, 0) ** 2 * 4 + np.abs(area) * 100 + spread)
+
+
+def _sound(eighths: Array, diagonal: bool) -> Array:
+    """(t,) whether (m, 2, t) trials are first eighths of convex polygons whose vertices all differ."""
+    x, y = eighths[:, 0], eighths[:, 1]
+    after = slice(-2, -1) if diagonal and len(x) > 1 else slice(-1, None)  # whose mirror image comes next
+    dx = np.diff(np.concatenate([x[:1], x, y[after]]), axis=0)
+    dy = np.diff(np.concatenate([-y[:1], y, x[after]]), axis=0)
+    bent = (dx[:-1] * dy[1:] - dx[1:] * dy[:-1] < 0).any(0)
+    crossed = y[-1] > x[-1] if diagonal else y[-1] >= x[-1]
+    wrong = bent | crossed | ((dx == 0) & (dy == 0))[:-1].any(0) | (y[0] < 1) | (dx > 0).any(0) | (dy < 0).any(0)
+    return np.asarray(~wrong)
 
 
 def mirrored(eighth: Array) -> Array:

@@ -31,8 +31,9 @@ class Tile:
 
     @property
     def names(self) -> list[str]:
-        """Label of each class, by its diameter at half height in nm."""
-        return [f"pillar_{1e3 * d:.1f}nm".replace(".0nm", "nm") for d in (self.foot_um + self.top_um) / 2]
+        """Label of each class, by its diameter at half height in nm; 105_9 is 105.9, as CAD takes no points."""
+        sizes = (f"{1e3 * d:.1f}".removesuffix(".0") for d in (self.foot_um + self.top_um) / 2)
+        return [f"pillar_{size.replace('.', '_')}nm" for size in sizes]
 
 
 def tile(

@@ -18,7 +18,8 @@ from metalens.ground.arrays import Array
 
 _WIDE_UM = 1.0  # ranges from there on are summed over points
 _CUT = 4.2  # ranges: exp(-17.6)
-_FINER = 3  # samples along a pixel
+_PER_RANGE = 4  # points of a wide shape along a range
+_FINER = 4  # samples along a pixel; even, so that an edge through its middle halves it
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,8 +73,7 @@ class Resist:
         self._near = [(a, e / total) for a, e in terms if a < _WIDE_UM]
         self._far = [(a, e / total) for a, e in terms if a >= _WIDE_UM]
         self._at = np.array([shape.middle for shape in drawn])
-        self._mass = np.array([shape.dose * shape.area for shape in drawn])
-        self._mean_square = np.array([shape.area for shape in drawn]) / (2 * np.pi)
+        self._spots = _spots(drawn, min((a for a, _ in self._far), default=np.inf) / _PER_RANGE)
         self._reach = np.array([np.ptp(shape.corners, axis=0).max() for shape in drawn])
 
     def pillar(self, number: int, pixel_um: float) -> tuple[float, float]:
@@ -90,6 +90,18 @@ class Resist:
         high, low = value[cleared - 1, ray], value[cleared, ray]
         edge = radii[cleared - 1] + (high - 0.5) / (high - low) * (radii[1] - radii[0])
         return float(value[20].mean() / 0.5), float(2 * np.sqrt((edge**2).mean()))
+
+    def edge(self, at_um: Array, outward: Array, pixel_um: float) -> tuple[float, float]:
+        """Exposure of a point on a straight edge over dose-to-size, and how far outside it, in um, the resist ends.
+
+        outward: (2,) unit vector across the edge.
+        """
+        image, first = self._image(at_um, 0.03, pixel_um)
+        aside = np.linspace(-0.02, 0.02, 41)
+        value = map_coordinates(image, (outward[::-1, None] * aside - first) / pixel_um, order=3)
+        cleared = min(max(int((value > 0.5).sum()), 1), 40)
+        high, low = value[cleared - 1], value[cleared]
+        return float(value[20] / 0.5), float(aside[cleared - 1] + (high - 0.5) / (high - low) * (aside[1] - aside[0]))
 
     def _image(self, middle: Array, half_um: float, pixel_um: float) -> tuple[Array, float]:
         """Exposure on pixels around a place, and where the first of them lies from it."""
@@ -112,7 +124,7 @@ class Resist:
         return image[some, some] + far(axis[some], axis[some]), float(axis[some][0])
 
     def _draw(self, shape: Shape, middle: Array, pixel_um: float, dose: Array) -> None:
-        """Add the dose on the pixels that a shape covers, in ninths; in sum its area where it lies on them whole."""
+        """Add the dose on the pixels that a shape covers, in sixteenths; in sum its area where it lies on them."""
         side, at = len(dose) // 2, (shape.corners - middle) / pixel_um
         low = np.maximum(np.floor(at.min(0)).astype(int) + side, 0)
         high = np.minimum(np.ceil(at.max(0)).astype(int) + side, 2 * side) + 1
@@ -127,9 +139,28 @@ class Resist:
         dose[low[1] : high[1], low[0] : high[0]] += shape.dose * share
 
     def _background(self, points: Array) -> Array:
-        apart = ((points[:, None] - self._at) ** 2).sum(-1)
+        at, mass, mean_square = self._spots
+        apart = ((points[:, None] - at) ** 2).sum(-1)
         total = np.zeros(len(points))
         for a, energy in self._far:
-            width = a**2 + self._mean_square  # a disc of diameter D adds D^2 / 8 to the square of the 1/e radius
-            total += energy / np.pi * (np.exp(-apart / width) @ (self._mass / width))
+            width = a**2 + mean_square  # a disc of diameter D adds D^2 / 8 to the square of the 1/e radius
+            total += energy / np.pi * (np.exp(-apart / width) @ (mass / width))
         return total
+
+
+def _spots(drawn: Sequence[Shape], step_um: float) -> tuple[Array, Array, Array]:
+    """(n, 2) points that stand for shapes, their area times dose, and their area / 2 pi; of wide shapes a raster."""
+    at, mass, mean_square = [], [], []
+    for shape in drawn:
+        low, high = shape.corners.min(0), shape.corners.max(0)
+        counts = np.maximum(np.ceil((high - low) / step_um), 1).astype(int)
+        middle = shape.middle[None]
+        if counts.max() > 1:
+            x, y = (low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k] for k in (0, 1))
+            raster = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+            inside = raster[Outline(shape.corners).contains_points(raster)]
+            middle = inside if len(inside) else middle
+        at.append(middle)
+        mass.append(np.full(len(middle), shape.dose * shape.area / len(middle)))
+        mean_square.append(np.full(len(middle), shape.area / len(middle) / (2 * np.pi)))
+    return np.concatenate(at), np.concatenate(mass), np.concatenate(mean_square)

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from matplotlib.path import Path as Outline
 
 import layout
+from layout.certify import certify
 from layout.files import doses
 from layout.mask import build
-from layout.process.process import Exposure, Process
+from layout.process.process import Die, Exposure, Process
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
 
@@ -31,7 +33,7 @@ def lens_map(n, pitch, low, high, share):
     ],
 )
 def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
-    """1 % and 1 nm; pixels of a quarter of the core, in ninths, and polygons for circles add 0.3 % and 0.1 nm."""
+    """1 % and 1 nm; pixels of a quarter of the core, in sixteenths, and polygons for circles add 0.3 % and 0.1 nm."""
     process = Process(exposure=Exposure(**beam))
     plan = build.prepare(lens_map(*source), process, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
@@ -48,3 +50,38 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
         edge, made = resist.pillar(number, min(beam["alpha_um"] / 4, 0.004))
         assert abs(edge - 1) < 0.013, at[number]
         assert abs(made - drawn[number].diameter_um) < 1.1e-3, at[number]
+
+
+def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(tmp_path):
+    """Points on crosses, verniers, box and letters by plain convolution: 0.3 % and 0.1 nm (pixels, rasters)."""
+    beam = {"alpha_um": 0.017, "beta_um": 11.3, "eta": 0.7}
+    process = Process(exposure=Exposure(**beam), die=Die(margin_um=330, mark_um=60, label="R4"))
+    plan = build.prepare(lens_map(29, 0.4, 0.11, 0.29, 0.7), process).plan
+    layout.write_gdsii(plan, tmp_path / "m.gds")
+    doses.write(plan, process, tmp_path / "doses.csv")
+    drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
+    resist = plain_exposure.Resist(drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])])
+    found = certify(layout.read_gdsii(tmp_path / "m.gds"), doses.read(tmp_path / "doses.csv"), process).edges
+    assert set(found.layer.tolist()) == {process.layers.marks[0], process.layers.labels[0]}
+    rng = np.random.default_rng(4)
+    each = [np.flatnonzero(found.layer == layer) for layer in sorted(set(found.layer.tolist()))]
+    picked = np.concatenate([rng.choice(some, 7, replace=False) for some in each])
+    worst = np.argsort(-np.abs(found.exposure - 1))[:3]
+    for n in [*picked.tolist(), *worst.tolist()]:
+        at = np.array([found.x_um[n], found.y_um[n]])
+        edge, shift = resist.edge(at, outward(drawn, at), 0.004)
+        assert abs(edge - found.exposure[n]) < 0.003, at
+        assert abs(shift * 1e3 - found.shift_nm[n]) < 0.1, at
+        assert abs(edge - 1) < 0.023, at
+
+
+def outward(drawn, at):
+    """Across the edge through a point: no shape lies on that side of it."""
+    near = [s for s in drawn if (s.corners.min(0) - 0.1 < at).all() and (at < s.corners.max(0) + 0.1).all()]
+    free = []
+    for across in np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]):
+        beside = [at + 0.02 * across + aside * across[::-1] for aside in (-0.005, 0.005)]
+        if not any(Outline(s.corners).contains_points(beside).any() for s in near):
+            free.append(across)
+    assert len(free) == 1
+    return free[0]

@@ -81,6 +81,6 @@ def test_equal_area_vertices_stand_outside_the_circle_and_cost_little_there():
     angle = (np.arange(n // 8) + 0.5) * 2 * math.pi / n
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     out, on = (np.rint(radius * ring).astype(np.int64) for radius in (ideal, diameter / 2))
-    cost = polygon._cost(np.stack([out, on]), diameter)
+    cost = polygon._cost(np.stack([out, on], -1), diameter)
     assert cost[0] < 0.5  # rounding: 1/6 in the mean square, area 1e-4
     assert cost[1] > 100  # 0.64 % of the area: 12 times the 0.05 % that is free

@@ -68,6 +68,16 @@ def test_step_is_whole_and_what_differs_is_told(tmp_path):
     assert "solids, planned" in readback.step_differences(path, fewer)[0]
 
 
+def test_diameters_of_tenths_of_a_nanometre_keep_their_names(tmp_path):
+    """A bias table leaves such diameters; readers of STEP make an underscore of a point in a name."""
+    pytest.importorskip("build123d")
+    path = tmp_path / "a.step"
+    pillars = dataclasses.replace(tile(2), foot_um=np.array([0.1559, 0.24]), top_um=np.array([0.1262, 0.21]))
+    assert pillars.names == ["pillar_141_1nm", "pillar_225nm"]  # the mean of both ends is 141.05
+    step.write_step(path, pillars)
+    assert readback.step_differences(path, pillars) == ()
+
+
 def test_a_module_has_its_parts_and_its_length(tmp_path):
     pytest.importorskip("build123d")
     path = tmp_path / "m.step"
