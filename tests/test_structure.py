@@ -43,7 +43,6 @@ MOST_MODULES = 16  # of a folder
 MOST_LINES, MOST_LINES_OF_A_FUNCTION = 350, 40  # the latter without decorators and docstring
 LONGER = {  # {module or module:function: lines}: may only shrink; what is short enough by now is struck off
     "codesign.eye.lanes:dual": 56,
-    "metalens.rcwa.any_shape:_waves": 41,
 }
 TABLES = {"metalens.cli"}  # names the verbs of every package: the one place that knows them all
 

@@ -86,22 +86,14 @@ def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, i
 @lru_cache(maxsize=64)
 def _normals(outlines: tuple[Outline, ...], cell: Cell, most: tuple[int, int]) -> tuple[Array, Array, Array]:
     """As ``normal_tables``, over m, n from -most to most, for all truncations at once."""
-    from scipy.spatial import cKDTree
-
     x, y = cell.lattice.periods_um(cell.pitch_um)
     counts = [max(2 * m + 2, math.ceil(_GRID * edge / cell.pitch_um)) for m, edge in zip(most, (x, y), strict=True)]
     counts = [count + count % 2 for count in counts]
-    found = [outline.boundary(cell.pitch_um / 200) for outline in outlines]
-    points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
-    steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
-    near = np.abs(steps).max(axis=1) < 1.6 * max(x, y)
-    copies = (points[None] + steps[near][:, None]).reshape(-1, 2)
     px, py = np.meshgrid(np.arange(counts[0]) * (x / counts[0]), np.arange(counts[1]) * (y / counts[1]), indexing="ij")
     px, py = px - x * (px > x / 2), py - y * (py > y / 2)
-    distance, place = cKDTree(copies).query(np.stack([px, py], axis=-1).reshape(-1, 2))
-    n = np.tile(normals, (int(near.sum()), 1))[place].reshape(*px.shape, 2)
+    n, distance = _nearest(outlines, cell, px, py)
     far = _FAR * distance.max()
-    weight = (1 / (1 + (distance / far) ** 4)).reshape(px.shape)
+    weight = 1 / (1 + (distance / far) ** 4)
     kept = [flips for flips in FLIPS if all(outline.keeps(*flips) for outline in outlines)]
 
     def table(values: Array, *, odd: bool = False) -> Array:
@@ -116,6 +108,50 @@ def _normals(outlines: tuple[Outline, ...], cell: Cell, most: tuple[int, int]) -
         table(weight * n[..., 1] ** 2),
         table(weight * n[..., 0] * n[..., 1], odd=True),
     )
+
+
+def _nearest(outlines: tuple[Outline, ...], cell: Cell, px: Array, py: Array) -> tuple[Array, Array]:
+    """(..., 2) normal of the nearest point of any boundary, and (...) its distance; points in the middle rectangle."""
+    from scipy.spatial import cKDTree
+
+    found = [outline.boundary(cell.pitch_um / 200) for outline in outlines]
+    points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
+    near = _sites(cell)
+    copies = (points[None] + near[:, None]).reshape(-1, 2)
+    distance, place = cKDTree(copies).query(np.stack([px, py], axis=-1).reshape(-1, 2))
+    n = np.tile(normals, (len(near), 1))[place].reshape(*px.shape, 2)
+    return n, np.asarray(distance).reshape(px.shape)
+
+
+def _sites(cell: Cell) -> Array:
+    """(n, 2) the site at the origin and those around it that reach into the middle rectangle."""
+    steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
+    return np.asarray(steps[np.abs(steps).max(axis=1) < 1.6 * max(cell.lattice.periods_um(cell.pitch_um))])
+
+
+def _wrapped(cell: Cell, x_um: Array, y_um: Array) -> tuple[Array, Array]:
+    """Points moved by whole periods into the middle rectangle."""
+    px, py = cell.lattice.periods_um(cell.pitch_um)
+    return x_um - px * np.round(x_um / px), y_um - py * np.round(y_um / py)
+
+
+def normals_at(outlines: tuple[Outline, ...], cell: Cell, x_um: Array, y_um: Array) -> tuple[Array, Array]:
+    """(..., 2) n and (...) w of the normal field at any points."""
+    edges = cell.lattice.periods_um(cell.pitch_um)
+    axes = (np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / cell.pitch_um)) for edge in edges)
+    far = _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
+    n, distance = _nearest(outlines, cell, *_wrapped(cell, x_um, y_um))
+    return n, np.asarray(1 / (1 + (distance / far) ** 4))
+
+
+def permittivity(this: Slab, cell: Cell, x_um: Array, y_um: Array) -> Array:
+    """(...) eps at any points."""
+    x, y = _wrapped(cell, x_um, y_um)
+    eps = np.full(x.shape, this.outside, complex)
+    for outline, inner in zip(reversed(this.outlines), reversed(this.inside), strict=True):
+        for site in _sites(cell):
+            eps[outline.inside(x - site[0], y - site[1])] = inner
+    return eps
 
 
 def _real(values: Array) -> Array:

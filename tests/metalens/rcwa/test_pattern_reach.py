@@ -5,7 +5,7 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Polygon
-from metalens.rcwa import any_shape, mirrors, pattern
+from metalens.rcwa import mirrors, pattern, problem
 from metalens.rcwa.mirrors import IDENTITY
 
 CELL = Cell(
@@ -31,8 +31,8 @@ def test_a_longer_table_holds_the_shorter_one_in_its_middle():
 def test_without_loss_the_operator_is_hermitian(angle_rad):
     """Q is eps less kappa² in orders: real permittivities make it its own adjoint, however complex its entries."""
     space = mirrors.orders(3, pattern.frame(CELL, (IDENTITY,)))
-    light = any_shape._tangent(0.633, angle_rad, 0.4)
-    ways, _ = any_shape._waves(space, CELL, light)
+    light = problem.tangent(0.633, angle_rad, 0.4)
+    ways, _ = problem.waves_of(space, CELL, light)
     slab = pattern.Slab((CELL.outline(0.24),), (2.6**2,), 1.1**2)
     Q = pattern.operators(space, ways, slab, CELL)[1]
     assert np.abs(Q.imag).max() > 0.01
