@@ -30,6 +30,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "CELL.toml -> library.h5: pillar sweep with an error bar on every entry",
     ),
     "study": ("metalens.commands.study", "which pitch and height cover a full turn: table, JSON and figure"),
+    "field": ("metalens.commands.field", "CELL.toml -> field.h5: E and H in and around one pillar, with a picture"),
     "design": (
         "metalens.commands.design",
         "DESIGN.toml -> lens.h5: hyperbolic, double helix, cubic, Fisher, own map",

@@ -26,6 +26,7 @@ OWN = {
     "lens": "lens_panels",
     "psf": "psf_panels",
     "far-field": "far_field_panels",
+    "near-field": "near_field_panels",
 }
 
 

@@ -1,8 +1,8 @@
 """Rigorous coupled-wave analysis of one pillar cell.
 
-``jones`` gives both polarisations of a cell of any shape, lattice and layers. ``solve`` gives the zero-order response
-with an error estimate, ``solve_many`` shares the work over diameters, ``derivatives`` differentiates it exactly (round
-pillars). Light comes from the substrate.
+``jones`` gives both polarisations of a cell of any shape, lattice and layers, ``near_field`` the fields in it.
+``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares the work over diameters,
+``derivatives`` differentiates it exactly (round pillars). Light comes from the substrate.
 """
 
 from typing import TYPE_CHECKING
@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from metalens.rcwa.any_shape import Jones as Jones
     from metalens.rcwa.any_shape import jones as jones
     from metalens.rcwa.any_shape import most_harmonics as most_harmonics
+    from metalens.rcwa.near import Grid as Grid
+    from metalens.rcwa.near import NearField as NearField
+    from metalens.rcwa.near import near_field as near_field
+    from metalens.rcwa.near import near_fields as near_fields
     from metalens.rcwa.verbs import derivatives as derivatives
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
@@ -22,12 +26,16 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Grid": "near",
         "SAFETY": "any_shape",
         "Jones": "any_shape",
         "anchored": "",
         "derivatives": "verbs",
         "jones": "any_shape",
+        "NearField": "near",
         "most_harmonics": "any_shape",
+        "near_field": "near",
+        "near_fields": "near",
         "solve": "verbs",
         "solve_many": "verbs",
     },

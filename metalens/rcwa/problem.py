@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Film, Light, check_direction, materials
+from metalens.cell import Cell, Film, check_direction, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import mirrors
-from metalens.rcwa.conditions import direction
 from metalens.rcwa.made import check_size
 from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
 from metalens.rcwa.stack import Media

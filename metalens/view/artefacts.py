@@ -163,6 +163,27 @@ def far_field_panels(path: Path) -> list[Panel]:
     ]
 
 
+def near_field_panels(path: Path) -> list[Panel]:
+    """Both cuts and the maps of a pillar's field: |E|, |H| and the parts of E, and the refractive index."""
+    stored = store.load(path, "near-field")
+    held, about = stored.arrays, stored.attributes
+    step, heights = float(about["step_um"]), Axis("height", (1e3 * held["heights_um"]).tolist(), "nm")
+    out: list[Panel] = []
+    for name, title in (("xz", "Along x and z"), ("yz", "Along y and z"), ("xy", "Across, along x and y")):
+        e, h = np.abs(held[f"{name}/e"]), np.abs(held[f"{name}/h"])
+        shown = np.stack([np.sqrt((e**2).sum(axis=0)), *e, np.sqrt((h**2).sum(axis=0)), held[f"{name}/index"].real])
+        up = shown if name == "xy" else shown[..., ::-1, :]
+        parts = Axis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
+        words = (
+            f"For light of {1e3 * float(about['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance of "
+            f"vacuum); relative error {float(about[f'error_{name}']):.1e} (root mean square)."
+        )
+        if name != "xy":
+            words += f" Light goes upwards; z from {held['z_um'][0]:.4g} to {held['z_um'][-1]:.4g} um, 0 at the foot."
+        out.append(Images(title, up, [parts, heights] if name == "xy" else [parts], step, "", words))
+    return out
+
+
 def _angle(pair: Array) -> str:
     return _degrees(np.degrees(pair))
 
