@@ -61,6 +61,7 @@ def test_a_wavelength_outside_the_library_is_refused_before_the_search(tmp_path,
 # verb: words that need an output, with inputs that are there; and what must not be called
 NEEDS = {
     "library": ("cell.toml", "metalens.pillars.sweep:sweep"),
+    "field": ("cell.toml --diameter-um 0.12", "metalens.commands.field:near_fields"),
     "design": ("design.toml", "metalens.commands.design:_make"),
     "psf": ("lens.h5", "metalens.commands.psf:_make"),
     "export": ("lens.h5 --samples 9", "metalens.lens.export:write"),
@@ -77,8 +78,8 @@ NEEDS = {
     "study": ("", "metalens.pillars.study:run"),
     "view": ("lens.h5", "metalens.commands.view:_shown"),
 }
-NAMES = {"library": "o.h5", "design": "o.h5", "psf": "o.h5", "export": "o.npz", "fit": "o.h5", "budget": "o.h5",
-         "check": "o.lyrdb", "view": "o.html"}  # fmt: skip
+NAMES = {"library": "o.h5", "field": "o.h5", "design": "o.h5", "psf": "o.h5", "export": "o.npz", "fit": "o.h5",
+         "budget": "o.h5", "check": "o.lyrdb", "view": "o.html"}  # fmt: skip
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from metalens.pillars.proxy import Proxy
 CASES = {
     "library": ("cell.toml -o out.h5", "out.h5"),
     "study": ("-o out", "out"),
+    "field": ("cell.toml --diameter-um 0.12 -o out.h5", "out.h5"),
     "design": ("design.toml -o out.h5", "out.h5"),
     "psf": ("lens.h5 -o out.h5", "out.h5"),
     "export": ("lens.h5 -o out.npz", "out.npz"),

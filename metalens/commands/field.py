@@ -145,8 +145,8 @@ def run(options: Options) -> int:
     ]
     if missed:
         words.append(
-            f"  FAILED: {', '.join(missed)} above the tolerance {wanted.tolerance:g} at {found[0].orders} orders: allow "
-            "a larger one (fields at edges converge slowly)"
+            f"  FAILED: {', '.join(missed)} above the tolerance {wanted.tolerance:g} at {found[0].orders} orders: "
+            "allow a larger one (fields at edges converge slowly)"
         )
     title = f"{options.output}: field of {wanted.cell.described}, {NM * wanted.wavelength_um:g} nm"
     told = {"orders": found[0].orders, "tolerance": wanted.tolerance, "cuts": values}

@@ -134,7 +134,7 @@ def near_fields(
     history: list[list[tuple[Array, Array]]] = []
     for reach in climb.reaches:
         found = _fields(this, stack, light, grids, reach)
-        farthest = np.max([_apart(one, found) for one in history[-climb.before :]] or [np.ones(len(grids))], axis=0)
+        farthest = np.max([[1.0] * len(grids)] if not history else [_apart(one, found) for one in history], axis=0)
         error = np.minimum(climb.crowded * safety(reach) * farthest + cut, 2.0)
         if len(history) >= climb.before and error.max() <= tolerance:
             break
@@ -198,7 +198,7 @@ def _looks(this: Problem, slabs: list[Slab], grid: Grid) -> list[_Look]:
 
 def _index(this: Problem, slabs: list[Slab], looks: list[_Look], grid: Grid) -> Array:
     """(nz, ny, nx)."""
-    return np.sqrt(np.stack([looks[i].eps for i in places(this, slabs, np.asarray(grid.z_um))]))
+    return np.asarray(np.sqrt(np.stack([looks[i].eps for i in places(this, slabs, np.asarray(grid.z_um))])))
 
 
 def _fields(this: Problem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int) -> list[tuple[Array, Array]]:

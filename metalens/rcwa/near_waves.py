@@ -70,8 +70,8 @@ def edges(this: Problem, slabs: list[Slab]) -> Array:
 
 def places(this: Problem, slabs: list[Slab], z_um: Array) -> Array:
     """(nz,) 0 for the substrate, then the slabs, last the cover."""
-    heights = edges(this, slabs)
-    return np.searchsorted(heights, 2 * math.pi / this.light.wavelength_um * z_um + _ON * heights[-1], side="right")
+    ends, heights = edges(this, slabs), 2 * math.pi / this.light.wavelength_um * z_um
+    return np.asarray(np.searchsorted(ends, heights + _ON * (ends[-1] - ends[0]), side="right"))
 
 
 _ON = 1e-12  # of the height: a point so little below an interface lies on it

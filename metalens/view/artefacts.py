@@ -175,8 +175,8 @@ def near_field_panels(path: Path) -> list[Panel]:
         up = shown if name == "xy" else shown[..., ::-1, :]
         parts = Axis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
         words = (
-            f"For light of {1e3 * float(about['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance of "
-            f"vacuum); relative error {float(about[f'error_{name}']):.1e} (root mean square)."
+            f"For light of {1e3 * float(about['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance "
+            f"of vacuum); relative error {float(about[f'error_{name}']):.1e} (root mean square)."
         )
         if name != "xy":
             words += f" Light goes upwards; z from {held['z_um'][0]:.4g} to {held['z_um'][-1]:.4g} um, 0 at the foot."

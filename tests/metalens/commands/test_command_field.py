@@ -1,0 +1,99 @@
+"""``metalens field``: what is asked for, written, drawn and said."""
+
+import numpy as np
+import pytest
+
+from metalens import rcwa
+from metalens.cell import Light
+from metalens.cli import main
+from metalens.commands import field
+from metalens.ground import store
+from metalens.view import artefacts
+
+CELL = """[cell]
+pitch_um = 0.34
+height_um = 0.41
+pillar = { n = 2.4 }
+[cell.lattice]
+kind = "rectangular"
+ratio = 1.25
+[[cell.under]]
+material = { n = 1.7 }
+thickness_um = 0.06
+[sweep]
+wavelengths_um = [0.83]
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell.toml").write_text(CELL)
+    return tmp_path
+
+
+FIRST = ["field", "cell.toml", "--diameter-um", "0.2"]
+WORDS = [*FIRST, *("--samples", "12", "--angle-deg", "12"), *("--polarization", "y", "--tolerance", "1")]
+
+
+def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
+    assert main([*WORDS, "--heights-um", "0.1", "0.3", "--around-um", "0.2", "--quiet"]) == 0
+    stored = store.load(here / "field.h5", "near-field")
+    held, step = stored.arrays, 0.34 / 12
+    assert held["x_um"] == pytest.approx((np.arange(12) - 5.5) * step)
+    assert held["y_um"] == pytest.approx((np.arange(15) - 7) * step)
+    assert held["z_um"][:2] == pytest.approx([-0.26 + step / 2, -0.26 + 1.5 * step])
+    assert abs(held["z_um"][-1] + step / 2 - 0.61) <= step
+    assert held["xz/e"].shape == held["xz/h"].shape == (3, len(held["z_um"]), 12)
+    assert held["yz/index"].shape == (len(held["z_um"]), 15)
+    assert held["xy/e"].shape == (3, 2, 15, 12)
+    cell = field.asked(field.Options(here / "cell.toml", 0.2)).cell
+    light = Light(0.83, np.radians(12.0), "y")
+    grid = {"x_um": held["x_um"], "y_um": held["y_um"], "z_um": [0.1, 0.3]}
+    same = rcwa.near_field(cell, 0.2, light, **grid, tolerance=1.0)
+    assert np.array_equal(held["xy/h"], same.h)
+    assert np.array_equal(held["xy/index"], same.index)
+    assert stored.attributes["error_xy"] == same.error
+    assert stored.attributes["wavelength_um"] == 0.83
+    assert (here / "field.png").read_bytes()[:4] == b"\x89PNG"
+    assert "angle_deg = 12.0" in stored.provenance.config
+    assert list(stored.provenance.inputs) == ["cell.toml"]
+
+
+def test_info_and_view_show_it(here, capsys):
+    assert main([*WORDS, "--quiet"]) == 0
+    assert main(["info", "field.h5"]) == 0
+    assert "near-field version 1" in capsys.readouterr().out
+    assert main(["view", "field.h5", "--quiet"]) == 0
+    along, other, across = artefacts.near_field_panels(here / "field.h5")
+    held = store.load(here / "field.h5").arrays
+    assert across.axes[1].values == pytest.approx([102.5, 205.0, 307.5])
+    assert across.step_um == pytest.approx(0.34 / 12)
+    size = np.sqrt((np.abs(held["xz/e"]) ** 2).sum(axis=0))
+    assert along.values[0] == pytest.approx(size[::-1])  # light goes upwards on the page
+    assert other.values[2] == pytest.approx(np.abs(held["yz/e"][1])[::-1])
+    assert across.values[5] == pytest.approx(held["xy/index"].real)
+
+
+def test_a_bar_above_the_tolerance_is_a_failure(here, monkeypatch, capsys):
+    monkeypatch.setattr(field, "near_fields", lambda *a, **k: rcwa.near_fields(*a, **{**k, "harmonics": 2}))
+    assert main([*WORDS[:-1], "1e-6"]) == 1
+    told = capsys.readouterr().out
+    assert "FAILED: xz, yz, xy above the tolerance 1e-06" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--samples 7", "samples = 7: need 8 to 400"),
+        ("--around-um -1", "around_um = -1"),
+        ("--heights-um nan", "heights_um = [nan]"),
+        ("--wavelength-nm 0", "wavelength_um = 0.0"),
+        ("--angle-deg 90", "need finite angles"),
+        ("--diameter-um 0.5", "touches its neighbour"),
+    ],
+)
+def test_what_makes_no_field_is_refused(here, capsys, words, told):
+    assert main([*FIRST, *words.split()]) == 2
+    assert told in capsys.readouterr().err
+    assert not (here / "field.h5").exists()
