@@ -33,7 +33,7 @@ from benchmarks import (
     _hardness_values,
 )
 from benchmarks.__main__ import table
-from metalens.ground import store
+from metalens.ground import lock, store
 
 KILLS, WRITERS, DISKS, MUTATIONS = 18, 18, 18, 9000
 QUICK = ("design", "psf", "export", "layout", "library", "capture", "measure", "check", "view", "demo")
@@ -179,10 +179,11 @@ def _tried() -> Tried:
 
 
 def _note(kind: str, name: str, entry: dict[str, Any]) -> Tried:
-    """Put an entry into what was tried so far; all of that."""
-    tried = _tried()
-    tried.setdefault(kind, {})[name] = entry
-    store.write_text(TRIALS, json.dumps(tried, indent=1) + "\n")
+    """Put an entry into what was tried so far; all of that. Runs of other verbs or kinds may do so at the same time."""
+    with lock.folder(TRIALS.parent):
+        tried = _tried()
+        tried.setdefault(kind, {})[name] = entry
+        store.write_text(TRIALS, json.dumps(tried, indent=1) + "\n")
     return tried
 
 
