@@ -125,6 +125,7 @@ class Sweep:
         elif not killed:
             here.expect(status in (0, 1, 130, -signal.SIGINT), f"ended with {status}, {words}")
         here.expect(killed or not here.scratch(unfinished=True), f"left {here.scratch(unfinished=True)}, {words}")
+        (here.folder / "filler").unlink(missing_ok=True)  # the next run has room
         here.found += self._next(here)
 
     def _next(self, here: Bench) -> list[str]:

@@ -84,22 +84,38 @@ def points(sweeps: int, verbs: tuple[str, ...], seconds: float = math.inf) -> li
         if not bench.fills:
             print("no mounts of one's own can be made here: file operations are not tried one by one")
             return []
-        for verb, _ in itertools.product(verbs, range(sweeps)):
+        for verb, number in _sweeps(verbs, sweeps):
             bench.verbs = (verb,)
             bench.prepare()
             entry = _tried().get("points", {}).get(verb, {"done": 0, "failed": {}})
-            sweep = _hardness_points.Sweep(bench, verb, entry["done"], fresh=entry["done"] % 2 == 1)
+            sweep = _hardness_points.Sweep(bench, verb, number, fresh=number % 2 == 1)
             sweep.run()
-            for kind, count in sweep.counts.items():
-                entry[kind] = entry.get(kind, 0) + count
-            entry["done"] += 1
-            entry["failed"] |= {f"{sweep.number}: {how}": found for how, found in sweep.found.items()}
+            if number == entry["done"]:
+                for kind, count in sweep.counts.items():
+                    entry[kind] = entry.get(kind, 0) + count
+                entry["done"] += 1
+            kept = {words: found for words, found in entry["failed"].items() if _number(words) != number}
+            entry["failed"] = kept | {f"{number}: {how}": found for how, found in sweep.found.items()}
             _note("points", verb, entry)
             print(f"{verb}: {sweep.counts}, {len(sweep.found)} failed", flush=True)
             if time.perf_counter() > end:
                 break
     tried = _tried()
     return [_of_trials(kind, tried.get(kind, {}), tried["points"]) for kind in AGAINST]
+
+
+def _sweeps(verbs: tuple[str, ...], more: int) -> Iterator[tuple[str, int]]:
+    """(verb, number) of sweeps in which something failed before, then of so many new ones."""
+    tried = _tried().get("points", {})
+    for verb in verbs:
+        entry = tried.get(verb, {"done": 0, "failed": {}})
+        again = sorted({_number(words) for words in entry["failed"]})
+        yield from ((verb, number) for number in (*again, *range(entry["done"], entry["done"] + more)))
+
+
+def _number(words: str) -> int:
+    """Of the sweep that a failure belongs to."""
+    return int(words.partition(":")[0])
 
 
 def _trials(tried: Tried, asked: dict[str, int], verbs: tuple[str, ...]) -> Iterator[tuple[str, str, int]]:

@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.ground import console, lock
+from metalens.ground import console, lock, reading
 from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -161,9 +161,8 @@ def _guarded(words: list[str], *, debug: bool) -> int:
     """Run the command; its exit status, with one line for whatever stopped it."""
     told = lock.COMMAND.set(" ".join(words))
     try:
-        if debug:
-            return _shown(words)
-        return _dispatch(words[0], words[1:])
+        with reading.remembered():
+            return _shown(words) if debug else _dispatch(words[0], words[1:])
     except FitRefused as error:
         return _refuse(_said(error), FAILED_CHECK)
     except (MetalensError, OSError) as error:

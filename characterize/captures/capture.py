@@ -83,14 +83,16 @@ def load(path: str | Path) -> Capture:
 
     Raises:
         CaptureError: nothing there, lossy or truncated images, frames of different size, non-finite values,
-            stage rows that do not match the frames; file, row and frame are named.
+            stage rows that do not match the frames; file, row and frame are named. StoreError: it was changed or
+            replaced while it was read.
     """
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)")
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it makes of a damaged file is said in one error
     try:
-        return _load_folder(path) if path.is_dir() else _load_file(path)
+        with reading.steady(path):
+            return _load_folder(path) if path.is_dir() else _load_file(path)
     except MetalensError:
         raise
     except (*store.DAMAGE, IndexError, ArithmeticError, RecursionError, struct.error) as error:

@@ -17,7 +17,7 @@ from characterize.inference import Options as FitOptions
 from characterize.model import Known
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
-from metalens.ground import config, store, transaction
+from metalens.ground import config, reading, store, transaction
 from metalens.ground.errors import ConfigError
 
 
@@ -55,8 +55,9 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
     truth = config.load(options.truth, Truth) if options.truth else None
     hidden = {k.name: k.value for k in truth.parameter} if truth else None
+    about = _provenance(options, design)
     with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
-        result = dataclasses.replace(fit(shots, lens, choice), provenance=_provenance(options, design))
+        result = dataclasses.replace(fit(shots, lens, choice), provenance=about)
         asbuilt.save(draft.path, result)
         report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
     options.console.result(_lens_values(result), _lens_text(result, target))
@@ -68,9 +69,10 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
     if spec.mask is not None:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     shots = captures.load(options.capture)
+    about = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
     with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
         found = fit_pupil(shots, spec, insist=options.insist)
-        save(draft.path, found, _provenance(options, pupil, *([spec.mask] if spec.mask else [])))
+        save(draft.path, found, about)
         report.pupil_report(draft.path.with_suffix(".html"), found)
     options.console.result(_values(found), _text(found, target))
     return 1 if found.problems else 0
@@ -81,7 +83,7 @@ def _provenance(options: Options, *sources: Path) -> store.Provenance:
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     files += [*sources] + ([options.metrology] if options.metrology else [])
     texts = [p.read_text(encoding="utf-8") for p in (options.pupil, options.metrology) if p is not None]
-    return store.Provenance(config="\n".join(texts), inputs={p.name: store.sha256(p) for p in files})
+    return store.Provenance(config="\n".join(texts), inputs={p.name: reading.sha256(p) for p in files})
 
 
 def _lens_values(result: AsBuilt) -> dict[str, object]:

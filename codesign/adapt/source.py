@@ -11,7 +11,7 @@ from characterize.inference import AsBuilt
 from codesign.network import Architecture, check
 from codesign.train import Run, RunConfig
 from codesign.train import run as runs
-from metalens.ground import manifest
+from metalens.ground import manifest, reading
 from metalens.ground.errors import FitError, TrainingError
 from metalens.lens import Lens
 
@@ -44,10 +44,11 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
             f"{folder} is {what}: {', '.join(missing)} missing; finish it with "
             f"`metalens codesign RUN.toml -o {folder} --resume`"
         )
-    manifest.check(folder)
-    settings = runs.load(folder / "run.toml")
-    made = runs.resume(folder / "checkpoint.safetensors", settings)
-    rows = rows_of(folder)
+    with reading.steady(folder):
+        manifest.check(folder)
+        settings = runs.load(folder / "run.toml")
+        made = runs.resume(folder / "checkpoint.safetensors", settings)
+        rows = rows_of(folder)
     found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
     if not found:
         have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)

@@ -1,11 +1,11 @@
 """Parts of a long piece of work that are done, kept beside its output, so that an interrupted run goes on."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import manifest, store
+from metalens.ground import manifest, reading, store
 
 
 class Journal:
@@ -13,14 +13,16 @@ class Journal:
 
     The first line names the work; a file of other work is started afresh, a line that was cut short is dropped.
 
-    path: None keeps nothing. title: all that the parts follow from, the version first.
+    path: None keeps nothing. title: all that the parts follow from, the version first. inputs: files that each part
+    reads anew.
 
     Raises:
-        StoreError: a file that is no journal stands there.
+        StoreError: a file that is no journal stands there; later, that an input was replaced.
     """
 
-    def __init__(self, path: Path | None = None, title: str = "") -> None:
+    def __init__(self, path: Path | None = None, title: str = "", *, inputs: Iterable[Path] = ()) -> None:
         self._path, self._known = path, dict[str, Any]()
+        self._read = {file: reading.stamp(file) for file in inputs}
         if path is None:
             return
         self._known = dict(found for line in manifest.journal(path, json.dumps(title)) if (found := _part(line)))
@@ -29,6 +31,8 @@ class Journal:
         """What ``work`` returns, or returned in an earlier run: numbers, words, lists."""
         if name not in self._known:
             value = work()
+            for file, before in self._read.items():
+                reading.check_same(file, before)
             if self._path is not None:
                 store.append_line(self._path, json.dumps([name, value]))
             self._known[name] = value

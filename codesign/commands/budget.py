@@ -18,7 +18,7 @@ from codesign.budget import page as budget_page
 from codesign.commands.options.budget import Options
 from codesign.optics import Numerics
 from metalens import __version__, lens, library
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.reading import reader
 from metalens.made import of_process
@@ -104,7 +104,7 @@ def _provenance(options: Options, given: Given) -> store.Provenance:
     files = [options.lens, options.library, options.process, options.asbuilt, weights]
     return store.Provenance(
         config=config.dumps(given.numerics) + f"fwhm_nm = {given.fwhm_nm}\n",
-        inputs={f.name: store.sha256(f) for f in files if f is not None},
+        inputs={f.name: reading.sha256(f) for f in files if f is not None},
     )
 
 

@@ -13,7 +13,7 @@ from codesign.adapt import train as retraining
 from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, total
 from codesign.commands.options.plan import Options
 from metalens import __version__
-from metalens.ground import config, report, store
+from metalens.ground import config, reading, report, store
 from metalens.ground.errors import ConfigError
 from metalens.pillars import workers
 
@@ -53,9 +53,9 @@ def run(options: Options) -> int:
         least = floor.floor(rig, run, options.frames, fwhm_nm=wanted.led_fwhm_nm)
         floor.allowance_rad(goal, least)
         chain = Chain(wanted, options.console.say)
-        read = {str(file): store.sha256(file) for file in workers.material_files(wanted.cell)}
+        read = {str(file): reading.sha256(file) for file in workers.material_files(wanted.cell)}
         title = f"{__version__}\n{config.dumps(wanted)}{read}"
-        journal = Journal(target.with_name(target.name + ".resume"), title)
+        journal = Journal(target.with_name(target.name + ".resume"), title, inputs=map(Path, read))
         measured = plan.pilot(chain, journal, floor=least)
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)

@@ -18,7 +18,7 @@ from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
 from codesign.train import Record, RunConfig, Trainer, checkpoint
 from metalens import __version__, lens
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.errors import TrainingError
 from metalens.ground.transaction import Draft
 from metalens.made import Bias
@@ -95,9 +95,9 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
 def _recipe(options: Options, source: Source) -> Recipe:
     return Recipe(
         options.settings,
-        store.sha256(options.asbuilt),
-        store.sha256(options.run_dir / "checkpoint.safetensors"),
-        store.sha256(options.truth) if options.truth else "",
+        reading.sha256(options.asbuilt),
+        reading.sha256(options.run_dir / "checkpoint.safetensors"),
+        reading.sha256(options.truth) if options.truth else "",
         source.settings,
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 from metalens.ground import config, store
 from metalens.ground.errors import ConfigError
 
+MADE = ("library.h5", "lens.h5", "bench_lens.h5", "asbuilt.h5")  # by the chain itself
 SHIPPED = ("cell", "design", "process", "run", "bench_truth", "bench_metrology")
 
 
@@ -76,22 +77,53 @@ def load(path: Path) -> ChainFiles:
 
 
 def lay_out(folder: Path, files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> ChainFiles:
-    """Copy the settings into the chain's folder under plain names; the files under those names.
+    """Copy the settings into the chain's folder under plain names, and the tables and maps that they name; the files.
 
     Args:
         source: folder that the files lie in; None for the shipped ones.
         aperture_mm: put in place of the aperture of the design.
+
+    Raises:
+        ConfigError: a file that is named lies above its settings file, or two files have one name.
     """
     for name, value in _given(files):
         if source is None:
             text = resources.files("metalens").joinpath("data", "demo", value.name).read_text(encoding="utf-8")
         else:
-            text = (source / value).read_text(encoding="utf-8")
+            text = (source / value).read_text(encoding="utf-8-sig")
+            _bring(folder, source / value)
         if name == "design" and aperture_mm is not None:
             lines = [line for line in text.splitlines() if not line.startswith("aperture_mm")]
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
         store.write_text(folder / f"{name}.toml", text)
     return _named(tuple(name for name, _ in _given(files)), budget=files.budget)
+
+
+def _bring(folder: Path, settings: Path) -> None:
+    """Copy what a settings file names beside or below it, or in the current folder.
+
+    Whole paths are left as they are, and files that the chain makes.
+    """
+    for word in sorted(set(_words(config.read(settings, ChainFiles)))):
+        found = [place / word for place in (settings.parent, Path()) if (place / word).is_file()]
+        if Path(word).is_absolute() or word in MADE or not found:
+            continue
+        if ".." in Path(word).parts:
+            raise ConfigError(f"{settings}: {word!r} lies above it; put it beside it, or give its whole path")
+        content, target = found[0].read_bytes(), folder / word
+        if target.is_file() and target.read_bytes() != content:
+            raise ConfigError(f"{settings}: {word!r} is not the file of that name beside other settings; rename it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        store.write_bytes(target, content)
+
+
+def _words(value: Any) -> Iterator[str]:
+    """Texts anywhere in a table that may be the name of a file: with an ending, of one line."""
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _words(part)
+    elif isinstance(value, str) and Path(value).suffix and value.isprintable():
+        yield value
 
 
 def _named(names: tuple[str, ...], *, budget: bool = True) -> ChainFiles:

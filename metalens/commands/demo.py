@@ -60,7 +60,7 @@ def run(options: Options) -> int:
         folder = draft.path
         with tempfile.TemporaryDirectory() as aside:  # nothing of other settings gets beside what is done
             chain.lay_out(Path(aside), wanted, source, aperture_mm=options.aperture_mm)
-            if (folder / OUTCOMES).is_file() and _settings(folder) != _settings(Path(aside)):
+            if (folder / OUTCOMES).is_file() and not _same(Path(aside), folder):
                 raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
         files = chain.lay_out(folder, wanted, source, aperture_mm=options.aperture_mm)
         outcomes: list[Outcome] = []
@@ -75,9 +75,11 @@ def run(options: Options) -> int:
     return next((o.status for o in outcomes if o.status), 0)
 
 
-def _settings(folder: Path) -> dict[str, bytes]:
-    """The settings files of the chain."""
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.toml"))}
+def _same(laid: Path, folder: Path) -> bool:
+    """Whether a chain's folder holds these settings, no others, and the same tables and maps."""
+    here, there = ({path.name for path in place.glob("*.toml")} for place in (laid, folder))
+    pairs = [(path, folder / path.relative_to(laid)) for path in laid.rglob("*") if path.is_file()]
+    return here == there and all(b.is_file() and a.read_bytes() == b.read_bytes() for a, b in pairs)
 
 
 def _name(stage: Stage) -> str:

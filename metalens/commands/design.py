@@ -30,7 +30,7 @@ from metalens.design import (
     meeting_um,
 )
 from metalens.design.free_form import Asked, Fisher
-from metalens.ground import config, store, transaction
+from metalens.ground import config, reading, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
@@ -161,12 +161,12 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         raise ConfigError("own_cell: rows of pillars of two sizes are not solved; leave --own-cell out")
     with options.claim(options.output, beside=(".png",), inputs=read) as draft:
         path = options.config.parent / (wanted.library or "")
-        made_of, inputs = axes.load(path), {file.name: store.sha256(file) for file in (path, options.config)}
+        made_of, inputs = axes.load(path), {file.name: reading.sha256(file) for file in (path, options.config)}
         wanted = wanted.at(made_of.wavelength_um.tolist())
         made_of.at(wanted.focus.wavelength_um)
         if options.process is not None:
             wanted = replace(wanted, limits=_printable(options.process, made_of.cell, wanted.limits))
-            inputs[options.process.name] = store.sha256(options.process)
+            inputs[options.process.name] = reading.sha256(options.process)
         wanted = replace(wanted, layers=_filled(wanted.layers, made_of.cell))
         radius_um = wanted.aperture_mm * 500
         phase, focus, _ = _phase(wanted, options, radius_um)
@@ -208,12 +208,12 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     proxy.at(wanted.focus.wavelength_um)  # outside the library it is refused here, not after the search for a phase
     if options.process is not None:
         wanted = replace(wanted, limits=_printable(options.process, cell, wanted.limits))
-        inputs[options.process.name] = store.sha256(options.process)
-    inputs[options.config.name] = store.sha256(options.config)
+        inputs[options.process.name] = reading.sha256(options.process)
+    inputs[options.config.name] = reading.sha256(options.config)
     wanted = replace(wanted, layers=_filled(wanted.layers, cell))
     own = _located(wanted, options.config)
     if wanted.profile == "map" and own is not None and own.file.is_file():
-        inputs[own.file.name] = store.sha256(own.file)
+        inputs[own.file.name] = reading.sha256(own.file)
     radius_um = wanted.aperture_mm * 500
     phase, focus, judged = _phase(wanted, options, radius_um)
     about: dict[str, Any] = {"aperture_um": 2 * radius_um, "limits": wanted.limits, "profile": wanted.profile}
@@ -331,7 +331,7 @@ def _pillars(wanted: Design, where: Path, console: Console) -> tuple[PillarLibra
     """The library of the pillars, and the hash of its file if there is one."""
     if wanted.library is not None:
         path = where.parent / wanted.library
-        return library.load(path), {path.name: store.sha256(path)}
+        return library.load(path), {path.name: reading.sha256(path)}
     cell = wanted.cell or library.DEFAULT_CELL
     return library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console), {}
 

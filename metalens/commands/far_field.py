@@ -91,7 +91,7 @@ def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"
     ]
 
 
-def save(path: Path, source: Path, wanted: Asked, found: list["FarField"], *, page: bool) -> None:
+def save(path: Path, wanted: Asked, found: list["FarField"], *, inputs: dict[str, str], page: bool) -> None:
     """The file of kind ``far-field``, its picture beside it, and with ``page`` its report."""
     arrays = {
         "share": np.stack([one.share for one in found]).astype(np.float32),
@@ -106,7 +106,7 @@ def save(path: Path, source: Path, wanted: Asked, found: list["FarField"], *, pa
         "error": np.array([one.error for one in found]),
     }
     about = {"wavelength_um": 1e-3 * wanted.wavelength_nm, "source_um": 1e3 * wanted.source_mm}
-    provenance = store.Provenance(config.dumps(wanted), {source.name: store.sha256(source)})
+    provenance = store.Provenance(config.dumps(wanted), inputs)
     store.save(path, "far-field", arrays, attributes=about | {"beam_sine": found[0].beam_sine}, provenance=provenance)
     image = picture(wanted, found)
     store.write_bytes(path.with_name(f"{path.stem}_far.png"), image)

@@ -14,7 +14,7 @@ from metalens import library
 from metalens.cell import Cell
 from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.errors import DomainError
 from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, axes, converted, workers
 from metalens.pillars import fit as proxy_fit
@@ -77,7 +77,7 @@ def run(options: Options) -> int:
 
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     """Hashes of the config and of the material tables that the cell names."""
-    return {file.name: store.sha256(file) for file in (path, *workers.material_files(cell))}
+    return {file.name: reading.sha256(file) for file in (path, *workers.material_files(cell))}
 
 
 def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:

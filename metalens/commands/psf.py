@@ -16,7 +16,7 @@ from metalens import design, lens, psf
 from metalens.commands import far_field
 from metalens.commands.common import Common, MaybeOutput
 from metalens.commands.psf_settings import Settings, read
-from metalens.ground import config, store, transaction
+from metalens.ground import config, reading, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Figure, KeyFigure, Section, Table, write
 from metalens.ground.store import Provenance, write_bytes
@@ -136,10 +136,10 @@ def _far(options: Options) -> int:
     if kind in SOURCES:
         raise ConfigError(f"{options.lens}: the far field of a design (lens.h5), not of a file of kind {kind}")
     made = lens.load(options.lens)
-    wanted = far_field.asked(options, made)
+    wanted, inputs = far_field.asked(options, made), {options.lens.name: reading.sha256(options.lens)}
     with options.claim(target, beside=("_far.png", ".html"), room=transaction.ROOM + 4 * wanted.samples**2) as draft:
         found = far_field.compute(made, wanted, options.console)
-        far_field.save(draft.path, options.lens, wanted, found, page=options.report)
+        far_field.save(draft.path, wanted, found, inputs=inputs, page=options.report)
     options.console.result(far_field.values(wanted, found), far_field.text(target, wanted, found))
     return 0
 
@@ -222,7 +222,7 @@ def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> p
 
 def _provenance(path: Path, settings: Settings) -> Provenance:
     files = [path, *(file for file in settings.spectrum if file.is_file())]
-    return Provenance(config.dumps(settings), {file.name: store.sha256(file) for file in files})
+    return Provenance(config.dumps(settings), {file.name: reading.sha256(file) for file in files})
 
 
 def _own_cell(made: lens.Lens, settings: Settings) -> psf.LeftOut:

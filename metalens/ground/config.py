@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from metalens.ground import reading
 from metalens.ground.errors import ConfigError, nearest
 
 Record = TypeVar("Record")
@@ -52,16 +53,15 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
     path = Path(path)
     try:
         with open(path, "rb") as file:
-            content = file.read(_LARGEST + 1)
+            before, content = reading.stamp(path), file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
             raise ConfigError(f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})")
+        reading.note(path, before, content)
         text = content.decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; need a TOML config ({record.__name__})") from None
     except UnicodeDecodeError:
-        raise ConfigError(
-            f"{path}: not a text file; need settings in TOML ({record.__name__}), in which files of data are named"
-        ) from None
+        raise ConfigError(f"{path}: not a text file; need TOML ({record.__name__}) that names files of data") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); need a TOML config") from None
     except ValueError as error:

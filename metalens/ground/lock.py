@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -15,6 +16,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from metalens.ground.errors import OutputError
 
@@ -130,32 +132,96 @@ def undisturbed() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+def left(target: Path) -> Iterator[Path]:
+    """Scratch of dead owners of an output that is held; under whatever case, where the system tells none apart."""
+    for path in sorted(target.parent.glob(".*.part-*")):
+        name = path.name[1:].rpartition(".part-")[0]
+        if name == target.name or (name.lower() == target.name.lower() and _one(target.with_name(name), target)):
+            yield path
+
+
+def _one(one: Path, other: Path) -> bool:
+    """Whether two names have one lock."""
+    paths = [path.with_name(f".{path.name}.lock") for path in (one, other)]
+    return all(path.exists() for path in paths) and paths[0].samefile(paths[1])
+
+
 def _taken(path: Path, target: Path) -> int:
     """An open handle of the lock file, locked; the file may have been removed by its last owner in between."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            told = _far(handle, path)
         except BlockingIOError:
-            who = _owner(handle)
-            os.close(handle)
-            raise OutputError(f"{target} is being written by {who}; wait for it or give another name") from None
+            told = _words(_owner(handle))
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP):
                 os.close(handle)
                 raise
+            told = _alive(handle, path)
+        if told:
+            os.close(handle)
+            raise OutputError(f"{target} is being written by {told}; wait for it or give another name")
         with contextlib.suppress(FileNotFoundError):
             if os.stat(path).st_ino == os.fstat(handle).st_ino:
                 return handle
         os.close(handle)
 
 
-def _owner(handle: int) -> str:
+def _far(handle: int, path: Path) -> str:
+    """Who else writes, where the lock of a file tells nothing of other machines and another one left its name; ''.
+
+    Where it does (a file server that keeps the locks), a lock that was had is free, whoever left the file.
+    """
+    owner = _owner(handle)
+    elsewhere = bool(owner) and owner["host"] != socket.gethostname()
+    return _alive(handle, path) if elsewhere and _locks_are_local(path) else ""
+
+
+def _alive(handle: int, path: Path) -> str:
+    """Who else writes, by the words in the lock file alone: a process that lives, or one of another machine; ''."""
+    owner = _owner(handle)
+    if not owner:
+        return ""
+    if owner["host"] != socket.gethostname():
+        return f"{_words(owner)}, as {path} says; if that one has ended, remove the file"
+    try:
+        os.kill(owner["process"], 0)
+    except ProcessLookupError:
+        return ""
+    except OSError:  # of another user
+        pass
+    return _words(owner)
+
+
+_LOCAL = re.compile(r" - (fuse|9p)|\b(nolock|localflock|local_lock=(all|flock))\b")  # in the table of mounts
+
+
+def _locks_are_local(path: Path) -> bool:
+    """Whether another machine that uses the same file system does not hear of locks; by the table of mounts (Linux)."""
+    try:
+        lines = Path("/proc/self/mountinfo").read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return False
+    device = os.stat(path).st_dev
+    name = f"{os.major(device)}:{os.minor(device)}"
+    return any(line.split()[2] == name and _LOCAL.search(line) for line in lines)
+
+
+def _owner(handle: int) -> dict[str, Any]:
+    """What the lock file says of its owner; {} where it says nothing."""
     try:
         told = json.loads(os.pread(handle, 65536, 0))
-        return f"process {told['process']} on {told['host']} (metalens {told['command']})"
-    except (ValueError, KeyError, TypeError):
-        return "another process"
+        return {"process": int(told["process"]), "host": str(told["host"]), "command": str(told["command"])}
+    except (ValueError, KeyError, TypeError, OverflowError):
+        return {}
+
+
+def _words(owner: dict[str, Any]) -> str:
+    return (
+        f"process {owner['process']} on {owner['host']} (metalens {owner['command']})" if owner else "another process"
+    )
 
 
 def _let_go() -> None:

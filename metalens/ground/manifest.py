@@ -92,6 +92,18 @@ def check(folder: Path) -> None:
             )
 
 
+def flush(folder: Path) -> None:
+    """Flush a folder and all that is in it."""
+    for place, _, names in os.walk(folder):
+        for name in names:
+            handle = os.open(os.path.join(place, name), os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+        store.sync_folder(Path(place))
+
+
 def files(folder: Path) -> Iterator[str]:
     """Names of all files below a folder, the manifest aside; folders that hold nothing end in a slash."""
     for place, folders, names in os.walk(folder):

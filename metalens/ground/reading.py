@@ -2,18 +2,23 @@
 
 The HDF5 library ends its process on some damaged files. So a forked child with little to lose reads a file first; and
 it writes to a file that never refuses, since it may end its process on a full disk too.
+
+An input that is replaced or edited while it is read is refused. A stamp tells, which is the same or not: it is never
+asked which of two is later, since clocks are set back.
 """
 
 import contextlib
 import dataclasses
 import faulthandler
 import functools
+import hashlib
 import io
 import os
 import resource
 import typing
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,6 +32,79 @@ _ROOM, _SECONDS = 600 << 20, 60  # address space beyond what this process has, t
 _DENSEST = 1100  # more of it for a byte of the file: what deflate can do at best, and copies
 _MOST_WORDS = 4000
 _WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
+_PLAIN = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum: packing that the HDF5 library undoes without harm
+Stamp = tuple[tuple[int, ...], ...]
+_noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar("_noted", default=None)  # of inputs, by path
+
+
+@contextlib.contextmanager
+def remembered() -> Iterator[None]:
+    """Remember inputs from their first reading on, until the block (a command) ends."""
+    token = _noted.set({})
+    try:
+        yield
+    finally:
+        _noted.reset(token)
+
+
+def stamp(path: str | Path) -> Stamp:
+    """Which file it is, its bytes and the time of its last change; of a folder, also of all that lies in it.
+
+    () where there is none.
+    """
+    try:
+        inside = sorted(os.scandir(path), key=lambda entry: entry.name) if os.path.isdir(path) else []
+        about = [os.stat(one) for one in (path, *inside)]
+    except OSError:
+        return ()
+    return tuple((found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns) for found in about)
+
+
+def check_same(path: str | Path, before: Stamp) -> None:
+    """Refuse an input that is no longer what it was.
+
+    Raises:
+        StoreError: naming it.
+    """
+    if stamp(path) != before:
+        raise StoreError(f"{path} was changed or replaced while it was being read: run again when it stands still")
+
+
+@contextlib.contextmanager
+def steady(path: str | Path) -> Iterator[None]:
+    """Refuse an input that another program writes to while the block reads it.
+
+    Raises:
+        StoreError: see :func:`check_same`, in place of what the block made of such an input.
+    """
+    before = stamp(path)
+    try:
+        yield
+    except (*DAMAGE, IndexError, ArithmeticError):
+        check_same(path, before)
+        raise
+    check_same(path, before)
+    note(path, before)
+
+
+def note(path: str | Path, before: Stamp, content: bytes | None = None) -> None:
+    """Note what an input was when this command first read it; with its content, its hash too."""
+    if (noted := _noted.get()) is not None:
+        noted.setdefault(os.path.abspath(path), (before, hashlib.sha256(content).hexdigest() if content else ""))
+
+
+def sha256(path: str | Path) -> str:
+    """Hexadecimal SHA-256 of an input as this command has read it.
+
+    Raises:
+        StoreError: it was replaced since; OSError: it cannot be read.
+    """
+    before, digest = (_noted.get() or {}).get(os.path.abspath(path), (stamp(path), ""))
+    if not digest:
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        check_same(path, before)
+    return digest
 
 
 class Through(io.FileIO):
@@ -99,11 +177,12 @@ def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
     """What ``read`` makes of an open HDF5 file, after a child process with limits has done the same and lived.
 
     What the child raised is raised here, without reading: a damaged file takes the child's memory alone. Of a file
-    above 64 MB the child reads every header, and the corners of the arrays.
+    above 64 MB the child reads every header, where each block of the arrays lies, and their corners; all of them where
+    they are packed otherwise than by gzip.
 
     Raises:
-        StoreError: the child died, as this process would have; or what ``read`` refuses (a MetalensError as it is,
-            anything else as a RuntimeError).
+        StoreError: the child died, as this process would have; the file was replaced meanwhile; or what ``read``
+            refuses (a MetalensError as it is, anything else as a RuntimeError).
     """
     import h5py
 
@@ -115,8 +194,9 @@ def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
     if os.path.exists(path) and not (plain or os.path.isdir(path)):  # a pipe that nobody writes to would be waited for
         raise StoreError(f"{path}: {absent(Path(path))}")
     size = os.path.getsize(path) if plain else 0
-    _probe(path, lambda: opened(read if size <= _WHOLE else _read_through), _ROOM + _DENSEST * size)
-    made: Made = opened(read)
+    with steady(path):
+        _probe(path, lambda: opened(read if size <= _WHOLE else read_through), _ROOM + _DENSEST * size)
+        made: Made = opened(read)
     return made
 
 
@@ -173,8 +253,8 @@ def _limit(room: int) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
-def _read_through(file: Any) -> None:
-    """Every attribute of a file, and the corners of every data set."""
+def read_through(file: Any) -> None:
+    """Every attribute of a file, the place of every block of its data sets, and their corners."""
     import h5py
 
     def visit(name: str, item: Any) -> None:
@@ -184,9 +264,23 @@ def _read_through(file: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.ndim and item.size and not (item.is_virtual or item.external):
             with contextlib.suppress(Exception):
                 item[(0,) * item.ndim], item[(-1,) * item.ndim]
+            with contextlib.suppress(Exception):
+                _blocks(item)
 
     visit("/", file)
     file.visititems(visit)
+
+
+def _blocks(item: Any) -> None:
+    """Go through the index of a data set's blocks; read them where a rare packing is to be undone."""
+    if item.chunks is None:
+        return
+    plan = item.id.get_create_plist()
+    if {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= _PLAIN:
+        item.id.chunk_iter(bool)
+        return
+    for block in item.iter_chunks():
+        item[block]
 
 
 def absent(path: Path) -> str:

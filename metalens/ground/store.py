@@ -78,7 +78,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     killed process left goes with the next writing of the same file. Writers at the same time do not meet.
     """
     path = Path(path)
-    _clear(path)
+    clear(path)
     handle, part = _part(path)
     try:
         os.fchmod(handle, 0o666 & ~_umask())
@@ -103,7 +103,7 @@ def _part(path: Path) -> tuple[int, Path]:
         os.close(handle)  # cleared away before it was locked
 
 
-def _clear(path: Path) -> None:
+def clear(path: Path) -> None:
     """Remove scratch files of writers that are gone."""
     start, end = f".{path.name}.", ".part"
     for entry in os.scandir(path.parent):
@@ -130,8 +130,13 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a journal, on the disk when this returns; a line that was cut short before it is dropped."""
+    """Add a line to a journal, on the disk when this returns; a line that was cut short before it is dropped.
+
+    Writers at the same time wait for each other: what one of them has half written is no line that was cut short.
+    """
     with open(path, "ab+") as file:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
         if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
             file.seek(0)
             file.truncate(file.read().rfind(b"\n") + 1)
@@ -243,11 +248,13 @@ def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
 
 
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
-    """Refuse a data set that claims more values than its bytes in the file can hold, or that lies in other files.
+    """Refuse a data set of no values, of more than its bytes in the file can hold, or that lies in other files.
 
     Raises:
         StoreError: naming what it claims and what is there.
     """
+    if item.shape is None:
+        raise StoreError(f"{path}: {name!r} is empty, without even a shape: damaged, or none of ours")
     if item.is_virtual or item.external:
         raise StoreError(f"{path}: {name!r} lies in other files; need a file that holds all of its values")
     if item.nbytes > _DENSEST * item.id.get_storage_size() + _SMALL:

@@ -19,7 +19,8 @@ from pathlib import Path
 from metalens.ground import lock, manifest, store
 from metalens.ground.errors import OutputError
 
-ROOM, UNFINISHED = 1 << 22, ".unfinished"  # bytes that every output may need; ending of long work
+ROOM = 1 << 22  # bytes that every output may need
+UNFINISHED, JOURNAL = ".unfinished", ".resume"  # endings of what an interruption leaves for the next run
 IN_PLACE = "the new one is in place, but the disk did not confirm it"
 _READY = "ready"
 
@@ -29,7 +30,7 @@ class Draft:
     """A claimed output.
 
     path: where to write it; companions of a file go beside this path under their own names.
-    target: where all appears at the end. resumed: whether ``path`` holds work of an earlier run.
+    target: where all appears at the end; where a link leads. resumed: whether ``path`` holds work of an earlier run.
     """
 
     path: Path
@@ -61,8 +62,9 @@ def file(target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()) ->
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
+    target = _real(target)
     names = [target.stem + end for end in beside]
-    if target.name in names:
+    if target.name.lower() in (name.lower() for name in names):  # one file where the system tells no case apart
         raise OutputError(f"{target}: a file of that name is written beside the result; give another ending, as .h5")
     with _claimed(target, terms, is_folder=False):
         _refuse(target, names, terms, is_folder=False)
@@ -79,6 +81,7 @@ def folder(target: Path, *, terms: Terms = Terms()) -> Iterator[Draft]:
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
+    target = _real(target)
     with _claimed(target, terms, is_folder=True):
         _refuse(target, (), terms, is_folder=True)
         with _scratch(target) as scratch:
@@ -111,6 +114,7 @@ def long_work(
     Raises:
         OutputError: nothing to resume, or unfinished work that would be lost; see :func:`_refuse`.
     """
+    target = _real(target)
     with _claimed(target, terms, is_folder=True), _scratch(target) as scratch:
         work = unfinished(target)
         if not (resume or grow):
@@ -131,7 +135,16 @@ def long_work(
 
 def unfinished(target: Path) -> Path:
     """Where the work on a folder is done until it is finished."""
+    target = _real(target)
     return target.with_name(target.name + UNFINISHED)
+
+
+def _real(target: Path) -> Path:
+    """What a link leads to, also where that does not stand yet: lock and scratch are beside it, as for who names it."""
+    try:
+        return target.resolve() if os.path.islink(target) else target
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{target}: a link that leads nowhere ({error}); give another name") from None
 
 
 @contextlib.contextmanager
@@ -139,6 +152,8 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
     """The lock of an output, with leftovers of dead owners cleared."""
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write")
+    if target.name.endswith((UNFINISHED, JOURNAL)):
+        raise OutputError(f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work")
     with contextlib.ExitStack() as held:
         if terms.parents:
             held.enter_context(lock.parents(target))
@@ -149,18 +164,15 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
             held.enter_context(lock.held(target))
         except OSError as error:
             raise OutputError(f"{target}: folder {target.parent} cannot be written ({error.strerror})") from error
-        for left in target.parent.glob(f".{_plain(target.name)}.part-*"):
+        for left in lock.left(target):
             _recover(left, target)
+        store.clear(target.with_name(target.name + JOURNAL))  # scratch of a journal whose writer was killed
         try:
             yield
         except OSError as error:
             if error.filename is None:  # a full disk
                 error.add_note(f"{target} could not be made; what stood there is unchanged")
             raise
-
-
-def _plain(name: str) -> str:
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 def _refuse(target: Path, beside: Iterable[str], terms: Terms, *, is_folder: bool) -> None:
@@ -174,8 +186,8 @@ def _refuse(target: Path, beside: Iterable[str], terms: Terms, *, is_folder: boo
             raise OutputError(f"{target} is also an input ({path}): it would be replaced; give another name")
         if is_folder and path.exists() and target.resolve() in path.resolve().parents and _something(target):
             raise OutputError(f"{target} holds the input {path}: it would be replaced; give another name")
-    if is_folder and os.path.ismount(target):
-        raise OutputError(f"{target} is a mount point, which cannot be replaced whole; give a folder inside it")
+    if os.path.ismount(target):
+        raise OutputError(f"{target} is a mount point, which cannot be replaced whole; give another name")
     if target.exists() and target.is_dir() != is_folder:
         raise OutputError(f"{target} is a {'folder' if target.is_dir() else 'file'}; need the name of a "
                           f"{'folder' if is_folder else 'file'}")  # fmt: skip
@@ -229,7 +241,7 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
     new, old = scratch / "new", scratch / "old"
     old.mkdir()
     made = sorted(p.name for p in new.iterdir())
-    _sync(new)
+    manifest.flush(new)
     with lock.undisturbed(), lock.folder(target.parent):
         others = {*beside, *made} - {target.name}
         _refuse(target, others, terms, is_folder=False)
@@ -250,7 +262,7 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
     """Give the folder its manifest and exchange it with what stands."""
     begun = manifest.read(new)
     manifest.write(new, lock.COMMAND.get(), others=begun["others"] if begun else ())
-    _sync(new)
+    manifest.flush(new)
     with lock.undisturbed(), lock.folder(target.parent):
         if not whoever:
             _refuse(target, (), terms, is_folder=True)
@@ -336,15 +348,3 @@ def _recover_folder(scratch: Path, target: Path, inode: int) -> None:
                 _put(scratch, path, target)
         elif path.is_dir() and target.is_dir() and target.stat().st_ino == inode:
             path.rename(scratch / "replaced")
-
-
-def _sync(folder: Path) -> None:
-    """Flush a folder and all that is in it."""
-    for place, _, names in os.walk(folder):
-        for name in names:
-            handle = os.open(os.path.join(place, name), os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
-        store.sync_folder(Path(place))

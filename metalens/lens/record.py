@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import h5py
 import numpy as np
 
 from metalens.cell import Cell, Lattice
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
-from metalens.ground.reading import reader
+from metalens.ground.reading import read_through, reader, survived
 from metalens.ground.store import Provenance
 from metalens.lens.diameters import DiameterMap as DiameterMap
 from metalens.lens.layers import Layers, check_gaps
@@ -161,16 +160,21 @@ def streamed(path: str | Path) -> Lens:
 
     What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray`` gives all of them.
     """
-    if not Path(path).is_file():  # told by the loader; a pipe would be waited for
-        return load(path)
     large = False
-    with contextlib.suppress(*store.DAMAGE), h5py.File(path, "r") as file:  # damage is told by the loader
-        large = file[_NAME].nbytes > MOST_HELD_BYTES
+    if Path(path).is_file():  # what else it is tells the loader, and what is damaged
+        with contextlib.suppress(*store.DAMAGE):
+            large = survived(path, _claimed) > MOST_HELD_BYTES
     if not large:
         return load(path)
     stored = store.load(path, "lens", without=(_NAME,))
     held = {**stored.arrays, _NAME: cast(Array, RowsOnDisk(path, _NAME))}
     return replace(from_parts(held, stored.attributes, where=str(path)), provenance=stored.provenance)
+
+
+def _claimed(file: Any) -> int:
+    """Bytes of the diameters, all of whose blocks can be found."""
+    read_through(file)
+    return int(file[_NAME].nbytes)
 
 
 def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:

@@ -6,6 +6,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 
 _BAND = 256  # rows, where the file is not cut into chunks
@@ -15,10 +16,12 @@ class RowsOnDisk:
     """Stands for an array (y, x) where blocks of rows are all that is needed; ``numpy.asarray`` reads all of it.
 
     A slice of rows (and columns), a row number, least and most: anything else needs ``numpy.asarray`` first. The band
-    of rows read last is kept, whole chunks of the file.
+    of rows read last is kept, whole chunks of the file. The file is to have been read with
+    :func:`metalens.ground.reading.survived` before; reading rows of one that was written to since is a StoreError.
     """
 
     def __init__(self, path: str | Path, name: str) -> None:
+        self._path, self._stamp = path, reading.stamp(path)
         self._file = h5py.File(path, "r")
         self._data: h5py.Dataset = self._file[name]
         self.shape: tuple[int, int] = self._data.shape
@@ -40,7 +43,9 @@ class RowsOnDisk:
         return self._rows(row, row + 1)[(0, *rest)]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        return np.asarray(self._data[...], dtype)
+        found = np.asarray(self._data[...], dtype)
+        reading.check_same(self._path, self._stamp)
+        return found
 
     def max(self, initial: float = 0.0) -> float:
         """Largest value; NaN where one is not a number."""
@@ -73,6 +78,7 @@ class RowsOnDisk:
             if not self._first <= first < self._first + len(self._kept):
                 self._first = first // self._height * self._height
                 self._kept = self._data[self._first : self._first + self._height]
+                reading.check_same(self._path, self._stamp)
             stop = min(end, self._first + len(self._kept))
             pieces.append(self._kept[first - self._first : stop - self._first])
             first = stop

@@ -10,7 +10,7 @@ import numpy as np
 
 from metalens import __version__
 from metalens.cell import Cell, Light, Response, materials
-from metalens.ground import config, executor, manifest, store
+from metalens.ground import config, executor, manifest, reading, store
 from metalens.ground.console import Console
 from metalens.pillars import curve as reduced
 from metalens.pillars.engines import precise, smooth
@@ -120,14 +120,15 @@ class Journal:
         path: None keeps nothing. about: records of settings that the tasks follow from.
 
     Raises:
-        StoreError: a file that is no journal stands there.
+        StoreError: a file that is no journal stands there; later, that a file of a material was replaced.
     """
 
     def __init__(self, path: Path | None, *about: Any) -> None:
         self._path = path
         self._known: dict[str, Result] = {}
+        self._read = {file: reading.stamp(file) for file in material_files(about)}
         if path is not None:
-            read = {str(file): store.sha256(file) for file in material_files(about)}
+            read = {str(file): reading.sha256(file) for file in self._read}
             title = json.dumps([__version__, *map(config.dumps, about), read])
             self._known = dict(filter(None, map(_entry, manifest.journal(path, title))))
 
@@ -143,6 +144,8 @@ class Journal:
         return [self._known[key] for key in keys]
 
     def _keep(self, key: str, result: Result) -> None:
+        for file, before in self._read.items():  # workers read them anew
+            reading.check_same(file, before)
         self._known[key] = result
         if self._path is not None:
             store.append_line(self._path, json.dumps([key, result]))

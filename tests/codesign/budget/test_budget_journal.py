@@ -81,3 +81,13 @@ def test_a_file_of_the_user_is_no_journal_and_stays(tmp_path):
     with pytest.raises(StoreError, match="no journal of metalens"):
         Journal(path, "0.1 a")
     assert path.read_text() == "my notes\n"
+
+
+def test_an_input_that_is_replaced_ends_the_work_before_its_part_is_kept(tmp_path):
+    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
+    table.write_text("0.8,3.60")
+    journal = Journal(path, "0.1 a", inputs=[table])
+    assert journal.part("one", lambda: 3) == 3
+    with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
+        journal.part("two", lambda: table.write_text("0.8,3.612"))
+    assert len(path.read_text().splitlines()) == 2  # its title and the first

@@ -80,6 +80,42 @@ def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_pa
     assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (0.25, "cubic", 5.0)
 
 
+def laid_out(tmp_path, **texts):
+    """Settings of which that of the cell names tables; the folder that they are laid out in."""
+    source, target = tmp_path / "source", tmp_path / "target"
+    for folder in (source / "tables", target):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, text in ({"c.toml": "", "d.toml": "", "p.toml": ""} | texts).items():
+        (source / name).write_text(text)
+    chain.lay_out(target, ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), source, aperture_mm=None)
+    return target
+
+
+def test_tables_and_maps_that_settings_name_are_laid_out_with_them(tmp_path):
+    """Beside or below them, at any depth of the file; what the chain makes, words and whole paths are left alone."""
+    (tmp_path / "mine.csv").write_text("whole path")
+    cell = f'a = [{{of = "tables/si.csv"}}, "{tmp_path}/mine.csv"]\n[b]\nn = "SiO2.x"\nk = "table.csv"\n'
+    tables = {"table.csv": "1,2\n", "library.h5": "none of the chain's"}
+    (tmp_path / "source" / "tables").mkdir(parents=True)
+    (tmp_path / "source" / "tables" / "si.csv").write_text("3,4\n")
+    target = laid_out(tmp_path, **{"c.toml": "\ufeff" + cell, "d.toml": 'library = "library.h5"\n'}, **tables)
+    found = sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
+    assert found == ["cell.toml", "design.toml", "process.toml", "table.csv", "tables/si.csv"]
+    assert (target / "tables" / "si.csv").read_text() == "3,4\n"
+    assert (target / "cell.toml").read_text() == cell
+
+
+def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path, monkeypatch):
+    (tmp_path / "up.csv").write_text("x")
+    with pytest.raises(ConfigError, match=r"'\.\./up\.csv' lies above"):
+        laid_out(tmp_path, **{"c.toml": 'n = "../up.csv"\n'})
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"'up\.csv' is not the file of that name"):
+        laid_out(tmp_path, **{"c.toml": 'n = "up.csv"\n'}) and laid_out(
+            tmp_path, **{"c.toml": 'n = "up.csv"\n', "up.csv": "y"}
+        )
+
+
 def test_the_shipped_settings_are_laid_out(tmp_path):
     chain.lay_out(tmp_path, chain.shipped(), None, aperture_mm=0.25)
     assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
@@ -107,7 +143,7 @@ def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
     assert not (tmp_path / demo.OUTCOMES).exists()
 
 
-def begun(tmp_path, monkeypatch):
+def begun(tmp_path, monkeypatch, config=None):
     """A chain that was interrupted at its third stage; the words of all stages that are begun from then on."""
     seen = []
 
@@ -119,7 +155,7 @@ def begun(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "run_verb", run)
     monkeypatch.setattr(demo, "_write", lambda folder, outcomes: None)
     with pytest.raises(KeyboardInterrupt):
-        demo.run(demo.Options(tmp_path / "out", quiet=True))
+        demo.run(demo.Options(tmp_path / "out", config=config, quiet=True))
     assert seen == ["library", "design", "psf"]
     seen[:] = ["-"] * 3
     return seen
@@ -133,6 +169,24 @@ def test_settings_that_differ_are_refused_at_every_resume(tmp_path, monkeypatch)
             demo.run(demo.Options(tmp_path / "out", aperture_mm=0.37, resume=True, quiet=True))
     assert len(seen) == 3
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
+    assert seen[3] == "psf"
+
+
+def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
+    """Curves would be solved for one, the rest of the chain be done with the other."""
+    (tmp_path / "table.csv").write_text("1,2\n")
+    for name in "dp":
+        (tmp_path / f"{name}.toml").write_text("")
+    (tmp_path / "c.toml").write_text('n = "table.csv"\n')
+    (tmp_path / "chain.toml").write_text('cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n')
+    seen = begun(tmp_path, monkeypatch, config=tmp_path / "chain.toml")
+    assert (tmp_path / "out.unfinished" / "table.csv").read_text() == "1,2\n"
+    again = demo.Options(tmp_path / "out", config=tmp_path / "chain.toml", resume=True, quiet=True)
+    (tmp_path / "table.csv").write_text("1,3\n")
+    with pytest.raises(ConfigError, match="begun with other settings"):
+        demo.run(again)
+    (tmp_path / "table.csv").write_text("1,2\n")
+    assert demo.run(again) == 0
     assert seen[3] == "psf"
 
 

@@ -143,6 +143,23 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     assert [done(study), done(study)] == [True, False]
 
 
+def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_mix(tmp_path, monkeypatch):
+    """Workers read it anew for every task; what was solved for the new one is not kept as one of the old."""
+    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
+    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
+    study = Study(pillar=str(table))
+
+    def told(tasks):
+        for i, _ in enumerate(tasks):
+            yield i, {"diameter_um": [0.1], "t": [[1.0, 0.5]], "r": [[0.0, 0.1]], "error": [0.2], "energy": [1.0]}
+            table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
+
+    monkeypatch.setattr(workers, "run", told)
+    with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
+        workers.Journal(path, study).run([{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells")
+    assert len(path.read_text().splitlines()) == 2  # its title and the first
+
+
 def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
     path = tmp_path / "out.resume"
     title = workers.Journal(path, SMALL) and path.read_text()
