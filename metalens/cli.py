@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.ground import console, lock, reading
+from metalens.ground import console, lock
 from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -159,6 +159,8 @@ def _prepare() -> None:
 
 def _guarded(words: list[str], *, debug: bool) -> int:
     """Run the command; its exit status, with one line for whatever stopped it."""
+    from metalens.ground import reading
+
     told = lock.COMMAND.set(" ".join(words))
     try:
         with reading.remembered():

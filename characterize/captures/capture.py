@@ -83,8 +83,7 @@ def load(path: str | Path) -> Capture:
 
     Raises:
         CaptureError: nothing there, lossy or truncated images, frames of different size, non-finite values,
-            stage rows that do not match the frames; file, row and frame are named. StoreError: it was changed or
-            replaced while it was read.
+            stage rows that do not match the frames; file, row and frame are named. StoreError: changed while read.
     """
     path = Path(path)
     if not path.exists():
