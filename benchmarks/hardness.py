@@ -36,6 +36,7 @@ from benchmarks.__main__ import table
 from metalens.ground import lock, store
 
 KILLS, WRITERS, DISKS, MUTATIONS = 18, 18, 18, 9000
+PORTION = 20_000  # damaged files after which all is noted: a run that is ended keeps what it did
 QUICK = ("design", "psf", "export", "layout", "library", "capture", "measure", "check", "view", "demo")
 OFTEN = 4  # turns of a quick command for one of the others
 WORDS = {"kills": "kills", "writers": "pairs of writers", "disks": "full disks"}
@@ -58,11 +59,11 @@ def rows() -> list[Row]:
 def runs(asked: dict[str, int], verbs: tuple[str, ...], seconds: float = math.inf) -> list[Row]:
     """Commands that are killed, run twice at once, or out of room: so many more trials of each kind, within a time."""
     tried = _tried()
-    end = time.perf_counter() + seconds
     with _hardness_runs.bench(verbs) as bench:
         if not bench.fills:
             print("no small file system can be made here: full disks are limits on the size of files alone")
         bench.prepare()
+        end = time.perf_counter() + seconds
         for kind, verb, number in _trials(tried, asked, verbs):
             found = bench.trial(kind, verb, number)
             entry = _tried().get(kind, {}).get(verb, {"done": 0, "failed": {}})
@@ -145,17 +146,17 @@ def _of_trials(kind: str, by_verb: dict[str, Any], at_operations: dict[str, Any]
 
 
 def mutations(copies: int, kinds: Sequence[str] = ()) -> Row:
-    """So many more damaged copies of every kind of file, or of those that are named."""
-    begun = _tried().get("mutations", {})
-    with tempfile.TemporaryDirectory() as name:
-        start = time.perf_counter()
-        for found in _hardness_files.counted(Path(name), copies, kinds, begun):
-            entry = begun.get(found.kind, {"done": 0, "refused": 0, "failed": {}})
-            entry["refused"] += found.refused
-            entry["done"] = max(entry["done"], found.last + 1)
-            entry["failed"] = {str(number): words for number, words in found.failures.items()}
-            begun = _note("mutations", found.kind, entry)["mutations"]
-        seconds = time.perf_counter() - start
+    """So many more damaged copies of every kind of file, or of those that are named; noted portion by portion."""
+    begun, start = _tried().get("mutations", {}), time.perf_counter()
+    for first in range(0, copies, PORTION):
+        with tempfile.TemporaryDirectory() as name:
+            for found in _hardness_files.counted(Path(name), min(PORTION, copies - first), kinds, begun):
+                entry = begun.get(found.kind, {"done": 0, "refused": 0, "failed": {}})
+                entry["refused"] += found.refused
+                entry["done"] = max(entry["done"], found.last + 1)
+                entry["failed"] = {str(number): words for number, words in found.failures.items()}
+                begun = _note("mutations", found.kind, entry)["mutations"]
+    seconds = time.perf_counter() - start
     done, refused = (sum(entry[name] for entry in begun.values()) for name in ("done", "refused"))
     failures = sum(len(entry["failed"]) for entry in begun.values())
     case = f"{done} damaged files of {len(begun)} kinds"
