@@ -229,25 +229,22 @@ class _Reader:
             batch.add(np.full(len(x), number, np.int32), x, y, turn)
 
     def array(self, found: dict[int, bytes], xy: Array, start: int) -> Iterator[tuple[Array, Array]]:
-        """Places of an array of references, some rows at a time, so that no memory is taken before it is counted."""
+        """Places of an array of references, some rows at a time, so that no memory is taken before it is counted.
+
+        Steps are parts of its ends: where they are no whole units, each copy stands on the unit next to its place.
+        """
         columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
         if columns < 1 or rows < 1:
             raise self.fail(f"array of {columns} x {rows}", start)
         self.count(columns * rows)
         across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
-        if (across % columns).any() or (along % rows).any():
-            raise self.fail(
-                f"array of {columns} x {rows} over {across.tolist()} and {along.tolist()} units: its steps are no "
-                "whole units; place the copies one by one, or on the grid",
-                start,
-            )
-        step, down = across // columns, along // rows
-        ends = xy[:2] + np.array([[i, j] for i in (0, columns - 1) for j in (0, rows - 1)]) @ np.array([step, down])
+        ends = [xy[:2] + across * i + along * j for i in (0, 1 - 1 / columns) for j in (0, 1 - 1 / rows)]
         if np.abs(ends).max() > FARTHEST:
             raise self.fail("array that reaches beyond 32 bits", start)
         i = np.arange(columns)
         for part in np.array_split(np.arange(rows), -(-columns * rows // _AT_ONCE)):
-            x, y = (xy[k] + (part[:, None] * down[k] + i * step[k]).ravel() for k in (0, 1))
+            off = (part[:, None] * along[k] / rows + i * across[k] / columns for k in (0, 1))
+            x, y = (xy[k] + np.floor(v + 0.5).astype(np.int64).ravel() for k, v in enumerate(off))
             yield x, y
 
     def turn(self, found: dict[int, bytes], start: int) -> Turn:

@@ -108,9 +108,14 @@ def aref(columns, rows, *corners):
     return body + gds.points(np.array(corners)) + gds.record(gds.ENDEL)
 
 
-def test_arrays_off_the_grid_and_nodes_are_refused_by_name():
-    with pytest.raises(MaskFileError, match=r"array of 3 x 1.*no whole units"):
-        gdsii_read.parse(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100))))
+def test_arrays_off_the_grid_stand_next_to_their_places_and_nodes_are_refused_by_name():
+    x, _ = gdsii_read.parse(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))).sites("TOP")["A"]
+    assert x.tolist() == [0, 333, 667]
+    x, y = gdsii_read.parse(gdsii(aref(2, 3, (7, 9), (7 + 41, 9 - 13), (7 + 20, 9 + 100)))).sites("TOP")["A"]
+    exact = {(7 + 20.5 * i + 20 / 3 * j, 9 - 6.5 * i + 100 / 3 * j) for i in range(2) for j in range(3)}
+    found = set(zip(x.tolist(), y.tolist(), strict=True))
+    assert len(found) == 6
+    assert all(min(max(abs(u - p), abs(v - q)) for p, q in found) <= 0.5 for u, v in exact)
     x, _ = gdsii_read.parse(gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))).sites("TOP")["A"]
     assert x.tolist() == [5, 338, 671]
     node = gds.record(gds.NODE) + gds.shorts(gds.LAYER, 1) + gds.record(gds.ENDEL)

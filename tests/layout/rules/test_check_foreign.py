@@ -289,3 +289,19 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(tmp_p
     assert found["violations"]["feature"] == planned.counts["feature"] > 20
     assert found["violations"]["gap"] == planned.counts["gap"] == 0
     assert found["minimum_feature_nm"] == pytest.approx(planned.minimum_feature_nm)
+
+
+def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
+    """Their rounded corners leave dents of parts of a unit; chords of them are no widths."""
+    made = db.Layout()
+    top, layer = made.create_cell("TOP"), made.layer(1, 0)
+    for n, turn in enumerate((0.0, 0.31, 0.77)):
+        angle = 2 * np.pi * np.arange(64) / 64 + turn
+        corners = np.rint(61 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int) + np.array([400 * n, 0])
+        top.shapes(layer).insert(db.Polygon([db.Point(int(p), int(q)) for p, q in corners]))
+    path = tmp_path / "m.gds"
+    made.write(str(path))
+    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=119))
+    assert report.ok
+    assert 119 < report.minimum_feature_nm < 123
+    assert foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)).counts["feature"] == 3
