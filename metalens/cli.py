@@ -83,6 +83,7 @@ VIEWS = {
     "run": "codesign.commands.view:panels",
     "scene": "codesign.commands.view:scene",
     "layers": "codesign.commands.view:layers",
+    "answers": "codesign.commands.view:answers",
     "budget": "codesign.commands.view:budget",
 }
 # and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``

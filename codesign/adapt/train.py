@@ -215,7 +215,7 @@ def held(source: Source, config: RetrainConfig) -> Held:
 def judge(
     going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack], *, frames: Held | None = None
 ) -> Accuracy:
-    """Errors on test frames through these lenses, all of them together.
+    """Errors on test frames, each the mean over these lenses: the frames are what all cases share.
 
     frames: of :func:`held`, where several cases are judged.
     """
@@ -226,7 +226,7 @@ def judge(
         seen = assess.frames(going, frames, config.test_batches, stack=made)
         answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
         parts.append(reading.accuracy(answers, seen))
-    return Accuracy(torch.cat([p.error_mm for p in parts]), torch.cat([p.iou for p in parts]))
+    return Accuracy(torch.stack([p.error_mm for p in parts]).mean(0), torch.stack([p.iou for p in parts]).mean(0))
 
 
 def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]) -> Outcome:

@@ -15,8 +15,8 @@ from codesign.network import Baseline, Subnet
 from codesign.optics import formed
 from codesign.optics import stack as trained
 from codesign.train import (
+    End,
     Journal,
-    Model,
     Part,
     Record,
     Run,
@@ -35,7 +35,14 @@ from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.image import sensor as camera
 
-CHECKPOINT, LOG, SETTINGS, RESULT = "checkpoint.safetensors", "log.jsonl", "run.toml", "result.json"
+CHECKPOINT, LOG, SETTINGS, RESULT, ANSWERS = (
+    "checkpoint.safetensors",
+    "log.jsonl",
+    "run.toml",
+    "result.json",
+    "answers.h5",
+)
+SHOWN = 8  # test frames that are kept with the answers
 
 
 def run(options: Options) -> int:
@@ -81,7 +88,8 @@ def _work(
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
     for budget, born in runs.search(going, folder / CHECKPOINT):
-        _log(folder, {"kind": "birth", "budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6})
+        one = {"budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6}
+        _log(folder, {"kind": "birth", **one, "architecture": asdict(born.architecture)})
         console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
     parallel.leave()
     ends = finished(going)
@@ -89,7 +97,7 @@ def _work(
     _keep(folder, going, ends, said)
     if options.export:
         _export(folder, going, ends)
-    return [row for row, _ in ends], said
+    return [end.row for end in ends], said
 
 
 def _of_pitch(settings: RunConfig, limit_um: float) -> str:
@@ -109,14 +117,14 @@ def _image(going: Run) -> dict[str, Any]:
     return formed.described(settings.optics, coefficients, side, margin=settings.scenes.margin)
 
 
-def _export(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]]) -> None:
+def _export(folder: Path, going: Run, ends: list[End]) -> None:
     """Every budget's network as ONNX."""
     pitch = float(going.trainer.model.pitch_um.detach())
     size = camera.pixel_count(going.settings.scenes.pixels, going.settings.optics.sample_um, pitch)
-    for (row, made), state in zip(ends, going.searches, strict=False):
-        if not isinstance(made.net, Baseline):
-            cut = Subnet(made.net, best(state.history).architecture)
-            cut.export_onnx(folder / f"subnet_{row['budget_mmacs']:g}.onnx", size=size)
+    for end, state in zip(ends, going.searches, strict=False):
+        if not isinstance(end.model.net, Baseline):
+            cut = Subnet(end.model.net, best(state.history).architecture)
+            cut.export_onnx(folder / f"subnet_{end.row['budget_mmacs']:g}.onnx", size=size)
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
@@ -186,26 +194,38 @@ def _log(folder: Path, entry: dict[str, Any]) -> None:
         file.write(json.dumps(entry) + "\n")
 
 
-def _keep(folder: Path, going: Run, ends: list[tuple[dict[str, Any], Model]], said: dict[str, Any]) -> None:
-    """lens.h5, the networks, result.json and the plot of the Pareto set."""
+def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> None:
+    """lens.h5, the networks, result.json, answers.h5 and the plot of the Pareto set."""
     settings = going.settings
     _lens(folder / "lens.h5", going)
-    for (row, made), state in zip(ends, [*going.searches, None], strict=False):
-        net = made.net
-        kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
-        name = settings.network if row["budget_mmacs"] is None else f"subnet_{row['budget_mmacs']:g}"
-        with store.replacing(folder / f"{name}.safetensors") as part:
-            tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
-            save_file(tensors, str(part), metadata={"kind": "subnet"})
+    _weights(folder, going, ends)
     pitch = float(going.trainer.model.pitch_um.detach())
-    rows = [row for row, _ in ends]
+    rows = [end.row for end in ends]
     found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
+    found |= {"bound": pictures.bound(going)}
     found |= {"network": settings.network, "frozen": list(settings.run.frozen), "image": said}
     found |= {"pitch_held_um": going.trainer.pitch_held_um}
     found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
+    said_by = {f"network_{i}": _named(row["budget_mmacs"]) for i, row in enumerate(rows)}
+    store.save(folder / ANSWERS, "answers", pictures.answered(ends, SHOWN), attributes=said_by)
     if going.searches:
         store.write_bytes(folder / "pareto.png", _plot(going))
+
+
+def _weights(folder: Path, going: Run, ends: list[End]) -> None:
+    """Every network, cut to its own architecture."""
+    for end, state in zip(ends, [*going.searches, None], strict=False):
+        net, budget = end.model.net, end.row["budget_mmacs"]
+        kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
+        name = going.settings.network if budget is None else f"subnet_{budget:g}"
+        with store.replacing(folder / f"{name}.safetensors") as part:
+            tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
+            save_file(tensors, str(part), metadata={"kind": "subnet"})
+
+
+def _named(budget_mmacs: float | None) -> str:
+    return "network" if budget_mmacs is None else f"budget {budget_mmacs:g} million MACs"
 
 
 def _lens(path: Path, going: Run) -> None:

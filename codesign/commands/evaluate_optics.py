@@ -1,7 +1,6 @@
 """LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
 
 import dataclasses
-import html
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from metalens.design.free_form import Fisher, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.ground import config, store
 from metalens.ground.errors import ConfigError
-from metalens.ground.report import Figure, Markup, Section, write
+from metalens.ground.report import Figure, Section, write
 from metalens.lens import Lens
 
 
@@ -68,14 +67,15 @@ def _measure(
     pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
     axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
     scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
-    text = evaluate_tables.tables(axial, scenes, measured)
+    tables = evaluate_tables.tables(axial, scenes, measured)
     values = evaluate_tables.values(axial, scenes, measured)
     if options.reader:
         told = judged(dict(zip(names, made, strict=True)), settings.reader)
         found = dict(options.console.track(told, total=len(made), label="reader"))
-        text += "\n\n" + "\n".join(reader.table(found, settings.reader))
+        tables.append(reader.table(found, settings.reader))
         values["reader"] = {"settings": dataclasses.asdict(settings.reader)}
         values["reader"]["lenses"] = {name: one.values() for name, one in found.items()}
+    text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {
@@ -89,7 +89,7 @@ def _measure(
     write(
         folder / "report.html",
         "What the lenses tell",
-        [Section("Pictures", items=items), Section("Tables", items=[Markup(f"<pre>{html.escape(text)}</pre>")])],
+        [Section("Pictures", items=items), Section("Tables", items=tables)],
     )
     return values, text
 

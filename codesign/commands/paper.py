@@ -105,11 +105,8 @@ def _named(folder: Path, name: str, run_dir: Path) -> Path:
 
 def table(told: list[Line]) -> str:
     """The lines as text."""
-    rows = [("place", "what", "paper", "ours", "ratio", "conditions"), *(t.words() for t in told)]
-    widths = [max(len(row[i]) for row in rows) for i in range(5)]
-    return "\n".join(
-        "  ".join([*(c.ljust(w) for c, w in zip(row, widths, strict=False)), row[5]]).rstrip() for row in rows
-    )
+    head = ("place", "what", "paper", "ours", "ratio", "conditions")
+    return report.Table(head, [line.words() for line in told]).text
 
 
 def _write(folder: Path, told: list[Line]) -> None:

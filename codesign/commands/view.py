@@ -1,4 +1,4 @@
-"""Panels of a co-design run (how it trained, what its networks read, its lens), of rendered eyes, and of a budget."""
+"""Panels of a co-design run (training, searches, networks, answers, bound, lens), of rendered eyes, of a budget."""
 
 import json
 import math
@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from codesign.commands import budget as budgets
+from codesign.network import Architecture
+from codesign.train import Candidate, pareto
 from metalens.ground import report, store
 from metalens.ground.errors import StoreError
-from metalens.view import Axis, Curves, Images, Numbers, Panel, lens_panels
+from metalens.view import Axis, Curves, Images, Numbers, Panel, Points, lens_panels
 
-LOG, RESULT, LENS = "log.jsonl", "result.json", "lens.h5"
+LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
 
 
 def panels(path: Path) -> list[Panel]:
@@ -21,9 +23,12 @@ def panels(path: Path) -> list[Panel]:
     Raises:
         StoreError: a log or a result that is no JSON.
     """
-    shown = _training(_lines(path / LOG))
-    if (path / RESULT).is_file():
-        shown += _networks(_json((path / RESULT).read_text(encoding="utf-8"), path / RESULT))
+    entries = _lines(path / LOG)
+    result = _json((path / RESULT).read_text(encoding="utf-8"), path / RESULT) if (path / RESULT).is_file() else {}
+    shown = [*_training(entries), *_searched(entries), *_networks(result)]
+    if (path / ANSWERS).is_file():
+        shown += answers(path / ANSWERS)
+    shown += _bound(result)
     if (path / LENS).is_file():
         shown += lens_panels(path / LENS)
     return shown
@@ -58,11 +63,99 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
     return [Curves(f"Training: {said[name]}", x, "step", {said[name]: lines[name]}, "") for name in moving]
 
 
+def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
+    """Every network that the searches tried, and those that no other beats in both error and cost."""
+    births = [e for e in entries if e.get("kind") == "birth" and {"error", "mmacs", "budget_mmacs"} <= set(e)]
+    births = [e for e in births if math.isfinite(e["error"])]
+    if not births:
+        return []
+    tried = [Candidate(_architecture(e.get("architecture", {})), e["error"], e["mmacs"]) for e in births]
+    front = [next(i for i, one in enumerate(tried) if one is best) for best in pareto(tried)]
+    notes = [dict(_layers(e["architecture"])) if e.get("architecture") else {} for e in births]
+    return [
+        Points(
+            "Networks of the searches",
+            [e["mmacs"] for e in births],
+            [e["error"] for e in births],
+            "million MACs",
+            "slippage error on validation frames / mm",
+            [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
+            front,
+            notes=notes,
+            caption="Pick a network to read its layers.",
+        )
+    ]
+
+
+def _architecture(held: dict[str, Any]) -> Architecture:
+    sizes = {name: tuple(held.get(name, ())) for name in ("depths", "kernels", "expansions")}
+    return Architecture(**sizes, width=held.get("width", 1.0), resolution=held.get("resolution", 1.0))
+
+
+def _layers(held: dict[str, Any]) -> list[tuple[str, str]]:
+    """(what, how many) of a network: its input, its channels, and the blocks of each stage."""
+    depths = held["depths"]
+    slots = len(held["kernels"]) // len(depths)
+    rows = [("input scale", f"{held['resolution']:.3g}"), ("channels, of the full ones", f"{held['width']:.3g}")]
+    for stage, depth in enumerate(depths):
+        used = range(stage * slots, stage * slots + depth)
+        blocks = ", ".join(f"{held['kernels'][i]}×{held['kernels'][i]} × {held['expansions'][i]:g}" for i in used)
+        rows.append((f"stage {stage + 1}", blocks))
+    return rows
+
+
+def _bound(result: dict[str, Any]) -> list[Panel]:
+    held = result.get("bound")
+    if not held:
+        return []
+    x, least = np.array(held["depth_mm"]), np.array(held["window_depth_mm"])
+    words = (
+        "Least standard deviation of any reader of the blur of one window, on axis: 1/f texture as wide as the PSFs, "
+        "noise a thousandth of its power. Readers of real frames collect less."
+    )
+    return [
+        Curves("Bound on the depth of a window", x, "depth / mm", {"bound": least}, "mm", caption=words, scale="log")
+    ]
+
+
+def answers(path: Path) -> list[Panel]:
+    """Test frames and what the networks said of them, beside the truth."""
+    stored = store.load(path, "answers")
+    held, count = stored.arrays, len(stored.arrays["frames"])
+    names = [str(stored.attributes[f"network_{i}"]) for i in range(len(held["told_slip_um"]))]
+    axes = [Axis("network", names), Axis("frame", list(range(count))), Axis("shown", ["truth", "answer"], blink=True)]
+    shown: list[Panel] = [
+        Images("Frames of the test", held["frames"], axes[1:2], 1.0, "of its spread", across="pixels", from_least=True)
+    ]
+    for title, true, told, unit in _PAIRS:
+        if told in held:
+            both = np.stack([np.broadcast_to(held[true], held[told].shape), held[told]], axis=2)
+            scaled = both * (1e-3 if unit == "mm" else 1.0)
+            shown.append(Images(title, scaled, axes, 1.0, unit, across="cells", from_least=unit == "mm"))
+    rows = []
+    for i, name in enumerate(names):
+        slips = np.stack([held["slip_um"], held["told_slip_um"][i]], axis=2).reshape(count, 6)
+        wide = [1e-3 * v if v == v else "–" for v in held["interval_um"][i].tolist()]
+        rows += [(name, k, *(1e-3 * slips[k]).tolist(), wide[k]) for k in range(count)]
+    head = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]
+    words = "Slippage of the eye; z is along the axis of the camera."
+    return [*shown, Numbers("Answers", ("network", "frame", *head, "90 % interval of z / mm"), rows, words)]
+
+
 def _networks(result: dict[str, Any]) -> list[Panel]:
+    if not result:
+        return []
     rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
     names = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float, str))})
     table = [[row.get(name, "") for name in names] for row in rows]
-    return [Numbers("Networks of the run", [report.in_words(name) for name in names], table)]
+    shown: list[Panel] = [Numbers("Networks of the run", [report.in_words(name) for name in names], table)]
+    drawn = [(f"budget {row['budget_mmacs']:g}", _layers(held)) for row in rows if (held := row.get("architecture"))]
+    if drawn:
+        head = ["", *(name for name, _ in drawn)]
+        lines = [[what, *(layers[i][1] for _, layers in drawn)] for i, (what, _) in enumerate(drawn[0][1])]
+        words = "Blocks of each stage: side of the kernel × expansion of the channels."
+        shown.append(Numbers("Layers of the networks", head, lines, words))
+    return shown
 
 
 def scene(path: Path) -> list[Panel]:
@@ -108,4 +201,8 @@ def budget(path: Path) -> list[Panel]:
     return [Numbers("Error of every link", head, shown, words)]
 
 
+_PAIRS = (
+    ("Pupil", "pupil", "told_pupil", "share of the pixel"),
+    ("Depth of the windows", "window_um", "told_window_um", "mm"),
+)
 _XYZ = (", x", ", y", ", z")

@@ -31,6 +31,7 @@ from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.train import Scenes, read_out
 from metalens.ground.errors import ConfigError
+from metalens.ground.report import Table
 from metalens.image import Grid, Imager, Sensor, UniformImager, imager
 from metalens.lens import Lens
 from metalens.psf import Source
@@ -263,23 +264,22 @@ def _judge(made: ReferenceReader, spare: Frames, judged: Frames, image_error: fl
     return Read(error[:, 2], error[:, :2].mean(1), window, guess, inside, wide, image_error)
 
 
-def table(found: dict[str, Read], config: ReaderConfig) -> list[str]:
-    """Lines of text: one a lens."""
-    width = max(14, *(len(name) for name in found)) + 2
+def table(found: dict[str, Read], config: ReaderConfig) -> Table:
+    """A row a lens."""
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
-    lines = [
-        f"Read by the reference reader: {config.frames} frames of {config.pixels} pixels of {config.pitch_um:g} um, "
-        f"{config.electrons:g} e, {light}, whole field; 95 % interval over {config.test} test frames",
-        f"{'lens':<{width}}{'axial / mm':<22}{'90 % interval covers':<28}{'lateral / mm':<14}"
-        f"{'windows / mm (guess)':<24}image error",
-    ]
+    caption = (
+        f"Read by the reference reader: {config.frames} frames of {config.pixels} pixels of {config.pitch_um:g} µm, "
+        f"{config.electrons:g} e, {light}, whole field; 95 % interval over {config.test} test frames."
+    )
+    head = ("lens", "axial / mm", "90 % interval", "covers", "lateral / mm", "windows / mm (guess)", "image error")
+    rows = []
     for name, one in found.items():
         v = one.values()
         axial = f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
-        wide = f"+-{v['interval_mm']:.2f} mm, {100 * v['covered']:.0f} %"
+        wide, covered = f"±{v['interval_mm']:.2f} mm", f"{100 * v['covered']:.0f} %"
         windows = f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})"
-        lines.append(f"{name:<{width}}{axial:<22}{wide:<28}{v['lateral_mm']:<14.2f}{windows:<24}{v['image_error']:.3f}")
-    return lines
+        rows.append((name, axial, wide, covered, f"{v['lateral_mm']:.2f}", windows, f"{v['image_error']:.3f}"))
+    return Table(head, rows, caption)
 
 
 def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str, Read]]:

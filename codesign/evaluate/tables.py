@@ -1,4 +1,4 @@
-"""Tables 1 and 3 of the paper for any lenses, as text and as numbers, with intervals over scenes."""
+"""Tables 1 and 3 of the paper for any lenses, as tables and as numbers, with intervals over scenes."""
 
 import math
 from collections.abc import Mapping
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from codesign.evaluate.optics import Axial, Filled, SceneEnergy
+from metalens.ground.report import Table
 
 KINDS = ("gaze", "slip", "separability")
 PAPER_SCENES = {"gaze": 1.85, "slip": 1.60, "separability": 1.57}  # proposed lens against hyperbolic, Table 1
@@ -62,44 +63,42 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
     return out
 
 
-def tables(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> str:
+def tables(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> list[Table]:
     """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the paper's numbers below each."""
-    width = max(14, *(len(name) for name in axial)) + 2
+    return [_axial(axial, setting), _scenes(scenes)]
+
+
+def _axial(axial: Mapping[str, Axial], setting: Filled) -> Table:
     low, high = setting.depths_mm
-    lines = [
-        f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}-{high:g} mm, {setting.normalisation} "
-        f"normalisation, honest; pixels of {setting.pixel_um:g} um"
-    ]
-    angles = "".join(f"{angle:>8g}°" for angle in setting.angles_deg)
-    lines.append(f"{'lens':<{width}}{'binning':<9}{angles}   energy in {setting.radius_um:g} um, least")
+    caption = (
+        f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
+        f"normalisation, averaged over sub-pixel positions; pixels of {setting.pixel_um:g} µm. Light: the least share "
+        f"within {setting.radius_um:g} µm over the depths."
+    )
+    head = ("lens", "binning", *(f"{angle:g}°" for angle in setting.angles_deg), "light on axis", "light at all angles")
+    rows: list[tuple[str, ...]] = []
     for name, found in axial.items():
         for k, b in enumerate(setting.binnings):
-            row = "".join(f"{float(v):9.3f}" for v in found.information[:, k].mean(-1))
-            least = (
-                f"   {float(found.encircled[0].min()):.2f} on axis, {float(found.encircled.min()):.2f} at all angles"
-            )
-            lines.append(f"{name if k == 0 else '':<{width}}{f'{b} x {b}':<9}{row}{least if k == 0 else ''}")
+            told = [f"{float(v):.3f}" for v in found.information[:, k].mean(-1)]
+            least = [f"{float(found.encircled[0].min()):.2f}", f"{float(found.encircled.min()):.2f}"] if k == 0 else []
+            rows.append((name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""])))
     for name, numbers in PAPER_AXIAL.items():
         known = dict(zip(PAPER_ANGLES, numbers, strict=True))
-        row = "".join(f"{known[a]:9.2f}" if a in known else f"{'-':>9}" for a in setting.angles_deg)
-        lines.append(f"{f'paper: {name}':<{width}}{'':<9}{row}")
-    lines += ["", *_scene_lines(scenes, width)]
-    return "\n".join(lines)
+        told = [f"{known[a]:.2f}" if a in known else "–" for a in setting.angles_deg]
+        rows.append((f"paper: {name}", "", *told, "", ""))
+    return Table(head, rows, caption)
 
 
-def _scene_lines(scenes: Mapping[str, SceneEnergy], width: int) -> list[str]:
+def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
     first = next(iter(scenes))
-    count = len(scenes[first].gaze)
-    lines = [f"Energy-matched images of {count} scenes: ratio to {first}, 95 % interval over the scenes"]
-    lines.append(
-        f"{'lens':<{width}}" + "".join(f"{kind:<21}" for kind in KINDS) + "span angle   light in window   image error"
+    caption = (
+        f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
     )
+    rows: list[tuple[str, ...]] = []
     for name, found in ratios(scenes).items():
-        parts = "".join(f"{f'{value:.2f} [{low:.2f}, {high:.2f}]':<21}" for value, low, high in found.values())
-        angle = float(torch.rad2deg(scenes[name].angle_rad).mean())
-        lines.append(
-            f"{name:<{width}}{parts}{f'{angle:.1f}°':<13}{scenes[name].light:<18.2f}{scenes[name].image_error:.3f}"
-        )
-    paper = "".join(f"{PAPER_SCENES[kind]:<21.2f}" for kind in KINDS)
-    lines.append(f"{'paper: proposed':<{width}}{paper}")
-    return lines
+        one = scenes[name]
+        parts = [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in found.values()]
+        angle = float(torch.rad2deg(one.angle_rad).mean())
+        rows.append((name, *parts, f"{angle:.1f}°", f"{one.light:.2f}", f"{one.image_error:.3f}"))
+    rows.append(("paper: proposed", *(f"{PAPER_SCENES[kind]:.2f}" for kind in KINDS), "–", "–", "–"))
+    return Table(("lens", *KINDS, "span angle", "light in window", "image error"), rows, caption)

@@ -102,6 +102,15 @@ def resized(mask: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
 
 
+def at_pixels(logits: Tensor, mask: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
+    """Logits, interpolated, and the mask's coverage, averaged, on a grid of ``pixels`` along a side."""
+    size = (pixels, pixels)
+    logits = F.interpolate(logits[:, None], size=size, mode="bilinear", align_corners=False)[:, 0]
+    coarse = min(pixels, *mask.shape[-2:])  # a mask that was kept coarser than the pixels is interpolated
+    mask = F.interpolate(mask[:, None], size=(coarse, coarse), mode="area")
+    return logits, F.interpolate(mask, size=size, mode="bilinear", align_corners=False)[:, 0]
+
+
 def overlap(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tensor:
     """(batch,) intersection over union of the thresholded masks; 1 where both are empty, nan without a mask.
 
@@ -112,11 +121,7 @@ def overlap(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tenso
     if not logits.numel():
         return torch.full((len(mask),), float("nan"))
     if pixels is not None:
-        size = (pixels, pixels)
-        logits = F.interpolate(logits[:, None], size=size, mode="bilinear", align_corners=False)[:, 0]
-        coarse = min(pixels, *mask.shape[-2:])  # a mask that was kept coarser than the pixels is interpolated
-        mask = F.interpolate(mask[:, None], size=(coarse, coarse), mode="area")
-        mask = F.interpolate(mask, size=size, mode="bilinear", align_corners=False)[:, 0]
+        logits, mask = at_pixels(logits, mask, pixels)
     found, truth = logits > 0, resized(mask, logits) > 0.5
     union = (found | truth).sum((1, 2))
     both = (found & truth).sum((1, 2))

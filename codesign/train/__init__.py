@@ -11,8 +11,10 @@ if TYPE_CHECKING:
     from codesign.train import run as run
     from codesign.train.assess import Answers as Answers
     from codesign.train.assess import Seen as Seen
+    from codesign.train.evolution import Candidate as Candidate
     from codesign.train.evolution import best as best
     from codesign.train.evolution import pareto as pareto
+    from codesign.train.finish import End as End
     from codesign.train.finish import finished as finished
     from codesign.train.formation import read_out as read_out
     from codesign.train.inner import Batch as Batch
@@ -36,6 +38,8 @@ __getattr__, __dir__, __all__ = attach(
     {
         "Answers": "assess",
         "Batch": "inner",
+        "Candidate": "evolution",
+        "End": "finish",
         "InnerConfig": "inner",
         "Journal": "journal",
         "Model": "inner",

@@ -70,6 +70,7 @@ class Answers:
     iou: (n,) of the pupil's mask, at the sensor's pixels.
     slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of one that gives none.
     depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its spread; likewise.
+    mask: (n, y, x) logits of the pupil on the network's own grid; likewise.
     """
 
     slip_mm: Tensor
@@ -77,6 +78,7 @@ class Answers:
     iou: Tensor
     slip_sd_mm: Tensor | None = None
     depth: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @torch.no_grad()
@@ -88,7 +90,8 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
     net.train(training)
     slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
-    shared = losses.overlap(torch.cat([f.mask_logits for f in found]), seen.mask, pixels=pixels)
+    mask = torch.cat([f.mask_logits for f in found])
+    shared = losses.overlap(mask, seen.mask, pixels=pixels)
     spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
     depth = [f.depth for f in found if f.depth is not None]
     return Answers(
@@ -97,6 +100,7 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
         shared,
         torch.cat(spread).exp() * torch.tensor(inner.slip_scale_mm) if spread else None,
         torch.cat(depth) if depth else None,
+        mask if mask.numel() else None,
     )
 
 

@@ -3,8 +3,10 @@
 import copy
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
+
+from torch import Tensor
 
 from codesign.batches import TEST, VALIDATION
 from codesign.network import Architecture, Baseline, blur, recalibrate, smallest
@@ -23,11 +25,27 @@ def finish(run: Run) -> list[dict[str, Any]]:
     Raises:
         TrainingError: a search has not ended.
     """
-    return [row for row, _ in finished(run)]
+    return [end.row for end in finished(run)]
 
 
-def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
-    """Rows of :func:`finish`, each with the model that reached it (fine-tuned where that is asked for).
+@dataclass(frozen=True, eq=False, slots=True)
+class End:
+    """What a budget ended in.
+
+    row: of the result. model: that reached it, fine-tuned where that is asked for. seen, answers: test frames, and
+    what the model said of them. interval_mm: (n,) half width of its 90 % intervals of the axial slippage; None of a
+    network that gives none.
+    """
+
+    row: dict[str, Any]
+    model: Model
+    seen: Seen
+    answers: Answers
+    interval_mm: Tensor | None
+
+
+def finished(run: Run) -> list[End]:
+    """The ends of :func:`finish`, a budget each.
 
     ``effective_pitch_um``: distance of the cells that the network sees: of pixels binned to its resolution.
     ``axial_coverage_90``: share of test frames within the network's calibrated 90 % interval, whose mean half width is
@@ -51,8 +69,9 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
         row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": best.macs / 1e6}
         row["effective_pitch_um"] = float(run.trainer.model.pitch_um.detach()) / architecture.resolution
         reach = widths(assess.predict(net, architecture, apart, settings.inner), apart)
+        plain = assess.predict(net, architecture, tests[""], settings.inner)
         for name, seen in tests.items():
-            answers = assess.predict(net, architecture, seen, settings.inner)
+            answers = assess.predict(net, architecture, seen, settings.inner) if name else plain
             row |= _errors(name, answers, seen) | told(name, answers, seen, reach)
         response = depth_response(
             trainer, pairs or run.scenes(TEST), net, architecture, batches=max(1, settings.test_batches // 4)
@@ -60,7 +79,7 @@ def finished(run: Run) -> list[tuple[dict[str, Any], Model]]:
         row["depth_response_mm_per_mm"] = response.mean
         row["depth_response_error"] = response.standard_error
         row["architecture"] = json.loads(evolution.dumps(Search((best,))))["history"][0] if budget else None
-        out.append((row, trainer.model))
+        out.append(End(row, trainer.model, tests[""], plain, _wide(plain, reach)))
     return out
 
 
@@ -98,11 +117,15 @@ def widths(answers: Answers, seen: Seen, *, share: float = 0.9) -> float | None:
     return float(ratio.sort().values[rank - 1])
 
 
+def _wide(answers: Answers, reach: float | None) -> Tensor | None:
+    """(n,) half width of the 90 % intervals of the axial slippage."""
+    return None if answers.slip_sd_mm is None or reach is None else reach * answers.slip_sd_mm[:, 2]
+
+
 def told(name: str, answers: Answers, seen: Seen, reach: float | None) -> dict[str, float]:
     """What the network tells beside the slippage: coverage of its 90 % intervals, their width, depth of windows."""
     row: dict[str, float] = {}
-    if answers.slip_sd_mm is not None and reach is not None:
-        wide = reach * answers.slip_sd_mm[:, 2]
+    if (wide := _wide(answers, reach)) is not None:
         row[f"{name}axial_coverage_90"] = float(((answers.slip_mm - seen.slip_mm)[:, 2].abs() <= wide).float().mean())
         row[f"{name}axial_interval_mm"] = float(wide.mean())
     if answers.depth is not None and seen.vergence is not None:

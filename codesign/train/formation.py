@@ -69,22 +69,30 @@ def network_macs(net: Supernet | Baseline, architecture: Architecture, window_um
     return cost.interpolated(lambda sizes: net.counts(architecture, sizes), size)
 
 
+def depth_information(made: Stack) -> Tensor:
+    """(depths - 1,) information on depth between the depths, in the blur of a window of 1/f texture, per mm².
+
+    The window is as wide as the PSFs; the noise is a thousandth of the texture's mean power. One over its square root
+    is the least standard deviation of any reader that knows the statistics of the texture and nothing else of it
+    (:func:`metalens.fisher.texture_information`): readers of real frames collect less.
+    """
+    psfs = made.intensity
+    spectrum = _texture(psfs.shape[-1]).to(psfs)
+    gaps = (made.depths_um[1:] - made.depths_um[:-1]).tolist()
+    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
+    told = [
+        texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
+        for pair, gap in zip(pairs, gaps, strict=True)
+    ]
+    return torch.stack(told)
+
+
 def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:
     """-log of the information on depth in blurred texture, and a hinge on the encircled energy (paper Eq. 6).
 
     A texture's blur is what the network reads; the information of the PSF alone ranks lenses wrongly.
     """
-    psfs = made.intensity
-    size = psfs.shape[-1]
-    spectrum = _texture(size).to(psfs)
-    step = (made.depths_um[1:] - made.depths_um[:-1])[:, None, None].to(psfs)
-    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
-    told = torch.stack(
-        [
-            texture_information(pair, step_um=float(gap), spectrum=spectrum, noise=1e-3)[0]
-            for pair, gap in zip(pairs, step.flatten(), strict=True)
-        ]
-    )
+    told, psfs = depth_information(made), made.intensity
     share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
     return -torch.log(told + 0.05).mean() + 50 * torch.relu(energy - share).mean()
 

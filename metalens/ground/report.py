@@ -46,6 +46,21 @@ class Table:
         """Rows as text."""
         return [[self._text(value) for value in row] for row in self.rows]
 
+    @property
+    def text(self) -> str:
+        """Caption, head and rows as lines of text, each column as wide as its widest cell.
+
+        >>> print(Table(("lens", "axial / mm"), [("a long name", 0.41), ("b", None)], "Read.").text)
+        Read.
+        lens         axial / mm
+        a long name  0.41
+        b            –
+        """
+        lines = [list(self.head), *self.cells]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        rows = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in lines]
+        return "\n".join([self.caption, *rows] if self.caption else rows)
+
     def _text(self, value: Any) -> str:
         return in_figures(value, self.digits)
 

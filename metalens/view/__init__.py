@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from metalens.view.panels import Numbers as Numbers
     from metalens.view.panels import Outline as Outline
     from metalens.view.panels import Panel as Panel
+    from metalens.view.panels import Points as Points
     from metalens.view.panels import at_brightest as at_brightest
     from metalens.view.server import serve as serve
 
@@ -30,6 +31,7 @@ __getattr__, __dir__, __all__ = attach(
         "Numbers": "panels",
         "Outline": "panels",
         "Panel": "panels",
+        "Points": "panels",
         "at_brightest": "panels",
         "html": "page",
         "lens_panels": "artefacts",

@@ -1,5 +1,6 @@
 """Panels of the artefacts of the optics core: library, lens, PSF stack; and of any other HDF5 artefact, plainly."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from metalens import lens as lenses
 from metalens import library as libraries
 from metalens import psf
-from metalens.ground import store
+from metalens.ground import report, store
 from metalens.ground.arrays import Array
 from metalens.pillars import axes
 from metalens.view import standing
@@ -137,7 +138,16 @@ def psf_panels(path: Path) -> list[Panel]:
             optics=True,
         ),
         Curves("Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]),
+        _budget(stack),
     ]
+
+
+def _budget(stack: psf.PsfStack) -> Numbers:
+    """The error of the PSFs by cause; what is not known of a cause is a dash."""
+    held = dataclasses.asdict(stack.budget or psf.Budget(stack.error))
+    rows = [(report.in_words(name), "–" if math.isnan(value) else value) for name, value in held.items()]
+    words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
+    return Numbers("Budget of the error", ("cause", "error"), rows, words)
 
 
 def far_field_panels(path: Path) -> list[Panel]:

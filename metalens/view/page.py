@@ -14,7 +14,7 @@ import numpy as np
 from metalens import __version__
 from metalens.ground import store
 from metalens.ground.arrays import Array
-from metalens.view.panels import Axis, Classes, Curves, Drawing, Images, Numbers, Outline, Panel
+from metalens.view.panels import Axis, Classes, Curves, Drawing, Images, Numbers, Outline, Panel, Points
 
 DTYPES = {"float32": "Float32Array", "int32": "Int32Array", "uint8": "Uint8Array", "uint16": "Uint16Array"}
 
@@ -91,7 +91,21 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "unit": panel.unit_um,
             "marks": [list(mark) for mark in panel.marks],
         }
-    return shared | _table(panel)
+    return shared | (_points(panel) if isinstance(panel, Points) else _table(panel))
+
+
+def _points(panel: Points) -> dict[str, Any]:
+    notes = panel.notes or [{}] * len(panel.x)
+    return {
+        "x": [_number(v) for v in panel.x],
+        "y": [_number(v) for v in panel.y],
+        "xName": panel.x_name,
+        "yName": panel.y_name,
+        "groups": list(panel.groups),
+        "front": list(panel.front),
+        "frontName": panel.front_name,
+        "notes": [{name: _number(v) for name, v in note.items()} for note in notes],
+    }
 
 
 def _outline(outline: Outline) -> dict[str, Any]:

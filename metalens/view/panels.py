@@ -1,5 +1,6 @@
-"""What a page can show: images with sliders, curves with error bars, maps of classes, numbers. Data, no drawing."""
+"""What a page can show: images with sliders, curves, maps of classes, points to pick, numbers. Data, no drawing."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -138,7 +139,32 @@ class Drawing:
     marks: Sequence[tuple[float, float, str]] = ()
 
 
-Panel = Images | Curves | Classes | Drawing | Numbers
+@dataclass(frozen=True, eq=False, slots=True)
+class Points:
+    """Points that can be picked, by a click or with the arrow keys; what is known of the picked one is told.
+
+    x, y: (n,) finite. groups: (n,) name of each, which gives its colour. front: places of the points that a stepped
+    line joins, by rising x (a Pareto set). notes: (n,) further values of each point by name.
+    """
+
+    title: str
+    x: Sequence[float]
+    y: Sequence[float]
+    x_name: str
+    y_name: str
+    groups: Sequence[str]
+    front: Sequence[int] = ()
+    front_name: str = "Pareto set"
+    notes: Sequence[Mapping[str, Any]] = ()
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        counts = {len(self.x), len(self.y), len(self.groups), len(self.notes or self.x)}
+        if len(counts) > 1 or not all(map(math.isfinite, [*self.x, *self.y])):
+            raise StoreError(f"{self.title}: need as many finite x, finite y, groups and notes, found {sorted(counts)}")
+
+
+Panel = Images | Curves | Classes | Drawing | Numbers | Points
 
 
 def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:

@@ -72,6 +72,11 @@ const ticks = (_, splits) => splits.map((v, i) => {
   return Number(v.toPrecision(Math.max(1, Math.min(12, 2 + Math.ceil(Math.log10(Math.max(Math.abs(v), step) / step)))))).toString();
 });
 
+function axesOf(xName, yName) {
+  const ink = { stroke: css("--soft"), grid: { stroke: css("--line"), width: 1 } };
+  return [{ label: xName, values: ticks, ...ink }, { label: yName, size: (_, shown) => 36 + 8 * Math.max(3, ...(shown ?? []).map((v) => v.length)), values: ticks, ...ink }];
+}
+
 function plot(parent, title, xName, yName, log) {
   let chart = null;
   return (x, lines, bands = []) => {
@@ -88,11 +93,10 @@ function plot(parent, title, xName, yName, log) {
       }
     });
     if (log) for (let i = 1; i < data.length; i++) data[i] = data[i].map((v) => (v > 0 ? v : null));
-    const ink = { stroke: css("--soft"), grid: { stroke: css("--line"), width: 1 } };
     const drawn = { hooks: { drawAxes: (u) => { u.ctx.save(); u.ctx.fillStyle = css("--b") + "40"; bands.forEach(([a, b]) => { const l = u.valToPos(a, "x", true), r = u.valToPos(b, "x", true); u.ctx.fillRect(l, u.bbox.top, Math.max(1, r - l), u.bbox.height); }); u.ctx.restore(); } } };
     chart?.destroy();
     chart = new uPlot({ width, height: 260, title, series, bands: shade, plugins: [drawn], scales: { x: { time: false }, y: log ? { distr: 3 } : {} }, legend: { show: Object.keys(lines).length > 1 },
-      axes: [{ label: xName, values: ticks, ...ink }, { label: yName, size: (_, shown) => 36 + 8 * Math.max(3, ...(shown ?? []).map((v) => v.length)), values: ticks, ...ink }] }, data, parent);
+      axes: axesOf(xName, yName) }, data, parent);
     chart.root.querySelectorAll(".u-legend .u-series").forEach((row) => { if (/ [+-] bar$/.test(row.querySelector(".u-label")?.textContent.trim() ?? "")) row.style.display = "none"; });
   };
 }
@@ -192,6 +196,38 @@ async function curves(panel, section) {
     const at = now();
     return Array.from(x, (v, i) => [v, ...Object.values(at).flatMap((l) => (l.error ? [l.y[i], l.error[i]] : [l.y[i]]))]);
   });
+  draw();
+  addEventListener("resize", draw);
+}
+
+// Points to pick: a click takes the nearest, arrow keys step through them by rising x.
+async function points(panel, section) {
+  const { x, y, groups, front, notes } = panel, order = x.map((_, i) => i).sort((a, b) => x[a] - x[b] || y[a] - y[b]), kinds = [...new Set(groups)];
+  const box = element("div", section, { class: "plot pick", tabindex: 0, role: "group", "aria-label": `${panel.title}; arrow keys step through the points` });
+  const readout = element("p", section, { class: "readout", "aria-live": "polite" });
+  let chart = null, at = front.length ? front[front.length - 1] : order[0];
+  const noted = (i) => Object.entries(notes[i]).map(([name, v]) => `, ${name} ${text(v)}`).join("");
+  const pick = (i) => { at = i; readout.textContent = `${groups[i]}${front.includes(i) ? ` (in the ${panel.frontName})` : ""}: ${panel.xName} ${text(x[i])}, ${panel.yName} ${text(y[i])}${noted(i)}`; chart.redraw(); };
+  const place = (u, i) => [u.valToPos(x[i], "x", true), u.valToPos(y[i], "y", true)];
+  const ring = { hooks: { draw: (u) => { const c = u.ctx, r = devicePixelRatio || 1; c.save(); c.strokeStyle = css("--ink"); c.lineWidth = 2 * r; c.beginPath(); c.arc(...place(u, at), 9 * r, 0, 7); c.stroke(); c.restore(); } } };
+  const joined = uPlot.paths.stepped({ align: 1 }), none = () => null;
+  function draw() {
+    const colours = ["--a", "--b", "--c", "--d"].map(css), held = new Set(front);
+    const series = [{ label: panel.xName }, ...kinds.map((name, i) => ({ label: name, paths: none, stroke: colours[i % 4], points: { show: true, size: 8, fill: colours[i % 4] } }))], data = [order.map((i) => x[i]), ...kinds.map((name) => order.map((i) => (groups[i] === name ? y[i] : null)))];
+    if (front.length) { series.push({ label: panel.frontName, paths: joined, stroke: css("--ink"), width: 1.5, spanGaps: true, points: { show: false } }); data.push(order.map((i) => (held.has(i) ? y[i] : null))); }
+    chart?.destroy();
+    const reach = (all) => { const low = Math.min(...all), high = Math.max(...all), more = 0.06 * (high - low || Math.abs(high) || 1); return () => [low - more, high + more]; };
+    chart = new uPlot({ width: Math.max(260, box.clientWidth), height: 320, series, plugins: [ring], scales: { x: { time: false, range: reach(x) }, y: { range: reach(y) } }, axes: axesOf(panel.xName, panel.yName), cursor: { drag: { x: false, y: false } }, legend: { live: false } }, data, box);
+    pick(at);
+  }
+  box.addEventListener("click", (e) => { // before the chart, which keeps clicks to itself where the pointer has moved
+    if (e.target !== chart.over) return;
+    const r = chart.over.getBoundingClientRect(), far = (i) => Math.hypot(chart.valToPos(x[i], "x") - (e.clientX - r.left), chart.valToPos(y[i], "y") - (e.clientY - r.top));
+    pick(order.reduce((a, b) => (far(b) < far(a) ? b : a)));
+  }, true);
+  box.addEventListener("keydown", (e) => { const step = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[e.key]; if (step) { e.preventDefault(); pick(order[Math.max(0, Math.min(order.length - 1, order.indexOf(at) + step))]); } });
+  const names = [...new Set(notes.flatMap((note) => Object.keys(note)))];
+  tableOf(section, ["", panel.xName, panel.yName, panel.frontName, ...names], () => order.map((i) => [groups[i], x[i], y[i], front.includes(i) ? "yes" : "", ...names.map((name) => notes[i][name] ?? "")]));
   draw();
   addEventListener("resize", draw);
 }
@@ -430,7 +466,7 @@ async function drawing(panel, section) {
   }, "Shapes and how many copies they have");
 }
 
-const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Numbers: async (panel, section) => fill(element("div", section, { class: panel.rows.length > 40 ? "scroll" : "scroll whole", tabindex: 0 }), panel.head, panel.rows) };
+const DRAW = { Images: images, Curves: curves, Classes: classes, Drawing: drawing, Points: points, Numbers: async (panel, section) => fill(element("div", section, { class: panel.rows.length > 40 ? "scroll" : "scroll whole", tabindex: 0 }), panel.head, panel.rows) };
 (async () => {
   const data = JSON.parse(document.getElementById("data").textContent), main = document.getElementById("panels"), status = document.getElementById("status");
   for (const panel of data.panels) {

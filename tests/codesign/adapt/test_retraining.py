@@ -106,6 +106,24 @@ def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(f
     assert not any(torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn)
 
 
+def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(folder):
+    """As on a real bench: the error of a frame is its mean over the lenses, so one lens and three compare."""
+    config = replace(SHORT, judge=3)
+    source = retraining.load(folder)
+    blind = retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), config)
+    going = retraining.trainer(source, config, (blind.nominal,))
+    told = retraining.outcome(source, config, blind, {"nominal": going, "retrained": going})
+    assert told.known is None
+    assert told.gap_sigma_mm > 0
+    frames = retraining.held(source, config)
+    apart = [retraining.judge(going, source, config, (one,), frames=frames) for one in blind.judges]
+    assert len(apart) == 3
+    assert told.before.error_mm.shape == apart[0].error_mm.shape == (source.settings.inner.batch, 3)
+    mean = sum(one.error_mm for one in apart) / 3
+    assert torch.allclose(told.before.error_mm, mean, rtol=1e-6, atol=0)
+    assert told.before.slip_mm == pytest.approx(sum(one.slip_mm for one in apart) / 3, rel=1e-6)
+
+
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
     source = retraining.load(folder)
     whole = retraining.job(source, SHORT, found, "retrained")

@@ -62,7 +62,7 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     read = values["reader"]["lenses"]
     assert set(read) == {"a", "b"}
     assert all(0 <= one["covered"] <= 1 and one["axial_low_mm"] < one["axial_mm"] for one in read.values())
-    assert "90 % interval covers" in (tmp_path / "out" / "tables.txt").read_text()
+    assert "90 % interval" in (tmp_path / "out" / "tables.txt").read_text()
     for name in ("axial.png", "slices.png", "scenes.png", "report.html"):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 

@@ -96,8 +96,9 @@ def test_the_table_names_every_lens_and_the_light():
     one = reader.Read(
         torch.tensor([0.4, 0.6]), torch.tensor([0.2, 0.3]), torch.tensor([1.0, 1.4]), 2.7, 0.91, 1.3, 0.02
     )
-    lines = reader.table({"mine": one}, replace(TINY, fwhm_nm=30.0))
+    lines = reader.table({"mine": one}, replace(TINY, fwhm_nm=30.0)).text.splitlines()
     assert "30 nm of light" in lines[0]
     assert "0.50 [0.40, 0.60]" in lines[2]
-    assert "+-1.30 mm, 91 %" in lines[2]
+    assert "±1.30 mm" in lines[2]
+    assert "91 %" in lines[2]
     assert "1.20 (2.70)" in lines[2]

@@ -65,3 +65,21 @@ def test_the_optics_loss_is_minus_log_information_and_a_hinge_on_the_energy():
     energy = float(np.sort(share)[1]) + 0.01  # two of three are below
     want = -np.mean(np.log(np.array(told) + 0.05)) + 50 * np.maximum(energy - share, 0).mean()
     assert float(formation.depth_loss(made, settings, energy=energy)) == pytest.approx(want, rel=1e-5)
+
+
+def test_information_on_depth_is_that_of_the_whole_spectrum_at_unequal_steps():
+    """1/2 sum over all frequencies of (d log S / dz)^2, S = |H|^2 texture + noise: here on the whole grid, in numpy."""
+    depths_mm, size = np.array([14.0, 17.0, 25.0]), 15
+    x = np.arange(size) - 7.0
+    psf = np.stack([np.exp(-(x**2 / (2 * (0.8 + 0.05 * z) ** 2))) for z in depths_mm])
+    psf = psf[:, :, None] * np.exp(-(x**2) / (2 * 1.3**2))
+    psf /= psf.sum((1, 2), keepdims=True)
+    fy, fx = np.fft.fftfreq(size), np.fft.fftfreq(size)
+    texture = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
+    texture /= texture[:, : size // 2 + 1].mean()  # of mean 1 over the half that a real image has
+    power = np.log(np.abs(np.fft.fft2(psf)) ** 2 * texture + 1e-3)
+    wanted = 0.5 * ((np.diff(power, axis=0) / np.diff(depths_mm)[:, None, None]) ** 2).sum((1, 2))
+
+    made = SimpleNamespace(intensity=torch.tensor(psf), depths_um=torch.tensor(1e3 * depths_mm))
+    found = formation.depth_information(made)
+    assert found.tolist() == pytest.approx(wanted.tolist(), rel=1e-6)  # the texture is made in single precision

@@ -169,7 +169,8 @@ def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tm
     assert plain == rows
     assert {"ambiguous_axial_slip_mm", "depth_response_mm_per_mm"} <= set(rows[0])
     before = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
-    row, made = finished(going)[0]
+    end = finished(going)[0]
+    row, made = end.row, end.model
     assert row == rows[0]
     assert torch.equal(made.coefficients_rad, going.trainer.model.coefficients_rad)
     assert not torch.equal(made.net.stem.weight, before["stem.weight"])

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from metalens.view import Axis, Classes, Curves, Images, Numbers, at_brightest, page
+from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, at_brightest, page
 from tests.metalens.view.browser_page import BROWSER, told
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
@@ -123,3 +123,43 @@ def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):
     panel = Images("psf", values, [], 0.5, unit="electrons")
     words = _told(tmp_path, [panel], "return document.querySelector('.bar').innerText;")
     assert words.split() == ["0", "3.25", "electrons;", "5.5", "×", "3.5", "µm"]
+
+
+def _points():
+    return Points(
+        "Networks", [4.0, 1.0, 9.0, 6.5], [0.5, 0.9, 0.2, 0.8], "cost", "error", ["a", "b", "a", "b"], [1, 0, 2],
+        notes=[{"width": 0.4}, {"width": 0.1}, {"width": 0.9}, {"width": 0.65}],
+    )  # fmt: skip
+
+
+def test_arrow_keys_step_through_points_by_rising_x(tmp_path):
+    script = """const box = document.querySelector(".pick"), said = [document.querySelector(".readout").textContent];
+for (const key of ["ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowRight"]) {
+  box.dispatchEvent(new KeyboardEvent("keydown", { key })); said.push(document.querySelector(".readout").textContent);
+}
+return said.map((words) => words.match(/cost ([0-9.]+)/)[1] + (words.includes("Pareto set") ? "*" : "")).join(" ");"""
+    # it opens at the dearest of the front, and stops at the cheapest; 6.5 is not of the front
+    assert _told(tmp_path, [_points()], script) == "9* 6.5 4* 1* 1* 4*"
+
+
+def test_a_click_picks_the_nearest_point_and_tells_what_is_known_of_it(tmp_path):
+    # the plot spans the values and 6 % of them on either side, so a point lies at a known share of its edges
+    script = """const over = document.querySelector(".u-over"), r = over.getBoundingClientRect(), said = [];
+for (const [x, y] of [[4, 0.5], [6.5, 0.8], [1, 0.9]]) {
+  const across = ((x - 1) / 8 + 0.06) / 1.12, up = ((y - 0.2) / 0.7 + 0.06) / 1.12;
+  const clientX = r.left + across * r.width + 5, clientY = r.bottom - up * r.height - 5;
+  over.dispatchEvent(new MouseEvent("click", { clientX, clientY }));
+  said.push(document.querySelector(".readout").textContent);
+}
+return said.join("|");"""
+    assert _told(tmp_path, [_points()], script) == (
+        "a (in the Pareto set): cost 4, error 0.5, width 0.4|b: cost 6.5, error 0.8, width 0.65|"
+        "b (in the Pareto set): cost 1, error 0.9, width 0.1"
+    )
+
+
+def test_points_have_their_table(tmp_path):
+    script = """const box = document.querySelector("details"); box.open = true; box.dispatchEvent(new Event("toggle"));
+const words = (row) => [...row.children].map((cell) => cell.textContent).join(",");
+return [...box.querySelectorAll("tbody tr")].map(words).join("|");"""
+    assert _told(tmp_path, [_points()], script) == "b,1,0.9,yes,0.1|a,4,0.5,yes,0.4|b,6.5,0.8,,0.65|a,9,0.2,yes,0.9"

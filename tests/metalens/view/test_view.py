@@ -1,6 +1,7 @@
 """Pages to explore artefacts: nothing is lost on the way into the page, nothing leads out of it, a browser shows it."""
 
 import base64
+import dataclasses
 import json
 import re
 import zlib
@@ -16,7 +17,7 @@ from metalens.ground import store
 from metalens.ground.errors import OutputError, StoreError
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
-from metalens.view import Axis, Classes, Curves, Images, Numbers, artefacts, page
+from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, artefacts, page
 from metalens.view.panels import classes_of
 from tests.metalens.view.browser_page import BROWSER, told
 
@@ -68,7 +69,7 @@ def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(
     """Two angles of three depths of 28 x 28 samples: half of them leave the first and the last depth."""
     stack = psf.load(folder / "psf.h5")
     monkeypatch.setattr(artefacts, "MOST_SAMPLES", stack.intensity.size // 2)
-    images, curves = artefacts.psf_panels(folder / "psf.h5")
+    images, curves, _ = artefacts.psf_panels(folder / "psf.h5")
     assert images.axes[-1].values == pytest.approx([0.7, 1.4])
     assert images.values == pytest.approx(stack.intensity[..., ::2, :, :] / stack.intensity[..., ::2, :, :].max())
     assert curves.x == pytest.approx([0.7, 1.4])
@@ -115,6 +116,21 @@ def test_figures_that_do_not_fit_are_refused():
         Images("psf", np.zeros((2, 4, 4)), [Axis("depth", [1, 2, 3])], 1.0)
     with pytest.raises(StoreError, match="class 5 of 2"):
         Classes("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
+
+
+def test_points_need_a_place_and_a_name_each():
+    with pytest.raises(StoreError, match="as many finite x"):
+        Points("networks", [1.0, 2.0], [0.5], "cost", "error", ["a", "b"])
+    with pytest.raises(StoreError, match="as many finite x"):
+        Points("networks", [1.0, float("nan")], [0.5, 0.7], "cost", "error", ["a", "b"])
+
+
+def test_a_psf_tells_what_its_error_is_made_of(folder):
+    budget = {row[0]: row[1] for row in artefacts.psf_panels(folder / "psf.h5")[-1].rows}
+    held = psf.load(folder / "psf.h5").budget
+    assert budget["numerical"] == held.numerical
+    assert budget["outside"] == (held.outside if held.outside == held.outside else "–")
+    assert len(budget) == len(dataclasses.fields(held))
 
 
 def test_the_command_writes_a_page_once(folder, tmp_path):
