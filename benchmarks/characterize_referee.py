@@ -44,6 +44,7 @@ CASES: dict[str, dict[str, Any]] = {
         },
     },
 }
+REACH, SHARES = 1.959964, (1.0, 0.75, 0.5, 0.25, 0.15, 0.0)
 FAULTS: dict[str, dict[str, float]] = {
     "cover glass 100 um": {"glass_um": 100.0},
     "cover glass 100 um, tilted 10 deg": {"glass_um": 100.0, "glass_tilt_deg": 10.0},
@@ -122,7 +123,33 @@ def study(case: str, seed: int, faults: dict[str, float] | None = None) -> dict[
 def rows() -> list[Row]:
     """What is stored."""
     out = [row for case in CASES for row in _rows(case, list(_stored(case).values()))]
-    return out + [_fault_row(name, run) for name, run in _stored("faults").items()]
+    out += [_fault_row(name, run) for name, run in _stored("faults").items()]
+    return out + _sizes(*(_judged(_stored(case)) for case in ("small", "faults")))
+
+
+def _judged(stored: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs that were not refused."""
+    return [run for run in stored.values() if "inside" in run and not run["problems"]]
+
+
+def _sizes(clean: list[dict[str, Any]], faulty: list[dict[str, Any]]) -> list[Row]:
+    """What intervals would hold, were what is unstated reckoned with at a share: sigma² (1 + share² (whole² - 1)).
+
+    By 1.96 sigma and the errors of the fits that are stored.
+    """
+    out = []
+    for share in SHARES if clean and faulty else ():
+        held = [float(np.mean([_holds(run, share) for run in runs])) for runs in (clean, faulty)]
+        head = f"the unstated at {share:g} of its size"
+        out.append(Row(head, "clean benches covered", math.nan, held[0], "truth", goal="0.93 to 0.97"))
+        out.append(Row(head, "benches with a fault covered", math.nan, held[1], "truth", goal="none missed"))
+    return out
+
+
+def _holds(run: dict[str, Any], share: float) -> list[bool]:
+    """Of every parameter."""
+    z, whole = (np.array([run[key][name] for name in run["inside"]]) for key in ("z", "wider"))
+    return [bool(one) for one in np.abs(z) < REACH * np.sqrt(1 + share**2 * (whole**2 - 1))]
 
 
 def _rows(case: str, runs: list[dict[str, Any]]) -> list[Row]:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import fft, optimize
 
 from characterize.inference.leastsquares import Data
-from characterize.model import PLACE, ForwardModel, vector
+from characterize.model import PLACE, ForwardModel, Setting, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -49,6 +49,16 @@ class Arrangement:
         return (TURNS + MIRRORED)[self.orientation]
 
 
+def few_frames(setting: Setting) -> Array:
+    """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
+    chosen: list[int] = []
+    for angle in np.unique(setting.angle_rad, axis=0):
+        index = np.flatnonzero((setting.angle_rad == angle).all(1))
+        by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
+        chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
+    return np.unique(chosen)
+
+
 def turn(frames: Array, orientation: int) -> Array:
     """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation mod 4) times."""
     turned = frames[..., ::-1] if orientation >= 4 else frames
@@ -73,7 +83,7 @@ def arrange(
     found = _laid(frames, plain, score)
     if reach_um > 0 and (found.reordered or found.clearly or score < _SURE):
         distances = start[PLACE["distance_um"]] + reach_um * np.linspace(-1, 1, _DISTANCES)
-        moved, _ = frames.scanned(start, zeros[:: _ZEROS // 4], distances)
+        moved, _ = frames.some(few_frames(model.setting)).scanned(start, zeros[:: _ZEROS // 4], distances)
         moved, better = frames.scanned(moved, zeros)
         other = _laid(frames, moved, better)
         simpler = (other.reordered, other.clearly) < (found.reordered, found.clearly)
@@ -98,6 +108,11 @@ class _Frames:
         light = _prepare(np.where(data.usable, data.electrons, np.nan))
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
         return cls(model, model.rough(_ROUGH), light, noise, data.saturated.mean((1, 2)), _reversed(model))
+
+    def some(self, index: Array) -> "_Frames":
+        """Some of the frames."""
+        model, rough = self.model.only(index), self.rough.only(index)
+        return _Frames(model, rough, self.light[index], self.noise[index], self.clipped[index], _reversed(model))
 
     def scanned(self, start: Array, zeros: Array, distances_um: Array | None = None) -> tuple[Array, float]:
         """Parameters at the best stage zero (and distance) for frames as stated or end to end; likeness there."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from characterize.inference import leastsquares, residual
-from characterize.inference.arrange import Arrangement
+from characterize.inference.arrange import Arrangement, few_frames
 from characterize.inference.constrained import Ball
 from characterize.inference.leastsquares import Data, Prior, Settings, Solution
-from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
+from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -197,16 +197,6 @@ def prior_of(names: Sequence[str], known: dict[str, Known], distance_um: float) 
     low = [max(p.low, -r) for p, r in zip(table, reach, strict=True)]
     high = [min(p.high, r) for p, r in zip(table, reach, strict=True)]
     return Prior(np.array(mean), np.array(sigma), np.array(low), np.array(high))
-
-
-def few_frames(setting: Setting) -> Array:
-    """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
-    chosen: list[int] = []
-    for angle in np.unique(setting.angle_rad, axis=0):
-        index = np.flatnonzero((setting.angle_rad == angle).all(1))
-        by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
-        chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
-    return np.unique(chosen)
 
 
 def with_values(x: Array, values: dict[str, float]) -> Array:

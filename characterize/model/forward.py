@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from characterize.model import detector, moments
 from characterize.model.glass import extra_path
 from characterize.model.kernel import turns
-from characterize.model.moments import LIT, Bases, Factor
+from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
@@ -266,15 +267,16 @@ class ForwardModel:
         """(name, what one unit does to the light on the nodes) of all parameters that change it."""
         for name in names:
             if name in WIDENING:
-                yield name, Factor("bias", group.widening[WIDENING[name]][None])
+                yield name, Factor.fixed("bias", group.widening[WIDENING[name]])
             elif name in ANSWERING:
-                yield name, Factor(name, np.ones_like(group.reduced.u)[None])
+                yield name, Factor.fixed(name, np.ones_like(group.reduced.u))
             elif (turning := group.turning(name)) is not None:
-                yield name, Factor(LIT, 1j * turning[None])
+                yield name, Factor.fixed(LIT, 1j * turning)
             elif name in GEOMETRY:
                 moves, um = _WINDOW.get(name, ("", 1.0))
                 added = "wave" if name == "wavelength_nm" else ""
-                yield name, Factor(LIT, 1j * self._phase_slope(x, group, name), moves, um, added)
+                slope = functools.partial(self._phase_slope, x, group, name)
+                yield name, Factor(LIT, slope, moves, um, added)
 
     def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
@@ -295,36 +297,34 @@ class ForwardModel:
         by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
         return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
-    def _phase(self, x: Array, group: _Group) -> Array:
-        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken off, aberrations; light."""
+    def _phase(self, x: Array, group: _Group, cut: Cut = WHOLE) -> Array:
+        """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken off, aberrations; light."""
         reduced, index, nominal = group.reduced, group.index, group.reduced.bench
+        here, every = (reduced.x_um[cut], reduced.y_um[cut]), (slice(None), *cut)
         k = 2 * math.pi / (nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
         d = nominal.distance_um + x[PLACE["distance_um"]]
         lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
         tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
         centre = d * tx + x[PLACE["decentre_x_um"]], d * ty + x[PLACE["decentre_y_um"]]
-        exit_path = sensor_path(reduced.x_um, reduced.y_um, centre, d)
-        known = reduced.k * reduced.path(reduced.x_um, reduced.y_um, nominal.distance_um, nominal)
+        exit_path = sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
-        lateral, out = [x[PLACE[f"source_{a}_um"]] for a in "xy"], np.empty((len(index), *reduced.x_um.shape))
+        lateral, out = [x[PLACE[f"source_{a}_um"]] for a in "xy"], np.empty((len(index), *here[0].shape))
         for i, z in enumerate(depth):
             tangents = tx - lateral[0] / z, ty - lateral[1] / z
-            path = source_path(reduced.x_um, reduced.y_um, tangents, 1 / z) + exit_path
+            path = source_path(*here, tangents, 1 / z) + exit_path
             if x[PLACE["glass_um"]] != 0:
-                path = path + extra_path(reduced.x_um, reduced.y_um, tangents=tangents, depth_um=float(z), values=x)
-            out[i] = k * path - known
-        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
+                path = path + extra_path(*here, tangents=tangents, depth_um=float(z), values=x)
+            out[i] = k * path - reduced.known[cut]
+        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending[every], 1)
         uneven = x[[PLACE[name] for name in LIGHT]]
-        light = -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1) if uneven.any() else 0.0
-        return out + light + (np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0)
+        light = -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1) if uneven.any() else 0.0
+        return out + light + (np.tensordot(self.modes, group.residual[every], 1) if len(self.modes) else 0.0)
 
-    def _phase_slope(self, x: Array, group: _Group, name: str) -> Array:
-        """Derivative of :meth:`_phase` by a geometric parameter: central difference of a smooth real function."""
+    def _phase_slope(self, x: Array, group: _Group, name: str, cut: Cut) -> Array:
+        """Derivative of i times :meth:`_phase` by a geometric parameter: central difference of a smooth function."""
         step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
-        up, down = x.copy(), x.copy()
-        up[PLACE[name]] += step
-        down[PLACE[name]] -= step
-        return (self._phase(up, group) - self._phase(down, group)) / (2 * step)
+        way = step * (np.arange(len(x)) == PLACE[name])
+        return 0.5j / step * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
 
     def _operators(self, x: Array, group: _Group) -> Operators:
         nominal = group.reduced.bench

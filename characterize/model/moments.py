@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 
 LIT = "lit"
+Cut = tuple[Any, ...]
+WHOLE: Cut = (slice(None), slice(None))
 _DEGREE = 5
 _PLACES = 4  # of the window along each axis where coefficients are computed
 _ACROSS = 15  # places of the lens along each axis that they are fitted to
@@ -31,15 +34,20 @@ _COARSE_PIXEL = 7e-3  # of the lens's radius: pixels across which coefficients c
 class Factor:
     """What one unit of a parameter does to the light on the nodes: (frames or 1, q, p) ``values`` times one base.
 
-    moves, um: the name by which it moves the window too (``distance`` or ``wave``), and by how much. added: another
-    base, as it is.
+    values: of some rows and columns of the nodes, as these are asked for. moves, um: the name by which it moves the
+    window too (``distance`` or ``wave``), and by how much. added: another base, as it is.
     """
 
     base: str
-    values: Array
+    values: Callable[[Cut], Array]
     moves: str = ""
     um: float = 1.0
     added: str = ""
+
+    @classmethod
+    def fixed(cls, base: str, values: Array) -> "Factor":
+        """The same for all frames: (q, p) ``values``."""
+        return cls(base, lambda cut: values[cut][None])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,10 +69,11 @@ class Bases:
 
     def changed(self, factor: Factor) -> Array:
         """(frames, q, p) derivative of the light on the nodes, without the window's own move."""
+        values = factor.values(WHOLE)
         if factor.base == LIT:
-            out = factor.values.astype(self.lit.dtype) * self.lit
+            out = values.astype(self.lit.dtype) * self.lit
         else:
-            out = (factor.values * self.slopes[factor.base]).astype(self.lit.dtype) * self.phasor
+            out = (values * self.slopes[factor.base]).astype(self.lit.dtype) * self.phasor
         return np.asarray(out + self.of(factor.added) if factor.added else out)
 
 
@@ -156,7 +165,7 @@ def _tables(
     shapes = np.linalg.qr(np.stack([seen[:, 0] ** a * seen[:, 1] ** b for a, b in powers(_DEGREE)], -1))
     out = {}
     for name, factor in factors.items():
-        values = factor.values[:, cut[0], cut[1]][:, keep].astype(complex)
+        values = factor.values(cut)[:, keep].astype(complex)
         found = _fitted(shapes, values, _moves(turned, factor, p, q, places))
         if found is not None:
             degree, table = found

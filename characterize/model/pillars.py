@@ -12,12 +12,14 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE, state
+from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.made import Answers, Sensitivity, answer, designed, of_kind, transmission
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
+_COLOURS = 12  # wavelengths that t is interpolated between: it turns by less than one radian over the span
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(Answers)]
@@ -78,6 +80,7 @@ class Pillars:
         self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
         self._answer = answer(self.lens.proxy, self.response, self.diameter_um + self.nodes_um[:, None])
         self._designed: dict[float, Array] = {}
+        self._colours = self._through_colours()
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
@@ -113,12 +116,26 @@ class Pillars:
         """:meth:`exact` at the bias nodes; what the last few wavelengths made of the design is kept."""
         wave = self.lens.wavelength_um + change.wavelength_um
         if wave not in self._designed:
-            bias = self.nodes_um[:, None]
             if len(self._designed) >= 8:
                 self._designed.pop(next(iter(self._designed)))
-            d = self.diameter_um + bias
-            self._designed[wave] = designed(self.lens.proxy, d, wave, angle_rad=self.angle_rad)
+            self._designed[wave] = self._designed_at(wave, change.wavelength_um / self.span.wavelength_um)
         return np.asarray(self._designed[wave] * self._answer.factor(np.array(change.answers)))
+
+    def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
+        """(b, grid) t as designed at the bias nodes; between wavelengths that are known where ``share`` of the span is
+        inside it."""
+        if abs(share) <= 1 and len(self._colours):
+            return np.asarray(np.tensordot(legendre.interpolation(_COLOURS, np.array(share)), self._colours, 1))
+        d = self.diameter_um + self.nodes_um[:, None]
+        return designed(self.lens.proxy, d, wave_um, angle_rad=self.angle_rad)
+
+    def _through_colours(self) -> Array:
+        """(colours, b, grid) :meth:`_designed_at` over the span of wavelengths; none where the proxy ends before."""
+        middle, reach = self.lens.wavelength_um, self.span.wavelength_um
+        low, high = self.lens.proxy.wavelengths_um
+        if not low <= middle - reach < middle + reach <= high:
+            return np.empty(0)
+        return np.stack([self._designed_at(w) for w in legendre.mapped(_COLOURS, middle - reach, middle + reach)])
 
     def table(self) -> Array:
         """(r, entries): the conjugate basis on a fine grid of diameters; the last entry is no pillar."""

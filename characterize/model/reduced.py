@@ -7,7 +7,6 @@ low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pill
 sum for every smooth f.
 """
 
-import dataclasses
 import functools
 import math
 import threading
@@ -49,6 +48,7 @@ class Reduced:
     """A lens on nodes for one field angle.
 
     nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same over the lens radius.
+    known: (q, p) phase there that was taken off, that of :meth:`path`.
     gathered: (r, q, p) one field for each function of :class:`Pillars`. kind: of the complex numbers.
 
     Tables and sums are in single precision where ``tolerance`` lets them be, else in double: see :func:`precision`.
@@ -68,6 +68,7 @@ class Reduced:
         self.gathered = self._gather(lens, pillars).astype(self.kind)
         self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
         self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
+        self.known = self.k * self.path(self.x_um, self.y_um, bench.distance_um, bench)
 
     def _directions(self, depths_um: Array) -> None:
         d, (cx, cy) = self.bench.distance_um, self.center_um
@@ -182,7 +183,7 @@ class Reduced:
         y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
         x, across = ways(kernel.by_x, self.p[0], axes_um[1], bands[1], **about)
         kind = self.kind
-        parts = [Ways(*(getattr(one, f.name).astype(kind) for f in dataclasses.fields(one))) for one in (down, across)]
+        parts = [_as(one, kind) for one in (down, across)]
         inner = reach[0] - edge_um, reach[1] - edge_um
 
         def moved(name: str) -> Terms:
@@ -238,6 +239,11 @@ class Reduced:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
         r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
+
+
+def _as(way: Ways, kind: Any) -> Ways:
+    """In numbers of a kind."""
+    return Ways(way.to.astype(kind), way.fine.astype(kind), functools.cache(lambda name: way.moved(name).astype(kind)))
 
 
 def _pair(values: Array) -> tuple[Array, Array]:

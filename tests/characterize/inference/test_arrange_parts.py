@@ -125,15 +125,19 @@ def test_the_other_end_of_the_stage_is_at_each_angle():
 class _Stack:
     """Images whose width goes with depth; a longer lens-sensor distance moves the whole stack, 25 um by one frame."""
 
-    def __init__(self, count=9):
-        self.setting = SimpleNamespace(depth_um=100.0 * np.arange(5, 5 + count))
-        self.groups = groups(range(count)).groups
+    def __init__(self, index=range(9)):
+        self.index = np.array(index)
+        self.setting = SimpleNamespace(depth_um=100.0 * (5 + self.index), angle_rad=np.zeros((len(self.index), 2)))
+        self.groups = groups(range(len(self.index))).groups
+
+    def only(self, index):
+        return _Stack(self.index[index])
 
     def rough(self, _):
         return self
 
     def images(self, x):
-        at = np.arange(9) + x[PLACE["distance_um"]] / 25 + x[PLACE["stage_zero_um"]] / 1e4
+        at = self.index + x[PLACE["distance_um"]] / 25 + x[PLACE["stage_zero_um"]] / 1e4
         return (spots(1.1 + 0.24 * np.abs(at - 3.0) + 0.06 * (at > 3), level=4e4),)
 
 

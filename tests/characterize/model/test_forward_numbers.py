@@ -13,8 +13,9 @@ import bench_lens as b
 
 from characterize.inference.leastsquares import Data
 from characterize.inference.prepare import quick_enough
-from characterize.model import ForwardModel, Setting
+from characterize.model import ForwardModel, Setting, thinplate
 from characterize.model.forward import spectrum, true_depth
+from characterize.model.moments import WHOLE
 from characterize.model.parameters import vector
 
 
@@ -64,3 +65,16 @@ def test_the_fewest_terms_that_count_depend_on_the_light():
         assert rise < 0.02
         cuts.append(quick.cut)
     assert cuts[0] > cuts[1] >= cuts[2]
+
+
+def test_of_some_nodes_phase_and_its_slopes_are_those_of_all():
+    """Also through glass, with modes beyond the parameters and uneven light; to rounding."""
+    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    model = ForwardModel(b.lens(), setting, b.RESPONSE).with_residual(np.array([0.07, -0.11]), thinplate.basis)
+    x = vector(b.VALUES | {"glass_um": 170.0, "glass_tilt_x_deg": 3.1, "light_y": 0.13, "tilt_y_deg": 0.4})
+    group = model.groups[0]
+    cut = np.ix_([0, 3, 17], [2, 5, 9, 11])
+    assert model._phase(x, group, cut) == pytest.approx(model._phase(x, group)[:, *cut], rel=1e-12)
+    names = ["bias_r_nm", "height_nm", "coma_y_rad", "residual_1", "light_y", "distance_um", "stage_zero_um"]
+    for name, factor in model._factors(x, group, names):
+        assert factor.values(cut) == pytest.approx(factor.values(WHOLE)[:, *cut], rel=1e-6), name
