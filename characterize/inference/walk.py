@@ -16,8 +16,9 @@ import numpy as np
 from scipy import interpolate
 
 from characterize.inference import leastsquares
+from characterize.inference.arrange import few_frames
 from characterize.inference.leastsquares import Data, Model, Prior, Settings, Solution
-from characterize.inference.search import Task, distinct, few_frames, followed
+from characterize.inference.search import Task, distinct, followed
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
