@@ -10,8 +10,9 @@ import numpy as np
 from metalens.cell import Cell, Light, Response, check_tolerance
 from metalens.ground.arrays import Array
 from metalens.rcwa import layer as modes
-from metalens.rcwa import made, mirrors, pattern, wall
+from metalens.rcwa import made, pattern, wall
 from metalens.rcwa.conditions import direction
+from metalens.rcwa.orders import mirrors
 from metalens.rcwa.problem import Problem, classes, problem, tangent, waves_of
 from metalens.rcwa.solver import MOST_COMPARED, compared, crowding, safety
 from metalens.rcwa.stack import respond

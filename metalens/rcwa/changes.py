@@ -3,10 +3,10 @@
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa import basis as fourier
 from metalens.rcwa.conditions import Case
 from metalens.rcwa.layer import factored, join
-from metalens.rcwa.waves import Waves
+from metalens.rcwa.orders import basis as fourier
+from metalens.rcwa.orders.waves import Waves
 
 Change = tuple[Array, Array]  # dP, dQ of a layer; dK, dR of the wave vectors
 

@@ -6,9 +6,9 @@ from typing import Literal
 
 from metalens.cell import Cell, Film, Light, materials
 from metalens.ground.errors import CellError
-from metalens.rcwa import basis as fourier
+from metalens.rcwa.orders import basis as fourier
+from metalens.rcwa.orders.waves import Waves, waves
 from metalens.rcwa.stack import Media
-from metalens.rcwa.waves import Waves, waves
 
 _STRAIGHT = 1e-15  # cos or sin of an azimuth that lies in a mirror plane, to rounding
 
@@ -19,7 +19,7 @@ class Case:
 
     k0: 2 pi / wavelength_um.
     kx, ky: tangential wave vector over k0; turned into the plane y = 0 where a mirror plane allows it.
-    symmetry: of the fields, see :mod:`metalens.rcwa.basis`; wave: which zero order is incident.
+    symmetry: of the fields, see :mod:`metalens.rcwa.orders.basis`; wave: which zero order is incident.
     pillar, between: indices, exp(-iwt). media: indices and reduced thicknesses around and between.
     """
 

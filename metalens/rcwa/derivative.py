@@ -23,9 +23,9 @@ from metalens.rcwa import changes
 from metalens.rcwa.changes import Change
 from metalens.rcwa.conditions import Case, case_waves, widening
 from metalens.rcwa.layer import Layer, layer, operators
+from metalens.rcwa.orders.waves import Waves, half_space, normal_component
 from metalens.rcwa.solver import homogeneous
 from metalens.rcwa.stack import Fields, match, outgoing
-from metalens.rcwa.waves import Waves, half_space, normal_component
 
 _GRAZING = 1e-8  # |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh anomaly
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa import basis as fourier
-from metalens.rcwa.waves import Waves
+from metalens.rcwa.orders import basis as fourier
+from metalens.rcwa.orders.waves import Waves
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,7 +51,7 @@ _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincid
 def operators(
     ways: Waves, diameter_um: Array, pitch_um: float, pillar: complex, between: complex
 ) -> tuple[Array, Array]:
-    """P and Q of :mod:`metalens.rcwa.waves` for a batch of diameters; real where nothing absorbs (exp(-iwt))."""
+    """P and Q of :mod:`metalens.rcwa.orders.waves` for a batch of diameters; real where nothing absorbs (exp(-iwt))."""
     space = ways.space
     shape = fourier.disc(space, diameter_um, pitch_um)
     inside, outside = _real_if_lossless(pillar**2, between**2)

@@ -23,9 +23,10 @@ import numpy as np
 from metalens.cell import Cell, Light, check_tolerance
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.rcwa import mirrors, pattern
+from metalens.rcwa import pattern
 from metalens.rcwa.any_shape import Ladder, ladder
 from metalens.rcwa.near_waves import Points, Slab, orders_at, places, slabs_of, solved
+from metalens.rcwa.orders import mirrors
 from metalens.rcwa.problem import Problem, problem
 from metalens.rcwa.solver import safety
 

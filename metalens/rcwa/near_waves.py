@@ -8,11 +8,12 @@ import numpy as np
 from metalens.cell import Light
 from metalens.ground.arrays import Array
 from metalens.rcwa import layer as modes
-from metalens.rcwa import made, mirrors, pattern
+from metalens.rcwa import made, pattern
 from metalens.rcwa.conditions import direction
+from metalens.rcwa.orders import mirrors
+from metalens.rcwa.orders.waves import Waves, half_space, normal_component
 from metalens.rcwa.problem import Problem, waves_of
 from metalens.rcwa.stack import Fields, match, outgoing
-from metalens.rcwa.waves import Waves, half_space, normal_component
 
 
 @dataclass(frozen=True, slots=True)

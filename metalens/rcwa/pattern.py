@@ -14,9 +14,9 @@ import numpy as np
 from metalens.cell import Cell, Layer, materials
 from metalens.cell.shapes import Outline
 from metalens.ground.arrays import Array
-from metalens.rcwa import mirrors
-from metalens.rcwa.mirrors import Frame, Orders
-from metalens.rcwa.waves import Waves
+from metalens.rcwa.orders import mirrors
+from metalens.rcwa.orders.mirrors import Frame, Orders
+from metalens.rcwa.orders.waves import Waves
 
 _GRID = 192  # points along the pitch on which normals are sampled
 FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -159,7 +159,7 @@ def _real(values: Array) -> Array:
 
 
 def operators(space: Orders, ways: Waves, this: Slab, cell: Cell) -> tuple[Array, Array]:
-    """P and Q of :mod:`metalens.rcwa.waves` in these orders."""
+    """P and Q of :mod:`metalens.rcwa.orders.waves` in these orders."""
     direct, inverse = tables(this, cell, space.reach)
     xx, yy, xy = normal_tables(this.outlines, cell, space.reach)
     laurent = [mirrors.product(space, direct, link) for link in (0, 1)]

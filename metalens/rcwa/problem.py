@@ -8,11 +8,11 @@ import numpy as np
 from metalens.cell import Cell, Film, check_direction, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.rcwa import mirrors
 from metalens.rcwa.made import check_size
-from metalens.rcwa.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
+from metalens.rcwa.orders import mirrors
+from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
+from metalens.rcwa.orders.waves import Waves
 from metalens.rcwa.stack import Media
-from metalens.rcwa.waves import Waves
 
 _STRAIGHT = 1e-12
 

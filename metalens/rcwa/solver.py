@@ -13,8 +13,8 @@ from metalens.ground.arrays import Array
 from metalens.rcwa import wall
 from metalens.rcwa.conditions import Case, case_waves, widening
 from metalens.rcwa.layer import layer, operators
+from metalens.rcwa.orders.waves import Waves
 from metalens.rcwa.stack import Amplitudes, respond
-from metalens.rcwa.waves import Waves
 
 Moved = Callable[[Array], Array]
 _ROUNDING = 1e-13

@@ -13,7 +13,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.rcwa.layer import Layer
-from metalens.rcwa.waves import Waves, half_space, normal_component
+from metalens.rcwa.orders.waves import Waves, half_space, normal_component
 
 Pair = tuple[Array, Array]
 

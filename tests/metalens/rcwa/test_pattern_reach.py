@@ -5,8 +5,9 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Polygon
-from metalens.rcwa import mirrors, pattern, problem
-from metalens.rcwa.mirrors import IDENTITY
+from metalens.rcwa import pattern, problem
+from metalens.rcwa.orders import mirrors
+from metalens.rcwa.orders.mirrors import IDENTITY
 
 CELL = Cell(
     0.4,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa.basis import Basis, Orders
+from metalens.rcwa.orders.basis import Basis, Orders
 
 
 @dataclass(frozen=True, eq=False, slots=True)

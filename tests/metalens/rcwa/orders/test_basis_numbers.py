@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from metalens.rcwa import basis
+from metalens.rcwa.orders import basis
 
 PITCH, DIAMETER, N = 0.4, 0.23, 1000
 LINE = (np.arange(N) + 0.5) / N - 0.5

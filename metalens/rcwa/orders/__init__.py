@@ -1,0 +1,12 @@
+"""Fourier orders of a square cell under its mirrors, and of any lattice under what it shares with shape and light."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.rcwa.orders import basis as basis
+    from metalens.rcwa.orders import mirrors as mirrors
+    from metalens.rcwa.orders import waves as waves
+
+__getattr__, __dir__, __all__ = attach(__name__, {"basis": "", "mirrors": "", "waves": ""})
