@@ -83,6 +83,7 @@ VIEWS = {
     "run": "codesign.commands.view:panels",
     "scene": "codesign.commands.view:scene",
     "layers": "codesign.commands.view:layers",
+    "image": "codesign.commands.view:image",
     "answers": "codesign.commands.view:answers",
     "budget": "codesign.commands.view:budget",
 }

@@ -9,12 +9,15 @@ import torch
 
 from codesign.batches import varied, worn
 from codesign.commands.options.scene import Options
+from codesign.evaluate import imaged
 from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks
 from codesign.referee import pathtraced
-from metalens.ground import config, store, transaction
+from metalens import lens as lenses
+from metalens.ground import config, reading, store, transaction
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import Provenance
 from metalens.image import scene
+from metalens.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +82,24 @@ class Scene:
 def run(options: Options) -> int:
     """Render, write and show."""
     settings = Scene() if options.config is None else config.load(options.config, Scene)
+    if options.fwhm_nm < 0 or (options.fwhm_nm and options.lens is None):
+        raise ConfigError(f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is")
     if options.referee:
         pathtraced.start()
+    lens = None if options.lens is None else lenses.load(options.lens)
     folder = options.output
     with options.claim_folder(folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2) as draft:
         count = _make(settings, draft.path, referee=options.referee)
-    values = {"frames": settings.frames, "layers": count, "folder": str(folder)}
-    options.console.result(values, f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png")
+        values: dict[str, object] = {"frames": settings.frames, "layers": count, "folder": str(folder)}
+        words = f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png"
+        if lens is not None and options.lens is not None:
+            options.console.say("the lens over its field; half a minute for one of 1 mm")
+            about = Provenance(config.dumps(settings), {options.lens.name: reading.sha256(options.lens)}, settings.seed)
+            found = _imaged(settings, lens, options.fwhm_nm)
+            imaged.write(draft.path, found, about)
+            values["image_error"] = found.error
+            words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png"
+    options.console.result(values, words)
     return 0
 
 
@@ -105,6 +119,17 @@ def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
         pathtraced.picture(judged, folder / "referee.png")
         store.write_text(folder / "referee.txt", "\n".join(judged.lines()) + "\n")
     return count
+
+
+def _imaged(settings: Scene, lens: Lens, fwhm_nm: float) -> imaged.Imaged:
+    count = min(settings.frames, imaged.FRAMES)
+    states = dataset.states_at(torch.arange(count), settings.seed, motion=settings.motion)
+
+    def rendered(camera: Camera, rig: Rig) -> Rendered:
+        return worn(states, rig, camera, settings.variety, (settings.seed, 3))
+
+    camera = Camera(settings.pixels, settings.pitch_um)
+    return imaged.imaged(lens, camera, settings.rig, rendered, fwhm_nm=fwhm_nm)
 
 
 def _write_layers(path: Path, made: Rendered, step_um: float, about: Provenance) -> int:

@@ -12,7 +12,7 @@ from codesign.network import Architecture
 from codesign.train import Candidate, pareto
 from metalens.ground import report, store
 from metalens.ground.errors import StoreError
-from metalens.view import Axis, Curves, Images, Numbers, Panel, Points, lens_panels
+from metalens.view import Axis, Curves, Images, Numbers, Panel, Points, at_brightest, lens_panels
 
 LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
 
@@ -186,6 +186,27 @@ def layers(path: Path) -> list[Panel]:
     return [
         Images("Light of a layer", held["radiance"], axis, 1.0, "of full light", across="pixels"),
         Images("What a layer covers", held["coverage"], axis, 1.0, "share of the pixel", across="pixels"),
+    ]
+
+
+def image(path: Path) -> list[Panel]:
+    """Scenes and what a lens makes of them, and the PSFs over field and depth that did it."""
+    stored = store.load(path, "image")
+    held, about = stored.arrays, stored.attributes
+    frames = Axis("frame", list(range(len(held["scene"]))))
+    both = np.stack([held["scene"], held["image"]], axis=1)
+    shown = Axis("shown", ["scene", "image"], blink=True)
+    names = [Axis("depth", (1e-3 * held["depth_um"]).tolist(), "mm")]
+    names += [Axis("field, down", held["y_deg"].tolist(), "deg"), Axis("field, across", held["x_deg"].tolist(), "deg")]
+    psf, step = held["psf"] / held["psf"].max(), float(about["pitch_um"])
+    parts = [(report.in_words(k.removeprefix("error_")), v) for k, v in sorted(about.items()) if k.startswith("error_")]
+    words = f"Relative L2 error of a texture, {float(about['error']):.2g} together; outside: light beyond the windows."
+    unit = "light, as of the scene"
+    return [
+        Images("Scene and image", both, [frames, shown], step, unit),
+        Images("Image less scene", held["image"] - held["scene"], [frames], step, unit, signed=True),
+        Images("Points of the field", psf, at_brightest(names, psf), step, "of the highest peak", optics=True),
+        Numbers("Error of the image", ("cause", "error"), parts, words),
     ]
 
 

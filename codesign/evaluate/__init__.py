@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.evaluate import experiment_plots as experiment_plots
     from codesign.evaluate import gaze_experiment as gaze_experiment
+    from codesign.evaluate import imaged as imaged
     from codesign.evaluate import optics as optics
     from codesign.evaluate import paper as paper
     from codesign.evaluate import paper_runs as paper_runs
@@ -45,6 +46,7 @@ __getattr__, __dir__, __all__ = attach(
         "experiment_plots": "",
         "gaze_experiment": "",
         "judged": "reader",
+        "imaged": "",
         "optics": "",
         "paper": "",
         "paper_runs": "",

@@ -16,11 +16,16 @@ class Options(Common):
 
     Attributes:
         config: SCENE.toml; without it the defaults.
-        output: folder for scene.h5, layers.h5, sheet.png and labels.csv.
+        output: folder for scene.h5, layers.h5, sheet.png and labels.csv; with --lens also image.h5 and image.png.
+        lens: a lens that images the first frames onto its sensor, over the whole field and in its light: scene, image,
+            their difference, and the PSFs over field and depth.
+        fwhm_nm: width of that light, 0 for one wavelength.
         referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
             referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
     """
 
     config: tyro.conf.Positional[Path | None] = None
     output: Output = Path("scene")
+    lens: Path | None = None
+    fwhm_nm: float = 0.0
     referee: bool = False

@@ -1,0 +1,110 @@
+"""Rendered frames through a lens onto its sensor: scene, image, and the PSFs over field and depth that made it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from codesign.eye import Camera, Rendered, Rig
+from metalens.ground import report, store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import SceneError
+from metalens.ground.store import Provenance
+from metalens.image import Grid, imager
+from metalens.lens import Lens
+from metalens.psf import Source
+
+FRAMES = 6  # that are imaged
+BLUR_UM = 144.0  # of the scene around a frame that is blurred into it: half a window of the PSFs
+TOLERANCE = 0.03  # of the image, relative L2 of a texture
+NODES = 3  # PSFs that are kept along x, y and depth: first, middle, last
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Imaged:
+    """Frames and their images.
+
+    scene, image: (frames, y, x), the image scaled to the light of the scenes. psf: (depth, row, column, y, x) of sum
+    1, at depth_um, and at the field angles y_deg and x_deg of the rows and columns; the outermost are those of the
+    samples around the frame that are blurred into it. parts: of the error by cause.
+    """
+
+    scene: Array
+    image: Array
+    psf: Array
+    depth_um: Array
+    y_deg: Array
+    x_deg: Array
+    pitch_um: float
+    error: float
+    parts: dict[str, float]
+
+
+@torch.no_grad()
+def imaged(
+    lens: Lens, camera: Camera, rig: Rig, rendered: Callable[[Camera, Rig], Rendered], *, fwhm_nm: float = 0.0
+) -> Imaged:
+    """Image the first frames.
+
+    Args:
+        camera: samples of the sensor. rendered: gives the frames of a camera and a rig, whose lens is as far from its
+            sensor as this one. fwhm_nm: width of the light; 0 for one wavelength.
+
+    Raises:
+        SceneError: the lens cannot be imaged over this field to 3 %; see :func:`metalens.image.imager`.
+    """
+    margin = math.ceil(BLUR_UM / camera.pitch_um)
+    wide = Camera(camera.pixels + 2 * margin, camera.pitch_um)
+    made = rendered(wide, replace(rig, sensor_distance_um=lens.sensor_distance_um))
+    seen = made.frames.depth_um[made.frames.coverage > 0]
+    reach = 0.98 * float(seen.min()), 1.02 * float(seen.max())
+    grid = Grid((camera.pixels, camera.pixels), camera.pitch_um, reach, margin, 2 * margin + 1)
+    source = Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
+    optics = imager(lens, grid, spectrum=source, tolerance=TOLERANCE)
+    inside = slice(margin, margin + camera.pixels)
+    plain, light = made.pinhole()[:, inside, inside], optics(made.frames)
+    if not float(light.sum()) > 0:
+        raise SceneError("no light of these frames reaches the sensor")
+    rows, columns, depths = (np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3])
+    psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
+    angle = 180 / math.pi / lens.sensor_distance_um
+    return Imaged(
+        plain.numpy().astype(np.float32),
+        (light * (plain.sum() / light.sum())).numpy().astype(np.float32),
+        psf.numpy().astype(np.float32),
+        optics.plan.depths_um.numpy()[depths],
+        np.degrees(np.arctan(np.radians(optics.plan.y_um.numpy()[rows] * angle))),
+        np.degrees(np.arctan(np.radians(optics.plan.x_um.numpy()[columns] * angle))),
+        camera.pitch_um,
+        optics.error,
+        {name: float(value) for name, value in optics.parts.items()},
+    )
+
+
+def write(folder: Path, found: Imaged, about: Provenance) -> None:
+    """image.h5 (kind ``image``) and image.png."""
+    names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
+    arrays = {name: np.asarray(getattr(found, name)) for name in names}
+    said = {"pitch_um": found.pitch_um, "error": found.error} | {f"error_{k}": v for k, v in found.parts.items()}
+    store.save(folder / "image.h5", "image", arrays, attributes=said, provenance=about)
+    store.write_bytes(folder / "image.png", picture(found))
+
+
+def picture(found: Imaged) -> bytes:
+    """The first frame: scene, image, and what the lens took away and added."""
+    figure, axes = report.canvas(1, 3, size=(9.6, 3.3))
+    apart = found.image[0] - found.scene[0]
+    top, most = float(found.scene[0].max()), float(np.abs(apart).max())
+    half = found.pitch_um * len(apart) / 2000
+    shown = {"extent": (-half, half, half, -half)}
+    axes[0].imshow(found.scene[0], cmap="gray", vmin=0, vmax=top, **shown)
+    axes[1].imshow(found.image[0], cmap="gray", vmin=0, vmax=top, **shown)
+    last = axes[2].imshow(apart, cmap="RdBu_r", vmin=-most, vmax=most, **shown)
+    for one, title in zip(axes, ("scene", "image", "image − scene"), strict=True):
+        one.set(title=title, xlabel="x on the sensor / mm")
+        one.grid(visible=False)
+    figure.colorbar(last, ax=axes[2], label="light, as of the scene")
+    return report.png(figure)

@@ -1,0 +1,77 @@
+"""Rendered eyes through a lens: the same eyes, the same light, and PSFs at the angles of the sensor's rim."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.commands import view
+from codesign.evaluate import imaged
+from codesign.eye import Camera, Rig, dataset, render
+from metalens import cli, lens
+from metalens.ground.store import Provenance
+
+CAMERA = Camera(24, 3.0)
+RIG = replace(Rig(), elevation_rad=0.6)
+
+
+@pytest.fixture(scope="module")
+def found():
+    states = dataset.states_at(torch.arange(2), 5)
+    return imaged.imaged(m.small(), CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera))
+
+
+def test_the_scene_is_what_a_pinhole_at_the_lens_sees(found):
+    """Without the margin that is blurred in: the rays of a camera of that size alone."""
+    rig = replace(RIG, sensor_distance_um=m.small().sensor_distance_um)
+    plain = render(dataset.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA).pinhole().numpy()
+    # samples of wider frames have the same rays; a tenth of a per cent of them lie on edges that round otherwise
+    assert np.mean(np.abs(found.scene - plain) > 1e-4) < 2e-3
+
+
+def test_the_image_has_the_light_of_the_scene_and_less_of_its_detail(found):
+    assert found.image.sum() == pytest.approx(float(found.scene.sum()), rel=1e-5)
+    step = [float(np.abs(np.diff(one, axis=-1)).mean()) for one in (found.scene, found.image)]
+    assert step[1] < 0.8 * step[0]
+    assert 0 < found.error < 0.3
+
+
+def test_psfs_are_those_of_the_middle_and_the_rim(found):
+    """The outermost samples, those that are blurred into the frame included, lie 300 um behind the lens."""
+    beside = 48  # samples of 3 um: half a window of 288 um
+    rim = math.degrees(math.atan((24 + 2 * beside - 1) / 2 * 3.0 / 300.0))
+    assert found.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
+    assert found.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
+    assert np.all(np.diff(found.depth_um) > 0)
+    assert found.psf.shape[:3] == (3, 3, 3)
+    # a lens that is alike to both sides: left and right PSFs are each other's mirror images, to the nodes' own error
+    left, right = found.psf[1, 1, 0], found.psf[1, 1, 2][:, ::-1]
+    assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(left)
+
+
+def test_what_is_written_is_what_is_shown(found, tmp_path):
+    imaged.write(tmp_path, found, Provenance())
+    both, apart, points, parts = view.image(tmp_path / "image.h5")
+    assert np.array_equal(both.values[1, 0], found.scene[1])
+    assert np.array_equal(both.values[1, 1], found.image[1])
+    assert np.array_equal(apart.values, found.image - found.scene)
+    assert points.axes[2].values == pytest.approx(found.x_deg.tolist())
+    assert dict(parts.rows) == pytest.approx(found.parts)
+    assert (tmp_path / "image.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_images_through_a_lens_file(tmp_path, capsys):
+    lens.save(tmp_path / "lens.h5", m.small())
+    (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 4.0\n")
+    words = ["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]
+    assert cli.main([*words, "--fwhm-nm", "20"]) == 2
+    assert "need 0 or more, and --lens" in capsys.readouterr().err
+    assert cli.main([*words, "--lens", str(tmp_path / "lens.h5"), "--quiet"]) == 0
+    assert {"image.h5", "image.png", "scene.h5"} <= {path.name for path in (tmp_path / "out").iterdir()}
