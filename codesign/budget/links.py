@@ -25,6 +25,7 @@ from metalens.cell import Light
 from metalens.design import neighbours as supercell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, LensError
+from metalens.lens import Neighbours
 from metalens.made import State, draws, sensitivity, transmission
 from metalens.pillars import PillarLibrary, engines
 
@@ -150,25 +151,34 @@ def _stored(library: PillarLibrary, at_um: Array, wavelength_um: float) -> Array
 
 
 def _neighbours(about: Bench) -> Iterator[Entry]:
-    """Local periodic approximation: rows of unlike pillars solved as one."""
+    """Local periodic approximation: rows of unlike pillars solved as one; what is open of them where the lens holds
+    them."""
+    held = about.lens.neighbours
+    if held is not None:
+        found = [_among(about, other, "") for other in held.doubted(about.aperture.turn_sine())]
+        rms = [math.hypot(*column) for column in zip(*((e.phase_rad, e.psf, e.gaze_rad) for e in found), strict=True)]
+        said = "rows of the lens file, in the image: another truncation, a row left out, zones that get shorter"
+        yield Entry("neighbours", rms[0], rms[1], rms[2], said)
+        return
     try:
-        found = supercell.neighbours(about.lens)
+        rows = supercell.neighbours(about.lens)
     except CellError:
         return  # films or tilted walls: rows of those are not solved
-    factor = found.at(about.aperture.turn_sine())
-    phase, level = about.aperture.maps(about.aperture.designed())
-    maps = (
-        phase + torch.from_numpy(np.angle(factor).astype(np.float32)),
-        level * torch.from_numpy(np.abs(factor).astype(np.float32)),
-    )
-    built = about.aperture.place >= 0
-    turn = np.angle(factor[built])
-    counts = (
-        f"rows of {', '.join(str(round(about.lens.wavelength_um / s / about.lens.cell.pitch_um)) for s in found.sine)}"
-    )
+    straight = about.lens.wavelength_um / rows.sine[~rows.diagonal] / about.lens.cell.pitch_um
+    counts = f"rows of {', '.join(str(round(s)) for s in straight)}"
     said = f"{counts} unlike pillars solved as one cell; factor carried over the aperture by the angle of turning"
-    optics = about.device.image(wave=gathered(about.lens, maps[0] * torch.from_numpy(built), maps[1]))
-    yield about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
+    yield _among(about, rows, said)
+
+
+def _among(about: Bench, rows: Neighbours, said: str) -> Entry:
+    """The entry of other rows than the lens holds."""
+    built, sine = about.aperture.place >= 0, about.aperture.turn_sine()
+    turn = np.angle(rows.mean(sine[built]))
+    if about.lens.neighbours is not None:
+        turn = turn - np.angle(about.lens.neighbours.mean(sine[built]))
+    maps = about.aperture.maps(about.aperture.designed())
+    optics = about.device.image(wave=gathered(replace(about.lens, neighbours=rows), *maps))
+    return about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
 def _mask(about: Bench) -> Iterator[Entry]:

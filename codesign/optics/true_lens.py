@@ -17,7 +17,7 @@ from metalens.field import Layers, Optics, Plan, SmoothWave, Wave, node_light, n
 from metalens.image import Grid, Imager
 from metalens.image import imager as field_imager
 from metalens.lens import Lens
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Source, among
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 ROWS = 256  # of pillars at a time
@@ -60,19 +60,25 @@ def gathered(lens: Lens, phase: Tensor, level: Tensor) -> PillarCells:
     """The lens plane of pillars of these phases and amplitudes.
 
     Args:
-        phase, level: (y, x) of every site, float32; level 0 where there is no pillar.
+        phase, level: (y, x) of every site, float32; level 0 where there is no pillar. Taken one by one: unlike
+            neighbours are put on here, where the lens holds their rows.
     """
     d = lens.diameters
     radius = d.radius_um + d.pitch_um / 2
     focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
     smooth, block = SmoothWave(focus, radius), max(1, round(CELL_UM / d.pitch_um))
     x = torch.as_tensor(d.x_um, dtype=torch.float64)
+    factor = None
+    if lens.neighbours is not None:
+        factor = among.mean(torch.polar(level, phase), lens.neighbours, d.pitch_um)
     parts = []
     for rows in range(0, len(d.y_um), ROWS):
         part = slice(rows, rows + ROWS)
         ideal = smooth.carrier_rad(x, torch.as_tensor(d.y_um[part], dtype=torch.float64)[:, None])
         rest = torch.remainder(phase[part].double() - ideal, 2 * math.pi).float()
         whole = torch.polar(level[part], rest)
+        if factor is not None:
+            whole = whole * factor[part]
         parts.append(torch.stack([whole.real, whole.imag, (level[part] > 0).float()]))
     cells = _averaged(torch.cat(parts, 1), block)
     half_y, half_x = (n * block * d.pitch_um / 2 for n in cells.shape[-2:])

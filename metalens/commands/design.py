@@ -115,7 +115,7 @@ class Options(Common):
         process: PROCESS.toml whose printable pillars and gaps bound the diameters, in place of [limits].
         skip_focus_check: leave out the exact diffraction sum around the focus.
         accept_partial_turn: where the pillars cover less than a turn, take the nearest; the loss is stated.
-        own_cell: solve rows of its own unlike pillars for what they leave of the efficiency (a minute); else rough.
+        own_cell: solve rows of its own unlike pillars (minutes), for efficiency, lens file, PSFs, images; else rough.
     """
 
     config: tyro.conf.Positional[Path]
@@ -226,7 +226,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         made, quality = design.make(phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about)
     meets = wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
     quality = replace(quality, focuses=meets)
-    found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
+    made, found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
     check = check_focus(made) if _checkable(wanted, options, quality) else None
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))

@@ -1,7 +1,7 @@
 """What ``metalens design`` says of a lens: numbers for programs, lines for people."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from metalens import design
 from metalens.design import Conversion, FocusCheck, Quality, Unlike
@@ -11,8 +11,9 @@ from metalens.lens import Layers, Lens
 
 def neighbours(
     made: Lens, quality: Quality, conversion: Conversion | None, radius_um: float, *, solve: bool
-) -> Unlike | None:
-    """What unlike neighbours leave of the light in the focus, solved or rough; None where there is no such number.
+) -> tuple[Lens, Unlike | None]:
+    """The lens, holding its rows where they are to be solved, and what unlike neighbours leave of the light in the
+    focus, by those or rough; None where there is no such number.
 
     Raises:
         ConfigError: it is to be solved and cannot be.
@@ -21,8 +22,11 @@ def neighbours(
         if solve:
             why = "pillars that are turned" if conversion is not None else "a phase without a focus"
             raise ConfigError(f"own_cell: {why}: no rows are solved for it; leave --own-cell out")
-        return None
-    return (design.unlike if solve else design.rough_unlike)(made, radius_um=radius_um)
+        return made, None
+    if not solve:
+        return made, design.rough_unlike(made, radius_um=radius_um)
+    made = replace(made, neighbours=design.rows(made, radius_um=radius_um))
+    return made, design.unlike(made, radius_um=radius_um)
 
 
 def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> dict[str, object]:
@@ -87,7 +91,7 @@ def _neighbours(found: Unlike, quality: Quality) -> str:
     most = min(1.0, 1 - found.share + found.error)
     return (
         f"  that is of pillars one by one: unlike neighbours may cost as much as {most:.1%} of it "
-        "(rough, of another cell; --own-cell solves rows of these pillars)"
+        "(rough, of another cell; --own-cell solves rows of these pillars, and PSFs and images then hold them)"
     )
 
 

@@ -62,7 +62,7 @@ class Options(Common):
         spectrum: CSV files of wavelength in nm and value, whose product is the spectrum (LED, filter, sensor).
         wavelengths_nm: wavelengths whose intensities add.
         weights: of those wavelengths; left out: equal.
-        polarisation: scalar, vector or auto.
+        polarisation: scalar, flux, vector or auto.
         tolerance: relative L2 error.
         far_field: in place of PSFs, the light far behind the lens over direction cosines, with the share of every beam
             (deflectors, holograms, axicons): far_field.h5, NAME_far.png. Takes sources_mm (one; left out, a plane
@@ -186,8 +186,8 @@ def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
                 f"{path}: {name} is for a design; this {store.kind_of(path)} file has the wavelength and layers that "
                 "were fitted"
             )
-    if settings.polarisation == "vector":
-        words = f"polarisation = 'vector' is for a design; a {store.kind_of(path)} file is one scalar"
+    if settings.polarisation in ("flux", "vector"):
+        words = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
         raise ConfigError(f"{path}: {words}")
     found = given.psf_stack(settings.view, tolerance=settings.tolerance)
     return replace(found, provenance=_provenance(path, settings))
@@ -209,6 +209,9 @@ def _of_design(path: Path, settings: Settings, made: lens.Lens) -> psf.PsfStack:
 
 
 def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> psf.PsfStack:
+    found = _own_cell(made, settings) if settings.own_cell else None
+    if found is not None and isinstance(found.neighbours, lens.Neighbours):
+        made = replace(made, neighbours=found.neighbours)
     return psf.from_lens(
         made,
         settings.view,
@@ -216,7 +219,7 @@ def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> p
         spectrum=settings.nodes(made),
         provenance=provenance,
         polarisation=settings.polarisation,
-        left_out=_own_cell(made, settings) if settings.own_cell else None,
+        left_out=found,
     )
 
 

@@ -38,13 +38,15 @@ class Settings:
         filter, sensor).
     wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add. weights: of each; none for equal.
     tolerance: relative L2 error of the PSFs.
-    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in NA), ``vector`` (Ex, Ey, Ez of
-        both polarisations, squares added), or ``auto``: the scalar where its distance to that is below the tolerance.
+    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in NA), ``flux`` (that of both
+        polarisations, which a pixel counts), ``vector`` (Ex, Ey, Ez of both, squares added), or ``auto``: the scalar
+        where its distance to the flux is below the tolerance, else the flux.
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
     light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean of the two, where they are
         focused from and to the same distances (any light, for other lenses).
-    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell, for the error budget (seconds to a
-        minute); without it those terms are rough, of the default cell.
+    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell (seconds to minutes): the PSFs then
+        hold the factor of those neighbours, the error budget what is left. A lens of ``design --own-cell`` holds its
+        rows. Without either, pillars are taken one by one, and those terms are rough, of the default cell.
     """
 
     depths_mm: tuple[float, float, float] | None = None

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from metalens.design.own_cell import Unlike as Unlike
     from metalens.design.own_cell import left_out as left_out
     from metalens.design.own_cell import rough_unlike as rough_unlike
+    from metalens.design.own_cell import rows as rows
     from metalens.design.own_cell import unlike as unlike
     from metalens.design.paired import Split as Split
     from metalens.design.paired import make_paired as make_paired
@@ -60,6 +61,7 @@ __getattr__, __dir__, __all__ = attach(
         "printable": "of_phase",
         "profiles": "",
         "rough_unlike": "own_cell",
+        "rows": "own_cell",
         "unlike": "own_cell",
     },
 )

@@ -4,12 +4,17 @@ A lens is designed as if every pillar stood among its like. Here N different pil
 times the pitch, so every one feels its real neighbours; light leaves in the orders of that grating, and the wanted one
 is compared with what the pillars would give one by one. RCWA with normal vectors (Schuster et al. 2007), mirror
 symmetric in y, both solved at the same truncation so that truncation all but cancels.
+
+Rows run along the lattice, or along its diagonal, where every other pillar stands half a period aside:
+
+    straight    o o o o    period N p, p across          diagonal    o   o       period N p / √2, √2 p across
+                                                                       o   o
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import linalg
@@ -18,9 +23,10 @@ from scipy.special import j1
 from metalens.cell import Cell, materials
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.lens import Lens
+from metalens.lens import Lens, Neighbours
 
 LONG = 6  # pillars: of shorter rows several are solved
+STEEPEST = 0.95  # sine in the cover of the light of a row; that of steeper ones runs along the lens, or nowhere
 GRID = 48  # points across a cell for the normal field; its coefficients are needed to twice the harmonics
 Polarization = Literal["x", "y"]
 
@@ -43,6 +49,42 @@ class Row:
         return complex(self.t[int(np.flatnonzero(self.orders == m)[0])])
 
 
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """What repeats along a row: a square with one pillar, or along the diagonal with two. width_um: of the square."""
+
+    width_um: float
+    pillars: int
+
+    @property
+    def spacing_um(self) -> float:
+        """From pillar to pillar along the row."""
+        return self.width_um / self.pillars
+
+    def places_um(self, count: int) -> Array:
+        """(2, count) x and y of the pillars of a row about its middle; mirrored in y."""
+        order = np.arange(count)
+        across = (order % 2) * self.width_um / 2 if self.pillars > 1 else np.zeros(count)
+        return np.stack([(order - (count - 1) / 2) * self.spacing_um, across])
+
+    def normals(self) -> tuple[Array, Array, Array]:
+        """nx nx, ny ny, nx ny of the radial field about the nearest pillar at points of the square; ties: the mean."""
+        u = (np.arange(GRID) + 0.5) / GRID - 0.5
+        x, y = np.meshgrid(u, u, indexing="ij")
+        places = self.places_um(self.pillars) / self.width_um
+        dx, dy = (np.stack([v - one for one in axis]) for v, axis in zip((x, y), places, strict=True))
+        dx, dy = dx - np.rint(dx), dy - np.rint(dy)
+        r2 = dx**2 + dy**2
+        near = r2 <= r2.min(0) + 1e-9
+        xx, yy, xy = ((v / r2 * near).sum(0) / near.sum(0) for v in (dx * dx, dy * dy, dx * dy))
+        return xx, yy, xy
+
+
+def block_of(pitch_um: float, diagonal: bool) -> _Block:
+    """The square that repeats along a row of a square lattice."""
+    return _Block(math.sqrt(2) * pitch_um, 2) if diagonal else _Block(pitch_um, 1)
+
+
 def solve_row(
     cell: Cell,
     diameters_um: Sequence[float] | Array,
@@ -50,17 +92,21 @@ def solve_row(
     *,
     polarization: Polarization,
     harmonics: int = 4,
+    diagonal: bool = False,
 ) -> Row:
     """Orders of a row of pillars of these diameters, one pitch apart, repeated without end.
 
     Args:
         harmonics: orders to each side along y, and along x per pillar.
+        diagonal: along the diagonal of the lattice, pitch / √2 apart along it; an even number of pillars. As many
+            orders per wave vector.
 
     Accuracy: that of RCWA at this truncation, a few 1e-2 of t for silicon; differences between rows at one truncation
         are better by an order of magnitude. Energy holds to rounding.
 
     Raises:
-        CellError: films or tilted walls, no round pillars on a square lattice, no pillar, or pillars that touch.
+        CellError: films or tilted walls, no round pillars on a square lattice, no pillar, an odd number along the
+            diagonal, or pillars that touch.
     """
     if not cell.round:
         raise CellError(f"rows are solved for round pillars on a square lattice, not {cell.described}")
@@ -68,15 +114,15 @@ def solve_row(
         raise CellError("rows are solved for upright pillars without films; leave the films out")
     if not len(diameters_um) or not all(0 < d < cell.pitch_um for d in diameters_um):
         raise CellError(f"row of {len(diameters_um)} pillars: need diameters above 0 and below {cell.pitch_um} um")
-    count = len(diameters_um)
-    m, n = (
-        a.ravel()
-        for a in np.meshgrid(
-            np.arange(-harmonics * count, harmonics * count + 1), np.arange(-harmonics, harmonics + 1), indexing="ij"
-        )
-    )
-    kx, ky = m * wavelength_um / (count * cell.pitch_um), n * wavelength_um / cell.pitch_um
-    p, q = _layer(cell, diameters_um, wavelength_um, (m, n, kx, ky))
+    block = block_of(cell.pitch_um, diagonal)
+    if len(diameters_um) % block.pillars:
+        raise CellError(f"row of {len(diameters_um)} pillars along the diagonal: need an even number")
+    blocks = len(diameters_um) // block.pillars
+    across = math.ceil(harmonics * block.width_um / cell.pitch_um - 1e-9)
+    reach = across * blocks
+    m, n = (a.ravel() for a in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-across, across + 1), indexing="ij"))
+    kx, ky = m * wavelength_um / (blocks * block.width_um), n * wavelength_um / block.width_um
+    p, q = _layer(cell, diameters_um, wavelength_um, block, (m, n, kx, ky))
     electric, magnetic = _mirror(n, polarization)
     p, q = electric.T @ p @ magnetic, magnetic.T @ q @ electric
     return _matched(cell, wavelength_um, (p, q), (m, n, kx, ky), (electric, magnetic, polarization))
@@ -85,17 +131,19 @@ def solve_row(
 Grid = tuple[Array, Array, Array, Array]  # orders m, n and the wave vector kx, ky in units of k0
 
 
-def _layer(cell: Cell, diameters_um: Sequence[float] | Array, wavelength_um: float, grid: Grid) -> tuple[Array, Array]:
+def _layer(
+    cell: Cell, diameters_um: Sequence[float] | Array, wavelength_um: float, block: _Block, grid: Grid
+) -> tuple[Array, Array]:
     """Matrices of dE/dz = P H and dH/dz = Q E in the pillar layer, lengths in units of 1 / k0."""
     m, n, kx, ky = grid
     inside, around = (materials.index(name, wavelength_um) ** 2 for name in (cell.pillar, cell.between))
     dm, dn = m[:, None] - m, n[:, None] - n
-    disc = _discs(dm, dn, np.asarray(diameters_um), cell.pitch_um)
+    disc = _discs(dm, dn, np.asarray(diameters_um), block)
     one = np.eye(len(m))
     eps = around * one + (inside - around) * disc
     harmonic = np.linalg.inv(one / around + (1 / inside - 1 / around) * disc)
     gap = eps - harmonic
-    xx, yy, xy = (_product(gap, field[dm, dn]) for field in _normal_fields(len(diameters_um), m, n))
+    xx, yy, xy = (_product(gap, field[dm, dn]) for field in _normal_fields(len(diameters_um), m, n, block))
     inverse = np.linalg.inv(eps)
     x, y = np.diag(kx), np.diag(ky)
     p = np.block([[x @ inverse @ y, one - x @ inverse @ x], [y @ inverse @ y - one, -y @ inverse @ x]])
@@ -108,32 +156,31 @@ def _product(gap: Array, normal: Array) -> Array:
     return np.asarray((gap @ normal + normal @ gap) / 2)
 
 
-def _discs(dm: Array, dn: Array, diameters_um: Array, pitch_um: float) -> Array:
+def _discs(dm: Array, dn: Array, diameters_um: Array, block: _Block) -> Array:
     """Fourier coefficients of the indicator of all discs: sum of f 2 J1(x) / x exp(-iGx)."""
-    count = len(diameters_um)
-    size = np.hypot(dm / count, dn) / pitch_um
+    blocks = len(diameters_um) // block.pillars
+    size = np.hypot(dm / blocks, dn) / block.width_um
     total = np.zeros(dm.shape, complex)
-    for place, diameter in enumerate(diameters_um):
+    for (x_um, y_um), diameter in zip(block.places_um(len(diameters_um)).T, diameters_um, strict=True):
         x = np.pi * diameter * size
-        share = np.pi * diameter**2 / (4 * count * pitch_um**2)
+        share = np.pi * diameter**2 / (4 * blocks * block.width_um**2)
         shape = np.where(x > 0, 2 * j1(x) / np.where(x > 0, x, 1), 1.0)
-        total += share * shape * np.exp(-2j * np.pi * dm * (place - (count - 1) / 2) / count)
+        turns = (dm * x_um / blocks + dn * y_um) / block.width_um
+        total += share * shape * np.exp(-2j * np.pi * turns)
     return total
 
 
-def _normal_fields(count: int, m: Array, n: Array) -> tuple[Array, Array, Array]:
+def _normal_fields(count: int, m: Array, n: Array, block: _Block) -> tuple[Array, Array, Array]:
     """Tables over differences of orders of nx nx, ny ny, nx ny of the radial field about the nearest pillar."""
     u = (np.arange(GRID) + 0.5) / GRID - 0.5
-    x, y = u[:, None], u[None, :]
-    r2 = x**2 + y**2
+    blocks = count // block.pillars
     reach_x, reach_y = 2 * int(m.max()), 2 * int(n.max())
-    along = np.exp(-2j * np.pi * np.arange(-reach_x, reach_x + 1)[:, None] * u / count) / GRID
+    orders = np.arange(-reach_x, reach_x + 1)[:, None]
+    along = np.exp(-2j * np.pi * orders * u / blocks) / GRID
     across = np.exp(-2j * np.pi * np.arange(-reach_y, reach_y + 1)[:, None] * u) / GRID
-    comb = np.exp(
-        -2j * np.pi * np.arange(-reach_x, reach_x + 1)[:, None] * (np.arange(count) - (count - 1) / 2) / count
-    ).mean(1)
+    comb = np.exp(-2j * np.pi * orders * (np.arange(blocks) - (blocks - 1) / 2) / blocks).mean(1)
     tables = []
-    for field in (x * x / r2, y * y / r2, x * y / r2):
+    for field in block.normals():
         table = (along @ field @ across.T) * comb[:, None]
         tables.append(np.roll(table, (-reach_x, -reach_y), (0, 1)))  # so that negative differences index from the end
     return tables[0], tables[1], tables[2]
@@ -208,96 +255,71 @@ def _forward(kz: Array) -> Array:
     return np.asarray(np.where(kz.real + kz.imag < 0, -kz, kz))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Neighbours:
-    """Factor c(s) = 1 + a s + b s² on the amplitude that goes where it should, s the sine that light is turned by.
-
-    The first term is that of the zone borders, whose number grows with s; the second that of the slope between them.
-
-    a, b: complex. sine, factor: (n,) measured on rows. scatter: (n,) share of the transmitted power that goes
-    elsewhere, beyond what pillars one by one would send there. wavelength_um: of the rows.
-    by_polarization: (2, n) the factor of light whose field lies along the row, and across it.
-    """
-
-    a: complex
-    b: complex
-    sine: Array
-    factor: Array
-    scatter: Array
-    wavelength_um: float
-    by_polarization: Array
-
-    def at(self, sine: Array) -> Array:
-        """Complex factor where light is turned by this much."""
-        s = np.abs(sine)
-        return np.asarray(1 + self.a * s + self.b * s**2)
-
-    def without(self, row: int) -> "Neighbours":
-        """The same without a row, a and b as they are."""
-        sine, factor, scatter = (np.delete(part, row) for part in (self.sine, self.factor, self.scatter))
-        both = np.delete(self.by_polarization, row, axis=1)
-        return Neighbours(self.a, self.b, sine, factor, scatter, self.wavelength_um, both)
-
-    def share(self, sine: Array, weight: Array, cover: float) -> float:
-        """Share of the power in the focus of pillars taken one by one that unlike neighbours leave there.
-
-        |∫ (P + S) / 2|² over the lens, P² = c² / cos θ of the light along the slope, S² = c² cos θ of that across it,
-        θ in a cover of this index: tangential fields are c, the power that leaves in a direction is P² and S².
-
-        Args:
-            sine, weight: (m,) turned by, and share of the lens, of sum 1.
-        """
-        powers = np.stack([self.sine, self.sine**2], 1).astype(complex)
-        coefficients = np.linalg.lstsq(powers, self.by_polarization.T - 1, rcond=None)[0]
-        factor = 1 + np.stack([sine, sine**2], 1) @ coefficients
-        cosine = np.sqrt(np.maximum(1 - (sine / cover) ** 2, 0.0))
-        along, across = factor[:, 0] / np.sqrt(np.maximum(cosine, 1e-9)), factor[:, 1] * np.sqrt(cosine)
-        return float(abs(weight @ (along + across) / 2) ** 2)
-
-
-def neighbours(lens: Lens, *, counts: tuple[int, ...] = (6, 5), harmonics: int = 3) -> Neighbours:
+def neighbours(
+    lens: Lens, *, counts: tuple[int, ...] = (6, 5), harmonics: int = 3, diagonal: bool = True
+) -> Neighbours:
     """How far unlike neighbours change the pillars of this lens: blazed rows of its own pillars, both polarisations.
 
     A row of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N pitch), as the lens does where
     its phase has that slope. Of short rows several are solved, whose phases begin elsewhere, and their mean is taken.
 
+    Args:
+        counts: pillars of the rows along the lattice. harmonics: of :func:`solve_row`; one less for ``coarse``.
+        diagonal: also solve rows along the diagonal, of the even numbers next to √2 of those.
+
     Raises:
         CellError: the cell has films or tilted walls, or is no round pillar on a square lattice.
     """
-    sines, factors, scatter = [], [], []
-    for count in counts:
-        begins = max(1, round(LONG / count))
-        found = []
-        for begin in range(begins):
-            wanted = 2 * np.pi * (np.arange(count) + 0.25 + begin / begins) / count
-            diameters = lens.proxy.diameter_um(wanted, lens.wavelength_um, within_um=printed(lens), gap="nearest")
-            found.append(_blazed(lens, np.asarray(diameters), harmonics))
-        sines.append(lens.wavelength_um / (count * lens.cell.pitch_um))
-        factors.append(np.mean([ratio for ratio, _ in found], axis=0))
-        scatter.append(float(np.mean([lost for _, lost in found])))
-    s, both = np.array(sines), np.array(factors).T
-    a, b = np.linalg.lstsq(np.stack([s, s**2], 1).astype(complex), both.mean(axis=0) - 1, rcond=None)[0]
-    return Neighbours(complex(a), complex(b), s, both.mean(axis=0), np.array(scatter), lens.wavelength_um, both)
+    cover = materials.index(lens.cell.cover, lens.wavelength_um).real
+    aside = sorted({2 * max(1, round(count / math.sqrt(2))) for count in counts}) if diagonal else []
+    rows = [(count, False) for count in counts] + [(count, True) for count in aside]
+    sines = [lens.wavelength_um / (n * block_of(lens.cell.pitch_um, turned).spacing_um) for n, turned in rows]
+    told = [(row, sine) for row, sine in zip(rows, sines, strict=True) if sine < STEEPEST * cover]
+    found = [[_mean(lens, *row, reach) for row, _ in told] for reach in (harmonics, harmonics - 1)]
+    fine, coarse = ([factor for factor, _ in one] for one in found)
+    return Neighbours(
+        np.array([sine for _, sine in told]),
+        np.array([turned for (_, turned), _ in told], bool),
+        np.array(fine).reshape(-1, 2).T,
+        np.array(coarse).reshape(-1, 2).T,
+        np.array([lost for _, lost in found[0]]),
+        lens.wavelength_um,
+        cover,
+    )
 
 
-def _blazed(lens: Lens, diameters_um: Array, harmonics: int) -> tuple[Array, float]:
+def _mean(lens: Lens, count: int, diagonal: bool, harmonics: int) -> tuple[Array, float]:
+    """(2,) factor and the power that went elsewhere, mean over rows of ``count`` whose phases begin elsewhere."""
+    begins = max(1, round(LONG / count))
+    found = []
+    for begin in range(begins):
+        wanted = 2 * np.pi * (np.arange(count) + 0.25 + begin / begins) / count
+        diameters = lens.proxy.diameter_um(wanted, lens.wavelength_um, within_um=printed(lens), gap="nearest")
+        found.append(_blazed(lens, np.asarray(diameters), harmonics, diagonal))
+    return np.mean([ratio for ratio, _ in found], axis=0), float(np.mean([lost for _, lost in found]))
+
+
+def _blazed(lens: Lens, diameters_um: Array, harmonics: int, diagonal: bool) -> tuple[Array, float]:
     """Amplitude in the wanted order against pillars one by one, of light along and across the row, and power that went
     elsewhere, the mean of both."""
-    count = len(diameters_um)
+    count, block = len(diameters_um), block_of(lens.cell.pitch_um, diagonal)
     place = np.arange(count) - (count - 1) / 2
+    about: dict[str, Any] = {"harmonics": harmonics, "diagonal": diagonal}
     ratios, lost = [], []
     for polarization in ("x", "y"):
-        whole = solve_row(lens.cell, diameters_um, lens.wavelength_um, polarization=polarization, harmonics=harmonics)
+        whole = solve_row(lens.cell, diameters_um, lens.wavelength_um, polarization=polarization, **about)
         alone = np.array(
             [
-                solve_row(lens.cell, [d], lens.wavelength_um, polarization=polarization, harmonics=harmonics).order(0)
+                solve_row(lens.cell, [d] * block.pillars, lens.wavelength_um, polarization=polarization, **about).order(
+                    0
+                )
                 for d in diameters_um
             ]
         )
         want = (alone * np.exp(-2j * np.pi * place / count)).mean()
         got = whole.order(1)
         ratios.append(got / want)
-        travels = np.abs(whole.orders) * lens.wavelength_um < count * lens.cell.pitch_um
+        travels = np.abs(whole.orders) * lens.wavelength_um < count * block.spacing_um
         total = float((np.abs(whole.t[travels]) ** 2).sum())
         lost.append(1 - abs(got) ** 2 / total - (1 - abs(want) ** 2 / float((np.abs(alone) ** 2).mean())))
     return np.array(ratios), float(np.mean(lost))

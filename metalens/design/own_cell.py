@@ -11,18 +11,16 @@ from typing import Literal
 import numpy as np
 
 from metalens import rcwa
-from metalens.cell import materials
 from metalens.design.neighbours import neighbours, printed
 from metalens.design.profiles import Focus
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.lens import Lens
-from metalens.psf import LeftOut
+from metalens.lens import CURVED, Lens, Neighbours
+from metalens.psf import NEIGHBOURS, LeftOut
 
 RINGS = 48  # of a lens, over which light is summed
 FEWEST, MOST = 2, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
 # (with two, light to both sides is told apart by rows whose phases begin elsewhere)
-CURVED = 0.2  # of the loss: a cut through a lens solved whole loses that much less (python -m benchmarks neighbours)
 DIAMETERS = 5
 TOLERANCE = 1e-2  # of t
 
@@ -41,18 +39,24 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
     """
     if lens.pairs is not None:
         raise CellError("own_cell: rows of pillars of two sizes are not solved here; leave own_cell out")
-    rim = lens.wavelength_um / (lens.cell.pitch_um * aperture)
-    long = int(np.clip(round(rim), FEWEST + 1, MOST))
-    found = neighbours(lens, counts=(long, max(FEWEST, round(long / 1.5))))
+    found = lens.neighbours or neighbours(lens, counts=_counts(lens, aperture))
     angle = angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2 if incidence_rad else 0.0
-    return LeftOut((found.a, found.b), angle, "the lens's own cell")
+    return LeftOut(found, angle, "the lens's own cell")
+
+
+def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
+    """Pillars in rows from the zone of the rim on, where light is turned by the sine ``aperture``."""
+    rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * aperture)))
+    shortest = min(rim, MOST // 2)
+    return shortest, math.ceil(1.5 * shortest), 2 * shortest
 
 
 @dataclass(frozen=True, slots=True)
 class Unlike:
     """What unlike neighbours leave of the light that pillars, taken one by one, bring to the focus.
 
-    share: of that power. error: estimate of its error. pillars: in the rows that were solved; none: rough.
+    share: of that power. error: estimate of its error. pillars: in the rows along the lattice that were solved; none:
+    rough.
     """
 
     share: float
@@ -60,42 +64,48 @@ class Unlike:
     pillars: tuple[int, ...] = ()
 
 
-def unlike(lens: Lens, *, radius_um: float) -> Unlike:
-    """Rows of the lens's own pillars, with the zones of its rim and longer ones, summed over its aperture.
-
-    Accuracy: the error is what another truncation, and leaving out any one row, change, and a fifth of the loss for
-        zones that get shorter from one to the next, which no row has. Zones off the lattice axes are not solved.
+def rows(lens: Lens, *, radius_um: float) -> Neighbours:
+    """Rows of the lens's own pillars with the zones of its rim and longer ones, for the lens to hold.
 
     Raises:
         CellError: the cell has films or tilted walls, or no round pillars on a square lattice.
     """
-    sine, weight, cover = _rings(lens, radius_um)
-    rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * float(sine.max()))))
-    shortest = min(rim, MOST // 2)
-    counts = shortest, math.ceil(1.5 * shortest), 2 * shortest
-    fine, coarse = (neighbours(lens, counts=counts, harmonics=harmonics) for harmonics in (3, 2))
-    share = fine.share(sine, weight, cover)
-    less = [fine.without(k).share(sine, weight, cover) for k in range(len(counts))]
-    error = abs(coarse.share(sine, weight, cover) - share) + max(abs(one - share) for one in less)
-    error += CURVED * abs(1 - share)
-    return Unlike(share, error, counts)
+    return neighbours(lens, counts=_counts(lens, float(_rings(lens, radius_um)[0].max())))
+
+
+def unlike(lens: Lens, *, radius_um: float) -> Unlike:
+    """Rows of the lens's own pillars (those that it holds, else solved here), summed over its aperture.
+
+    Accuracy: the error is what another truncation, and leaving out any one row, change, and a fifth of the loss for
+        zones that get shorter from one to the next, which no row has.
+
+    Raises:
+        CellError: as :func:`rows`.
+    """
+    found = lens.neighbours or rows(lens, radius_um=radius_um)
+    sine, weight = _rings(lens, radius_um)
+    share = found.share(sine, weight)
+    less = [other.share(sine, weight) for other in found.others]
+    error = abs(found.coarser.share(sine, weight) - share) + max((abs(one - share) for one in less), default=0.0)
+    pitches = lens.wavelength_um / (found.sine[~found.diagonal] * lens.cell.pitch_um)
+    return Unlike(share, error + CURVED * abs(1 - share), tuple(np.rint(pitches).astype(int).tolist()))
 
 
 def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
     """The same with the factor of another cell (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more."""
-    sine, weight, _ = _rings(lens, radius_um)
-    a, b = LeftOut().neighbours
+    sine, weight = _rings(lens, radius_um)
+    a, b = NEIGHBOURS
     share = float(abs(weight @ (1 + a * sine + b * sine**2)) ** 2)
     return Unlike(share, 1 - share)
 
 
-def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array, float]:
-    """(m,) sines by which rings of a lens turn light, their shares of the area, and the index of the cover."""
+def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
+    """(m,) sines by which rings of a lens turn light, and their shares of the area."""
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
     focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
     sine = np.array([focus.aperture(r) + r / math.hypot(r, lens.source_distance_um) for r in radius.tolist()])
-    return sine, weight / 2, materials.index(lens.cell.cover, lens.wavelength_um).real
+    return sine, weight / 2
 
 
 def angle_change(lens: Lens, incidence_rad: float) -> float:

@@ -12,12 +12,11 @@ from metalens.field.forming import Imager, between_nodes, blurred, psfs_used, tr
 from metalens.field.patches import relative
 from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
 from metalens.field.points import Optics, sampling
-from metalens.field.polarised import Counted
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Polarisation, Source
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
@@ -35,7 +34,7 @@ def imager(
     field: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-2,
     distance_um: float | None = None,
-    polarisation: Counted = "auto",
+    polarisation: Polarisation = "auto",
     device: torch.device | str = "cpu",
 ) -> Imager:
     """Prepare a lens for frames of a grid.

@@ -12,10 +12,9 @@ from torch import Tensor
 from metalens.field import compiled
 from metalens.field.patches import dense, relative
 from metalens.field.points import Optics, Window, psfs
-from metalens.field.polarised import Counted
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Polarisation, Source
 from metalens.psf import spectrum as spectra
 
 STEPS = (24, 16, 12, 8, 6, 4)  # between depths that are tried, in 96ths of the range of 1/z
@@ -95,7 +94,7 @@ def planned(
     *,
     tolerance: float,
     folds: bool,
-    polarisation: Counted = "auto",
+    polarisation: Polarisation = "auto",
 ) -> Plan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
@@ -197,7 +196,7 @@ def polarised(
     at: tuple[Tensor, Tensor],
     tolerance: float,
     *,
-    polarisation: Counted,
+    polarisation: Polarisation,
 ) -> Window:
     """The window with one scalar where that images within the tolerance (``auto``), else with as few components of
     the fields of both polarisations as image within their share of it."""

@@ -24,6 +24,7 @@ from metalens.field.rays import Paths, Rays, rays, source_paths
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, media
+from metalens.psf import Mixed, strongest
 
 SPARE = 1.06  # period of the nodes per width of the window
 CLEAR = 0.7  # of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
@@ -183,7 +184,7 @@ def _one(
     mixed = None
     if grid.components:
         fields = polarised.factors(found, tangents, after.order[-1], flux=grid.flux)
-        mixed = polarised.strongest(fields, pupil.weight, grid.components)
+        mixed = strongest(fields, pupil.weight, grid.components)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
     moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
@@ -201,7 +202,7 @@ def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor])
     return shown
 
 
-def _fluxes(light: Tensor, mixed: polarised.Mixed | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
+def _fluxes(light: Tensor, mixed: Mixed | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
     """(depths, size, size) |U|² of the transforms of the light on the nodes, and with ``aside`` the flux along x and y.
 
     mixed: whose light adds up; None for the scalar.

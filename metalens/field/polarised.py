@@ -13,27 +13,14 @@ differs from the flux by 1e-2 and 0.1 there, and by more from the side. A field 
 passes; fields are how it lies on the window.
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from metalens.field.rays import Rays
-from metalens.psf import turned
+from metalens.psf import Mixed, of_flux, turned
 
-Counted = Literal["auto", "scalar", "flux", "vector"]
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
 STEEPEST = 1e-3  # cos² of nodes beyond the rim, which have no light
-NOTHING = 1e-12  # of the light of the strongest combination of factors: rounding
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Mixed:
-    """pupils: (components, …) real factors on the scalar's pupil; signs: 1 or -1 of what each adds to the light."""
-
-    pupils: Tensor
-    signs: tuple[float, ...]
 
 
 def factors(seen: Rays, tangents: Tensor, index: float, *, flux: bool) -> Mixed:
@@ -49,35 +36,3 @@ def factors(seen: Rays, tangents: Tensor, index: float, *, flux: bool) -> Mixed:
     slope = torch.cat([tangents, tangents.new_ones(1)])
     electric = turned(slope / slope.norm(), b)
     return of_flux(electric, b) if flux else Mixed(electric, (1.0,) * OF_ENERGY)
-
-
-def of_flux(electric: Tensor, b: Tensor) -> Mixed:
-    """From (2 polarisations x 3 components, …) fields of rays in the directions b (3, …) to those of their flux."""
-    parts: list[Tensor] = []
-    for e in electric.reshape(2, 3, *electric.shape[1:]):
-        h = torch.linalg.cross(b.expand_as(e), e, dim=0)
-        parts += [e[0] + h[1], e[0] - h[1], e[1] - h[0], e[1] + h[0]]
-    return Mixed(torch.stack(parts) / 2, (1.0, -1.0) * 4)
-
-
-def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
-    """Mixtures, ``count`` or all that are not 0, that hold most of the light, whose sum is that of ``weight``².
-
-    With A Aᵀ the products of the fields over the nodes and D their signs, axes y of Aᵀ D A of eigenvalue λ are pupils
-    √|λ| A⁻ᵀ y of sign λ. Differentiable in the fields.
-
-    Args:
-        weight: (…) of each node.
-    """
-    light = (fields.pupils.detach() * weight).flatten(1)
-    power, axes = torch.linalg.eigh(light @ light.mT)
-    kept = power > NOTHING * power[-1]
-    root = torch.sqrt(power[kept])
-    signs = torch.tensor(fields.signs, dtype=light.dtype, device=light.device)
-    inner = (axes[:, kept] * root).mT @ (signs[:, None] * (axes[:, kept] * root))
-    size, turn = torch.linalg.eigh(inner)
-    first = torch.argsort(size.abs(), descending=True)[:count]
-    first = first[size[first].abs() > NOTHING * size.abs().max()]
-    mixture = (axes[:, kept] / root) @ turn[:, first] * torch.sqrt(size[first].abs())
-    level = torch.sqrt((weight**2).sum() / size[first].sum())
-    return Mixed(level * torch.einsum("dc,d...->c...", mixture, fields.pupils), tuple(torch.sign(size[first]).tolist()))

@@ -16,6 +16,7 @@ from torch import Tensor
 from metalens.design import Focus
 from metalens.ground.errors import SceneError
 from metalens.lens import Lens, Media, media
+from metalens.psf import among
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 
@@ -64,6 +65,7 @@ class PillarWave:
 
     diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in.
 
+    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`, the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image; it lands far outside the window.
 
     Raises:
@@ -123,6 +125,8 @@ class PillarWave:
     def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
         """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
+        if self.lens.neighbours is not None:
+            t = t * among.mean(t, self.lens.neighbours, self.lens.diameters.pitch_um)
         rest = torch.view_as_real(t * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
         layers = torch.cat([rest, open_[None]])
         size = layers.shape[-2:]

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from metalens.lens.layers import Layers as Layers
     from metalens.lens.layers import check_gaps as check_gaps
     from metalens.lens.media import Media as Media
+    from metalens.lens.neighbours import CURVED as CURVED
+    from metalens.lens.neighbours import Neighbours as Neighbours
     from metalens.lens.pairs import Pairs as Pairs
     from metalens.lens.record import HANDS as HANDS
     from metalens.lens.record import Hand as Hand
@@ -27,12 +29,14 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "CURVED": "neighbours",
         "DiameterMap": "diameters",
         "HANDS": "record",
         "Hand": "record",
         "Layers": "layers",
         "Lens": "record",
         "Media": "media",
+        "Neighbours": "neighbours",
         "Pairs": "pairs",
         "check_gaps": "layers",
         "export": "",

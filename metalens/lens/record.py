@@ -16,6 +16,7 @@ from metalens.ground.reading import read_through, reader, survived
 from metalens.ground.store import Provenance
 from metalens.lens.diameters import DiameterMap as DiameterMap
 from metalens.lens.layers import Layers, check_gaps
+from metalens.lens.neighbours import Neighbours
 from metalens.lens.pairs import Pairs
 from metalens.lens.rows import RowsOnDisk
 from metalens.pillars import Proxy
@@ -43,6 +44,8 @@ class Lens:
         pillar) or "left"; the proxy is then that of the light that leaves with the other hand. Empty: any light.
     pairs: table of pillars of two sizes in place of the proxy; None where they have one. light: polarisation, "x" or
         "y", that phase, transmission and distances are for where they have two (:meth:`seen`).
+    neighbours: rows of its own unlike pillars (:func:`metalens.design.neighbours`), whose factor PSFs and images then
+        hold; None where none was solved.
 
     Raises:
         LensError: layers with another cover than the cell's; turned pillars without a hand, or the other way round;
@@ -61,6 +64,7 @@ class Lens:
     hand: Hand = ""
     pairs: Pairs | None = None
     light: Literal["x", "y"] = "x"
+    neighbours: Neighbours | None = None
 
     def __post_init__(self) -> None:
         if (self.pairs is None) != (self.diameters.length_um is None) or (self.pairs is None and self.light != "x"):
@@ -194,6 +198,8 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
     if not d.plain:
         attributes |= {"lattice": config.dumps(d.lattice), "row_um": d.steps_um[1], "shape": lens.cell.shape.name}
         attributes |= {"hand": lens.hand, "light": lens.light}
+    if lens.neighbours is not None:
+        arrays |= {f"{group}neighbours/{name}": array for name, array in lens.neighbours.to_arrays().items()}
     if d.angle_rad is not None:
         arrays |= {f"{group}angle_rad": d.angle_rad}
     if d.length_um is not None:
@@ -205,9 +211,9 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
 
 def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, where: str, group: str = "") -> Lens:
     """Inverse of :func:`parts`; ``where`` names the file in errors."""
-    proxy, held = (
+    proxy, held, rows = (
         {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
-        for start in (f"{group}proxy/", f"{group}pairs/")
+        for start in (f"{group}proxy/", f"{group}pairs/", f"{group}neighbours/")
     )
     pairs = Pairs.from_arrays(held) if held else None
     return Lens(
@@ -222,6 +228,7 @@ def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, wh
         hand=attributes.get("hand", ""),
         pairs=pairs,
         light=attributes.get("light", "x"),
+        neighbours=Neighbours.from_arrays(rows) if rows else None,
     )
 
 

@@ -79,13 +79,13 @@ def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
     energy = normalised.sum(1, dtype=float)
     normalised /= energy[:, None].astype(normalised.dtype)
     order = _orders([samples[0].shape for samples in windows])
-    mean = normalised.mean(0, dtype=float, keepdims=True)
+    mean = np.maximum(normalised.mean(0, dtype=float, keepdims=True), 0.0)  # a flux may run back where it is dark
     near = _near(mean[0], [samples[0].shape[-2:] for samples in windows])
     points, chance = draw(mean, order, count[0], edges, near)
     points, chance = np.tile(points, (len(depths), 1)), np.tile(chance, (len(depths), 1))
     direct = _direct_light(windows, depths, points[0]) / energy[:, None]
     difference = direct - np.take_along_axis(normalised, points, 1)
-    noise = sum(2 * s.weight * s.noise**2 * (1 / energy).sum() for s in windows[0])
+    noise = sum(2 * abs(s.weight) * s.noise**2 * (1 / energy).sum() for s in windows[0])
     least = NORMALISED if points.shape[1] >= mean.size // EVERY else SPARSE
     total = square_error(normalised, points, chance, difference, least) + float(noise)
     return float(SAFETY * np.sqrt(total / _squares(normalised).sum()))

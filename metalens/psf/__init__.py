@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.psf import among as among
     from metalens.psf import export as export
     from metalens.psf import plots as plots
     from metalens.psf import spectrum as spectrum
+    from metalens.psf.budget import NEIGHBOURS as NEIGHBOURS
     from metalens.psf.budget import Budget as Budget
     from metalens.psf.budget import LeftOut as LeftOut
+    from metalens.psf.budget import Polarisation as Polarisation
     from metalens.psf.budget import scalar_error as scalar_error
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
@@ -23,7 +26,6 @@ if TYPE_CHECKING:
     from metalens.psf.of_lens import from_lens as from_lens
     from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
-    from metalens.psf.record import Polarisation as Polarisation
     from metalens.psf.record import PsfStack as PsfStack
     from metalens.psf.record import SourceShape as SourceShape
     from metalens.psf.record import load as load
@@ -31,6 +33,9 @@ if TYPE_CHECKING:
     from metalens.psf.spectrum import Nodes as Nodes
     from metalens.psf.spectrum import Source as Source
     from metalens.psf.stack import psf_stack as psf_stack
+    from metalens.psf.vector import Mixed as Mixed
+    from metalens.psf.vector import of_flux as of_flux
+    from metalens.psf.vector import strongest as strongest
     from metalens.psf.vector import turned as turned
 
 __getattr__, __dir__, __all__ = attach(
@@ -40,24 +45,29 @@ __getattr__, __dir__, __all__ = attach(
         "Extent": "extended",
         "FarField": "directions",
         "LeftOut": "budget",
+        "Mixed": "vector",
+        "NEIGHBOURS": "budget",
         "Nodes": "spectrum",
-        "Polarisation": "record",
+        "Polarisation": "budget",
         "PsfStack": "record",
         "Source": "spectrum",
         "SourceShape": "record",
         "View": "of_lens",
+        "among": "",
         "aperture": "of_lens",
         "export": "",
         "far_field": "directions",
         "from_lens": "of_lens",
         "unpolarised": "of_lens",
         "load": "record",
+        "of_flux": "vector",
         "on_pixels": "pixels",
         "plots": "",
         "psf_stack": "stack",
         "save": "record",
         "scalar_error": "budget",
         "spectrum": "",
+        "strongest": "vector",
         "turned": "vector",
     },
 )

@@ -2,41 +2,49 @@
 
 The model's terms are relative L2 errors of the PSF of a perfect lens of the same aperture, from radial integrals
 
-    U(ρ) = ∫ √spread(p) c(p) J0(k p ρ) p dp        (scalar; c = 1 for pillars that do not feel their neighbours)
+    U(ρ) = ∫ √spread(p) C(p) J0(k p ρ) p dp        (scalar; C = 1 for pillars that do not feel their neighbours)
 
-and, for both polarisations, Ex, Ey, Ez of rays turned by the lens (Richards and Wolf 1959) with |E|² cos θ kept.
+and, for both polarisations, the flux of rays turned by the lens (Richards and Wolf 1959) with |E|² cos θ kept.
 """
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 from scipy.special import jv
 
 from metalens.ground.arrays import Array
+from metalens.lens import CURVED, Neighbours
 
+Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell: amplitude 0.986, -0.066 rad at sine
 # 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 ANGLE = 2.5  # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst pillar off resonance
+HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
     """What is known of pillars that the model of a lens leaves out; by default rough, of another cell.
 
-    neighbours: (a, b) of the factor 1 + a s + b s² on light that unlike neighbours turn by the sine s.
+    neighbours: rows of the lens's own pillars, whose factor its PSFs hold; or (a, b) of the factor 1 + a s + b s² on
+        light that unlike neighbours turn by the sine s, which they lack.
     angle: relative change of t over sin² of the incidence. of: whose numbers they are.
     """
 
-    neighbours: tuple[complex, complex] = NEIGHBOURS
+    neighbours: Neighbours | tuple[complex, complex] = NEIGHBOURS
     angle: float = ANGLE
     of: str = ""
 
     @property
     def words(self) -> str:
         """For a person."""
-        return f"neighbours and angle: of {self.of or 'the default cell, rough'}"
+        if isinstance(self.neighbours, tuple):
+            return f"neighbours and angle: of {self.of or HOW}"
+        angle = "" if self.of else "; angle: of the default cell, rough"
+        return f"unlike neighbours counted, by {len(self.neighbours.sine)} solved rows{angle}"
 
 
 ROUGH = LeftOut()
@@ -49,7 +57,8 @@ class Budget:
     numerical: of the propagation, measured on the result. sampling: of the integration over the cells of the window.
     spectrum: of the quadrature over wavelengths. source: of a source of finite size, whose points are taken as alike.
     polarisation: of one scalar in place of both polarisations. neighbours: of pillars taken as if each stood among its
-        like. angle: of pillars that answer as at normal incidence. glass: of light that goes twice between two faces.
+        like, or of the factor of solved rows where the lens holds them. angle: of pillars that answer as at normal
+        incidence. glass: of light that goes twice between two faces.
     outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
         show it, so it is in no total.
     """
@@ -107,7 +116,7 @@ def with_model(
     budget: Budget,
     *,
     aperture: float,
-    vector: bool,
+    polarisation: Polarisation,
     incidence_rad: float,
     has_angles: bool,
     ghost: float,
@@ -118,31 +127,43 @@ def with_model(
 
     Args:
         aperture: half the spread in sin θ of the rays to the sensor. uneven: as in :func:`scalar_error`.
-        vector: whether both polarisations were computed. has_angles: whether the pillars answer at the light's angle.
+        polarisation: that was computed. has_angles: whether the pillars answer at the light's angle.
     """
     return replace(
         budget,
-        polarisation=0.0 if vector else scalar_error(aperture, uneven),
-        neighbours=_difference(_scalar(aperture, left_out.neighbours), _scalar(aperture)),
+        polarisation=scalar_error(aperture, uneven) if polarisation == "scalar" else 0.0,
+        neighbours=_neighbours(aperture, left_out.neighbours, polarisation),
         angle=0.0 if has_angles else min(1.0, left_out.angle * math.sin(incidence_rad) ** 2),
         glass=ghost,
     )
 
 
 def scalar_error(aperture: float, uneven: float = 0.0) -> float:
-    """Relative L2 difference between the scalar PSF and |E|² of both polarisations.
+    """Relative L2 difference between the scalar PSF and the flux of both polarisations, which a pixel counts.
 
-    In focus it is that of a perfect lens of this aperture. Out of it rays fall apart, and the scalar's power is weighed
-    by 1/cos θ alone: the difference is how uneven that is over the aperture. Light from the side and aberrated light
-    have of both and lie below the two together (36 of 36 lenses drawn, NA 0.1 to 0.6, up to 25 degrees: 0.25 to 0.87).
-
-    A pixel counts flux, which has no 1/cos θ: the scalar is that to 7e-5 at NA 0.24 and 4e-3 at NA 0.6
-    (:mod:`metalens.field.polarised`).
+    That of a perfect lens of this aperture in focus (7e-5 at NA 0.24, 4e-3 at 0.6), and of light from the side: two
+    rays b, b' of it add up as (b_z + b'_z) / 2√(b_z b'_z), which is 1 but for squares of how uneven 1/cos θ is. Of 36
+    lenses drawn (NA 0.1 to 0.6, up to 25 degrees, in focus, out of it, aberrated) 36 lie below, at 0.29 to 0.86 of it.
 
     Args:
         uneven: standard deviation of 1/cos θ over the aperture, over its mean (:func:`metalens.psf.of_lens.uneven`).
     """
-    return math.hypot(_difference(_scalar(aperture), _vectorial(aperture)), uneven)
+    return math.hypot(_difference(_scalar(aperture), _flux(aperture)), uneven**2 / 2)
+
+
+def _neighbours(aperture: float, known: Neighbours | tuple[complex, complex], polarisation: Polarisation) -> float:
+    """Of pillars taken one by one; or of the factor of rows: another truncation, any row left out, zones that get
+    shorter from one to the next, and for the scalar that fields along and across the slope are told apart."""
+    p, _, _ = _nodes(aperture)
+    if isinstance(known, tuple):
+        return _difference(_scalar(aperture, 1 + known[0] * p + known[1] * p * p), _scalar(aperture))
+    used = _scalar(aperture, known.mean(p))
+    less = [_difference(_scalar(aperture, other.mean(p)), used) for other in known.others]
+    left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(less, default=0.0)
+    left += CURVED * _difference(_scalar(aperture), used)
+    along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
+    aside = _scalar(aperture, (along - across) / 2, order=2)
+    return left if polarisation != "scalar" else math.hypot(left, _difference(used + aside, used))
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:
@@ -153,20 +174,19 @@ def _nodes(aperture: float) -> tuple[Array, Array, Array]:
     return p, w * p * edge / 2, np.linspace(0, 30 / edge, 240)
 
 
-def _scalar(aperture: float, factor: tuple[complex, complex] = (0, 0)) -> Array:
-    """(ρ,) |U|² through a factor 1 + a p + b p²."""
+def _scalar(aperture: float, factor: Array | float = 1.0, *, order: int = 0) -> Array:
+    """(ρ,) |U|² through a factor at the nodes, of light that turns ``order`` times about the axis."""
     p, weight, at = _nodes(aperture)
-    level = weight / (1 - p * p) * (1 + factor[0] * p + factor[1] * p * p)
-    return np.asarray(np.abs(level @ jv(0, np.outer(p, at))) ** 2)
+    level = weight / (1 - p * p) * factor
+    return np.asarray(np.abs(level @ jv(order, np.outer(p, at))) ** 2)
 
 
-def _vectorial(aperture: float) -> Array:
-    """(ρ,) |Ex|² + |Ey|² + |Ez|², unpolarised."""
+def _flux(aperture: float) -> Array:
+    """(ρ,) I0² - I2² of Richards and Wolf: power through the plane, unpolarised."""
     p, weight, at = _nodes(aperture)
     cosine = np.sqrt(1 - p * p)
     level, x = weight / (1 - p * p) / np.sqrt(cosine), np.outer(p, at)
-    parts = ((level * (1 + cosine)) @ jv(0, x), (level * p) @ jv(1, x), (level * (1 - cosine)) @ jv(2, x))
-    return np.asarray(parts[0] ** 2 + 2 * parts[1] ** 2 + parts[2] ** 2)
+    return np.asarray(((level * (1 + cosine)) @ jv(0, x)) ** 2 - ((level * (1 - cosine)) @ jv(2, x)) ** 2)
 
 
 def _difference(one: Array, other: Array) -> float:

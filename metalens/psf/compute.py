@@ -201,8 +201,8 @@ def _judged(
         lit = torch.stack([(row @ row) / row.sum() for row in seen_light]).min()
     else:
         lit = seen_light.mean(-1).min()
-    brightness = float(lit) / sum(
-        weight * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
+    brightness = float(lit) / sum(  # weights of a flux have signs
+        abs(weight) * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
     )
     error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
     return Result(total, error, choice.reason, light, brightness=brightness)

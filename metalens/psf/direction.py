@@ -10,6 +10,8 @@ from metalens.ground.errors import PropagationError
 from metalens.lens import media
 from metalens.propagate import Case, Moving
 from metalens.psf import extended
+from metalens.psf.among import Jones
+from metalens.psf.budget import Polarisation
 from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
 from metalens.psf.compute import Result, intensity
 from metalens.psf.extended import Extent
@@ -17,6 +19,7 @@ from metalens.psf.vector import expanded
 
 HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once; each share has a plan of its own
 SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
+COUNTED = ("scalar", "flux", "vector")
 STRICTER = 4  # settings for sources of finite size, whose estimate takes differences of PSFs
 
 
@@ -25,17 +28,20 @@ class Wanted:
     """What is asked of a direction, as in :func:`metalens.psf.psf_stack`.
 
     Raises:
-        PropagationError: a tolerance that is not above 0.
+        PropagationError: a tolerance that is not above 0, a polarisation that is none.
     """
 
     tolerance: float
-    vector: bool
+    polarisation: Polarisation
     integrate: bool
     source: Extent | None
+    fields: Jones | None = None
 
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
             raise PropagationError(f"tolerance is {self.tolerance}, need a relative error above 0")
+        if self.polarisation not in COUNTED:
+            raise PropagationError(f"polarisation = {self.polarisation!r}: need one of {', '.join(COUNTED)}")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,8 +72,9 @@ def direction(
     """
     if wanted.source is not None and moving is not None:
         raise PropagationError("a source of finite size has no derivatives in the geometry: give numbers, or a point")
-    if wanted.vector:
-        maps, cases, weights = expanded(maps, cases, weights)
+    if wanted.polarisation != "scalar":
+        flux = wanted.polarisation == "flux"
+        maps, cases, weights = expanded(maps, cases, weights, flux=flux, fields=wanted.fields)
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
     found = [_lens(Light(pair, cases, weights), wanted, moving) for pair in lenses]

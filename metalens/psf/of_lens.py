@@ -12,9 +12,9 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
-from metalens.psf.budget import Budget, LeftOut, scalar_error, with_model, worst
+from metalens.psf.budget import Budget, LeftOut, Polarisation, scalar_error, with_model, worst
 from metalens.psf.extended import Extent
-from metalens.psf.record import Polarisation, PsfStack
+from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
 
@@ -59,13 +59,15 @@ def from_lens(
 
     The proxy is asked at the angle of every direction where its library has angles, else at normal incidence, which
     ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the proxy holds the mean of both
-    polarisations, at normal incidence they are alike. The lens' films and cover are gone through.
+    polarisations, at normal incidence they are alike. The lens' films and cover are gone through, and the factor of its
+    own unlike neighbours where it holds their rows (``lens.neighbours``).
 
     Args:
         spectrum: wavelengths and weights; by default the design wavelength alone. Its error is in the budget.
-        polarisation: one scalar, Ex, Ey, Ez of both polarisations, or ``auto``: the scalar where its error
-            (:func:`metalens.psf.scalar_error`) is below the tolerance.
-        left_out: of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough numbers.
+        polarisation: as for :func:`psf_stack`, or ``auto``: the scalar where its error
+            (:func:`metalens.psf.scalar_error`) is below the tolerance, else the flux.
+        left_out: what is known of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough
+            numbers.
 
     Raises:
         DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``vector`` for a lens
@@ -74,7 +76,7 @@ def from_lens(
     nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
-    budgets, parts, seen, own = [], [], math.nan, left_out or LeftOut()
+    budgets, parts, seen, own = [], [], math.nan, left_out or _known(lens)
     for angle in view.angles_rad:
         if seen != (tilt := incidence(lens, angle)):  # without angles in the library all directions share the maps
             maps, seen = _all_maps(lens, nodes, angle, dtype), tilt
@@ -91,10 +93,11 @@ def from_lens(
                 **view.seen,
                 tolerance=share,
                 layers=lens.layers,
-                vector=_vectorial(lens, angle, polarisation, tolerance),
+                polarisation=_counted(lens, angle, polarisation, tolerance),
+                neighbours=lens.neighbours,
             ).numpy()
         )
-        budgets.append(_budget(lens, angle, parts[-1], nodes, _vectorial(lens, angle, polarisation, tolerance), own))
+        budgets.append(_budget(lens, angle, parts[-1], nodes, _counted(lens, angle, polarisation, tolerance), own))
     stack = _joined(parts, provenance or Provenance())
     found = worst(budgets)
     words = "; ".join([stack.reason, *([AT_NORMAL] if found.angle else []), own.words])
@@ -110,8 +113,13 @@ def unpolarised(x: PsfStack, y: PsfStack) -> PsfStack:
     return dataclasses.replace(worse, intensity=intensity, energy_um2=energy.astype(x.energy_um2.dtype))
 
 
+def _known(lens: Lens) -> LeftOut:
+    """Rough terms, but for neighbours that the lens holds."""
+    return LeftOut() if lens.neighbours is None else LeftOut(lens.neighbours)
+
+
 def _budget(
-    lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, vector: bool, left_out: LeftOut
+    lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, counted: Polarisation, left_out: LeftOut
 ) -> Budget:
     """Of one direction: what was computed, and what the model of a lens leaves out."""
     made = stack.budget or Budget(stack.error)
@@ -119,7 +127,7 @@ def _budget(
         dataclasses.replace(made, spectrum=nodes.error),
         aperture=aperture(lens, angle),
         uneven=uneven(lens, angle),
-        vector=vector,
+        polarisation=counted,
         incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
         has_angles=lens.proxy.max_angle_rad > 0,
         ghost=lens.layers.ghost(lens.wavelength_um),
@@ -127,17 +135,19 @@ def _budget(
     )
 
 
-def _vectorial(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> bool:
+def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> Polarisation:
+    """``auto`` decided."""
     if lens.hand or lens.pairs is not None:
-        if polarisation == "vector":
+        if polarisation in ("flux", "vector"):
             own = "is for circular light" if lens.hand else "has pillars of two sizes"
             raise PropagationError(
-                f"polarisation = 'vector' is for pillars that treat x and y alike; this lens {own}: take 'scalar'"
+                f"polarisation = {polarisation!r} is for pillars that treat x and y alike; this lens {own}: take "
+                "'scalar'"
             )
-        return False
+        return "scalar"
     if polarisation == "auto":
-        return scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance
-    return polarisation == "vector"
+        return "flux" if scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance else "scalar"
+    return polarisation
 
 
 def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:

@@ -15,7 +15,6 @@ from metalens.ground.store import Provenance
 from metalens.propagate import axis
 from metalens.psf.budget import Budget
 
-Polarisation = Literal["scalar", "vector", "auto"]
 SourceShape = Literal["disc", "square", "gaussian"]
 
 

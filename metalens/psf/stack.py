@@ -11,9 +11,10 @@ import torch
 from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.lens import Layers
+from metalens.lens import Layers, Neighbours
 from metalens.propagate import Case, Moving
-from metalens.psf.budget import Budget
+from metalens.psf import among
+from metalens.psf.budget import Budget, Polarisation
 from metalens.psf.compute import Result
 from metalens.psf.direction import Wanted, direction
 from metalens.psf.extended import Extent
@@ -35,9 +36,10 @@ def psf_stack(
     weights: Sequence[float] | None = None,
     offset_um: Any = (0.0, 0.0),
     layers: Layers | None = None,
-    vector: bool = False,
+    polarisation: Polarisation = "scalar",
     integrate: bool = True,
     source: Extent | None = None,
+    neighbours: Neighbours | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,
 ) -> PsfStack:
@@ -61,8 +63,12 @@ def psf_stack(
         source: its size and shape where it is no point; the PSF is then that of a point blurred by the image of the
             source (:mod:`metalens.psf.extended`), its error ``budget.source``.
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
-        vector: Ex, Ey and Ez of both polarisations in place of one scalar (:mod:`metalens.psf.vector`); six times the
-            work.
+        polarisation: ``scalar``; or of both polarisations (:mod:`metalens.psf.vector`) the ``flux`` through the
+            sensor's plane, which a pixel counts and four times the work, or ``vector``: |Ex|² + |Ey|² + |Ez|², six
+            times.
+        neighbours: solved rows of unlike pillars, whose factor goes onto the maps where the phase has that slope
+            (:mod:`metalens.psf.among`): onto fields along and across it apart, their mean for the scalar. None: pillars
+            taken one by one. Square lattices.
         row_um, site_um2: of another lattice than a square one, see :func:`metalens.propagate.case`.
 
     Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
@@ -79,8 +85,8 @@ def psf_stack(
 
     Accuracy: ``error`` of the record, 1 to 3 times the true error; ``budget`` has its parts.
     """
-    wanted = Wanted(tolerance, vector, integrate, source)
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
+    maps, wanted = _among(maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source))
     about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers}
     about |= {"depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)), "offset_um": _value(offset_um)}
@@ -90,14 +96,29 @@ def psf_stack(
         seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
-        alike = [dataclasses.replace(one, centre_um=cases[-1].centre_um) for one in seen]
-        found.append(direction(maps, alike, share.tolist(), wanted, moving))
+        found.append(direction(maps, _centred(seen, cases[-1]), share.tolist(), wanted, moving))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
     given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
     stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
+
+
+def _centred(cases: list[Case], like: Case) -> list[Case]:
+    """The cases with the window of one of them."""
+    return [dataclasses.replace(one, centre_um=like.centre_um) for one in cases]
+
+
+def _among(
+    maps: tuple[torch.Tensor, torch.Tensor], neighbours: Neighbours | None, pitch_um: float, wanted: Wanted
+) -> tuple[tuple[torch.Tensor, torch.Tensor], Wanted]:
+    """The maps with the mean factor of unlike neighbours, or as they are and with it on both fields."""
+    if neighbours is None:
+        return maps, wanted
+    if wanted.polarisation == "scalar":
+        return among.scalar(*maps, neighbours, pitch_um), wanted
+    return maps, dataclasses.replace(wanted, fields=among.jones(*maps, neighbours, pitch_um))
 
 
 def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor) -> PsfStack:

@@ -33,3 +33,20 @@ def turned(x, y, distance):
     along, across = np.sqrt(cosine), 1 / np.sqrt(cosine)
     mixed = (along - across) * s * c
     return np.array([[along * c**2 + across * s**2, mixed], [mixed, along * s**2 + across * c**2]])
+
+
+def flux(light, *, step, wavelength, distance, count):
+    """As :func:`image`: Re(Ex Hy* - Ey Hx*) of E and of H = b x E of every plane wave, the mean of both."""
+    f = np.fft.fftfreq(count, step) * wavelength
+    p, q = np.meshgrid(f, f)
+    runs = p**2 + q**2 < 0.998
+    s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
+    move = runs * np.exp(2j * np.pi / wavelength * distance * s)
+    total = np.zeros((count, count))
+    for given in light:
+        ex, ey = (np.fft.fft2(np.pad(e, [(0, count - n) for n in e.shape])) * move for e in given)
+        ez = -(p * ex + q * ey) / s
+        hx, hy = q * ez - s * ey, s * ex - p * ez
+        ex, ey, hx, hy = (np.fft.ifft2(w) for w in (ex, ey, hx, hy))
+        total += np.real(ex * hy.conj() - ey * hx.conj()) / 2
+    return total

@@ -95,24 +95,33 @@ def test_pillars_are_solved_thirty_times_as_precisely_at_twelve_diameters(monkey
         assert ratio == pytest.approx(one, rel=1e-12)
 
 
-def test_neighbours_turn_and_dim_the_pillars_that_are_built(monkeypatch):
-    factor = np.array([[0.9 * np.exp(0.2j), 0.8 * np.exp(-0.3j)], [0.7 * np.exp(0.5j), 1.1 * np.exp(1.4j)]])
+def test_neighbours_go_onto_the_pillars_and_turn_those_that_are_built(monkeypatch):
+    """Rows solved here where the lens holds none; where it does, what is open of them, as squares."""
     place = np.array([[3, 1], [0, -1]])  # the last site is empty
-    phase, level = torch.tensor([[0.1, 0.2], [0.3, 0.0]]), torch.tensor([[0.9, 0.8], [0.7, 0.0]])
-    found = SimpleNamespace(at=lambda sine: factor * (1 if sine == 0.17 else 99), sine=[0.85 / 0.42 / 6])
-    monkeypatch.setattr(links.supercell, "neighbours", lambda lens: found)
-    monkeypatch.setattr(links, "gathered", lambda lens, *maps: maps)
-    aperture = SimpleNamespace(
-        turn_sine=lambda: 0.17, designed=lambda: "t", maps=lambda table: (phase, level), place=place
-    )
+    sine = np.array([[0.1, 0.2], [0.3, 0.9]])
+
+    def rows(slope):
+        sines = np.array([0.85 / 0.42 / 6, 0.2])
+        aside = np.array([False, True])
+        return SimpleNamespace(mean=lambda s: np.exp(1j * slope * s), sine=sines, diagonal=aside)
+
+    monkeypatch.setattr(links.supercell, "neighbours", lambda lens: rows(-0.7))
+    monkeypatch.setattr(links, "gathered", lambda lens, *maps: (lens.neighbours, maps))
+    monkeypatch.setattr(links, "replace", lambda lens, neighbours: SimpleNamespace(neighbours=neighbours))
+    aperture = SimpleNamespace(turn_sine=lambda: sine, designed=lambda: "t", maps=lambda table: (table,), place=place)
     seen = []
     bench = about(aperture=aperture)
+    bench.lens.neighbours = None
     bench.device.image = lambda *, wave: seen.append(wave)
     (got,) = links._neighbours(bench)
-    assert got.phase_rad == pytest.approx(np.std([0.2, -0.3, 0.5]), rel=1e-6)
-    turned, dimmed = seen[0]
-    assert turned.numpy() == pytest.approx(np.array([[0.3, -0.1], [0.8, 0.0]]), abs=1e-6)
-    assert dimmed.numpy() == pytest.approx(np.array([[0.81, 0.64], [0.49, 0.0]]), abs=1e-6)
+    assert got.phase_rad == pytest.approx(0.7 * np.std([0.1, 0.2, 0.3]), rel=1e-9)
+    assert seen[0][1] == ("t",)
+    held = rows(-0.7)
+    held.doubted = lambda sines: [rows(-0.4), rows(-0.9)] if sines is sine else None
+    bench.lens.neighbours = held
+    (got,) = links._neighbours(bench)
+    assert got.phase_rad == pytest.approx(math.hypot(0.3, 0.2) * np.std([0.1, 0.2, 0.3]), rel=1e-9)
+    assert "lens file" in got.method
 
 
 def test_the_mask_rounds_every_diameter_to_its_step(monkeypatch):

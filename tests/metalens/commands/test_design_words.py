@@ -38,6 +38,6 @@ def test_a_solved_share_is_stated_with_its_error_and_a_rough_one_as_a_bound():
     ],
 )
 def test_where_no_rows_are_solved_the_option_is_refused_and_nothing_is_said(quality, conversion, why):
-    assert words.neighbours(None, quality, conversion, 10.0, solve=False) is None
+    assert words.neighbours(None, quality, conversion, 10.0, solve=False) == (None, None)
     with pytest.raises(ConfigError, match=f"own_cell: {why}"):
         words.neighbours(None, quality, conversion, 10.0, solve=True)

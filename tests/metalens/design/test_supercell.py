@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from metalens import design, modal
 from metalens.cell.record import Cell, Film, Index
@@ -12,10 +13,12 @@ from metalens.design import neighbours as supercell
 from metalens.design.profiles import Focus
 from metalens.ground.errors import CellError
 from metalens.pillars.proxy import Proxy
+from metalens.psf import among
 
 CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6), substrate="SiO2")
 GLASS = dataclasses.replace(CELL, pillar=Index(1.05))
 WAVE = 0.85
+HELD_OUT = 0.5  # of the change by neighbours
 
 
 def test_a_single_pillar_is_the_periodic_cell_of_the_modal_method():
@@ -45,6 +48,25 @@ def test_energy_holds_and_a_mirrored_row_mirrors_its_orders(polarization):
     assert there.energy == pytest.approx(1, abs=1e-9)
     assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
     assert abs(there.order(1) - there.order(-1)) > 0.05  # the row is not its own mirror image
+
+
+@pytest.mark.parametrize("polarization", ["x", "y"])
+def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_another(polarization):
+    """Equal pillars have the orders of their own lattice alone, every other one of a square of two (|m + n| even), and
+    light along both axes is alike; truncated to another set of waves than along the lattice, 1e-2 of t."""
+    about = dict(polarization=polarization, harmonics=2, diagonal=True)
+    four = supercell.solve_row(CELL, [0.14] * 4, WAVE, **about)
+    assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 1e-9
+    two = [supercell.solve_row(CELL, [0.14] * 2, WAVE, **about | dict(polarization=p)).order(0) for p in ("x", "y")]
+    assert two == pytest.approx([four.order(0)] * 2, abs=1e-9)
+    fine = supercell.solve_row(CELL, [0.14], WAVE, polarization=polarization, harmonics=5).order(0)
+    assert abs(supercell.solve_row(CELL, [0.14] * 2, WAVE, **about | dict(harmonics=4)).order(0) - fine) < 0.02
+    there = supercell.solve_row(CELL, [0.1, 0.12, 0.17, 0.2], WAVE, **about)
+    back = supercell.solve_row(CELL, [0.2, 0.17, 0.12, 0.1], WAVE, **about)
+    assert there.energy == pytest.approx(1, abs=1e-9)
+    assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
+    with pytest.raises(CellError, match="diagonal: need an even number"):
+        supercell.solve_row(CELL, [0.14] * 3, WAVE, **about)
 
 
 def test_absorbing_pillars_lose_energy():
@@ -78,22 +100,30 @@ def _lens():
 
 def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     found = supercell.neighbours(_lens(), counts=(6, 5, 4), harmonics=2)
-    assert found.sine == pytest.approx(WAVE / 0.3 / np.array([6, 5, 4]))
-    change = np.abs(found.factor - 1)
+    assert found.sine[~found.diagonal] == pytest.approx(WAVE / 0.3 / np.array([6, 5, 4]))
+    assert found.sine[found.diagonal] == pytest.approx(WAVE * 2**0.5 / 0.3 / np.array([6, 8]))  # √2 of those, even
+    cosine = np.sqrt(1 - found.sine**2)
+    power = found.factor * np.stack([cosine**-0.5, cosine**0.5])
+    change = np.abs(power - 1)
     assert (change > 0.01).all()
     assert (change < 0.6).all()
-    assert np.abs(found.at(found.sine) - found.factor).max() < 0.5 * change.max()  # two terms for three rows
-    assert found.at(0.0) == pytest.approx(1.0)  # nothing turned, nothing changed
+    model = found.at(found.sine, np.where(found.diagonal, np.pi / 4, 0.0))
+    assert np.abs(model - power).max() < 0.5 * change.max()  # two terms for three rows
+    assert found.at(np.array(0.0)) == pytest.approx(1.0)  # nothing turned, nothing changed
+    assert np.abs(found.coarse - found.factor).max() > 0
 
 
 def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(monkeypatch):
-    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t. Neighbours: through their rows."""
+    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t. Neighbours: of its rim's zone."""
     monkeypatch.setattr("metalens.design.own_cell.DIAMETERS", 2)
+    counts = []
+    monkeypatch.setattr(
+        "metalens.design.own_cell.neighbours", lambda _, counts, told=counts: told.append(counts) or "rows"
+    )
     lens, tilt = _lens(), 0.3
     found = design.left_out(lens, aperture=0.5, incidence_rad=tilt)
-    rows = supercell.neighbours(lens, counts=(6, 4))  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim, and 3.8
-    at = rows.sine[0]
-    assert 1 + found.neighbours[0] * at + found.neighbours[1] * at**2 == pytest.approx(rows.factor[0], abs=1e-9)
+    assert counts == [(6, 9, 12)]  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim
+    assert found.neighbours == "rows"
     changes = []
     for side in ("s", "p"):
         flat, tilted = (
@@ -163,45 +193,55 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     """Sign and size; what is left are the ends of twelve pillars and how fast their zones change."""
     found = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
     solved = [_solved_whole(steep, polarization) for polarization in ("x", "y")]
-    whole, predicted = np.mean([ratio for ratio, _ in solved]), found.at(solved[0][1]).mean()
+    cosine = np.sqrt(1 - solved[0][1] ** 2)
+    fields = found.at(solved[0][1]) * np.stack([cosine**0.5, cosine**-0.5])
+    whole, predicted = np.mean([ratio for ratio, _ in solved]), fields.mean()
     assert np.angle(predicted) < -0.3  # late, not early
     assert np.angle(whole) == pytest.approx(np.angle(predicted), abs=0.06)
     assert abs(whole) == pytest.approx(abs(predicted), abs=0.12)
     assert abs(solved[0][0]) < abs(solved[1][0]) - 0.05  # light along the row loses more
-    assert (np.abs(found.by_polarization[0]) < np.abs(found.by_polarization[1]) - 0.05)[:2].all()
-
-
-def test_the_share_left_in_the_focus_counts_both_polarisations_by_power():
-    """One ring that turns light by 0.6: tangential amplitudes c, powers c² / 0.8 along the slope and 0.8 c² across."""
-    sine = np.array([0.5, 0.25])
-    along, across = 1 + (0.2 - 0.3j) * sine - 0.4 * sine**2, 1 + 0.1j * sine + 0.3 * sine**2
-    none = np.zeros(2)
-    found = supercell.Neighbours(0j, 0j, sine, none, none, GREEN, np.array([along, across]))
-    want = (1 + (0.2 - 0.3j) * 0.6 - 0.4 * 0.36) / 0.8**0.5 + (1 + 0.06j + 0.3 * 0.36) * 0.8**0.5
-    assert found.share(np.array([0.6]), np.array([1.0]), 1.0) == pytest.approx(abs(want / 2) ** 2, rel=1e-12)
-    assert found.without(1).sine == pytest.approx([0.5])
-    assert found.without(1).by_polarization[:, 0] == pytest.approx([along[0], across[0]])
+    assert (np.abs(found.factor[0]) < np.abs(found.factor[1]) - 0.05)[:2].all()
 
 
 def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(steep, monkeypatch):
-    solved = {}
-
-    def kept(lens, *, counts, harmonics):
-        solved[harmonics] = supercell.neighbours(lens, counts=counts, harmonics=harmonics - 1)  # a third of the time
-        return solved[harmonics]
+    def kept(lens, *, counts):
+        return supercell.neighbours(lens, counts=counts, harmonics=2)  # a third of the time
 
     monkeypatch.setattr("metalens.design.own_cell.neighbours", kept)
-    found = design.unlike(steep, radius_um=10.0)
+    rows = design.rows(steep, radius_um=10.0)
+    found = design.unlike(dataclasses.replace(steep, neighbours=rows), radius_um=10.0)
     assert found.pillars == (2, 3, 4)  # 0.532 / (0.32 · 0.8) = 2.1 pillars in a zone of the rim
     r = 10.0 * np.sqrt((np.arange(4000) + 0.5) / 4000)
-    shares = {h: rows.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000), 1.0) for h, rows in solved.items()}
-    assert found.share == pytest.approx(shares[3], rel=1e-3)
-    assert found.error > abs(shares[3] - shares[2]) + 0.2 * (1 - shares[3])
-    assert found.error < 0.3
+    shares = [one.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000)) for one in (rows, rows.coarser, *rows.others)]
+    assert found.share == pytest.approx(shares[0], rel=1e-3)
+    apart = np.abs(np.array(shares) - shares[0])
+    assert found.error == pytest.approx(apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2)
+    assert found.error < 0.4
     rough = design.rough_unlike(steep, radius_um=10.0)
     assert abs(rough.share - found.share) < rough.error  # what is said without a solve covers it
     flat = design.rough_unlike(dataclasses.replace(steep, sensor_distance_um=75.0), radius_um=10.0)
     assert flat.share > 0.98
+
+
+@pytest.mark.parametrize(("count", "diagonal"), [(5, False), (8, True)])
+def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(steep, count, diagonal):
+    """A grating of the lens's pillars, as the maps of PSFs take it, against all its pillars solved as one cell.
+
+    Rows of 2, 3 and 4 pillars (2, 4 and 6 along the diagonal) are known. Apart: rows whose phases begin elsewhere.
+    """
+    rows = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
+    block = supercell.block_of(TITANIA.pitch_um, diagonal)
+    solved = supercell._mean(steep, count, diagonal, 2)[0]
+    sine = GREEN / (count * block.spacing_um)
+    want = solved * np.array([(1 - sine**2) ** -0.25, (1 - sine**2) ** 0.25])
+    along, down = np.indices((24, 24))[::-1]
+    turns = 2 * np.pi / count * (along + down if diagonal else along)
+    got = among.jones(torch.tensor(np.angle(np.exp(1j * turns))), torch.ones(24, 24).double(), rows, TITANIA.pitch_um)
+    middle = [complex(part[12, 12]) for part in got]
+    fields = [middle[0] + middle[2], middle[0] - middle[2]] if diagonal else middle[:2]
+    change = np.abs(want - 1).max()
+    assert change > 0.1
+    assert np.abs(np.array(fields) - want).max() < HELD_OUT * change
 
 
 def test_rows_of_other_cells_are_refused_by_name():

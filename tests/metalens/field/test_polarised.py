@@ -14,10 +14,9 @@ from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
 from metalens.field.patches import relative
 from metalens.field.plan import polarised, unpolarised
-from metalens.field.polarised import Mixed, of_flux, strongest
 from metalens.ground.errors import PropagationError
 from metalens.image import Frames
-from metalens.psf import Nodes, turned
+from metalens.psf import Mixed, Nodes, of_flux, strongest, turned
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee

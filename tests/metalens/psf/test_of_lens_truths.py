@@ -68,17 +68,6 @@ def test_the_aperture_is_half_the_spread_of_sines_seen_from_the_chief_rays_place
         assert of_lens.aperture(lens(), angle) == pytest.approx((sines[0] - sines[1]) / 2, rel=1e-9)
 
 
-def test_obliquity_is_uneven_over_the_aperture_by_1_over_cos():
-    """Against a fine lattice over the disc, in air: √(r² + d²) / d from the chief ray's place; 0 for a narrow lens."""
-    edge = 200.2
-    x, y = np.meshgrid(*2 * [(np.arange(801) - 400) / 400 * edge])
-    disc = np.hypot(x, y) <= edge
-    for angle in ((0.0, 0.0), (0.3, 0.0), (0.2, -0.15)):
-        cx, cy = (700 * math.tan(a) for a in angle)
-        steep = np.sqrt((cx - x[disc]) ** 2 + (cy - y[disc]) ** 2 + 700.0**2) / 700
-        assert of_lens.uneven(lens(), angle) == pytest.approx(steep.std() / steep.mean(), rel=3e-3)
-
-
 def test_pillars_are_asked_at_the_angle_of_both_slopes_where_they_know_angles():
     want = math.atan(math.hypot(math.tan(0.2), math.tan(-0.15)))
     assert of_lens.incidence(lens(0.5), (0.2, -0.15)) == pytest.approx(want)
@@ -108,14 +97,25 @@ def test_directions_are_joined_in_their_order_with_the_worst_error_and_its_reaso
     assert made.intensity.shape == (3, 2, 3, 4)
 
 
+def test_obliquity_is_uneven_over_the_aperture_by_1_over_cos():
+    """Against a fine lattice over the disc, in air: √(r² + d²) / d from the chief ray's place; 0 for a narrow lens."""
+    edge = 200.2
+    x, y = np.meshgrid(*2 * [(np.arange(801) - 400) / 400 * edge])
+    disc = np.hypot(x, y) <= edge
+    for angle in ((0.0, 0.0), (0.3, 0.0), (0.2, -0.15)):
+        cx, cy = (700 * math.tan(a) for a in angle)
+        steep = np.sqrt((cx - x[disc]) ** 2 + (cy - y[disc]) ** 2 + 700.0**2) / 700
+        assert of_lens.uneven(lens(), angle) == pytest.approx(steep.std() / steep.mean(), rel=3e-3)
+
+
 def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
     asked = {}
     monkeypatch.setattr(of_lens, "with_model", lambda budget, **about: asked.update(about, budget=budget) or budget)
     part = dataclasses.replace(stack((0.2, -0.15), 2e-4, (1.0, 2.0)), budget=Budget(1e-4, sampling=2e-4))
-    of_lens._budget(lens(), (0.2, -0.15), part, SimpleNamespace(error=0.013), True, "rough")
+    of_lens._budget(lens(), (0.2, -0.15), part, SimpleNamespace(error=0.013), "vector", "rough")
     assert asked["budget"] == Budget(1e-4, sampling=2e-4, spectrum=0.013)
     assert asked["aperture"] == pytest.approx(of_lens.aperture(lens(), (0.2, -0.15)))
     assert asked["uneven"] == pytest.approx(of_lens.uneven(lens(), (0.2, -0.15)))
     assert asked["incidence_rad"] == pytest.approx(math.atan(math.hypot(math.tan(0.2), math.tan(-0.15))))
-    assert (asked["vector"], asked["has_angles"], asked["left_out"]) == (True, False, "rough")
+    assert (asked["polarisation"], asked["has_angles"], asked["left_out"]) == ("vector", False, "rough")
     assert asked["ghost"] == lens().layers.ghost(0.85)

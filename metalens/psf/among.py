@@ -1,0 +1,118 @@
+"""Pillars among unlike neighbours: the factor C of solved rows (:class:`metalens.lens.Neighbours`) on a lens's maps.
+
+    C(s, α),  s = λ |∇φ| / 2π,  α the azimuth of ∇φ          slope of the lens's own phase at every pillar
+    J = C_along g gᵀ + C_across (1 - g gᵀ),  g = ∇φ/|∇φ|      on the field of the light that comes (x, y)
+
+One scalar takes the mean of both, J = C; what it leaves out is in the budget.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from metalens.lens import Neighbours
+
+REACH = 2  # pillars to each side over which phasors are averaged: single pillars err, slopes of lenses hardly change
+ROWS = 256  # of pillars at a time
+_FLAT = 1e-8  # (rad/um)² below which a slope has no azimuth
+
+
+class Jones(NamedTuple):
+    """Complex factors on the field of every pillar, (…, y, x); yx is xy."""
+
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+
+
+def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
+    """(…, y, x) slopes along x and y of the phase of complex t, rad/um, from the pairs of pillars around each.
+
+    Slopes up to π / pitch. 0 where no pair stands. Differentiable.
+    """
+    found = []
+    for axis in (-1, -2):
+        count = light.shape[axis]
+        if count < 2:
+            found.append(torch.zeros_like(light.real))
+            continue
+        pairs = light.narrow(axis, 1, count - 1) * light.narrow(axis, 0, count - 1).conj()
+        around = _around(pairs, along=axis)
+        lit = around.abs() > 0
+        turn = torch.angle(torch.where(lit, around, torch.ones_like(around)))
+        found.append(turn / pitch_um)
+    return found[0], found[1]
+
+
+def _around(pairs: Tensor, *, along: int) -> Tensor:
+    """Sum of the pairs around each pillar; there is one more pillar than pairs on the axis ``along``."""
+    shape, parts = pairs.shape, torch.view_as_real(pairs).movedim(-1, -3).reshape(-1, 1, *pairs.shape[-2:])
+    whole, between = 2 * REACH + 1, 2 * REACH
+    kernel = (whole, between) if along == -1 else (between, whole)
+    total = torch.nn.functional.avg_pool2d(parts, kernel, stride=1, padding=REACH, divisor_override=1)
+    total = total.reshape(*shape[:-2], 2, *total.shape[-2:]).movedim(-3, -1).contiguous()
+    return torch.view_as_complex(total)
+
+
+def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
+    """(…, y, x) complex: mean of C over both polarisations at every pillar of complex t."""
+    parts = []
+    for inner, some in _shares(light):
+        s, aside, _ = _turned(*slopes(some, pitch_um), neighbours)
+        both = [_factor(neighbours, field, s, aside) for field in (0, 1)]
+        parts.append(((both[0] + both[1]) / 2)[..., inner, :])
+    return torch.cat(parts, -2)
+
+
+def scalar(phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float) -> tuple[Tensor, Tensor]:
+    """(phase, transmission) of (…, y, x) maps times that mean."""
+    factor = mean(torch.polar(level, phase), neighbours, pitch_um)
+    return phase + torch.angle(factor), level * factor.abs()
+
+
+def jones(phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float) -> Jones:
+    """J of (…, y, x) maps, complex."""
+    parts = []
+    for inner, some in _shares(torch.polar(level, phase)):
+        s, aside, (cosine2, both) = _turned(*slopes(some, pitch_um), neighbours)
+        along, across = (_factor(neighbours, field, s, aside) for field in (0, 1))
+        apart = along - across
+        found = across + apart * cosine2, along - apart * cosine2, apart * both
+        parts.append([one[..., inner, :] for one in found])
+    return Jones(*(torch.cat(one, -2) for one in zip(*parts, strict=True)))
+
+
+def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
+    """Rows of the map with those around them, and which of these count."""
+    rows, found = light.shape[-2], []
+    for start in range(0, rows, ROWS):
+        first, last = max(start - REACH - 1, 0), min(start + ROWS + REACH + 1, rows)
+        found.append((slice(start - first, min(start + ROWS, rows) - first), light[..., first:last, :]))
+    return found
+
+
+def _turned(across: Tensor, down: Tensor, neighbours: Neighbours) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """Sine by which light is turned, sin² 2α, and (cos² α, cos α sin α)."""
+    square = across * across + down * down
+    steep = square > _FLAT
+    safe = torch.where(steep, square, torch.ones_like(square))
+    s = torch.where(steep, torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)), torch.zeros_like(square))
+    cosine2, both = torch.where(steep, across * across / safe, 0.5), torch.where(steep, across * down / safe, 0.0)
+    return s, 4 * both * both, (cosine2, both)
+
+
+def _factor(neighbours: Neighbours, field: int, s: Tensor, aside: Tensor) -> Tensor:
+    """Complex C of a field along (0) or across (1) the slope."""
+    straight, diagonal = neighbours.coefficients[:, field]
+    apart = diagonal - straight
+    s, turned = (s.clamp_max(most) for most in neighbours.steepest)
+    parts = [
+        a * s + b * s * s + aside * (a2 * turned + b2 * turned * turned)
+        for (a, b), (a2, b2) in (
+            (straight.real.tolist(), apart.real.tolist()),
+            (straight.imag.tolist(), apart.imag.tolist()),
+        )
+    ]
+    return torch.complex(1 + parts[0], parts[1])
