@@ -49,7 +49,7 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml"), "--reader"]
     assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 0
     shown = capsys.readouterr().out
-    assert "Read by the reference reader: 64 frames of 32 pixels of 12 um" in shown
+    assert "Read by the reference reader: 64 frames of 32 pixels of 12 µm" in shown
     assert "paper: proposed" in shown
     assert "image error" in shown
     assert 0 < json.loads((tmp_path / "out" / "optics.json").read_text())["lenses"]["b"]["image_error"] < 0.3

@@ -21,5 +21,5 @@ def test_the_first_and_the_last_entry_of_every_data_set_are_read(tmp_path, monke
 
     with h5py.File(tmp_path / "a.h5", "r") as file:
         monkeypatch.setattr(h5py.Dataset, "__getitem__", asked)
-        reading._read_through(file)
+        reading.read_through(file)
     assert read == {"/line": {0.0, 6.0}, "/more/box": {0.0, 59.0}}
