@@ -25,6 +25,7 @@ OWN = {
     "axes-library": "axes_panels",
     "lens": "lens_panels",
     "psf": "psf_panels",
+    "lights": "lights_panels",
     "far-field": "far_field_panels",
     "near-field": "near_field_panels",
 }
@@ -36,7 +37,7 @@ class Options(Common):
 
     Attributes:
         file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain; a mask (GDSII or OASIS);
-            or the folder of a mask, of captures, or of a co-design run.
+            or the folder of a mask, of captures, of a co-design run, or of PSFs alone (one lens in several lights).
         output: the page to write; by default the file's name with .html, beside it, or with _view.html where a report
             of that name stands there.
         serve: show the page in a browser on this machine and follow what grows, until Ctrl-C; nothing is written. A
@@ -123,7 +124,14 @@ def kind_of(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
-    return next((k for k, names in FOLDERS.items() if any(True for name in names for _ in path.glob(name))), None)
+    kind = next((k for k, names in FOLDERS.items() if any(True for name in names for _ in path.glob(name))), None)
+    return kind or ("lights" if _of_lights(path) else None)
+
+
+def _of_lights(path: Path) -> bool:
+    """Whether a folder holds several PSF stacks and no other file of ours."""
+    files = [p for p in path.glob("*.h5") if p.is_file()]
+    return len(files) > 1 and all(store.kind_of(p) == "psf" for p in files)
 
 
 def _inside(path: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from metalens import library as libraries
 from metalens import psf
 from metalens.ground import report, store
 from metalens.ground.arrays import Array
+from metalens.ground.errors import StoreError
 from metalens.pillars import axes
 from metalens.view import standing
 from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, at_brightest, classes_of
@@ -114,40 +115,76 @@ def _section(diameter: Array, lens: lenses.Lens) -> Curves:
 
 
 def psf_panels(path: Path) -> list[Panel]:
-    """PSFs with sliders over all that they depend on."""
+    """PSFs with sliders over all that they depend on, and the error by cause."""
     stack = psf.load(path)
-    values = np.asarray(stack.intensity)
-    some = slice(None, None, math.ceil(values.size / MOST_SAMPLES))  # of the depths
-    values, depth = values[..., some, :, :], 1e-3 * stack.depths_um[some]
+    return [*_psfs([stack], [path.stem]), _budgets([stack], ["error"])]
+
+
+def lights_panels(path: Path) -> list[Panel]:
+    """The PSF files of a folder, a slider over them: one lens in light of several wavelengths or polarisations.
+
+    Raises:
+        StoreError: a file that is no PSF stack, or of other depths, angles or samples than the first.
+    """
+    files = sorted(path.glob("*.h5"))
+    stacks = [psf.load(file) for file in files]
+    for file, stack in zip(files, stacks, strict=True):
+        for what in ("depths_um", "angles_rad", "step_um"):
+            if not np.array_equal(getattr(stack, what), getattr(stacks[0], what)):
+                raise StoreError(f"{file} has other {what} than {files[0].name}: look at them one by one")
+        if np.shape(stack.intensity) != np.shape(stacks[0].intensity):
+            raise StoreError(f"{file} has other samples than {files[0].name}: look at them one by one")
+    names = [f"{file.stem}, {_light(stack)}" for file, stack in zip(files, stacks, strict=True)]
+    return [*_psfs(stacks, names), _budgets(stacks, names)]
+
+
+def _light(stack: psf.PsfStack) -> str:
+    """Its wavelength, or the first and last of a spectrum."""
+    waves = [f"{1e3 * w:.4g}" for w in np.asarray(stack.wavelengths_um)[[0, -1]].tolist()]
+    return f"{waves[0]} nm" if waves[0] == waves[1] else f"{waves[0]} to {waves[1]} nm"
+
+
+def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
+    """Stacks on one grid, with a slider over them where there are several."""
+    first = stacks[0]
+    some = slice(None, None, math.ceil(len(stacks) * first.intensity.size / MOST_SAMPLES))  # of the depths
+    values = np.stack([np.asarray(stack.intensity)[..., some, :, :] for stack in stacks])
+    energy = np.stack([np.asarray(stack.energy_um2)[..., some] for stack in stacks])
+    depth = 1e-3 * first.depths_um[some]
     names = [Axis("depth", depth.tolist(), "mm")]
-    if values.ndim >= 4:
-        names.insert(0, Axis("field angle", [_angle(pair) for pair in stack.angles_rad]))
-    while values.ndim - 2 > len(names):
+    if values.ndim >= 5:
+        names.insert(0, Axis("field angle", [_angle(pair) for pair in first.angles_rad]))
+    while values.ndim - 3 > len(names):
         names.insert(0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))))
+    if len(stacks) > 1:
+        names.insert(0, Axis("light", lights))
+    else:
+        values, energy = values[0], energy[0]
     peak, names = float(values.max()), at_brightest(names, values)
-    energy = np.asarray(stack.energy_um2)[..., some]
     lines = {"peak": values.max(axis=(-2, -1)) / peak, "light in the window": energy / energy.max()}
+    worst = max(stacks, key=lambda stack: stack.error)
     return [
         Images(
             "Point spread function",
             values / peak,
             names,
-            stack.step_um,
+            first.step_um,
             "of the highest peak",
-            f"Samples of {stack.step_um:g} um; stated relative error {stack.error:.1e} ({stack.reason}).",
+            f"Samples of {first.step_um:g} um; stated relative error {worst.error:.1e} ({worst.reason}).",
             optics=True,
         ),
         Curves("Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]),
-        _budget(stack),
     ]
 
 
-def _budget(stack: psf.PsfStack) -> Numbers:
+def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> Numbers:
     """The error of the PSFs by cause; what is not known of a cause is a dash."""
-    held = dataclasses.asdict(stack.budget or psf.Budget(stack.error))
-    rows = [(report.in_words(name), "–" if math.isnan(value) else value) for name, value in held.items()]
+    held = [dataclasses.asdict(stack.budget or psf.Budget(stack.error)) for stack in stacks]
+    rows = [
+        (report.in_words(cause), *("–" if math.isnan(one[cause]) else one[cause] for one in held)) for cause in held[0]
+    ]
     words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
-    return Numbers("Budget of the error", ("cause", "error"), rows, words)
+    return Numbers("Budget of the error", ("cause", *names), rows, words)
 
 
 def far_field_panels(path: Path) -> list[Panel]:
