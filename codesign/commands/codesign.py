@@ -35,13 +35,8 @@ from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.image import sensor as camera
 
-CHECKPOINT, LOG, SETTINGS, RESULT, ANSWERS = (
-    "checkpoint.safetensors",
-    "log.jsonl",
-    "run.toml",
-    "result.json",
-    "answers.h5",
-)
+CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
+RESULT, ANSWERS = "result.json", "answers.h5"
 SHOWN = 8  # test frames that are kept with the answers
 
 

@@ -70,14 +70,14 @@ def imaged(
         raise SceneError("no light of these frames reaches the sensor")
     rows, columns, depths = (np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3])
     psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
-    angle = 180 / math.pi / lens.sensor_distance_um
+    y_um, x_um = optics.plan.y_um.numpy()[rows], optics.plan.x_um.numpy()[columns]
     return Imaged(
         plain.numpy().astype(np.float32),
         (light * (plain.sum() / light.sum())).numpy().astype(np.float32),
         psf.numpy().astype(np.float32),
         optics.plan.depths_um.numpy()[depths],
-        np.degrees(np.arctan(np.radians(optics.plan.y_um.numpy()[rows] * angle))),
-        np.degrees(np.arctan(np.radians(optics.plan.x_um.numpy()[columns] * angle))),
+        np.degrees(np.arctan(y_um / lens.sensor_distance_um)),
+        np.degrees(np.arctan(x_um / lens.sensor_distance_um)),
         camera.pitch_um,
         optics.error,
         {name: float(value) for name, value in optics.parts.items()},

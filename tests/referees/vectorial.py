@@ -7,18 +7,28 @@ each; their sum on the sensor is |Ex|² + |Ey|² + |Ez|², the mean of both pola
 import numpy as np
 
 
-def image(light, *, step, wavelength, distance, count):
-    """(count, count) intensity on the lattice of a field (2 polarisations, x and y component, rows, columns)."""
+def _lattice(step, wavelength, distance, count):
+    """Direction cosines p, q, s of the plane waves of a lattice, and what each gains on the way; 0 where it fades."""
     f = np.fft.fftfreq(count, step) * wavelength
     p, q = np.meshgrid(f, f)
     runs = p**2 + q**2 < 0.998
     s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
-    move = runs * np.exp(2j * np.pi / wavelength * distance * s)
+    return p, q, s, runs * np.exp(2j * np.pi / wavelength * distance * s)
+
+
+def _waves(field, cosines, move):
+    """Plane waves Ex, Ey, Ez on the sensor of a field's x and y component."""
+    p, q, s = cosines
+    ex, ey = (np.fft.fft2(np.pad(e, [(0, len(p) - n) for n in e.shape])) * move for e in field)
+    return ex, ey, -(p * ex + q * ey) / s
+
+
+def image(light, *, step, wavelength, distance, count):
+    """(count, count) intensity on the lattice of a field (2 polarisations, x and y component, rows, columns)."""
+    *cosines, move = _lattice(step, wavelength, distance, count)
     total = np.zeros((count, count))
-    for ex, ey in light:
-        waves = [np.fft.fft2(np.pad(e, [(0, count - n) for n in e.shape])) * move for e in (ex, ey)]
-        waves.append(-(p * waves[0] + q * waves[1]) / s)
-        total += sum(np.abs(np.fft.ifft2(w)) ** 2 for w in waves) / 2
+    for field in light:
+        total += sum(np.abs(np.fft.ifft2(w)) ** 2 for w in _waves(field, cosines, move)) / 2
     return total
 
 
@@ -37,16 +47,11 @@ def turned(x, y, distance):
 
 def flux(light, *, step, wavelength, distance, count):
     """As :func:`image`: Re(Ex Hy* - Ey Hx*) of E and of H = b x E of every plane wave, the mean of both."""
-    f = np.fft.fftfreq(count, step) * wavelength
-    p, q = np.meshgrid(f, f)
-    runs = p**2 + q**2 < 0.998
-    s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
-    move = runs * np.exp(2j * np.pi / wavelength * distance * s)
+    *cosines, move = _lattice(step, wavelength, distance, count)
+    p, q, s = cosines
     total = np.zeros((count, count))
-    for given in light:
-        ex, ey = (np.fft.fft2(np.pad(e, [(0, count - n) for n in e.shape])) * move for e in given)
-        ez = -(p * ex + q * ey) / s
-        hx, hy = q * ez - s * ey, s * ex - p * ez
-        ex, ey, hx, hy = (np.fft.ifft2(w) for w in (ex, ey, hx, hy))
+    for field in light:
+        ex, ey, ez = _waves(field, cosines, move)
+        ex, ey, hx, hy = (np.fft.ifft2(w) for w in (ex, ey, q * ez - s * ey, s * ex - p * ez))
         total += np.real(ex * hy.conj() - ey * hx.conj()) / 2
     return total
