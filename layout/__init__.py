@@ -15,13 +15,17 @@ if TYPE_CHECKING:
     from layout.mask.build import plan as plan
     from layout.oasis.read import read as read_oasis
     from layout.oasis.write import write as write_oasis
+    from layout.process.process import Process as Process
+    from layout.process.process import load as load_process
     from layout.rules.check import check as check
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Process": "layout.process.process",
         "check": "layout.rules.check",
         "compare": "layout.files.verify",
+        "load_process": "layout.process.process:load",
         "plan": "layout.mask.build",
         "read_gdsii": "layout.gdsii.read:read",
         "read_oasis": "layout.oasis.read:read",

@@ -72,7 +72,11 @@ class Limits:
 
 
 def phase_of(shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float) -> PhaseOf:
-    """The wanted phase as a function of position: ``shape`` on top of the focus, None for hyperbolic."""
+    """The wanted phase as a function of position: ``shape`` on top of the focus, None for hyperbolic.
+
+    Returns:
+        A function of the positions x (columns,) and y (rows,) in um to the phase (rows, columns) in rad.
+    """
     if isinstance(shape, PhaseMap):
         samples = phase_map.read(shape)
 
@@ -103,7 +107,8 @@ def make(
     """Fill a round aperture with pillars (paper Eq. 2 inverted).
 
     Args:
-        phase: wanted phase; see :func:`phase_of`. On a hexagonal lattice the pillars stand on its sites.
+        phase: function of the sites' positions x (columns,) and y (rows,) in um to the wanted phase (rows, columns) in
+            rad, of a block of rows at a time (:func:`phase_of`). On a hexagonal lattice the pillars stand on its sites.
         aperture_um: diameter of the aperture; every pillar's centre lies half a pitch inside it.
         limits: of the process; the proxy's domain is narrowed to them.
         profile: name kept in the lens.
@@ -114,7 +119,8 @@ def make(
         The lens (float32 diameters: 2e-8 um, below 1e-6 rad) and its quality.
 
     Raises:
-        LensError: the aperture holds no pillar, or the printable diameters reach less than a full turn.
+        LensError: the aperture holds no pillar, the printable diameters reach less than a full turn, or the phase has
+            another shape.
     """
     within = printable(proxy, cell, limits or Limits(), focus.wavelength_um, accept_partial_turn=accept_partial_turn)
     gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"

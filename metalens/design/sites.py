@@ -30,7 +30,11 @@ class Sites:
     aperture_um: float
 
     def blocks(self, phase: PhaseOf) -> Iterator[tuple[slice, Array, Array]]:
-        """Blocks of rows: which of their sites hold a pillar, and the phase wanted there."""
+        """Blocks of rows: which of their sites hold a pillar, and the phase wanted there.
+
+        Raises:
+            LensError: a phase of another shape than (rows, columns).
+        """
         x, y = ((np.arange(n) - (n - 1) / 2) * s for n, s in zip(self.shape[::-1], self.steps_um, strict=True))
         reach = self.aperture_um / 2 - self.pitch_um / 2 if self.shape != (1, 1) else 0.0
         size = max(1, _BLOCK_SITES // self.shape[1])
@@ -40,7 +44,13 @@ class Sites:
             if self.lattice.centred:
                 odd = (np.arange(self.shape[0])[rows, None] + np.arange(self.shape[1])) % 2
                 inside &= odd == 0
-            yield rows, inside, phase(x, y[rows])[inside]
+            wanted = phase(x, y[rows])
+            if np.shape(wanted) != inside.shape:
+                raise LensError(
+                    f"phase of shape {np.shape(wanted)} for x of {x.shape} and y of {y[rows].shape}: need {inside.shape}, "
+                    "as phase(x, y[:, None]) of a function of one point gives"
+                )
+            yield rows, inside, wanted[inside]
 
     def map(self, diameter_um: Array, angle_rad: Array | None = None, length_um: Array | None = None) -> DiameterMap:
         """The pillars on these sites."""

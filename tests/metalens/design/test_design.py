@@ -1,6 +1,7 @@
 """Lenses: profiles against closed forms, pillars that make the wanted phase, refusals by name."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -146,6 +147,15 @@ def test_empty_aperture_and_unprintable_cells_are_refused(proxy):
         _make(proxy, limits=Limits(min_diameter_nm=295))
     with pytest.raises(LensError, match="of a turn"):
         _make(proxy, limits=Limits(min_diameter_nm=230))
+
+
+def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):
+    focus = Focus(0.85, 300.0, math.inf)
+    make = partial(design.make, focus=focus, aperture_um=8.0, cell=Cell(pitch_um=0.4, pillar=Index(3.6)), proxy=proxy)
+    with pytest.raises(LensError, match=r"phase of shape \(20,\) .*need \(20, 20\)"):
+        make(lambda x, y: profiles.hyperbolic(x, y, focus))  # positions along the diagonal alone
+    with pytest.raises(LensError, match=r"phase of shape \(\) "):
+        make(lambda x, y: 0.0)
 
 
 def test_one_pillar_is_a_lens(proxy):
