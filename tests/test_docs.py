@@ -1,6 +1,7 @@
 """The pages of docs/: every Python block runs, every settings file is accepted, every link leads somewhere."""
 
 import functools
+import importlib
 import importlib.util
 import re
 import subprocess
@@ -135,3 +136,25 @@ def test_links_and_commands_of_a_page_exist(page):
             assert (page.parent / target).exists(), target
     for verb in re.findall(r"^ *metalens ([a-z]+)", text, re.M):
         assert verb in VERBS, verb
+
+
+def test_the_reference_holds_what_the_packages_show():
+    named = set(re.findall(r"^::: ([\w.]+)$", (ROOT / "docs/reference/api.md").read_text(encoding="utf-8"), re.M))
+    for name in named:
+        where, _, last = name.rpartition(".")
+        assert getattr(importlib.import_module(where), last).__doc__, name
+    for package in ("layout", "characterize", "codesign"):
+        assert {f"{package}.{one}" for one in dir(importlib.import_module(package))} <= named
+
+
+def test_fields_and_roles_of_docstrings_are_set_as_lists_and_links():
+    griffe = pytest.importorskip("griffe")
+    extensions = griffe.load_extensions(str(ROOT / "docs" / "site" / "docstrings.py"))
+    film = griffe.load("metalens.cell.record", search_paths=[str(ROOT)], extensions=extensions)["Film"]
+    assert "Attributes:\n    material: a name, a file" in film.docstring.value
+    assert film.docstring.value.startswith("A homogeneous layer")
+    maker = griffe.load("metalens.design.of_phase", search_paths=[str(ROOT)], extensions=extensions)["make"]
+    assert "[`phase_of`]" not in maker.docstring.value  # a bare name is no place of the reference
+    assert ":func:" not in maker.docstring.value
+    stack = griffe.load("metalens.psf.of_lens", search_paths=[str(ROOT)], extensions=extensions)["View"]
+    assert "[`metalens.psf.psf_stack`][metalens.psf.psf_stack]" in stack.docstring.value

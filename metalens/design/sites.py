@@ -47,8 +47,8 @@ class Sites:
             wanted = phase(x, y[rows])
             if np.shape(wanted) != inside.shape:
                 raise LensError(
-                    f"phase of shape {np.shape(wanted)} for x of {x.shape} and y of {y[rows].shape}: need {inside.shape}, "
-                    "as phase(x, y[:, None]) of a function of one point gives"
+                    f"phase of shape {np.shape(wanted)} for x of {x.shape} and y of {y[rows].shape}: need "
+                    f"{inside.shape}, as phase(x, y[:, None]) of a function of one point gives"
                 )
             yield rows, inside, wanted[inside]
 
