@@ -6,11 +6,15 @@ The first term is that of the zone borders, whose number grows with s; the secon
 b go through solved rows (:mod:`metalens.design.neighbours`), apart for fields along the slope and across it, and for
 slopes along the lattice and along its diagonal; between these they go as sin² 2α, the least that a square lattice has.
 Beyond the steepest row along the lattice C stays as it is; beyond that along the diagonal, what sets it apart does.
+Rows are solved at one wavelength and at normal incidence. Light of another wavelength or from the side is given the
+same factor where the zones are as wide: s is that of the rows' wavelength. What that leaves out is for who uses it to
+count (:mod:`metalens.psf.budget`).
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -72,18 +76,21 @@ class Neighbours:
         straight, aside = (float(self.sine[rows].max(initial=0.0)) for rows in (~self.diagonal, self.diagonal))
         return straight, min(straight, aside)
 
+    def of_field(self, field: int, sine: Any, aside: Any) -> Any:
+        """(…) complex C of fields along the slope (0) or across it (1); NumPy or torch, differentiable.
+
+        Args:
+            sine: (…) by which the slope turns light of the rows' wavelength. aside: sin² 2α of its azimuth α.
+        """
+        straight, diagonal = self.coefficients[:, field]
+        (a, b), (a2, b2) = straight.tolist(), (diagonal - straight).tolist()
+        s, turned = (abs(sine).clip(max=most) for most in self.steepest)
+        return 1 + s * (a + b * s) + aside * (turned * (a2 + b2 * turned))
+
     def at(self, sine: Array, azimuth_rad: Array | float = 0.0) -> Array:
         """(2, …) complex C of fields along the slope and across it, of slopes in this azimuth of the lattice."""
-        s, turned = (np.minimum(np.abs(sine), most) for most in self.steepest)
         aside = np.sin(2 * np.asarray(azimuth_rad)) ** 2
-        straight, diagonal = self.coefficients
-        apart = diagonal - straight
-        return np.stack(
-            [
-                1 + a * s + b * s**2 + aside * (a2 * turned + b2 * turned**2)
-                for (a, b), (a2, b2) in zip(straight, apart, strict=True)
-            ]
-        )
+        return np.stack([self.of_field(field, np.asarray(sine), aside) for field in (0, 1)])
 
     def mean(self, sine: Array) -> Array:
         """(…) complex: mean of both polarisations and of all azimuths."""

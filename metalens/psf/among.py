@@ -3,7 +3,8 @@
     C(s, α),  s = λ |∇φ| / 2π,  α the azimuth of ∇φ          slope of the lens's own phase at every pillar
     J = C_along g gᵀ + C_across (1 - g gᵀ),  g = ∇φ/|∇φ|      on the field of the light that comes (x, y)
 
-One scalar takes the mean of both, J = C; what it leaves out is in the budget.
+One scalar takes the mean of both, J = C; what it leaves out is in the budget. λ is that of the rows, whatever the
+light's: zones of one width have one factor.
 """
 
 import math
@@ -61,7 +62,7 @@ def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
     parts = []
     for inner, some in _shares(light):
         s, aside, _ = _turned(*slopes(some, pitch_um), neighbours)
-        both = [_factor(neighbours, field, s, aside) for field in (0, 1)]
+        both = [neighbours.of_field(field, s, aside) for field in (0, 1)]
         parts.append(((both[0] + both[1]) / 2)[..., inner, :])
     return torch.cat(parts, -2)
 
@@ -77,7 +78,7 @@ def jones(phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float)
     parts = []
     for inner, some in _shares(torch.polar(level, phase)):
         s, aside, (cosine2, both) = _turned(*slopes(some, pitch_um), neighbours)
-        along, across = (_factor(neighbours, field, s, aside) for field in (0, 1))
+        along, across = (neighbours.of_field(field, s, aside) for field in (0, 1))
         apart = along - across
         found = across + apart * cosine2, along - apart * cosine2, apart * both
         parts.append([one[..., inner, :] for one in found])
@@ -101,18 +102,3 @@ def _turned(across: Tensor, down: Tensor, neighbours: Neighbours) -> tuple[Tenso
     s = torch.where(steep, torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)), torch.zeros_like(square))
     cosine2, both = torch.where(steep, across * across / safe, 0.5), torch.where(steep, across * down / safe, 0.0)
     return s, 4 * both * both, (cosine2, both)
-
-
-def _factor(neighbours: Neighbours, field: int, s: Tensor, aside: Tensor) -> Tensor:
-    """Complex C of a field along (0) or across (1) the slope."""
-    straight, diagonal = neighbours.coefficients[:, field]
-    apart = diagonal - straight
-    s, turned = (s.clamp_max(most) for most in neighbours.steepest)
-    parts = [
-        a * s + b * s * s + aside * (a2 * turned + b2 * turned * turned)
-        for (a, b), (a2, b2) in (
-            (straight.real.tolist(), apart.real.tolist()),
-            (straight.imag.tolist(), apart.imag.tolist()),
-        )
-    ]
-    return torch.complex(1 + parts[0], parts[1])

@@ -29,7 +29,8 @@ HOW = "the default cell, rough (design --own-cell has a lens hold its own neighb
 class LeftOut:
     """What is known of pillars that the model of a lens leaves out; by default rough, of another cell.
 
-    neighbours: rows of the lens's own pillars, whose factor its PSFs hold; or (a, b) of the factor 1 + a s + b s² on
+    neighbours: rows of the lens's own pillars, whose factor its PSFs hold (at the rows' wavelength and at normal
+        incidence; what other light changes is counted); or (a, b) of the factor 1 + a s + b s² on
         light that unlike neighbours turn by the sine s, which they lack.
     angle: relative change of t over sin² of the incidence. of: whose numbers they are.
     """
@@ -44,7 +45,8 @@ class LeftOut:
         if isinstance(self.neighbours, tuple):
             return f"neighbours and angle: of {self.of or HOW}"
         angle = "" if self.of else "; angle: of the default cell, rough"
-        return f"unlike neighbours counted, by {len(self.neighbours.sine)} solved rows{angle}"
+        at = f"at {self.neighbours.wavelength_um:g} um and normal incidence"
+        return f"unlike neighbours counted, by {len(self.neighbours.sine)} solved rows {at}{angle}"
 
 
 ROUGH = LeftOut()
@@ -122,18 +124,21 @@ def with_model(
     ghost: float,
     uneven: float = 0.0,
     left_out: LeftOut = ROUGH,
+    light: tuple[Array, Array] | None = None,
 ) -> Budget:
     """The budget with what the model of a lens leaves out.
 
     Args:
         aperture: half the spread in sin θ of the rays to the sensor. uneven: as in :func:`scalar_error`.
         polarisation: that was computed. has_angles: whether the pillars answer at the light's angle.
+        light: wavelengths in um, and weights of sum 1; None for that of the rows of unlike neighbours.
     """
+    slanted = min(1.0, left_out.angle * math.sin(incidence_rad) ** 2)
     return replace(
         budget,
         polarisation=scalar_error(aperture, uneven) if polarisation == "scalar" else 0.0,
-        neighbours=_neighbours(aperture, left_out.neighbours, polarisation),
-        angle=0.0 if has_angles else min(1.0, left_out.angle * math.sin(incidence_rad) ** 2),
+        neighbours=_neighbours(aperture, left_out.neighbours, polarisation, (light, slanted)),
+        angle=0.0 if has_angles else slanted,
         glass=ghost,
     )
 
@@ -151,16 +156,29 @@ def scalar_error(aperture: float, uneven: float = 0.0) -> float:
     return math.hypot(_difference(_scalar(aperture), _flux(aperture)), uneven**2 / 2)
 
 
-def _neighbours(aperture: float, known: Neighbours | tuple[complex, complex], polarisation: Polarisation) -> float:
+def _neighbours(
+    aperture: float,
+    known: Neighbours | tuple[complex, complex],
+    polarisation: Polarisation,
+    seen: tuple[tuple[Array, Array] | None, float],
+) -> float:
     """Of pillars taken one by one; or of the factor of rows: another truncation, any row left out, zones that get
-    shorter from one to the next, and for the scalar that fields along and across the slope are told apart."""
+    shorter from one to the next, other light than the rows', and for the scalar that fields along and across the slope
+    are told apart.
+
+    seen: wavelengths and weights, of which the factor may follow the sine rather than the zones; share of the change
+        that light from the side may change, as t of a pillar does.
+    """
     p, _, _ = _nodes(aperture)
     if isinstance(known, tuple):
         return _difference(_scalar(aperture, 1 + known[0] * p + known[1] * p * p), _scalar(aperture))
     used = _scalar(aperture, known.mean(p))
     less = [_difference(_scalar(aperture, other.mean(p)), used) for other in known.others]
     left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(less, default=0.0)
-    left += CURVED * _difference(_scalar(aperture), used)
+    left += math.hypot(CURVED, seen[1]) * _difference(_scalar(aperture), used)
+    for wave, weight in zip(*(seen[0] or ((), ())), strict=True):
+        away = _difference(_scalar(aperture, known.mean(p * (wave / known.wavelength_um))), used)
+        left = math.hypot(left, math.sqrt(weight) * away)
     along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
     aside = _scalar(aperture, (along - across) / 2, order=2)
     return left if polarisation != "scalar" else math.hypot(left, _difference(used + aside, used))

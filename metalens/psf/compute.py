@@ -59,6 +59,11 @@ class Result:
     sampling: float = 0.0
     source: float = 0.0
 
+    @property
+    def whole(self) -> float:
+        """All errors together."""
+        return math.hypot(self.error, self.sampling, self.source)
+
 
 def intensity(
     phase: torch.Tensor,
@@ -77,8 +82,8 @@ def intensity(
         moving: :class:`Moving` or None.
 
     The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
-    tolerance; the result of the last try is returned with its estimate in any case. Dim and tiny windows are summed in
-    float64, since the estimate knows rounding as noise of a mean size only.
+    tolerance, all that is added to it later included; the result of the last try is returned with its estimate in any
+    case. Dim and tiny windows are summed in float64, since the estimate knows rounding as noise of a mean size only.
     """
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
     if not needs_grad and phase.device.type == "cpu":  # at the setting that the windowed method begins with
@@ -97,11 +102,10 @@ def intensity(
     for setting, kind in tries:
         dtype = torch.float64 if dim else kind
         result = _windowed((phase, level), dtype, cases, weights, max(setting, FINEST), moving)
-        error = math.hypot(result.error, OUTPUT[dtype])
+        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype])
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
-    error = math.hypot(error, KEPT[phase.dtype])
     return Result(result.intensity.to(phase.dtype), error, result.reason, result.power)
 
 

@@ -20,6 +20,7 @@ from metalens.psf.vector import expanded
 HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once; each share has a plan of its own
 SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
 COUNTED = ("scalar", "flux", "vector")
+CELLS = 0.5  # of the tolerance that the integration over cells may take; the rest is the sums
 STRICTER = 4  # settings for sources of finite size, whose estimate takes differences of PSFs
 
 
@@ -92,12 +93,13 @@ def _lens(given: Light, wanted: Wanted, moving: Moving | None) -> tuple[torch.Te
         if max(wide.samples) > MOST and fine.points > 1:
             raise PropagationError(f"cells of {fine.points} points in {wide.samples} samples: give a smaller window")
         lit, results = [], []
+        own = wanted if fine.points == 1 else replace(wanted, tolerance=wanted.tolerance * math.sqrt(1 - CELLS**2))
         for some in _few(wide, given, moving):
-            light, result = _depths(given, fine, some, wanted, moving)
+            light, result = _depths(given, fine, some, own, moving)
             lit.append(light)
             results.append(result)
         result = _together(results)
-        if result.sampling <= wanted.tolerance / 2 or max(fine.case.samples) > MOST / 2:
+        if result.sampling <= CELLS * wanted.tolerance or max(fine.case.samples) > MOST / 2:
             break
     if fine.points > 1:
         why = f"; light integrated over cells of {fine.points} x {fine.points} points"

@@ -12,6 +12,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
+from metalens.psf import among
+from metalens.psf.among import Jones
 from metalens.psf.budget import Budget, LeftOut, Polarisation, scalar_error, with_model, worst
 from metalens.psf.extended import Extent
 from metalens.psf.record import PsfStack
@@ -19,6 +21,7 @@ from metalens.psf.spectrum import Nodes
 from metalens.psf.stack import psf_stack
 
 RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
+ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 
@@ -76,15 +79,17 @@ def from_lens(
     nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
-    budgets, parts, seen, own = [], [], math.nan, left_out or _known(lens)
+    budgets, parts, own = [], [], left_out or _known(lens)
+    seen: tuple[float, bool] | None = None
     for angle in view.angles_rad:
-        if seen != (tilt := incidence(lens, angle)):  # without angles in the library all directions share the maps
-            maps, seen = _all_maps(lens, nodes, angle, dtype), tilt
-        phase, level = maps
+        counted = _counted(lens, angle, polarisation, tolerance)
+        alike = incidence(lens, angle), counted == "scalar"
+        if seen != alike:  # without angles in the library all directions share the maps
+            maps, fields = _all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
+            seen = alike
         parts.append(
             psf_stack(
-                phase,
-                level,
+                *maps,
                 **lens.diameters.grid._asdict(),
                 wavelength_um=nodes.wavelengths_um.tolist(),
                 weights=nodes.weights.tolist(),
@@ -93,14 +98,15 @@ def from_lens(
                 **view.seen,
                 tolerance=share,
                 layers=lens.layers,
-                polarisation=_counted(lens, angle, polarisation, tolerance),
-                neighbours=lens.neighbours,
+                polarisation=counted,
+                neighbours=fields,
             ).numpy()
         )
-        budgets.append(_budget(lens, angle, parts[-1], nodes, _counted(lens, angle, polarisation, tolerance), own))
+        budgets.append(_budget(lens, angle, parts[-1], nodes, counted, own))
     stack = _joined(parts, provenance or Provenance())
     found = worst(budgets)
-    words = "; ".join([stack.reason, *([AT_NORMAL] if found.angle else []), own.words])
+    above = [ABOVE] if found.computed > tolerance and stack.converged else []
+    words = "; ".join([stack.reason, *above, *([AT_NORMAL] if found.angle else []), own.words])
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
 
 
@@ -132,6 +138,7 @@ def _budget(
         has_angles=lens.proxy.max_angle_rad > 0,
         ghost=lens.layers.ghost(lens.wavelength_um),
         left_out=left_out,
+        light=(nodes.wavelengths_um, nodes.weights),
     )
 
 
@@ -179,12 +186,17 @@ def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
 
 
 def _all_maps(
-    lens: Lens, nodes: Nodes, angle_rad: tuple[float, float], dtype: torch.dtype
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(wavelength, y, x) phase and transmission of every pillar for light from a direction."""
-    maps = [pillar_maps(lens, float(w), angle_rad) for w in nodes.wavelengths_um]
-    phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in maps]) for i in (0, 1))
-    return phase, level
+    lens: Lens, nodes: Nodes, angle_rad: tuple[float, float], dtype: torch.dtype, *, scalar: bool
+) -> tuple[tuple[torch.Tensor, torch.Tensor], Jones | None]:
+    """(wavelength, y, x) phase and transmission of every pillar for light from a direction, with the mean factor of
+    unlike neighbours; or that factor on both fields beside them."""
+    found = [pillar_maps(lens, float(w), angle_rad) for w in nodes.wavelengths_um]
+    phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in found]) for i in (0, 1))
+    if lens.neighbours is None:
+        return (phase, level), None
+    if scalar:
+        return among.scalar(phase, level, lens.neighbours, lens.diameters.pitch_um), None
+    return (phase, level), among.jones(phase, level, lens.neighbours, lens.diameters.pitch_um)
 
 
 def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:

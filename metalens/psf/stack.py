@@ -1,7 +1,6 @@
 """PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,8 +13,9 @@ from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, Neighbours
 from metalens.propagate import Case, Moving
 from metalens.psf import among
+from metalens.psf.among import Jones
 from metalens.psf.budget import Budget, Polarisation
-from metalens.psf.compute import Result
+from metalens.psf.compute import EXACT, KEPT, Result
 from metalens.psf.direction import Wanted, direction
 from metalens.psf.extended import Extent
 from metalens.psf.record import PsfStack
@@ -39,7 +39,7 @@ def psf_stack(
     polarisation: Polarisation = "scalar",
     integrate: bool = True,
     source: Extent | None = None,
-    neighbours: Neighbours | None = None,
+    neighbours: Neighbours | Jones | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,
 ) -> PsfStack:
@@ -67,8 +67,9 @@ def psf_stack(
             sensor's plane, which a pixel counts, or ``vector``: |Ex|² + |Ey|² + |Ez|². A 1 mm lens at 21 depths takes
             6 and 2 s of processor time where the scalar takes 0.03.
         neighbours: solved rows of unlike pillars, whose factor goes onto the maps where the phase has that slope
-            (:mod:`metalens.psf.among`): onto fields along and across it apart, their mean for the scalar. None: pillars
-            taken one by one. Square lattices.
+            (:mod:`metalens.psf.among`): onto fields along and across it apart, their mean for the scalar; at every
+            wavelength and angle as at those of the rows. Or, for both polarisations, what
+            :func:`metalens.psf.among.jones` made of them. None: pillars taken one by one. Square lattices.
         row_um, site_um2: of another lattice than a square one, see :func:`metalens.propagate.case`.
 
     Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
@@ -98,7 +99,7 @@ def psf_stack(
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
         found.append(direction(maps, _centred(seen, cases[-1]), share.tolist(), wanted, moving))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
-    worst = max((result for row in found for result in row[1]), key=lambda result: result.error)
+    worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
     given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
     stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
@@ -111,11 +112,15 @@ def _centred(cases: list[Case], like: Case) -> list[Case]:
 
 
 def _among(
-    maps: tuple[torch.Tensor, torch.Tensor], neighbours: Neighbours | None, pitch_um: float, wanted: Wanted
+    maps: tuple[torch.Tensor, torch.Tensor], neighbours: Neighbours | Jones | None, pitch_um: float, wanted: Wanted
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], Wanted]:
     """The maps with the mean factor of unlike neighbours, or as they are and with it on both fields."""
     if neighbours is None:
         return maps, wanted
+    if isinstance(neighbours, Jones):
+        if wanted.polarisation == "scalar":
+            raise PropagationError("factors on both fields, but one scalar: give the rows, or polarisation = 'flux'")
+        return maps, dataclasses.replace(wanted, fields=neighbours)
     if wanted.polarisation == "scalar":
         return among.scalar(*maps, neighbours, pitch_um), wanted
     return maps, dataclasses.replace(wanted, fields=among.jones(*maps, neighbours, pitch_um))
@@ -134,6 +139,7 @@ def _record(
 ) -> PsfStack:
     """The stack for intensities (…, depth, y, x), a case for each angle; axes are depths, wavelengths, weights."""
     energy = light.sum((-1, -2))
+    error = worst.whole
     divided = torch.div if light.requires_grad else torch.Tensor.div_  # in place where nothing else looks at it
     return PsfStack(
         divided(light, energy[..., None, None]),
@@ -146,9 +152,18 @@ def _record(
         centres_um=np.array([c.centre_um for c in cases]),
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
-        error=math.hypot(worst.error, worst.sampling, worst.source),
-        reason=worst.reason,
+        error=error,
+        reason=worst.reason if error <= tolerance else f"{worst.reason}; {_above(worst, tolerance, light.dtype)}",
     )
+
+
+def _above(worst: Result, tolerance: float, dtype: torch.dtype) -> str:
+    """What keeps an estimate above the tolerance."""
+    least = max(KEPT[dtype], EXACT[dtype])
+    if tolerance < least:
+        return f"above the tolerance: {str(dtype).removeprefix('torch.')} holds {least:.2g}, give float64 maps"
+    terms = {"sums": worst.error, "integration over cells": worst.sampling, "size of the source": worst.source}
+    return f"above the tolerance by its {max(terms, key=lambda name: terms[name])}"
 
 
 def _value(argument: Any) -> Any:

@@ -162,6 +162,25 @@ def test_two_wavelengths_of_flux_are_those_of_each_alone():
         assert both.intensity[k] * both.energy_um2[k] == pytest.approx(light, abs=1e-4 * light.max())
 
 
+def test_factors_made_once_serve_as_the_rows_do():
+    """Several directions share maps, and so the factors on both fields; one scalar has no use for two."""
+    phase, level, _ = lens(distance=14.0, count=40)
+    given = about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12, polarisation="flux")
+    fields = among.jones(torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH)
+    got, want = (psf.psf_stack(phase, level, **given, neighbours=of) for of in (fields, ROWS))
+    assert np.array_equal(got.intensity, want.intensity)
+    with pytest.raises(PropagationError, match="factors on both fields, but one scalar"):
+        psf.psf_stack(phase, level, **given | dict(polarisation="scalar"), neighbours=fields)
+
+
+def test_the_factor_is_one_formula_for_numpy_and_torch():
+    sine, aside = np.array([0.0, 0.2, 0.55, 0.9]), np.array([0.3, 0.0, 1.0, 0.5])
+    for field in (0, 1):
+        got = ROWS.of_field(field, torch.tensor(sine), torch.tensor(aside))
+        assert got.numpy() == pytest.approx(ROWS.of_field(field, sine, aside), rel=1e-14)
+        assert got.numpy() == pytest.approx(ROWS.at(sine, np.arcsin(np.sqrt(aside)) / 2)[field], rel=1e-12)
+
+
 def test_a_polarisation_that_maps_cannot_tell_is_refused():
     phase, level, _ = lens(distance=14.0, count=40)
     with pytest.raises(PropagationError, match="'auto': need one of scalar, flux, vector"):

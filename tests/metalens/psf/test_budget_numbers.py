@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
+from metalens.lens import Neighbours
 from metalens.psf import budget
 from metalens.psf.budget import Budget
 
@@ -97,3 +98,32 @@ def test_the_models_own_terms_are_integrals_over_the_aperture():
         Budget(0.01), aperture=0.1, polarisation="vector", incidence_rad=1.2, has_angles=False, ghost=0.0
     )
     assert wide.angle == 1.0
+
+
+def test_light_unlike_that_of_the_rows_has_its_own_terms_with_the_factor_of_unlike_neighbours():
+    """One row, alike for both fields and truncations: left are zones that get shorter (a fifth of the change), light
+    from the side (2.5 sin² of it) and, for each wavelength, a factor that goes with the sine in place of the zones."""
+    aperture, factor = 0.5, np.full((2, 1), 0.8 + 0.1j)
+    known = Neighbours(np.array([0.6]), np.zeros(1, bool), factor, factor, np.zeros(1), 0.85)
+    radius = np.linspace(0, 30 / aperture, 240)
+
+    def light(scale):
+        parts = [
+            [radial(aperture, r, 0, lambda p, of=of: of(known.mean(scale * p)) / (1 - p * p)) for r in radius]
+            for of in (np.real, np.imag)
+        ]
+        return np.hypot(*np.array(parts)) ** 2
+
+    def left(**more):
+        given = dict(aperture=aperture, polarisation="flux", has_angles=True, ghost=0.0, incidence_rad=0.0) | more
+        return budget.with_model(Budget(0.0), **given, left_out=budget.LeftOut(known)).neighbours
+
+    change = apart(light(0.0), light(1.0), radius)
+    assert left() == pytest.approx(0.2 * change, rel=1e-6)
+    assert left(light=(np.array([0.85]), np.ones(1))) == pytest.approx(0.2 * change, rel=1e-6)
+    side = math.hypot(0.2, 2.5 * math.sin(0.3) ** 2) * change
+    assert left(incidence_rad=0.3) == pytest.approx(side, rel=1e-6)
+    far = [apart(light(w / 0.85), light(1.0), radius) for w in (0.7, 0.8)]
+    want = math.sqrt((0.2 * change) ** 2 + 0.4 * far[0] ** 2 + 0.6 * far[1] ** 2)
+    assert left(light=(np.array([0.7, 0.8]), np.array([0.4, 0.6]))) == pytest.approx(want, rel=1e-6)
+    assert "1 solved rows at 0.85 um and normal incidence" in budget.LeftOut(known).words

@@ -12,6 +12,7 @@ from metalens.lens import Layers
 from metalens.psf import of_lens
 from metalens.psf.budget import Budget
 from metalens.psf.record import PsfStack
+from metalens.psf.spectrum import Nodes
 
 RNG = np.random.default_rng(3)
 
@@ -112,7 +113,9 @@ def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
     asked = {}
     monkeypatch.setattr(of_lens, "with_model", lambda budget, **about: asked.update(about, budget=budget) or budget)
     part = dataclasses.replace(stack((0.2, -0.15), 2e-4, (1.0, 2.0)), budget=Budget(1e-4, sampling=2e-4))
-    of_lens._budget(lens(), (0.2, -0.15), part, SimpleNamespace(error=0.013), "vector", "rough")
+    nodes = Nodes(np.array([0.84, 0.87]), np.array([0.3, 0.7]), 0.013)
+    of_lens._budget(lens(), (0.2, -0.15), part, nodes, "vector", "rough")
+    assert asked["light"] == (nodes.wavelengths_um, nodes.weights)
     assert asked["budget"] == Budget(1e-4, sampling=2e-4, spectrum=0.013)
     assert asked["aperture"] == pytest.approx(of_lens.aperture(lens(), (0.2, -0.15)))
     assert asked["uneven"] == pytest.approx(of_lens.uneven(lens(), (0.2, -0.15)))
