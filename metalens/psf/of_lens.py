@@ -85,11 +85,12 @@ def from_lens(
         counted = _counted(lens, angle, polarisation, tolerance)
         alike = incidence(lens, angle), counted == "scalar"
         if seen != alike:  # without angles in the library all directions share the maps
-            maps, fields = _all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
+            (phase, level), fields = _all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
             seen = alike
         parts.append(
             psf_stack(
-                *maps,
+                phase,
+                level,
                 **lens.diameters.grid._asdict(),
                 wavelength_um=nodes.wavelengths_um.tolist(),
                 weights=nodes.weights.tolist(),
