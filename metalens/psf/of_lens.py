@@ -104,8 +104,11 @@ def from_lens(
             ).numpy()
         )
         budgets.append(_budget(lens, angle, parts[-1], nodes, counted, own))
-    stack = _joined(parts, provenance or Provenance())
-    found = worst(budgets)
+    return _told(_joined(parts, provenance or Provenance()), worst(budgets), tolerance, own)
+
+
+def _told(stack: PsfStack, found: Budget, tolerance: float, own: LeftOut) -> PsfStack:
+    """With the budget of all directions, and in words what it is of; the stack's own tolerance is that of the sums."""
     above = [ABOVE] if found.computed > tolerance and stack.converged else []
     words = "; ".join([stack.reason, *above, *([AT_NORMAL] if found.angle else []), own.words])
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
