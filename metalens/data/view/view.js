@@ -139,7 +139,7 @@ async function images(panel, section) {
       const c = table[Math.max(0, Math.min(255, Math.round(255 * t)))];
       out.data.set([c[0], c[1], c[2], 255], 4 * i);
     }
-    context.putImageData(out, 0, 0);
+    stamped(context, out);
     ends(panel.signed ? -top : log ? 1e-4 * top : low, top, `${panel.unit}; ${text(nx * panel.step)} × ${text(ny * panel.step)} ${panel.across}`);
     context.fillStyle = "#ffffff50";
     context.fillRect(0, cross[0], nx, 0.5); context.fillRect(cross[1], 0, 0.5, ny);
@@ -258,6 +258,12 @@ function halved(from, h, w) {
   }
   return out;
 }
+// Pixels as a picture that is drawn: what is put into a canvas while a page is printed does not reach the paper.
+function stamped(c, pixels) {
+  const held = new OffscreenCanvas(pixels.width, pixels.height);
+  held.getContext("2d").putImageData(pixels, 0, 0);
+  c.drawImage(held, 0, 0);
+}
 // A plane to move about on: drag, wheel, keys, buttons. box: {w, h} of the whole in its own lengths, y down, from 0.
 // paint(c, view) draws what view = {scale, cx, cy, W, H} shows (scale: pixels a length); tell(x, y, scale) says what lies there.
 function board(panel, section, box, um, closeup, paint, tell) {
@@ -339,7 +345,7 @@ async function classes(panel, section) {
       for (let n = 0; n < 3; n++) out.data[to + n] = 255 + part * (rgb[n] - 255);
       out.data[to + 3] = 255;
     }
-    c.putImageData(out, 0, 0);
+    stamped(c, out);
   }
   function single(_, atX, atY, held) {
     const k = Math.floor(atX), i = Math.floor(atY), one = i >= 0 && k >= 0 && i < ny && k < nx ? index[i * nx + k] : 0;
@@ -425,7 +431,7 @@ async function drawing(panel, section) {
       for (let k = 0; k < 3; k++) out.data[i + k] = share ? 255 + part * (cover[i + k] / share - 255) : 255;
       out.data[i + 3] = 255;
     }
-    c.putImageData(out, 0, 0);
+    stamped(c, out);
   }
   function outlined(c, o, v, rgb) {
     const [a, b] = inView(o, v), lo = v.cx - v.W / 2 / v.scale + left - o.own.right, hi = v.cx + v.W / 2 / v.scale + left - o.own.left;

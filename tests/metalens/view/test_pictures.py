@@ -2,6 +2,7 @@
 
 import base64
 import io
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, at_brightest, page
-from tests.metalens.view.browser_page import BROWSER, told
+from tests.metalens.view.browser_page import BROWSER, printed, told
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
 # cividis (Nuñez, Anderton, Renslow 2018) at nine even steps, as drawn
@@ -163,3 +164,13 @@ def test_points_have_their_table(tmp_path):
 const words = (row) => [...row.children].map((cell) => cell.textContent).join(",");
 return [...box.querySelectorAll("tbody tr")].map(words).join("|");"""
     assert _told(tmp_path, [_points()], script) == "b,1,0.9,yes,0.1|a,4,0.5,yes,0.4|b,6.5,0.8,,0.65|a,9,0.2,yes,0.9"
+
+
+def test_a_map_reaches_the_paper(tmp_path):
+    index = np.where(np.hypot(*(np.mgrid[:300, :300] - 150)) < 140, 1, 0).astype(np.uint8)
+    page.write(tmp_path / "page.html", "page", [Classes("mask", index, np.array([120.0]), 0.3, "nm")])
+    printed(tmp_path / "page.html", tmp_path / "page.pdf")
+    sheets = (tmp_path / "page.pdf").read_bytes()
+    wide = [int(size) for size in re.findall(rb"/Subtype /Image\s+/Width (\d+)", sheets)]
+    # 180 mm of paper at 96 px an inch: what is drawn for it is a picture as wide, beside its bar of colours at most
+    assert max(wide, default=0) > 600
