@@ -101,9 +101,19 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
 
 
 def test_a_budget_drives_the_pitch_up():
-    trainer = _trainer(replace(MOVING, budget_weight=100.0), architecture=smallest(Space()))
-    list(trainer.run())
-    assert float(trainer.model.pitch_um.detach()) > 10.0
+    space = Space(resolution=(0.6, 1.0))  # which leaves room for pixels up to 16 um
+    member = replace(smallest(space), resolution=1.0)
+    start_um = SIZE * OPTICS.sample_um / 40.5  # 40 and 41 pixels differ in cost: between others the count is flat
+    pitch_um = []
+    for weight in (0.0, 100.0):
+        made = inner.model(OPTICS, pitch_um=start_um, seed=2, space=space)
+        config = replace(MOVING, budget_mmacs=0.7, budget_weight=weight)
+        trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
+        assert min(record.mmacs for record in trainer.run()) > 1.05 * config.budget_mmacs  # or nothing would drive
+        assert trainer.pitch_held_um is None
+        pitch_um.append(float(trainer.model.pitch_um.detach()))
+    assert pitch_um[1] > 1.01 * start_um  # Adam's steps have the size of the rate: 0.03 in all
+    assert pitch_um[1] > 1.005 * pitch_um[0]
 
 
 def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
