@@ -144,8 +144,13 @@ def split(point: PointExposure, diameter_um: Array, number: Array, pitch_um: flo
     return Ranges(some(far, 1.5 * mean_square / 4), some(middle, 1.5 * mean_square / 4), some(~far & ~middle, 0.0))
 
 
-def table(diameter_um: Array, goal: Array, number: Array, *, point: PointExposure, ranges: Ranges) -> Table:
+def table(
+    diameter_um: Array, goal: Array, number: Array, *, point: PointExposure, ranges: Ranges, pitch_um: float
+) -> Table:
     """The table of a mask.
+
+    Args:
+        pitch_um: the least of the lattices.
 
     Raises:
         ProcessError: no pillar, or pillars so much finer than the point exposure that their own dose hardly tells.
@@ -157,7 +162,7 @@ def table(diameter_um: Array, goal: Array, number: Array, *, point: PointExposur
     area = np.pi / 4 * diameter**2
     whole = sum(w * rim_of_own_disc(diameter, a) for a, w in zip(point.widths_um, point.weights, strict=True))
     own = np.where(used, whole - area * float(ranges.far.density(np.array(0.0))), 0.0)
-    beside = area * float(ranges.middle.density(np.array(0.0)))
+    beside = area * _beside(ranges.middle, pitch_um)
     if own[used].min() < _FAINT or (beside >= 0.9 * own)[used].any():
         thin = 1e3 * float(diameter[used][own[used].argmin()])
         raise ProcessError(
@@ -166,3 +171,14 @@ def table(diameter_um: Array, goal: Array, number: Array, *, point: PointExposur
         )
     slope = sum(w * slope_at_rim(diameter, a) for a, w in zip(point.widths_um, point.weights, strict=True))
     return Table(diameter, area, goal, own, np.where(used, slope, 0), number)
+
+
+def _beside(middle: PointExposure, pitch_um: float) -> float:
+    """Bound of the eigenvalues of what the sites of a square lattice, unit masses, give to each other, per um^2.
+
+    The sum over all other sites; or, as the whole kernel has no negative ones, what a site would give to itself.
+    """
+    far = int(np.ceil(5 * float(middle.widths_um.max(initial=0.0)) / pitch_um))
+    apart = np.arange(-far, far + 1) * pitch_um
+    itself = float(middle.density(np.array(0.0)))
+    return min(itself, float(middle.density(np.hypot(apart[:, None], apart)).sum()) - itself)

@@ -99,8 +99,9 @@ def solve(
     """
     point = exposure.point_exposure(settings)
     number = bodies.count(parts, len(diameter_um))
-    ranges = bodies.split(point, diameter_um, number, min(body.pitch_um for body in parts))
-    drawn = bodies.table(diameter_um, goal, number, point=point, ranges=ranges)
+    pitch = min(body.pitch_um for body in parts)
+    ranges = bodies.split(point, diameter_um, number, pitch)
+    drawn = bodies.table(diameter_um, goal, number, point=point, ranges=ranges, pitch_um=pitch)
     fields = _fields(parts, drawn, ranges, cut or Rects.none())
     ladder, needed = assign.ladder(fields, settings)
     pairs, rect_class, after = assign.assign(fields, ladder)

@@ -16,7 +16,6 @@ from metalens.ground.errors import ProcessError
 MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
-_LEAST_STEPS = 2  # grid steps by which a piece is longer than a side that counts as a corner
 _LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece at first, the first that takes few: others' doses differ beside it
 _FEW_PIECES = 100_000
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
@@ -55,7 +54,7 @@ def cut(
     Args:
         boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the pillars, um.
         tolerance: of the exposure; the background changes by a fifth of it between middle and end of a side, or
-            the piece is a 64th of the range short, or as short as a side that is left out as a corner.
+            the piece is a 64th of the range or two of the core short (doses that step so often are even once blurred).
 
     Raises:
         ProcessError: more than 500 000 pieces.
@@ -65,7 +64,7 @@ def cut(
         return np.asarray(boxes, np.int64), np.arange(len(boxes))
     around = PointExposure(point.widths_um[wide], point.weights[wide])
     least, core = float(around.widths_um.min()), float(point.widths_um.min())
-    shortest = max(least / _SHORTEST / step_um, CORNER * core / step_um + _LEAST_STEPS)
+    shortest = max(least / _SHORTEST, CORNER * core) / step_um
     change = _SHARE * tolerance * CLEARS
     for ranges in _LONGEST:
         most = MOST_PIECES if ranges == _LONGEST[-1] else min(_FEW_PIECES, MOST_PIECES)

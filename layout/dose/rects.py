@@ -9,7 +9,7 @@ from metalens.ground.arrays import Array
 
 _OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
 _AT_ONCE = 1_000_000  # pairs
-CORNER = 4.0  # widths of the core: edges that short are round
+CORNER = 2.0  # widths of the core: an edge is round that near its ends
 
 
 def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
@@ -26,7 +26,8 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     same = rects.group[one] == rects.group[two]
     one, two = one[same], two[same]
     starts = np.searchsorted(one, np.arange(count + 1))
-    points, piece = _outer(boxes, starts, two, CORNER * float(near.widths_um.min(initial=0.0)))
+    core_um = float(near.widths_um.min()) if len(near.widths_um) else 0.0
+    points, piece = _outer(rects, starts, two, CORNER * core_um)
     inner = np.bincount(piece, minlength=count) == 0
     at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
     of = np.concatenate([piece, np.flatnonzero(inner)])
@@ -85,21 +86,42 @@ def sums_of_boxes(at_um: Array, row: Array, boxes_um: Array, pairs: tuple[Array,
     return total
 
 
-def _outer(boxes: Array, starts: Array, near: Array, least_um: float) -> tuple[Array, Array]:
-    """Middles (n, 2) of those parts of the sides of each piece that no other piece of its shape covers, and the piece.
+def _outer(rects: Rects, starts: Array, near: Array, corner_um: float) -> tuple[Array, Array]:
+    """Points (n, 2) on those parts of the sides of each piece that no other piece of its shape covers, and the piece.
 
-    near: numbers of the pieces around each, from ``starts`` on. Parts up to ``least_um`` long, in a corner, are left
-    out.
+    near: numbers of the pieces around each, from ``starts`` on. A point is the middle of its part or, within
+    ``corner_um`` of an end of the straight run that the part belongs to, of what is left of the part beyond (nothing:
+    the nearest place beyond). Runs of twice that length are round: left out.
     """
-    room = 4 * (len(near) + len(boxes))
-    points, piece = np.empty((room, 2)), np.empty(room, np.int64)
-    count = _free(boxes, starts, near, least_um, _OUTSIDE_UM, points, piece)
-    return points[:count].copy(), piece[:count].copy()
+    room = 4 * (len(near) + len(rects.box_um))
+    part, piece, side = np.empty((room, 3)), np.empty(room, np.int64), np.empty(room, np.int64)
+    count = _free(rects.box_um, starts, near, _OUTSIDE_UM, part, piece, side)
+    part, piece, side = part[:count], piece[:count], side[:count]
+    low, high = _run(part, rects.group[piece], side)
+    low, high = low + corner_um, high - corner_um
+    straight = high > low
+    middle = (np.clip(part[:, 1], low, high) + np.clip(part[:, 2], low, high)) / 2
+    points = np.where((side % 2 == 0)[:, None], np.stack([part[:, 0], middle], -1), np.stack([middle, part[:, 0]], -1))
+    return points[straight], piece[straight]
+
+
+def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
+    """Both ends (n,) of the straight run of outline that each part (n, 3: across, from, to) of a side belongs to."""
+    line = np.rint(part[:, 0] / _OUTSIDE_UM)
+    order = np.lexsort((part[:, 1], line, side, group))
+    keys = np.stack([group, side, line])[:, order]
+    apart = part[order[1:], 1] > part[order[:-1], 2] + _OUTSIDE_UM
+    new = np.r_[True, (keys[:, 1:] != keys[:, :-1]).any(0) | apart]
+    run = np.cumsum(new) - 1
+    first = np.flatnonzero(new)
+    low, high = np.empty(len(part)), np.empty(len(part))
+    low[order], high[order] = part[order[first], 1][run], part[order[np.r_[first[1:], len(order)] - 1], 2][run]
+    return low, high
 
 
 @compiled
-def _free(boxes: Array, starts: Array, near: Array, least: float, step: float, points: Array, piece: Array) -> int:
-    """Fill in the free parts of all sides; how many there are."""
+def _free(boxes: Array, starts: Array, near: Array, step: float, part: Array, piece: Array, sides: Array) -> int:
+    """Fill in the free parts of all sides (across, from, to), longer than a step; how many there are."""
     count = 0
     for n in range(boxes.shape[0]):
         beside = boxes[near[starts[n] : starts[n + 1]]]
@@ -112,9 +134,9 @@ def _free(boxes: Array, starts: Array, near: Array, least: float, step: float, p
             low, high = boxes[n, along], boxes[n, along + 2]
             for k in range(over.shape[0] + 1):
                 end = over[k, along] if k < over.shape[0] else high
-                if low < high and min(end, high) - low > least:
-                    points[count, along], points[count, across] = (low + min(end, high)) / 2, at
-                    piece[count] = n
+                if low < high and min(end, high) - low > step:
+                    part[count, 0], part[count, 1], part[count, 2] = at, low, min(end, high)
+                    piece[count], sides[count] = n, side
                     count += 1
                 if k < over.shape[0]:
                     low = max(low, over[k, along + 2])

@@ -52,27 +52,44 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
         assert abs(made - drawn[number].diameter_um) < 1.1e-3, at[number]
 
 
-def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(tmp_path):
-    """Points on crosses, verniers, box and letters by plain convolution: 0.3 % and 0.1 nm (pixels, rasters)."""
-    beam = {"alpha_um": 0.017, "beta_um": 11.3, "eta": 0.7}
-    process = Process(exposure=Exposure(**beam), die=Die(margin_um=330, mark_um=60, label="R4"))
-    plan = build.prepare(lens_map(29, 0.4, 0.11, 0.29, 0.7), process).plan
+@pytest.mark.parametrize(
+    ("alpha_um", "beta_um", "eta", "thinnest_um"),
+    [
+        (0.017, 11.3, 0.7, 0.11),
+        (0.008, 3.7, 0.9, 0.11),
+        (0.025, 4.3, 0.6, 0.11),
+        (0.041, 3.1, 0.8, 0.11),
+        (0.06, 2.9, 0.7, 0.25),
+    ],
+)
+def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
+    tmp_path, alpha_um, beta_um, eta, thinnest_um
+):
+    """Points on crosses, verniers, box and letters by plain convolution: 0.3 % and 0.1 nm (pixels, rasters).
+
+    All along them 1 % and 1 nm hold, also for backscatter as short as a stroke and a core half as wide as a pillar.
+    """
+    beam = {"alpha_um": alpha_um, "beta_um": beta_um, "eta": eta}
+    process = Process(exposure=Exposure(**beam), die=Die(margin_um=330, mark_um=40, label="R4"))
+    plan = build.prepare(lens_map(29, 0.4, thinnest_um, 0.29, 0.7), process).plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
     doses.write(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     resist = plain_exposure.Resist(drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])])
     found = certify(layout.read_gdsii(tmp_path / "m.gds"), doses.read(tmp_path / "doses.csv"), process).edges
     assert set(found.layer.tolist()) == {process.layers.marks[0], process.layers.labels[0]}
+    assert np.abs(found.exposure - 1).max() < 0.01
+    assert 2 * np.abs(found.shift_nm).max() < 1
     rng = np.random.default_rng(4)
     each = [np.flatnonzero(found.layer == layer) for layer in sorted(set(found.layer.tolist()))]
-    picked = np.concatenate([rng.choice(some, 7, replace=False) for some in each])
+    picked = np.concatenate([rng.choice(some, 4, replace=False) for some in each])
     worst = np.argsort(-np.abs(found.exposure - 1))[:3]
     for n in [*picked.tolist(), *worst.tolist()]:
         at = np.array([found.x_um[n], found.y_um[n]])
-        edge, shift = resist.edge(at, outward(drawn, at), 0.004)
+        edge, shift = resist.edge(at, outward(drawn, at), min(0.004, alpha_um / 4))
         assert abs(edge - found.exposure[n]) < 0.003, at
         assert abs(shift * 1e3 - found.shift_nm[n]) < 0.1, at
-        assert abs(edge - 1) < 0.023, at
+        assert abs(edge - 1) < 0.013, at
 
 
 def outward(drawn, at):

@@ -1,8 +1,11 @@
 """Pieces of marks and letters: doses for their outer edges, against the convolution of a raster."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.special import erf
 
 from layout.dose import rects
 from layout.dose.bodies import Rects
@@ -45,4 +48,21 @@ def test_a_row_that_ends_over_the_middle_of_a_side_leaves_its_free_half(off):
     cut = Rects(boxes, np.zeros(3, int), np.ones(3))
     _, points, piece = rects.own(cut, PointExposure(np.array([0.02]), np.array([1.0])))
     first = sorted(map(tuple, points[piece == 0].round(9).tolist()))
-    assert first == [(0.1, 0.55), (0.4, 0.9), (0.7, 0.2)]
+    # below, the side runs on to 2.0: of its 0.1 to 1.3 two ranges at the corner count for nothing
+    assert first == [(0.1, 0.55), (0.4, 0.9), (0.72, 0.2)]
+
+
+def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
+    """Two ranges (0.1) off the corners; a shorter piece at the nearest such place, runs of 0.2 and less nowhere."""
+    ends = [0.0, 0.07, 0.16, 0.5]  # an arm 1.3 wide in slabs, then a foot of 0.2 at its side
+    boxes = np.array([[0.3, low, 1.6, high] for low, high in itertools.pairwise(ends)])
+    boxes = np.vstack([boxes, [[1.6, 0.3, 1.8, 0.5]]])
+    cut = Rects(boxes, np.zeros(4, int), np.ones(4))
+    _, points, piece = rects.own(cut, PointExposure(np.array([0.05, 40.0]), np.array([0.6, 0.4])))
+    found = [sorted(map(tuple, points[piece == n].round(9).tolist())) for n in range(4)]
+    assert found[0] == [(0.3, 0.1), (0.95, 0.0), (1.6, 0.1)]
+    assert found[1] == [(0.3, 0.13), (1.6, 0.13)]
+    assert found[2] == [(0.3, 0.28), (1.0, 0.5), (1.6, 0.18)]  # the top runs on over the foot, the right one to it
+    assert found[3] == [(1.65, 0.5)]
+    core = PointExposure(np.array([0.05]), np.array([0.6]))
+    assert rects.own(cut, core)[0][1] == pytest.approx(0.6 * (0.5 * erf(0.13 / 0.05) / 2 + 0.25), abs=1e-4)

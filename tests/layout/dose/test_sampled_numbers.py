@@ -173,7 +173,7 @@ def test_gaussians_are_sorted_by_reach_and_widened_by_the_pillars():
 def test_the_table_takes_from_each_pillar_what_the_far_field_counts_for_it():
     number = np.array([0, 30, 5, 0])
     ranges = bodies.split(POINT, DIAMETER, number, PITCH)
-    made = bodies.table(DIAMETER, GOAL, number, point=POINT, ranges=ranges)
+    made = bodies.table(DIAMETER, GOAL, number, point=POINT, ranges=ranges, pitch_um=PITCH)
     assert ranges.far.weights.tolist() == [0.25]
     for k in (1, 2):
         area = math.pi / 4 * DIAMETER[k] ** 2
@@ -207,6 +207,8 @@ def test_pillars_that_their_own_dose_hardly_reaches_are_refused(own, refused):
     number = np.array([0, 5, 0, 0])
     if refused:
         with pytest.raises(ProcessError, match=r"a pillar of 210 nm gives its own edge an exposure of 0\.019 only"):
-            bodies.table(DIAMETER, GOAL, number, point=point, ranges=near)
+            bodies.table(DIAMETER, GOAL, number, point=point, ranges=near, pitch_um=PITCH)
     else:
-        assert bodies.table(DIAMETER, GOAL, number, point=point, ranges=near).own[1] == pytest.approx(own)
+        assert bodies.table(DIAMETER, GOAL, number, point=point, ranges=near, pitch_um=PITCH).own[1] == pytest.approx(
+            own
+        )
