@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from metalens.propagate.paths import chief_path as chief_path
     from metalens.propagate.paths import cosines as cosines
     from metalens.propagate.paths import kernel as kernel
+    from metalens.propagate.pillars import Pupils as Pupils
+    from metalens.propagate.pillars import mixed as mixed
     from metalens.propagate.sincos import turns32 as turns32
     from metalens.propagate.verbs import angles as angles
     from metalens.propagate.verbs import angular_spectrum as angular_spectrum
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from metalens.propagate.wide import light_wide as light_wide
     from metalens.propagate.window import Moving as Moving
     from metalens.propagate.window import field_windowed as field_windowed
+    from metalens.propagate.window import light_windowed as light_windowed
     from metalens.propagate.window import plan as plan
     from metalens.propagate.window import plan_wide as plan_wide
 
@@ -45,6 +48,7 @@ __getattr__, __dir__, __all__ = attach(
         "Case": "geometry",
         "Choice": "choice",
         "Moving": "window",
+        "Pupils": "pillars",
         "SAFETY": "estimate",
         "SHARE": "blocks",
         "Sample": "estimate",
@@ -64,6 +68,8 @@ __getattr__, __dir__, __all__ = attach(
         "field_windowed": "window",
         "kernel": "paths",
         "light_wide": "wide",
+        "light_windowed": "window",
+        "mixed": "pillars",
         "paths": "",
         "plan": "window",
         "plan_wide": "window",

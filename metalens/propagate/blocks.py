@@ -81,7 +81,14 @@ Kernel = Callable[[Any, Any], Array]
 
 
 def choose(
-    case: Case, reference: float, kernel: Kernel, tolerance: float, itemsize: int, nodes: int = NODES
+    case: Case,
+    reference: float,
+    kernel: Kernel,
+    tolerance: float,
+    itemsize: int,
+    *,
+    nodes: int = NODES,
+    more: int = 0,
 ) -> tuple[Blocks, Blocks]:
     """(rows, columns) blocks that cost least.
 
@@ -89,17 +96,18 @@ def choose(
         kernel: (y, x) in um to (line, …) values whose variation over a block must be met, broadcasting.
         tolerance: root mean square error of the interpolation, relative.
         nodes: of the lens along an axis, to which the light of every block's goes on, about.
+        more: nodes of a block beyond those that the kernel needs.
     """
     height = next(n for n in LENGTHS[0] if n <= case.shape[0] and _carried(case, reference, n, itemsize))
     found = []
     for axis, longest in ((0, height), (1, LENGTHS[1][0])):
         options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
-        blocks = [_needed(case, axis, n, kernel, tolerance) for n in options]
+        blocks = [_needed(case, axis, n, kernel, tolerance, more) for n in options]
         found.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
     return found[0], found[1]
 
 
-def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float) -> Blocks:
+def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float, more: int) -> Blocks:
     """Blocks of a length along an axis with as few nodes as the kernel needs at its ends and its middle."""
     if length < 4:
         return Blocks(case.shape[axis], length, length)
@@ -109,7 +117,7 @@ def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float
     across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
     line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * step_um
     values = kernel(line, across) if axis == 0 else kernel(across, line)
-    count = max(legendre.needed(values, tolerance), 2)
+    count = max(legendre.needed(values, tolerance), 2) + more
     return Blocks(case.shape[axis], length, length if count > PROBES else min(count, length))
 
 

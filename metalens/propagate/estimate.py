@@ -41,9 +41,11 @@ NORMALISED, SPARSE = 0.03, 0.5
 class Sample:
     """One wavelength of a result to be judged.
 
-    weight: of its intensity; moments: (m + MORE, n + MORE) complex128 of the lens; noise: standard deviation of the
-    field from rounding and interpolation at the pillars; parts: tiles along each axis. nodes_um: (e,), (x,) of the lens
-    where ``moments`` are the light there, None where they are coefficients of polynomials.
+    weight: of its intensity; moments: (m + MORE, n + MORE) complex128 of the lens, or (map, …) of several; noise:
+    standard deviation of the field from rounding and interpolation at the pillars; parts: tiles along each axis.
+    nodes_um: (e,), (x,) of the lens where ``moments`` are the light there, None where they are coefficients of
+    polynomials. pupils: (components,) signs and (components, map, e, x) factors on the light of these nodes, whose
+    squares add up; None for the light of one map.
     """
 
     case: Case
@@ -52,6 +54,7 @@ class Sample:
     noise: float
     parts: int
     nodes_um: tuple[Array, Array] | None = None
+    pupils: tuple[Array, Array] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -116,7 +119,7 @@ def _squares(normalised: Array) -> Array:
 
 def _effort(windows: list[list[Sample]]) -> tuple[int, int]:
     """(points, depths) that are looked at: fewer where a point takes the sum over very many nodes."""
-    nodes = max(samples[0].moments.size for samples in windows)
+    nodes = max(math.prod(samples[0].moments.shape[-2:]) for samples in windows)
     if windows[0][0].nodes_um is None:
         pixels = sum(math.prod(samples[0].shape[-2:]) for samples in windows)
         return max(POINTS * min(4, len(windows)), pixels // EVERY), DEPTHS
@@ -191,46 +194,57 @@ def _direct_light(windows: list[list[Sample]], depths: Array, points: Array) -> 
         mine = np.nonzero((points >= first) & (points < first + ny * nx))[0]
         at = np.divmod(points[mine] - first, nx)
         for s in samples:
-            out[:, mine] += s.weight * np.abs(_direct(s, depths, at)) ** 2
+            signs = np.ones(1) if s.pupils is None else s.pupils[0]
+            out[:, mine] += s.weight * np.einsum("c,czp->zp", signs, np.abs(_direct(s, depths, at)) ** 2)
         first += ny * nx
     return np.asarray(out)
 
 
 def _at_nodes(sample: Sample) -> tuple[Array, Array, Array]:
-    """Light (row, column) on nodes of the lens, and their places."""
+    """Light (component, row, column) on nodes of the lens, and their places."""
+    m, n = sample.moments.shape[-2:]
     if sample.nodes_um is not None:
-        return sample.moments, *sample.nodes_um
-    m, n = sample.moments.shape
-    with one_blas_thread():
-        light = legendre.to_nodes(m).T @ sample.moments @ legendre.to_nodes(n)
-    hy, hx = sample.case.half_size_um
-    return light, legendre.mapped(m, -hy, hy), legendre.mapped(n, -hx, hx)
+        light, (e, x) = sample.moments, sample.nodes_um
+    else:
+        with one_blas_thread():
+            light = legendre.to_nodes(m).T @ sample.moments @ legendre.to_nodes(n)
+        hy, hx = sample.case.half_size_um
+        e, x = np.asarray(legendre.mapped(m, -hy, hy)), np.asarray(legendre.mapped(n, -hx, hx))
+    light = light.reshape(-1, m, n)
+    return light if sample.pupils is None else np.einsum("cmyx,myx->cyx", sample.pupils[1], light), e, x
 
 
 def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
-    """(depth, point) field at (y, x) indices, summed over the finer nodes."""
+    """(component, depth, point) field at (y, x) indices, summed over the finer nodes; one kernel serves them all."""
     case = sample.case
     light, e, x = _at_nodes(sample)
-    m, n = light.shape
     wy, wx = case.window_um
     points = np.stack([wx[at[1]], wy[at[0]]], -1)
     lengths = [*case.centre_um, case.sensor_distance_um, case.wavelength_um]
     numbers: Any = np.array([*case.tangents, reference_depth(case), *lengths])
     inverse = np.array(case.inverse_depths_per_um)[depths]
-    re, im = np.empty((2, m, len(depths), n))
-    out = np.zeros((len(depths), len(points)), complex)
-    turn: Any = _curved
+    given = [_of_depths(case, one, (e, x), numbers, inverse) for one in light]
+    re, im = (np.concatenate([parts[i] for parts in given], axis=1) for i in (0, 1))
+    out = np.zeros((re.shape[1], len(points)), complex)
     total: Any = _sum_nodes
-    if case.front:
-        angle = depth_factors(case, e[:, None], x, case.tangents, inverse[:, None, None])
-        turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
-        re[:], im[:] = turned.real, turned.imag
-    else:
-        split(m, lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, re[a:b], im[a:b]))
     if case.behind is not None:
         total, numbers = sum_rays, (case.wavenumber, *case.centre_um, *media_arrays(case.behind))
     split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
-    return np.asarray(out * case.area_um2)
+    return np.asarray(out * case.area_um2).reshape(len(light), len(depths), -1)
+
+
+def _of_depths(case: Case, light: Array, at_um: tuple[Array, Array], numbers: Array, inverse: Array) -> Array:
+    """(real and imaginary, row, depth, column) light (row, column) with the phase of every depth."""
+    e, x = at_um
+    out = np.empty((2, len(e), len(inverse), len(x)))
+    turn: Any = _curved
+    if case.front:
+        angle = depth_factors(case, e[:, None], x, case.tangents, inverse[:, None, None])
+        turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
+        out[:] = turned.real, turned.imag
+    else:
+        split(len(e), lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, out[0, a:b], out[1, a:b]))
+    return out
 
 
 @numba.njit(inline="always")

@@ -19,6 +19,9 @@ from metalens.propagate.blocks import CHUNK, NODES, ORDER, SHARE, Blocks, Carrie
 from metalens.propagate.compiled import gather, spread
 from metalens.propagate.geometry import Case
 
+# (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth factors on the light of several
+# maps: light on the window is Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
+Pupils = Callable[[Array, Array], tuple[Array, Array]]
 KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once
 DEVICE_ROWS = 256
 
@@ -63,15 +66,16 @@ def moments(
     dtype: torch.dtype,
     device: torch.device | None = None,
     nodes: int = NODES,
+    more: int = 0,
 ) -> Moments:
     """Blocks, and what light at their nodes is worth in each moment.
 
     Args:
         weights: of the rows and of the columns, (place,) um to (place, m): polynomials, or shares of an even grid.
-        kernel, nodes: as :func:`metalens.propagate.blocks.choose`.
+        kernel, nodes, more: as :func:`metalens.propagate.blocks.choose`.
     """
     itemsize = torch.finfo(dtype).bits // 8
-    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize, nodes)
+    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize, nodes=nodes, more=more)
     rows, columns = blocks
     width = columns.length
     wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
@@ -100,6 +104,17 @@ def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -
         phase_rad, transmission = (m.to(plan.rows.dtype) for m in (phase_rad, transmission))
     parts, power = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
     return torch.complex(parts[0], parts[1]), float(power)
+
+
+def mixed(
+    light: torch.Tensor, pupils: Pupils | None, places_um: tuple[Array, Array]
+) -> list[tuple[float, torch.Tensor]]:
+    """Sign and light of every component, from the light of every map (map, e, x) at these places (e,), (x,)."""
+    if pupils is None:
+        return [(1.0, light[0])]
+    signs, factors = pupils(*places_um)
+    by = torch.as_tensor(factors, device=light.device).to(light.real.dtype)
+    return [(float(sign), (factor * light).sum(0)) for sign, factor in zip(signs, by, strict=True)]
 
 
 class _Reduce(torch.autograd.Function):

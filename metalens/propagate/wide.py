@@ -30,7 +30,7 @@ from metalens.propagate.geometry import Case
 from metalens.propagate.grids import Axis, axes, grid_um, spread_weights
 from metalens.propagate.operators import depth_basis
 from metalens.propagate.paths import from_source, over_blocks, reference_depth, to_sensor
-from metalens.propagate.pillars import Moments, moments, reduce
+from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 
 BAND_BYTES = 8e6  # of the depths that are mixed at once
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
@@ -171,14 +171,21 @@ def _fade(axis: Axis, past: Array) -> Array:
 
 
 def light_wide(
-    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: WidePlan
-) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """|U|² on the window (depth, y, x); light on the even grid of the lens; the sum of squares of the transmission.
+    maps: tuple[torch.Tensor, torch.Tensor], plan: WidePlan, pupils: Pupils | None = None
+) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
+    """Light on the window (depth, y, x); that of every map on the even grid of the lens; the sums of squares of their
+    transmissions.
 
-    Differentiable in phase and transmission (y, x).
+    Differentiable in phase and transmission. maps: (map, y, x) of both. pupils: factors on their light; None for the
+    |U|² of one map.
     """
-    gathered, power = reduce(phase_rad, transmission, plan.moments)
-    return _mixed(fields_wide(gathered, plan), plan.coefficients), gathered.detach(), power
+    found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
+    gathered, total = torch.stack([g for g, _ in found]), None
+    for sign, light in mixed(gathered, pupils, plan.nodes_um):
+        here = _mixed(fields_wide(light, plan), plan.coefficients)
+        here = here if sign == 1 else sign * here
+        total = here if total is None else total + here
+    return torch.as_tensor(total), gathered.detach(), [power for _, power in found]
 
 
 def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:

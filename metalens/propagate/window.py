@@ -19,9 +19,10 @@ from metalens.propagate.geometry import Case, tiles
 from metalens.propagate.nodes import Layout, layout
 from metalens.propagate.operators import Depths, depth_basis, depth_factors, operators, pairs
 from metalens.propagate.paths import over_blocks, reference_depth, to_sensor
-from metalens.propagate.pillars import Moments, moments, reduce
+from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 from metalens.propagate.wide import WidePlan, wide_plan
 
+SMOOTH = 4, 2  # nodes more over the lens, and in a block, where light is multiplied by such factors there
 KEPT_BYTES = 400e6  # of plans that are kept
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
@@ -49,6 +50,17 @@ class Plan:
         return _nodes_um(self.case, self.layout.sizes.nodes)
 
     @property
+    def whole_um(self) -> tuple[Array, Array]:
+        """(e,), (x,) positions of the lens nodes of the whole window."""
+        return _nodes_um(self.case, self.layout.nodes)
+
+    @property
+    def judged_um(self) -> tuple[Array, Array]:
+        """(e,), (x,) positions of the nodes that its moments stand for, ``MORE`` than those."""
+        ny, nx = self.layout.nodes
+        return _nodes_um(self.case, (ny + MORE, nx + MORE))
+
+    @property
     def bytes(self) -> int:
         """Memory that its arrays take."""
         held = [*self.tensors.values(), *(t for made in self.slopes.values() for t in made.values())]
@@ -73,17 +85,25 @@ _kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
 _lock = threading.Lock()
 
 
-def plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, moving: bool = False) -> Plan:
+def plan(
+    case: Case,
+    tolerance: float,
+    dtype: torch.dtype,
+    device: torch.device,
+    moving: bool = False,
+    *,
+    smooth: bool = False,
+) -> Plan:
     """Plan a windowed propagation; those used last are kept, as many as fit in ``KEPT_BYTES``.
 
     Args:
-        moving: for use with :class:`Moving`.
+        moving: for use with :class:`Moving`. smooth: with factors (``Pupils``) on the light of the nodes.
 
     Raises:
         PropagationError: the window is too large for the method.
     """
-    made = functools.partial(_planned, case, tolerance, dtype, device, moving=moving)
-    return _keep((case, tolerance, dtype, device, moving), made)
+    made = functools.partial(_planned, case, tolerance, dtype, device, moving=moving, smooth=smooth)
+    return _keep((case, tolerance, dtype, device, moving, smooth), made)
 
 
 def plan_wide(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device) -> WidePlan:
@@ -115,12 +135,16 @@ def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
     return found
 
 
-def _planned(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, *, moving: bool) -> Plan:
+def _planned(
+    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, *, moving: bool, smooth: bool
+) -> Plan:
     """A new plan."""
     found = layout(case, tolerance)
     if found is None:
         raise PropagationError("the window is too large for one plan; see propagate.choose, or make it smaller")
-    ny, nx = found.nodes
+    lens, inside = SMOOTH if smooth else (0, 0)
+    ny, nx = (n + lens for n in found.nodes)
+    found = dataclasses.replace(found, nodes=(ny, nx))
     reference = reference_depth(case)
     pillars = moments(
         case,
@@ -130,6 +154,7 @@ def _planned(case: Case, tolerance: float, dtype: torch.dtype, device: torch.dev
         tolerance=tolerance,
         dtype=dtype,
         device=device,
+        more=inside,
     )
     depths = depth_basis(case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving)
     tensors = _shared(case, found, depths, dtype, device) | _stacked(case, found, depths, tolerance, (dtype, device))
@@ -218,11 +243,40 @@ def field_windowed(
     return from_moments(gathered, plan, moving), gathered.detach(), power
 
 
+def light_windowed(
+    maps: tuple[torch.Tensor, torch.Tensor], plan: Plan, moving: Moving | None, pupils: Pupils | None
+) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
+    """Light on the window, (depth, y, x); the moments of every map; the sums of squares of their transmissions.
+
+    maps: (map, y, x) phase and transmission. pupils: factors on their light, for a plan made ``smooth``; None for the
+    |U|² of one map.
+    """
+    found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
+    gathered, powers = torch.stack([g for g, _ in found]), [power for _, power in found]
+    parts = mixed(_on_nodes(gathered, plan), pupils, plan.whole_um)
+    lit = [(sign, _from_nodes(light, plan, moving)) for sign, light in parts]
+    total = functools.reduce(torch.add, (_power(field) if sign == 1 else sign * _power(field) for sign, field in lit))
+    return total, gathered.detach(), powers
+
+
+def _power(field: torch.Tensor) -> torch.Tensor:
+    return field.real**2 + field.imag**2
+
+
 def from_moments(gathered: torch.Tensor, plan: Plan, moving: Moving | None = None) -> torch.Tensor:
     """(depth, y, x) field on the window from the moments of a lens."""
-    t = plan.tensors
+    return _from_nodes(_on_nodes(gathered, plan), plan, moving)
+
+
+def _on_nodes(gathered: torch.Tensor, plan: Plan) -> torch.Tensor:
+    """(…, e, x) light on the nodes of the whole window from moments (…, m, n)."""
     ny, nx = plan.layout.nodes
-    light = t["rows_to_nodes"].T @ gathered[:ny, :nx] @ t["columns_to_nodes"]
+    return plan.tensors["rows_to_nodes"].T @ gathered[..., :ny, :nx] @ plan.tensors["columns_to_nodes"]
+
+
+def _from_nodes(light: torch.Tensor, plan: Plan, moving: Moving | None) -> torch.Tensor:
+    """(depth, y, x) field on the window from the light on its nodes."""
+    t = plan.tensors
     fewer = t["rows_to_tile"].T @ (light * t["turn"]) @ t["columns_to_tile"]
     coefficients = t["coefficients"] if moving is None else _coefficients(plan, moving)
     given = fewer[:, None] * t["basis"]

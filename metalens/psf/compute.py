@@ -1,6 +1,7 @@
 """Intensity of one lens in one direction, by the cheapest method, checked and repeated until the tolerance is met."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,17 +14,20 @@ from metalens.propagate import (
     Case,
     Choice,
     Moving,
+    Pupils,
     Sample,
     check_aperture,
     chief_path,
     choose,
     field_exact,
-    field_windowed,
     light_wide,
+    light_windowed,
+    mixed,
     plan,
     plan_wide,
     relative_error,
 )
+from metalens.psf.vector import Mixing
 
 FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
 BRIGHT = 30.0  # times the light of random phases below which float32 loses what is left of the sum
@@ -73,23 +77,25 @@ def intensity(
     *,
     tolerance: float,
     moving: Any = None,
+    mixing: Mixing | None = None,
 ) -> Result:
     """|U|² on the window, wavelengths added with their weights.
 
     Args:
-        phase, level: (wavelength, y, x).
+        phase, level: (wavelength, y, x), or with ``mixing`` as many maps of a wavelength after each other as it takes.
         cases: one a wavelength, alike in everything else.
-        moving: :class:`Moving` or None.
+        moving: :class:`Moving` or None. mixing: both polarisations in place of |U|² of one scalar.
 
     The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
     tolerance, all that is added to it later included; the result of the last try is returned with its estimate in any
     case. Dim and tiny windows are summed in float64, since the estimate knows rounding as noise of a mean size only.
     """
+    lit = Lit(phase, level, cases, weights, mixing)
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
     if not needs_grad and phase.device.type == "cpu":  # at the setting that the windowed method begins with
         choices = [choose(case, max(tolerance / 2, FINEST)) for case in cases]
         if all(choice.method == "exact" for choice in choices):
-            return _exact(phase, level, cases, weights, choices[0].reason)
+            return _exact(lit, choices[0].reason)
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
     if cases[0].samples[0] * cases[0].samples[1] < FEW:
         first = torch.float64
@@ -101,7 +107,7 @@ def intensity(
     dim = False
     for setting, kind in tries:
         dtype = torch.float64 if dim else kind
-        result = _windowed((phase, level), dtype, cases, weights, max(setting, FINEST), moving)
+        result = _windowed(lit, dtype, max(setting, FINEST), moving)
         error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype])
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
@@ -109,72 +115,100 @@ def intensity(
     return Result(result.intensity.to(phase.dtype), error, result.reason, result.power)
 
 
-def _exact(phase: torch.Tensor, level: torch.Tensor, cases: list[Case], weights: list[float], reason: str) -> Result:
-    arrays = [np.abs(field_exact(p.numpy(), t.numpy(), c)) ** 2 for p, t, c in zip(phase, level, cases, strict=True)]
-    total = sum(w * a for w, a in zip(weights, arrays, strict=True))
-    power = sum(w * float((t.double() ** 2).sum()) for w, t in zip(weights, level, strict=True))
-    return Result(torch.as_tensor(total).to(phase.dtype), EXACT[phase.dtype], reason, power)
+@dataclass(frozen=True, eq=False, slots=True)
+class Lit:
+    """What :func:`intensity` is asked of."""
+
+    phase: torch.Tensor
+    level: torch.Tensor
+    cases: list[Case]
+    weights: list[float]
+    mixing: Mixing | None = None
+
+    def each(self) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor], Case, float, Pupils | None]]:
+        """(maps of one, case, weight, components) of every wavelength."""
+        count = 1 if self.mixing is None else self.mixing.maps
+        for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
+            some = slice(i * count, (i + 1) * count)
+            pupils = None if self.mixing is None else self.mixing.pupils(case)
+            yield (self.phase[some], self.level[some]), case, weight, pupils
+
+    def power(self, case: Case, powers: list[float], level: torch.Tensor) -> float:
+        """What the pillars of a wavelength let through, from the sums of squares of its maps."""
+        return powers[0] if self.mixing is None else self.mixing.power(case, powers, level)
 
 
-def _windowed(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    dtype: torch.dtype,
-    cases: list[Case],
-    weights: list[float],
-    tolerance: float,
-    moving: Any,
-) -> Result:
+def _exact(lit: Lit, reason: str) -> Result:
+    total: Any = 0.0
+    power = 0.0
+    for (phase, level), case, weight, pupils in lit.each():
+        powers = (level.double() ** 2).sum((-1, -2)).tolist()
+        power += weight * lit.power(case, powers, level)
+        if pupils is None:
+            total = total + weight * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
+            continue
+        for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
+            field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
+            total = total + weight * sign * np.abs(field) ** 2
+    return Result(torch.as_tensor(total).to(lit.phase.dtype), EXACT[lit.phase.dtype], reason, power)
+
+
+def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Result:
     """One try with sums of a dtype: every wavelength and window, then the estimate from all of them."""
-    choice = choose(cases[0], tolerance, differentiable=True, moving=moving is not None)
+    choice = choose(lit.cases[0], tolerance, differentiable=True, moving=moving is not None)
     if choice.method == "wide":
-        return _wide(maps, dtype, cases, weights, tolerance, choice)
+        return _wide(lit, dtype, tolerance, choice)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
     seen: list[Any] = [0.0] * len(samples)
     total: Any = 0
-    light = 0.0
-    for p, t, case, weight in zip(*maps, cases, weights, strict=True):
+    given = 0.0
+    for maps, case, weight, pupils in lit.each():
         rows, index = [], 0
         for row in _windows(case, choice, tolerance):
             parts = []
             for window in row:
-                made = plan(window, tolerance, dtype, p.device, moving is not None)
-                field, gathered, power = field_windowed(p, t, made, _shifted(moving, case, window))
-                _check(p, t, case, power, gathered)
-                noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(power, case)
+                made = plan(window, tolerance, dtype, maps[0].device, moving is not None, smooth=pupils is not None)
+                light, gathered, powers = light_windowed(maps, made, _shifted(moving, case, window), pupils)
+                _check(maps, case, sum(powers), gathered)
+                power = lit.power(case, powers, maps[1])
+                at = None if pupils is None else pupils(*made.judged_um)
+                noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(_noisy(powers, at), case)
                 moments = gathered.cpu().numpy().astype(complex)
-                samples[index].append(Sample(window, weight, moments, noise, made.layout.parts))
-                here = weight * (field.real**2 + field.imag**2)
+                samples[index].append(Sample(window, weight, moments, noise, made.layout.parts, pupils=at))
+                here = weight * light
                 parts.append(here)
                 seen[index] = seen[index] + here.detach().cpu().numpy()
                 index += 1
             rows.append(torch.cat(parts, -1))
-        light += weight * power
+        given += weight * power
         total = total + torch.cat(rows, -2)
-    result = _judged(total, samples, seen, (cases, weights, light), choice)
+    result = _judged(total, samples, seen, (lit.cases, lit.weights, given), choice)
     return _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
 
 
-def _wide(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    dtype: torch.dtype,
-    cases: list[Case],
-    weights: list[float],
-    tolerance: float,
-    choice: Choice,
-) -> Result:
+def _noisy(powers: list[float], at: Any) -> float:
+    """Sum of squares of the transmission of all components, each factor as large as it gets: what rounds."""
+    if at is None:
+        return powers[0]
+    return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
+
+
+def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Result:
     """One try of a wide window by Fourier transforms, as :func:`_windowed`."""
     total: Any = None
     power, samples = 0.0, []
-    for p, t, case, weight in zip(*maps, cases, weights, strict=True):
-        made = plan_wide(case, tolerance, dtype, p.device)
-        light, gathered, given = light_wide(p, t, made)
-        _check(p, t, case, given, gathered)
-        noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(given, case)
-        samples.append(Sample(case, weight, gathered.cpu().numpy().astype(complex), noise, 1, made.nodes_um))
+    for maps, case, weight, pupils in lit.each():
+        made = plan_wide(case, tolerance, dtype, maps[0].device)
+        light, gathered, powers = light_wide(maps, made, pupils)
+        _check(maps, case, sum(powers), gathered)
+        at = None if pupils is None else pupils(*made.nodes_um)
+        noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(_noisy(powers, at), case)
+        given = gathered.cpu().numpy().astype(complex)
+        samples.append(Sample(case, weight, given, noise, 1, made.nodes_um, at))
         light = light if weight == 1 else light * weight
         total = light if total is None else total + light
-        power += weight * given
-    result = _judged(total, [samples], [total.detach().cpu().numpy()], (cases, weights, power), choice)
+        power += weight * lit.power(case, powers, maps[1])
+    result = _judged(total, [samples], [total.detach().cpu().numpy()], (lit.cases, lit.weights, power), choice)
     result = _few_seen(result, tolerance)
     return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
 
@@ -205,8 +239,8 @@ def _judged(
         lit = torch.stack([(row @ row) / row.sum() for row in seen_light]).min()
     else:
         lit = seen_light.mean(-1).min()
-    brightness = float(lit) / sum(  # weights of a flux have signs
-        abs(weight) * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
+    brightness = float(lit) / sum(
+        weight * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
     )
     error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
     return Result(total, error, choice.reason, light, brightness=brightness)
@@ -220,7 +254,7 @@ def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, 
     return tuple(tuple(replace(w, wavelength_um=case.wavelength_um) for w in row) for row in choice.tiles)
 
 
-def _check(phase: torch.Tensor, level: torch.Tensor, case: Case, power: float, moments: torch.Tensor) -> None:
+def _check(maps: tuple[torch.Tensor, torch.Tensor], case: Case, power: float, moments: torch.Tensor) -> None:
     """Refuse maps that hold nothing or what is not finite, as the sums over all pillars tell.
 
     Raises:
@@ -228,7 +262,7 @@ def _check(phase: torch.Tensor, level: torch.Tensor, case: Case, power: float, m
     """
     if power > 0 and math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all()):
         return
-    check_aperture(phase.detach().cpu().numpy(), level.detach().cpu().numpy(), case)
+    check_aperture(maps[0][0].detach().cpu().numpy(), maps[1][0].detach().cpu().numpy(), case)
     if not (math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())):
         raise PropagationError("phase or transmission is too large for its dtype; use float64, or wrap the phase")
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -15,7 +16,7 @@ from metalens.psf.budget import Polarisation
 from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
 from metalens.psf.compute import Result, intensity
 from metalens.psf.extended import Extent
-from metalens.psf.vector import expanded
+from metalens.psf.vector import Mixing, apart_maps
 
 HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once; each share has a plan of its own
 SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
@@ -47,11 +48,13 @@ class Wanted:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Light:
-    """Maps (wavelength, y, x) of one lens, and the cases and weights of the wavelengths."""
+    """Maps (wavelength, y, x) of one lens, and the cases and weights of the wavelengths; with ``mixing`` both
+    polarisations of so many maps a wavelength."""
 
     maps: tuple[torch.Tensor, torch.Tensor]
     cases: list[Case]
     weights: list[float]
+    mixing: Mixing | None
 
     def at(self, like: Case) -> list[Case]:
         """The cases with the direction, depths and window of another."""
@@ -73,12 +76,13 @@ def direction(
     """
     if wanted.source is not None and moving is not None:
         raise PropagationError("a source of finite size has no derivatives in the geometry: give numbers, or a point")
+    mixing = None
     if wanted.polarisation != "scalar":
-        flux = wanted.polarisation == "flux"
-        maps, cases, weights = expanded(maps, cases, weights, flux=flux, fields=wanted.fields)
+        mixing = Mixing(wanted.polarisation == "flux", wanted.fields is not None)
+        maps = maps if wanted.fields is None else apart_maps(maps, wanted.fields)
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
-    found = [_lens(Light(pair, cases, weights), wanted, moving) for pair in lenses]
+    found = [_lens(Light(pair, cases, weights, mixing), wanted, moving) for pair in lenses]
     light, results = _stacked([one for one, _ in found]), [result for _, result in found]
     power = torch.tensor([result.power for result in results], dtype=torch.float64).view(shape[:-3])
     return light.view(*shape[:-3], *light.shape[1:]), results, power * _passed(cases[0])
@@ -129,7 +133,7 @@ def _depths(
 ) -> tuple[torch.Tensor, Result]:
     """(depth, y, x) intensity on the window at some depths."""
     if wanted.source is None:
-        result = intensity(*given.maps, given.at(some), given.weights, tolerance=wanted.tolerance, moving=moving)
+        result = _intensity(given, some, wanted.tolerance, moving)
         light = result.intensity
     else:
         light, result = _blurred(given, fine, some, wanted.source, wanted.tolerance)
@@ -139,11 +143,16 @@ def _depths(
     return light, replace(result, intensity=light)
 
 
+def _intensity(given: Light, case: Case, tolerance: float, moving: Moving | None) -> Result:
+    about: dict[str, Any] = {"tolerance": tolerance, "moving": moving, "mixing": given.mixing}
+    return intensity(*given.maps, given.at(case), given.weights, **about)
+
+
 def _blurred(given: Light, fine: Cells, some: Case, source: Extent, tolerance: float) -> tuple[torch.Tensor, Result]:
     """As :func:`_depths` for a source of finite size, on the samples of the cells."""
 
     def point(case: Case) -> Result:
-        return intensity(*given.maps, given.at(case), given.weights, tolerance=tolerance / STRICTER)
+        return _intensity(given, case, tolerance / STRICTER, None)
 
     result = point(some)
     more = (some.samples[0] - fine.case.samples[0]) // 2, (some.samples[1] - fine.case.samples[1]) // 2

@@ -1,5 +1,8 @@
 """Both polarisations: Ex, Ey, Ez of light whose rays the lens turns, each propagated as a scalar.
 
+The factors below are smooth over the lens. They go onto the light where a method knows the lens by a few nodes, behind
+the one sum over its pillars.
+
 A ray of direction a, polarised along e, leaves a pillar in direction b for the window: its field is turned with it,
 R e = e - (a + b)(b·e)/(1 + a·b), and |E|² cos θ is kept: E = t R e / √b_z (Richards and Wolf 1959, for the two
 polarisations of the source). The direction is that to the window's centre. Intensity is |Ex|² + |Ey|² + |Ez|², the mean
@@ -9,18 +12,23 @@ What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), wh
 H = b x E of every ray it is a sum of squares with signs, like that of E:
 
     S_z = Σ_c s_c |Σ_j f_c(j) S_j|²        S_j: the scalar's light; f_c: (Ex ± Hy)/2, (Ey ± Hx)/2; s_c = ±1
+
+Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where pillars treat them alike.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.propagate import Case, cosines
+from metalens.ground.arrays import Array
+from metalens.propagate import Case, Pupils, cosines
 from metalens.psf.among import Jones
 
+POOLED = 64  # blocks of pillars along an axis over which the cosine of a ray is taken as alike
 NOTHING = 1e-12  # of the light of the strongest combination of factors: rounding
 
 
@@ -33,18 +41,81 @@ class Mixed:
     signs: tuple[float, ...]
 
 
-def components(case: Case, *, flux: bool = False) -> Mixed:
-    """Both polarisations, (components, y, x) real factors on the transmission of every pillar, float64: six of |E|², or
-    eight of the flux through the sensor's plane."""
-    y, x = case.pillars_um
-    across, down = x[None, :] - case.centre_um[0], (y - case.centre_um[1])[:, None]
+@dataclass(frozen=True, slots=True)
+class Mixing:
+    """Both polarisations of light from maps of pillars, as smooth factors where a lens is known by a few nodes.
+
+    flux: through the sensor's plane, else |E|². apart: of three maps (:func:`apart_maps`) in place of one, whose
+    pillars treat both polarisations alike.
+    """
+
+    flux: bool
+    apart: bool = False
+
+    @property
+    def maps(self) -> int:
+        """Of every wavelength."""
+        return 3 if self.apart else 1
+
+    def pupils(self, case: Case) -> Pupils:
+        """Components of the light of a case: of one map four of the flux of light along x, which is that of light along
+        y, or six of the mean |E|²; of three maps eight of the mean flux, or six. Those that are 0 all over are left
+        out."""
+        return lambda y_um, x_um: self._components(case, (y_um, x_um))
+
+    def _components(self, case: Case, at_um: tuple[Array, Array]) -> tuple[Array, Array]:
+        """(components,) signs and (components, map, y, x) factors."""
+        b = rays_to(case, at_um)
+        steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
+        a = torch.tensor([case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep], dtype=torch.float64)
+        x, y = turned(a, b).chunk(2)
+        none = torch.zeros_like(x)
+        both = [torch.cat(pair) for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])]
+        fields = [of_flux(one, b) if self.flux else Mixed(one, (1.0,) * len(one)) for one in both]
+        factors, signs = torch.stack([one.pupils for one in fields], 1).numpy(), np.array(fields[0].signs)
+        if self.flux and not self.apart:
+            factors, signs = factors[:4], signs[:4]
+        else:
+            factors = factors * math.sqrt(0.5)
+        size = np.abs(factors).max((1, 2, 3))
+        lit = size > NOTHING * size.max()
+        return signs[lit], factors[lit]
+
+    def power(self, case: Case, powers: Sequence[float], levels: Tensor) -> float:
+        """Mean over both polarisations of what the pillars let through, from the sums of squares of the maps; of |E|²
+        over the cosine of every ray, as it lies on the plane.
+
+        levels: (map, y, x) transmissions.
+        """
+        weights = (0.5, 0.5, 1.0) if self.apart else (1.0,)
+        total = 0.0
+        for weight, power, level in zip(weights, powers, levels, strict=True):
+            total += weight * power * (1.0 if self.flux or not power > 0 else self._steep(case, level))
+        return total
+
+    def _steep(self, case: Case, level: Tensor) -> float:
+        """Mean of 1/cos of the rays to the sensor, weighed by the light of the pillars; from means over blocks."""
+        counts = min(POOLED, case.shape[0]), min(POOLED, case.shape[1])
+        light = torch.nn.functional.adaptive_avg_pool2d(level.detach()[None] ** 2, counts)[0].double().cpu()
+        halves = [(n * step) / 2 for n, step in zip(case.shape, case.steps_um, strict=True)]
+        y, x = (half * ((2 * np.arange(n) + 1) / n - 1) for half, n in zip(halves, counts, strict=True))
+        return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
+
+
+def rays_to(case: Case, at_um: tuple[Array, Array]) -> Tensor:
+    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's centre, as they reach the sensor."""
+    across, down = at_um[1][None, :] - case.centre_um[0], (at_um[0] - case.centre_um[1])[:, None]
     last = 1.0 if case.behind is None else case.behind.order[-1]
     p, q = (torch.as_tensor(-cosines(case, *at) / last) for at in ((across, down), (down, across)))
-    b = torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
-    steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
-    a = torch.tensor([case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep], dtype=torch.float64)
-    electric = turned(a, b)
-    return of_flux(electric, b) if flux else Mixed(electric, (1.0,) * len(electric))
+    return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
+
+
+def apart_maps(maps: tuple[Tensor, Tensor], fields: Jones) -> tuple[Tensor, Tensor]:
+    """(…, wavelength · 3, y, x) phase and transmission of light from x to x, y to y, and between, of (…, wavelength, y,
+    x) maps of pillars with factors ``fields`` on the light that comes."""
+    phase, level = (one.unsqueeze(-3) for one in maps)
+    answered = torch.stack([fields.xx, fields.yy, fields.xy], -3)
+    return (phase + torch.angle(answered)).flatten(-4, -3), (level * answered.abs()).flatten(-4, -3)
 
 
 def turned(a: Tensor, b: Tensor) -> Tensor:
@@ -102,44 +173,3 @@ def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
     mixture = (axes[:, kept].conj() / root) @ turn[:, first] * torch.sqrt(size[first].abs())
     level = torch.sqrt((weight**2).sum() / size[first].sum())
     return Mixed(level * torch.einsum("dc,d...->c...", mixture, fields.pupils), tuple(torch.sign(size[first]).tolist()))
-
-
-def expanded(
-    maps: tuple[Tensor, Tensor],
-    cases: Sequence[Case],
-    weights: Sequence[float],
-    *,
-    flux: bool = False,
-    fields: Jones | None = None,
-) -> tuple[tuple[Tensor, Tensor], list[Case], list[float]]:
-    """Maps (…, wavelength, y, x), cases and weights of a scalar as those of the components of both polarisations.
-
-    flux: of the flux through the sensor's plane in place of |E|²: four components, eight with ``fields``.
-    fields: what every pillar does to the field of the light that comes, for each wavelength.
-    """
-    phase, level = maps
-    made, whole = [components(case, flux=flux) for case in cases], 2.0
-    if flux and fields is None:
-        lit = (level.detach() > 0).flatten(0, -3).any(0).double()
-        few = [strongest(one, lit, len(one.pupils)) for one in made]
-        if len({one.signs for one in few}) == 1:
-            made, whole = few, 1.0
-    signs = made[0].signs
-    pupils = torch.stack([one.pupils for one in made])
-    each = [sign * weight / whole for weight in weights for sign in signs]
-    longer = phase.repeat_interleave(len(signs), -3), [case for case in cases for _ in signs]
-    if fields is None:
-        return (longer[0], (level.unsqueeze(-3) * pupils.to(level)).flatten(-4, -3)), longer[1], each
-    answered = _answered(pupils.to(level), fields)
-    turned_by = torch.angle(answered).flatten(-4, -3)
-    return (longer[0] + turned_by, (level.unsqueeze(-3) * answered.abs()).flatten(-4, -3)), longer[1], each
-
-
-def _answered(pupils: Tensor, fields: Jones) -> Tensor:
-    """(…, wavelength, components, y, x) complex: factors of light whose field every pillar changes.
-
-    pupils: (wavelength, components, y, x), those of light along x first, then as many of light along y.
-    """
-    x, y = pupils.chunk(2, -3)
-    xx, yy, xy = (one.unsqueeze(-3) for one in fields)
-    return torch.cat([xx * x + xy * y, xy * x + yy * y], -3)

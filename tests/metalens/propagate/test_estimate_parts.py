@@ -36,7 +36,7 @@ def test_the_direct_field_is_a_sum_of_wavelets_over_the_nodes(films):
         case = replace(CASE, behind=Media((1.5, 1.0), (20.0, 42.0)))
     one = sample(case)
     depths, at = np.array([0, 2]), (np.array([0, 2, 1]), np.array([3, 1, 0]))
-    got = estimate._direct(one, depths, at)
+    got = estimate._direct(one, depths, at)[0]
     light, k = light_on_nodes(one.moments), 2 * np.pi / 0.85
     (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
     ey, ex = ty * 14.5 * 0.37, tx * 20 * 0.37
@@ -94,11 +94,11 @@ def test_a_film_in_front_changes_the_phase_of_the_depths():
     case = replace(CASE, tangents=(0.0, 0.0), centre_um=(0.0, 0.0), front=((1.5, 90.0),))
     air = replace(case, front=(), inverse_depths_per_um=tuple(1 / (z - 30.0) for z in (400, 900, 2500)))
     one = sample(case)
-    got = estimate._direct(one, np.arange(3), (np.array([0, 2]), np.array([1, 3])))
-    near = estimate._direct(replace(one, case=air), np.arange(3), (np.array([0, 2]), np.array([1, 3])))
+    got = estimate._direct(one, np.arange(3), (np.array([0, 2]), np.array([1, 3])))[0]
+    near = estimate._direct(replace(one, case=air), np.arange(3), (np.array([0, 2]), np.array([1, 3])))[0]
     plain = estimate._direct(
         replace(one, case=replace(case, front=())), np.arange(3), (np.array([0, 2]), np.array([1, 3]))
-    )
+    )[0]
 
     def apart(a, b):  # the middle depths differ, a common factor of the node: compared are ratios of depths
         return np.abs(a[0] / a[2] - b[0] / b[2]).max()
@@ -116,6 +116,27 @@ def test_weights_of_places_rise_to_ten_at_the_edges_of_a_tile():
     assert estimate._edges((3, 1, 4), 1) == pytest.approx([1 + 9 * v**8 for v in (0.75, 0.25, 0.25, 0.75)])
 
 
+def test_components_are_sums_of_maps_with_their_factors_on_the_nodes():
+    """Two maps, three components of signs of their own: each alone is a map whose light is the sum."""
+    one = sample()
+    maps = np.stack([one.moments, 0.3j * one.moments[::-1]])
+    rng = np.random.default_rng(6)
+    signs, factors = np.array([1.0, -1.0, 1.0]), rng.normal(size=(3, 2, 5, 6))
+    (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
+    nodes = ty * 14.5 * 0.37, tx * 20 * 0.37
+    at = (np.array([0, 2]), np.array([1, 3]))
+    both = replace(one, moments=maps, pupils=(signs, factors))
+    got = estimate._direct(both, np.arange(3), at)
+    light = np.stack([light_on_nodes(m) for m in maps])
+    alone = [
+        estimate._direct(replace(one, moments=(f * light).sum(0), nodes_um=nodes), np.arange(3), at)[0] for f in factors
+    ]
+    assert got == pytest.approx(np.stack(alone), rel=1e-9)
+    flat = at[0] * 4 + at[1]
+    want = one.weight * sum(sign * np.abs(field) ** 2 for sign, field in zip(signs, alone, strict=True))
+    assert estimate._direct_light([[both]], np.arange(3), flat) == pytest.approx(want, rel=1e-9)
+
+
 def test_light_on_nodes_of_the_lens_needs_no_polynomials():
     """The same field whether the light is given by its moments or on nodes of its own."""
     one = sample()
@@ -123,7 +144,8 @@ def test_light_on_nodes_of_the_lens_needs_no_polynomials():
     nodes = ty * 14.5 * 0.37, tx * 20 * 0.37
     other = replace(one, moments=light_on_nodes(one.moments), nodes_um=nodes)
     at = (np.array([0, 2]), np.array([1, 3]))
-    assert estimate._direct(other, np.arange(3), at) == pytest.approx(estimate._direct(one, np.arange(3), at), rel=1e-9)
+    want = estimate._direct(one, np.arange(3), at)
+    assert estimate._direct(other, np.arange(3), at) == pytest.approx(want, rel=1e-9)
     assert one.shape == (3, 3, 4)
 
 
@@ -148,7 +170,7 @@ def test_differences_are_of_the_drawn_pixels_of_every_part(monkeypatch):
 
     def direct(one, depths, at):
         asked.append((one, at))
-        return np.full((len(depths), len(at[0])), 1 + 2j) * (1 + one.weight)
+        return np.full((1, len(depths), len(at[0])), 1 + 2j) * (1 + one.weight)
 
     monkeypatch.setattr(estimate, "_direct", direct)
     points = np.array([5, 11, 12, 18, 21])

@@ -45,7 +45,7 @@ def test_against_the_exact_sum_where_it_is_bright_and_in_the_corners(angle, tole
     phase, level = lens()
     case = propagate.case(phase.shape, **ABOUT, **WINDOW, angle_rad=angle)
     made = propagate.plan_wide(case, tolerance / 2, torch.float64, torch.device("cpu"))
-    light = propagate.light_wide(torch.tensor(phase), torch.tensor(level), made)[0].numpy()
+    light = propagate.light_wide((torch.tensor(phase)[None], torch.tensor(level)[None]), made)[0].numpy()
     at = points(light)
     y, x = np.divmod(at, case.samples[1])
     wy, wx = case.window_um
@@ -64,7 +64,9 @@ def test_through_films_it_is_the_windowed_field_of_the_same_window():
     phase, level = (torch.tensor(m) for m in lens())
     films = Media((1.0, 1.52, 1.45), (DISTANCE - 85.0, 60.0, 25.0))
     case = dataclasses.replace(propagate.case(lens()[0].shape, **ABOUT, **WINDOW), behind=films)
-    light = propagate.light_wide(phase, level, propagate.plan_wide(case, 1e-6, torch.float64, phase.device))[0]
+    light = propagate.light_wide(
+        (phase[None], level[None]), propagate.plan_wide(case, 1e-6, torch.float64, phase.device)
+    )[0]
     small = dataclasses.replace(case, samples=(21, 21))  # of the middle, both counts odd
     field = propagate.field_windowed(phase, level, propagate.plan(small, 1e-6, torch.float64, phase.device))[0]
     want = field.abs() ** 2
@@ -94,7 +96,7 @@ def test_gradients_are_those_of_differences():
     way = torch.randn(phase.shape, generator=draw, dtype=torch.float64)
 
     def merit(at):
-        return (weight * propagate.light_wide(at, level, made)[0]).sum()
+        return (weight * propagate.light_wide((at[None], level[None]), made)[0]).sum()
 
     start = phase.clone().requires_grad_()
     (slope,) = torch.autograd.grad(merit(start), start)

@@ -24,7 +24,7 @@ def scripted(monkeypatch, *results):
     """``_windowed`` gives these (error, brightness) in turn; what it was asked for: (dtype, setting)."""
     asked, left = [], list(results)
 
-    def windowed(maps, dtype, cases, weights, tolerance, moving):
+    def windowed(lit, dtype, tolerance, moving):
         asked.append((dtype, tolerance))
         error, bright = left.pop(0)
         return Result(torch.ones(2, 9, 11, dtype=torch.float64), error, "typed", 7.0, brightness=bright)
@@ -133,15 +133,15 @@ def test_a_wide_window_tells_noise_brightness_and_transforms(monkeypatch):
     monkeypatch.setattr(
         compute,
         "light_wide",
-        lambda p, t, made: (
+        lambda maps, made, pupils: (
             bright * light[made.case.wavelength_um],
-            torch.ones(5, 6, dtype=torch.complex64),
-            power[made.case.wavelength_um],
+            torch.ones(1, 5, 6, dtype=torch.complex64),
+            [power[made.case.wavelength_um]],
         ),
     )
     monkeypatch.setattr(compute, "relative_error", lambda samples, seen: kept.append((samples, seen)) or 4e-4)
     choice = SimpleNamespace(method="wide", reason="typed")
-    found = compute._wide(maps(SINGLE, 2), SINGLE, [CASE, OTHER], [0.7, 0.4], 8e-3, choice)
+    found = compute._wide(compute.Lit(*maps(SINGLE, 2), [CASE, OTHER], [0.7, 0.4]), SINGLE, 8e-3, choice)
     own = math.hypot(math.hypot(1.5 * 4e-4, 0.02 * 8e-3), 1e-6)
     assert found.error == pytest.approx(own, rel=1e-12)
     total = 0.7 * 3 + 0.4 * 5

@@ -72,7 +72,7 @@ def test_a_wide_window_states_no_less_than_its_error(seed, least):
 
     def light_of(setting):
         choice = SimpleNamespace(method="wide", reason="")
-        found = compute._wide(pair, torch.float64, [case], [1.0], setting, choice)
+        found = compute._wide(compute.Lit(*pair, [case], [1.0]), torch.float64, setting, choice)
         return found.intensity[0].numpy(), found.error
 
     stated, true = judged(maps, case, 3e-6, light_of, **about)
@@ -90,7 +90,7 @@ def test_a_window_of_many_samples_is_looked_at_in_one_of_32():
     pair = tuple(torch.tensor(one)[None] for one in maps)
 
     def light_of(setting):
-        found = compute._windowed(pair, torch.float64, [case], [1.0], setting, None)
+        found = compute._windowed(compute.Lit(*pair, [case], [1.0]), torch.float64, setting, None)
         return found.intensity[0].numpy(), found.error
 
     stated, true = judged(maps, case, 1e-5, light_of, **about)

@@ -29,7 +29,7 @@ def test_noise_of_the_pillars_adds_up_as_random_phases_do(monkeypatch, tilt_rad)
     place = {"pitch_um": 0.41, "wavelength_um": 0.85, "sensor_distance_um": 90.0, "angle_rad": (tilt_rad, 0.0)}
     case = propagate.case(level.shape, **place, depths_um=[4000.0], window_um=130.0, samples=128)
     maps = torch.zeros(1, 12, 15, dtype=torch.float64), torch.from_numpy(level)[None]
-    compute._windowed(maps, torch.float64, [case], [1.0], 1e-5, None)
+    compute._windowed(compute.Lit(*maps, [case], [1.0]), torch.float64, 1e-5, None)
     [sample] = seen
     power = []
     for _ in range(400):
