@@ -69,6 +69,7 @@ VERBS = {
     "layout": ("layout lens{}.h5 -o out", "out"),
     "scene": ("scene scene{}.toml -o out", "out"),
     "library": ("library cell{}.toml -o out.h5 --accept-partial-turn", "out.h5"),
+    "field": ("field cell{}.toml --diameter-um 0.15 -o out.h5 --samples 24 --tolerance 0.3", "out.h5"),
     "study": ("study study{}.toml -o out", "out"),
     "capture": ("capture lens0.h5 --truth truth{}.toml -o out", "out"),
     "measure": ("measure shots{} -o out", "out"),

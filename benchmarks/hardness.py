@@ -37,7 +37,7 @@ from metalens.ground import lock, store
 
 KILLS, WRITERS, DISKS, MUTATIONS = 18, 18, 18, 9000
 PORTION = 20_000  # damaged files after which all is noted: a run that is ended keeps what it did
-QUICK = ("design", "psf", "export", "layout", "library", "capture", "measure", "check", "view", "demo")
+QUICK = ("design", "psf", "export", "layout", "library", "capture", "measure", "check", "view", "field")
 OFTEN = 4  # turns of a quick command for one of the others
 WORDS = {"kills": "kills", "writers": "pairs of writers", "disks": "full disks"}
 AGAINST = {

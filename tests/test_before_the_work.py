@@ -137,6 +137,37 @@ def test_no_command_begins_where_its_output_cannot_stand(inputs, monkeypatch, ca
         assert tree(inputs) == before
 
 
+@pytest.mark.parametrize("verb", ["library", "study", "capture", "layout"])
+def test_no_command_begins_where_its_workers_cannot_be_had(inputs, monkeypatch, capsys, verb):
+    words, work = NEEDS[verb]
+    module, _, name = work.partition(":")
+    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
+    words = [verb, *words.split(), *(["--study"] if verb == "layout" else []), "-o", NAMES.get(verb, "o")]
+    asked = {
+        "--workers 0": "0 workers: need 1 or more",
+        "--workers 2 --scheduler tcp://127.0.0.1:9": "ask for one",
+        "--scheduler nowhere://": "no dask scheduler at 'nowhere://'",
+    }
+    before = tree(inputs)
+    for more, told in asked.items():
+        assert main([*words, *more.split()]) == BAD_INPUT
+        assert told in capsys.readouterr().err
+        assert tree(inputs) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("layout lens.h5 -o o", "the work of --study"),
+        ("capture lens.h5 --plan truth.toml -o o.csv", "frames of --truth"),
+    ],
+)
+def test_workers_with_nothing_to_do_are_refused(inputs, capsys, words, told):
+    assert main([*words.split(), "--workers", "2"]) == BAD_INPUT
+    assert told in capsys.readouterr().err
+    assert not {path.name for path in inputs.iterdir()} & {"o", "o.csv"}
+
+
 @pytest.mark.parametrize(
     "words", ["library cell.toml -o o.png", "design design.toml -o o.png", "budget lens.h5 -o o.png"]
 )

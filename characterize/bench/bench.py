@@ -4,7 +4,6 @@ Nothing of the fit's reduced model is used: pillars are changed one by one, the 
 :func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
 """
 
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from scipy import ndimage, signal
 
 from characterize.model import LIGHT, PLACE, Known, extra_path, incidence_rad, light_maps, made, spectrum, vector
 from metalens import psf
+from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
@@ -21,7 +21,7 @@ from metalens.made import Sensitivity
 
 FINE = 9
 _MARGIN = 4  # pixels about the window that blur may reach in from
-_TOGETHER = 4_000_000  # fine samples of the frames that are computed together
+_TOGETHER = 1_000_000  # fine samples of the frames that are computed together, by one worker
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +122,17 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
     depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - middle)
     if depth.min() <= 0:
         raise FitError(f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens")
-    noise = np.random.default_rng(truth.seed + 1).standard_normal(lens.diameters.diameter_um.shape)
-    noise *= truth.diameter_noise_nm * 1e-3
-    frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
+    tasks = []
     for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
-        some = functools.lru_cache(1)(functools.partial(made.pillars, lens, response, colour, noise_um=noise))
-        for way, index in _alike(lens, truth, colour, depth, angles):
-            frames[index] += weight * _frames(lens, truth, colour, some(angle_rad=way.incidence_rad), way, depth[index])
+        tasks += [
+            _Task(colour, weight, way, index, depth[index]) for way, index in _alike(lens, truth, colour, depth, angles)
+        ]
+    frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
+    seen = executor.gather(_shown, _Made(lens, truth, response), tasks, beside=False)
+    for task, light in zip(tasks, seen, strict=True):
+        frames[task.index] += task.weight * light
     return np.asarray(frames / depth[:, None, None] ** 2)
 
 
@@ -160,6 +162,43 @@ def _alike(lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Arra
     for way, index in ways.items():
         for first in range(0, len(index), most):
             yield way, index[first : first + most]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Task:
+    """Frames of one colour, (parameters, weight in the spectrum), whose light comes the same way; their (n,) depths."""
+
+    x: Array
+    weight: float
+    way: _Way
+    index: list[int]
+    depth_um: Array
+
+
+@dataclass(eq=False, slots=True)
+class _Made:
+    """The hidden lens; light of its pillars for the colour and incidence that were asked for last is kept."""
+
+    lens: Lens
+    truth: Truth
+    response: Sensitivity
+    kept: tuple[tuple[bytes, float], Array] | None = None
+
+    def pillars(self, x: Array, incidence_rad: float) -> Array:
+        """(y, x) complex transmission."""
+        key = x.tobytes(), incidence_rad
+        if self.kept is None or self.kept[0] != key:
+            noise = np.random.default_rng(self.truth.seed + 1).standard_normal(self.lens.diameters.diameter_um.shape)
+            noise *= self.truth.diameter_noise_nm * 1e-3
+            t = made.pillars(self.lens, self.response, x, noise_um=noise, angle_rad=incidence_rad)
+            self.kept = key, t
+        return self.kept[1]
+
+
+def _shown(hidden: _Made, task: _Task) -> Array:
+    """(n, y, x) frames of one task."""
+    t = hidden.pillars(task.x, task.way.incidence_rad)
+    return _frames(hidden.lens, hidden.truth, task.x, t, task.way, task.depth_um)
 
 
 def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: Array) -> Array:

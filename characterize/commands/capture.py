@@ -25,6 +25,8 @@ def run(options: Options) -> int:
 
 
 def _plan(options: Options, path: Path) -> int:
+    if options.spread:
+        raise ConfigError("--workers and --scheduler share out the frames of --truth; a plan takes none")
     target, wanted, design = options.output, config.load(path, Protocol), lenses.load_plain(options.lens)
     with options.claim(target) as draft:
         found = protocol.plan(design, wanted, slopes(design))
@@ -59,7 +61,8 @@ def _shoot(options: Options, path: Path) -> int:
     truth = config.load(path, Truth)
     design = lenses.load_plain(options.lens)
     frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
-    with options.claim_folder(target, room=transaction.ROOM + 2 * frames * truth.camera.pixels**2) as draft:
+    room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
+    with options.claim_folder(target, room=room) as draft, options.shared():
         shots = bench.shoot(design, truth, slopes(design, wanted=[k.name for k in truth.parameter if k.value]))
         _fill(draft.path, shots, truth, design)
     values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}

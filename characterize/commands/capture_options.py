@@ -6,13 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from metalens.commands import Common, Output
+from metalens.commands import Distributed, Output
 
 WORK = "characterize.commands.capture"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Distributed):
     """Options of ``metalens capture``: either --truth or --protocol.
 
     Attributes:

@@ -35,7 +35,7 @@ def run(options: Options) -> int:
     if not options.dose:
         process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, correct=False))
     inputs = [options.lens.parent / file for file in named]
-    with options.claim_folder(options.output, inputs=inputs) as draft, noticed(options.console.say):
+    with options.claim_folder(options.output, inputs=inputs) as draft, options.shared(), noticed(options.console.say):
         work = Work(options, record, process, draft.path, Stages(options.console.say))
         made = _whole(work)
         _write(work, made)

@@ -1,5 +1,6 @@
 """What ``metalens layout`` was asked for, and what it has made so far."""
 
+import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -13,12 +14,13 @@ from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.rules import DrcReport
-from metalens.commands import Common, Output
+from metalens.commands import Distributed, Output
+from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Distributed):
     """Options of ``metalens layout``.
 
     Attributes:
@@ -52,6 +54,16 @@ class Options(Common):
     name: str = "METALENS"
     dose: bool = True
     study: bool = False
+
+    def shared(self) -> contextlib.AbstractContextManager[None]:
+        """Where the work of --study is done.
+
+        Raises:
+            ConfigError, WorkerError: as of other verbs; workers without --study, which is all that they share.
+        """
+        if self.spread and not self.study:
+            raise ConfigError("--workers and --scheduler share out the work of --study: ask for it too, or leave them")
+        return super().shared()
 
     @property
     def writes_oasis(self) -> bool:

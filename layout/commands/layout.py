@@ -15,7 +15,7 @@ def run(options: Options) -> int:
         from layout.commands import arranged
 
         return arranged.run(options)
-    with options.claim_folder(options.output) as draft, noticed(options.console.say):
+    with options.claim_folder(options.output) as draft, options.shared(), noticed(options.console.say):
         job = make.make(options, draft.path)
     options.console.result(make.values_of(job), _text(job, options.output))
     return 0 if job.ok else 1

@@ -1,16 +1,18 @@
 """How the transmission of a pillar answers to height, index, wall and every other cause of the table, by a solver."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.made import Answers, of_kind
 
 Solver = Callable[[Cell, Array, float, bool], Array]
+_Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,20 +44,42 @@ def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) 
     Raises:
         CellError, MaterialError: from the solver.
     """
-    cell, wave, solve = lens.cell, lens.wavelength_um, _rcwa if solver is None else solver
-    diameters = np.linspace(*lens.proxy.domain_um, count)
+    wave, diameters = lens.wavelength_um, np.linspace(*lens.proxy.domain_um, count)
+    tasks = list(_tasks(lens, diameters))
+    solved = iter(executor.gather(_solved, (_rcwa if solver is None else solver, wave), tasks))
     found, worst = [], 0.0
-    for acts in (row.acts for _, row in of_kind(Answers) if isinstance(row.acts, Answers)):
-        ends = [acts.changed(cell, sign * acts.step, wave) for sign in (-1, 1)]
-        some = diameters[:: 2 if ends[1].sidewall_rad else 1]
+    for acts in _answering():
         rates = []
-        for finer in (False, True):
-            less, more = (solve(end, some, wave, finer) for end in ends)
+        for _ in (False, True):  # coarser, finer
+            less, more = next(solved), next(solved)
             rates.append(np.log(more / less) / (2 * acts.step))
         scale = max(float(np.linalg.norm(rates[1])), 1e-9)
         worst = max(worst, float(np.linalg.norm(rates[1] - rates[0])) / scale)
-        found.append(np.interp(diameters, some, rates[1]))
+        found.append(np.interp(diameters, _some(lens, acts, diameters), rates[1]))
     return Sensitivities(diameters, np.array(found), worst)
+
+
+def _answering() -> list[Answers]:
+    return [row.acts for _, row in of_kind(Answers) if isinstance(row.acts, Answers)]
+
+
+def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
+    """Solves of one cause after the other: the coarser and the finer, each below and above."""
+    for acts in _answering():
+        ends = [acts.changed(lens.cell, sign * acts.step, lens.wavelength_um) for sign in (-1, 1)]
+        some = _some(lens, acts, diameter_um)
+        yield from ((end, some, finer) for finer in (False, True) for end in ends)
+
+
+def _some(lens: Lens, acts: Answers, diameter_um: Array) -> Array:
+    """Diameters that a cause is solved at: every other one where walls tilt."""
+    tilted = acts.changed(lens.cell, acts.step, lens.wavelength_um).sidewall_rad
+    return np.asarray(diameter_um[:: 2 if tilted else 1])
+
+
+def _solved(about: tuple[Solver, float], task: _Solve) -> Array:
+    (solve, wavelength_um), (cell, diameter_um, finer) = about, task
+    return solve(cell, diameter_um, wavelength_um, finer)
 
 
 def _rcwa(cell: Cell, diameter_um: Array, wavelength_um: float, finer: bool) -> Array:

@@ -6,6 +6,8 @@ singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pilla
 only weights these sums, at the nodes of :mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
 """
 
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,27 +15,43 @@ import numpy as np
 
 from layout.study.focus import Focus
 from layout.study.sensitivity import Sensitivities
+from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.made import Draw, Spread, State, draws, transmission
+from metalens.pillars import Proxy
 
 _ENTRY_UM = 5e-5  # resolution of the diameters in the table
-_BAND = 64
+_BAND, _PARTS = 16, 16  # rows that are summed at once, by any one worker; parts of a lens that workers take
 _LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss
 _DEGREE = 10  # of the dependence on the local bias
 _SAMPLES = 160
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Pillars:
+    """What t of a pillar follows from: the proxy of the lens at its wavelength, and the answers of a solver."""
+
+    proxy: Proxy
+    wavelength_um: float
+    sens: Sensitivities
+
+    def curve(self, diameter_um: Array, bias_um: Array, state: State) -> Array:
+        """(bias, diameters) complex t for local biases and one made lens."""
+        d = diameter_um + np.reshape(bias_um, (-1, 1))
+        return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Model:
     """Sums over the pillars of a lens for all draws of its process.
 
+    pillars: what any of them answers to.
     diameter_um, count: (entries,) of the pillars, to 0.05 nm. basis: (rank, entries) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
 
-    lens: Lens
-    sens: Sensitivities
+    pillars: Pillars
     focus: Focus
     diameter_um: Array
     count: Array
@@ -49,7 +67,7 @@ class Model:
         for state in lenses:
             bias = state.bias_um(x, y)
             middle, half = (bias.max() + bias.min()) / 2, (bias.max() - bias.min()) / 2 + 1e-9
-            curves = curve(self.lens, self.sens, self.diameter_um, middle + half * knots, state)
+            curves = self.pillars.curve(self.diameter_um, middle + half * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
             series = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
             at_nodes = np.polynomial.chebyshev.chebval((bias - middle) / half, series)
@@ -61,25 +79,37 @@ class Model:
 def reduce(lens: Lens, sens: Sensitivities, focus: Focus, spread: Spread, *, seed: int) -> Model:
     """Find the basis from random draws of the spread, and sum the pillars for each of its functions."""
     index, diameter, count = _table(lens)
+    pillars = Pillars(lens.proxy, lens.wavelength_um, sens)
     states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
     angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
     u, v = place * np.cos(angle), place * np.sin(angle)
-    curves = [
-        curve(lens, sens, diameter, state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)
-    ]
+    curves = [pillars.curve(diameter, state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)]
     weight = np.sqrt(count)
-    size, directions = np.linalg.svd(np.stack(curves) * weight, full_matrices=False)[1:]
+    with threads.one_blas_thread():  # the same bits on any machine's number of them
+        size, directions = np.linalg.svd(np.stack(curves) * weight, full_matrices=False)[1:]
     missed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
     rank = max(1, int((missed > _LEFT_OUT).sum()))
     basis = directions[:rank] / weight
     columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
-    moments = np.zeros((rank, len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
+    edges = [len(index) * i // _PARTS for i in range(_PARTS + 1)]
+    parts = [(start, index[start:stop]) for start, stop in itertools.pairwise(edges)]
+    moments = functools.reduce(np.add, executor.gather(_summed, (focus, columns), parts))
+    return Model(pillars, focus, diameter, count, basis, moments, lens.diameters.radius_um)
+
+
+def _summed(about: tuple[Focus, Array], part: tuple[int, Array]) -> Array:
+    """(rank, nodes y, nodes x) sums over rows of pillars.
+
+    about: and the (rank, 1 + entries) basis. part: first row; (rows, x) entry of each site.
+    """
+    (focus, columns), (first, index) = about, part
+    moments = np.zeros((len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
     for start in range(0, len(index), _BAND):
-        band = slice(start, min(start + _BAND, len(index)))
-        moments += focus.project(columns[:, index[band]], band)
-    return Model(lens, sens, focus, diameter, count, basis, moments, lens.diameters.radius_um)
+        some = index[start : start + _BAND]
+        moments += focus.project(columns[:, some], slice(first + start, first + start + len(some)))
+    return moments
 
 
 def missed(model: Model, lenses: Sequence[Draw]) -> float:
@@ -88,17 +118,11 @@ def missed(model: Model, lenses: Sequence[Draw]) -> float:
     for draw in lenses:
         state, along = draw.state(), np.array([0.0, 1.0, -1.0])
         bias = state.bias_um(along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad))
-        curves = curve(model.lens, model.sens, model.diameter_um, bias, state)
+        curves = model.pillars.curve(model.diameter_um, bias, state)
         weights = (curves * model.count) @ model.basis.conj().T
         rest = (abs(curves - weights @ model.basis) ** 2) @ model.count / (abs(curves) ** 2 @ model.count)
         worst = max(worst, float(np.sqrt(rest.max())))
     return worst
-
-
-def curve(lens: Lens, sens: Sensitivities, diameter_um: Array, bias_um: Array, state: State) -> Array:
-    """(bias, diameters) complex t of pillars for local biases and one made lens."""
-    d = diameter_um + np.reshape(bias_um, (-1, 1))
-    return transmission(lens.proxy, sens, d, lens.wavelength_um, state.answers())
 
 
 def _table(lens: Lens) -> tuple[Array, Array, Array]:

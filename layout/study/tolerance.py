@@ -1,5 +1,6 @@
 """What the spread of the process does to a lens: effect of each cause, and Monte Carlo with confidence bands."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,8 @@ import numpy as np
 from layout.process import Process
 from layout.study.focus import Window, peak, prepare, window
 from layout.study.sensitivity import Sensitivities, sensitivities
-from layout.study.spread_model import Model, curve, missed, reduce
+from layout.study.spread_model import Model, missed, reduce
+from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.lens import Lens, reach
@@ -124,27 +126,32 @@ def analyse(
 
 def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
     """Everything that is looked at, lens by lens; the first is the nominal one."""
+    with threads.one_blas_thread():  # as workers have
+        reference = np.asarray(abs(model.focus.light(model.drawn(lenses[:1]))[0, 0]) ** 2)
+    batches = [lenses[start : start + _BATCH] for start in range(0, len(lenses), _BATCH)]
+    parts = executor.gather(_seen, (model, reference, step_um), batches)
+    return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array, ...]:
+    """Fields of :class:`Outcome` of some lenses.
+
+    about: model, (y, x) intensity of the nominal lens at the design depth, step of the depths in um.
+    """
+    model, reference, step_um = about
     view = model.focus.window
     incident = model.count.sum() * model.focus.case.area_um2
-    parts, reference = [], np.zeros((1, 1))
-    for start in range(0, len(lenses), _BATCH):
-        light = model.focus.light(model.drawn(lenses[start : start + _BATCH]))
-        psf = abs(light) ** 2
-        design = psf[:, 0]
-        if start == 0:
-            reference = design[0]
-        unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
-        steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
-        parts.append(
-            (
-                peak(design) / peak(reference),
-                design.sum((1, 2)) * view.cell_um2 / incident,
-                np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
-                (steps**2).sum((2, 3)),
-                design[:, len(view.y_um) // 2] / reference.max(),
-            )
-        )
-    return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    psf = abs(model.focus.light(model.drawn(lenses))) ** 2
+    design = psf[:, 0]
+    unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
+    steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
+    return (
+        peak(design) / peak(reference),
+        design.sum((1, 2)) * view.cell_um2 / incident,
+        np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
+        (steps**2).sum((2, 3)),
+        design[:, len(view.y_um) // 2] / reference.max(),
+    )
 
 
 def _part(outcome: Outcome, rows: slice) -> Outcome:
@@ -176,8 +183,8 @@ def _pillar_change(model: Model, state: State) -> tuple[float, float]:
     """(rms phase change about the mean, rms change of |T|) over pillars spread evenly over the aperture."""
     radius, angle = np.sqrt((np.arange(64) + 0.5) / 64), np.arange(64) * np.pi * (3 - np.sqrt(5))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    lens, sens, d = model.lens, model.sens, model.diameter_um
-    before, after = curve(lens, sens, d, np.zeros(1), State.of()), curve(lens, sens, d, state.bias_um(u, v), state)
+    answered = functools.partial(model.pillars.curve, model.diameter_um)
+    before, after = answered(np.zeros(1), State.of()), answered(state.bias_um(u, v), state)
     weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
     turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
     turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))

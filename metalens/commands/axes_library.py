@@ -19,7 +19,7 @@ NM = 1e3
 
 def run(options: Distributed, target: Path, cell: Cell, sweep: Sweep, about: store.Provenance) -> int:
     """Sweep and write; exit 1 where most bars miss the tolerance, or a pair held out lies above its bar."""
-    with options.claim(target, beside=(".png",)) as draft, options.workers():
+    with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
         made = axes.sweep(cell, sweep, console=options.console, checkpoint=journal)

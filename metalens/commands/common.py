@@ -86,15 +86,25 @@ class Common:
 
 @dataclass(frozen=True, kw_only=True)
 class Distributed(Common):
-    """Options of verbs whose work is spread over processes.
+    """Options of verbs whose work is spread over processes; the result is the same for any number of them.
 
     Attributes:
-        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the work; left out: the cores of this
-            machine. The result is the same.
+        workers: processes of this machine that do the work; left out: as many as it has cores.
+        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the work in their place.
     """
 
+    workers: int | None = None
     scheduler: str | None = None
 
-    def workers(self) -> contextlib.AbstractContextManager[None]:
-        """Where the work of the block is done."""
-        return executor.on(self.scheduler)
+    @property
+    def spread(self) -> bool:
+        """Whether workers were asked for."""
+        return self.workers is not None or self.scheduler is not None
+
+    def shared(self) -> contextlib.AbstractContextManager[None]:
+        """Where the work of the block is done.
+
+        Raises:
+            ConfigError, WorkerError: see :func:`metalens.ground.executor.on`.
+        """
+        return executor.on(self.scheduler, processes=self.workers)

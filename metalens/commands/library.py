@@ -57,7 +57,7 @@ def run(options: Options) -> int:
         return axes_library.run(options, options.output, wanted.cell, wanted.sweep, about)
     library.check(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
-    with options.claim(target, beside=(".png",)) as draft, options.workers():
+    with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
         made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)

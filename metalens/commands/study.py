@@ -44,7 +44,7 @@ def run(options: Options) -> int:
         study = _printable(options.process, study)
         given += f" --process {options.process.name}"
     command = f"metalens study{given} -o {options.output.name}"
-    with options.claim_folder(options.output) as draft, options.workers():
+    with options.claim_folder(options.output) as draft, options.shared():
         journal = Journal(options.output.with_name(options.output.name + ".resume"), study)
         verdicts = cell_study.run(study, options.console, journal=journal)
         study_plots.write_study(draft.path, study, verdicts, command=command)

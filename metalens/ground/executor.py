@@ -6,23 +6,29 @@ done by one process with one BLAS thread, and knows nothing of the others.
 """
 
 import contextlib
+import functools
 import importlib
 import os
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from metalens.ground import threads
-from metalens.ground.errors import WorkerError
+from metalens.ground.errors import ConfigError, WorkerError
 
+Common = TypeVar("Common")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-_SCHEDULER: ContextVar[str | None] = ContextVar("_SCHEDULER", default=None)
+Done = Iterator[tuple[int, Any]]
+Place = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Done]  # (work, common, tasks): (index, result)
+_PLACE: ContextVar[Place | None] = ContextVar("_PLACE", default=None)
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # safe path: what lies in the current folder is never imported, whatever its name
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
+_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "inf"  # what a large lens takes is no leak to end a worker for
 _CONNECT_S = 10
 
 
@@ -32,13 +38,27 @@ def cores() -> int:
 
 
 @contextlib.contextmanager
-def on(scheduler: str | None) -> Iterator[None]:
-    """Do the tasks of the block on the dask cluster of this address; None for the cores of this machine."""
-    token = _SCHEDULER.set(scheduler)
-    try:
+def on(scheduler: str | None = None, *, processes: int | None = None) -> Iterator[None]:
+    """Do the tasks of the block on the dask cluster of this address, or on so many processes of this machine.
+
+    With neither, each verb has its own way: :func:`run` a process a core, :func:`gather` threads of this process.
+
+    Raises:
+        ConfigError: both are asked for, or fewer than 1 process. WorkerError: no cluster at the address.
+    """
+    if processes is not None and processes < 1:
+        raise ConfigError(f"{processes} workers: need 1 or more")
+    if processes is not None and scheduler is not None:
+        raise ConfigError("workers are processes of this machine, the cluster of a scheduler has its own: ask for one")
+    with contextlib.ExitStack() as held:
+        place: Place | None = None
+        if scheduler is not None:
+            place = functools.partial(_cluster, held.enter_context(_client(scheduler)), scheduler)
+        elif processes is not None:
+            place = functools.partial(_here, held.enter_context(_pool(processes)))
+        token = _PLACE.set(place)
+        held.callback(_PLACE.reset, token)
         yield
-    finally:
-        _SCHEDULER.reset(token)
 
 
 def run(
@@ -48,42 +68,85 @@ def run(
 
     Args:
         work: a function of a module (workers import it by name).
-        processes: on this machine; by default one a core.
+        processes: where :func:`on` says nothing; by default one a core.
 
     Raises:
-        WorkerError: a worker process died, with its cause; no cluster at the address. Whatever ``work`` raises.
+        WorkerError: a worker process died, with its cause. Whatever ``work`` raises.
     """
     if not tasks:
         return
-    address = _SCHEDULER.get()
-    if address is None:
-        yield from _here(work, tasks, min(processes or cores(), len(tasks)))
-    else:
-        yield from _cluster(work, tasks, address)
+    place = _PLACE.get()
+    if place is not None:
+        yield from place(_plain, work, tasks)
+        return
+    with _pool(min(processes or cores(), len(tasks))) as pool:
+        yield from _here(pool, _plain, work, tasks)
 
 
-def _here(work: Callable[[Task], Result], tasks: Sequence[Task], count: int) -> Iterator[tuple[int, Result]]:
+def gather(
+    work: Callable[[Common, Task], Result], common: Common, tasks: Sequence[Task], *, beside: bool = True
+) -> list[Result]:
+    """``work(common, task)`` of every task, in their order, each with one BLAS thread.
+
+    Args:
+        work: a function of a module. common: what all tasks need.
+        beside: where :func:`on` names no workers, side by side in threads of this process, for work that mostly
+            consists of calls which release the interpreter lock; else one after the other, each with all threads.
+
+    Raises:
+        WorkerError: as :func:`run`. Whatever ``work`` raises.
+    """
+    place = _PLACE.get()
+    if place is not None and tasks:
+        found: dict[int, Result] = dict(place(work, common, tasks))
+        return [found[i] for i in range(len(tasks))]
+    alone = functools.partial(work, common)
+    with threads.one_blas_thread():
+        return threads.each(alone, tasks) if beside else [alone(task) for task in tasks]
+
+
+def _plain(work: Callable[[Task], Result], task: Task) -> Result:
+    return work(task)
+
+
+@contextlib.contextmanager
+def _pool(count: int) -> Iterator[Any]:
+    """Processes that start with the first task and end with the block."""
+    from loky import ProcessPoolExecutor
+
+    with _environment():  # of loky's own helper too, which is started like a worker
+        pool = ProcessPoolExecutor(count, initializer=_settle, initargs=(os.getpid(),), env=_ENVIRONMENT)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, kill_workers=True)
+
+
+@contextlib.contextmanager
+def _environment() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _here(pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]) -> Done:
     from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
-    from loky import ProcessPoolExecutor
-
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)  # of loky's own helper too, which is started like a worker
-    pool = ProcessPoolExecutor(count, initializer=_settle, initargs=(os.getpid(),))
     try:
-        waiting = {pool.submit(work, task): i for i, task in enumerate(tasks)}
+        with _environment():
+            waiting = {pool.submit(work, common, task): i for i, task in enumerate(tasks)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     except BrokenProcessPool as error:
         cause = " ".join(str(error).split())
         raise WorkerError(
-            f"a worker process ended early ({cause}); often the memory ran out: start again on fewer cores (taskset)"
+            f"a worker process ended early ({cause}); often the memory ran out: start again with fewer --workers"
         ) from None
-    finally:
-        pool.shutdown(wait=True, kill_workers=True)
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _settle(parent: int) -> None:
@@ -98,8 +161,9 @@ def _watch(parent: int) -> None:
     os._exit(1)
 
 
-def _cluster(work: Callable[[Task], Result], tasks: Sequence[Task], address: str) -> Iterator[tuple[int, Result]]:
-    """A task of a lost worker is done again by another."""
+@contextlib.contextmanager
+def _client(address: str) -> Iterator[Any]:
+    """The cluster of an address."""
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError:
@@ -109,19 +173,32 @@ def _cluster(work: Callable[[Task], Result], tasks: Sequence[Task], address: str
     except (OSError, ValueError) as error:
         raise WorkerError(f"no dask scheduler at {address!r} ({error}); start one with `dask scheduler`") from None
     with client:
-        waiting = {client.submit(_alone, work, task, pure=False): i for i, task in enumerate(tasks)}
-        try:
-            for future in distributed.as_completed(waiting, loop=client.loop):
-                yield waiting[future], future.result()
-        except distributed.KilledWorker as error:
-            raise WorkerError(f"workers of the cluster died again and again on one task ({error})") from None
-        except distributed.CancelledError as error:
-            raise WorkerError(f"the cluster at {address} was lost ({error})") from None
-        finally:
-            client.cancel(list(waiting))
+        yield client
 
 
-def _alone(work: Callable[[Any], Result], task: Any) -> Result:
+def _cluster(client: Any, address: str, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]) -> Done:
+    """A task of a lost worker is done again by another; so is the fetching of what all tasks need."""
+    distributed: Any = importlib.import_module("distributed")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sending large graph")  # it is sent once
+        held = client.submit(_itself, common, pure=False)
+        waiting = {client.submit(_alone, work, held, task, pure=False): i for i, task in enumerate(tasks)}
+    try:
+        for future in distributed.as_completed(waiting, loop=client.loop):
+            yield waiting[future], future.result()
+    except distributed.KilledWorker as error:
+        raise WorkerError(f"workers of the cluster died again and again on one task ({error})") from None
+    except distributed.CancelledError as error:
+        raise WorkerError(f"the cluster at {address} was lost ({error})") from None
+    finally:
+        client.cancel([held, *waiting])
+
+
+def _itself(common: Common) -> Common:
+    return common
+
+
+def _alone(work: Callable[[Any, Any], Result], common: Any, task: Any) -> Result:
     """A task on one BLAS thread."""
     with threads.one_blas_thread():
-        return work(task)
+        return work(common, task)

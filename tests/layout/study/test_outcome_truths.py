@@ -56,7 +56,7 @@ def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(monkeypat
     assert found.information == pytest.approx(0.3)  # 13 of 10; 9 is off by less
 
 
-def test_what_the_basis_misses_is_the_worst_rms_of_any_draw_at_the_centre_and_both_edges(monkeypatch):
+def test_what_the_basis_misses_is_the_worst_rms_of_any_draw_at_the_centre_and_both_edges():
     """Over pillars of unlike count, relative to their own t: at right angles to a basis that is orthonormal so."""
     count = np.array([3.0, 1.0, 5.0, 2.0])
     first = np.array([0.4, 0.9, -0.2, 0.5])
@@ -64,12 +64,11 @@ def test_what_the_basis_misses_is_the_worst_rms_of_any_draw_at_the_centre_and_bo
     curves = {k: RNG.normal(size=(3, 4)) + 1j * RNG.normal(size=(3, 4)) for k in (0, 1)}
     asked = []
 
-    def curve(lens, sens, diameter, bias, state):
+    def curve(diameter, bias, state):
         asked.append(bias)
         return curves[len(asked) - 1]
 
-    monkeypatch.setattr(spread_model, "curve", curve)
-    model = SimpleNamespace(lens=None, sens=None, diameter_um=None, count=count, basis=first[None])
+    model = SimpleNamespace(pillars=SimpleNamespace(curve=curve), diameter_um=None, count=count, basis=first[None])
     draws = [Draw({"bias_x_nm": 2.0}, 0.7), Draw({"bias_nm": 1.5}, 0.0)]
     found = spread_model.missed(model, draws)
     worst = 0.0

@@ -58,7 +58,9 @@ def test_a_bias_changes_phase_and_light_by_the_slopes_of_the_proxy():
     """rms of dφ about the mean and of d|T| over the pillars, for a bias of 2 nm that is the same everywhere."""
     diameter, count = np.array([0.12, 0.2, 0.27, 0.29]), np.array([2, 3, 1, 1])
     sens = Sensitivities(np.array([0.1, 0.2, 0.3]), np.zeros((3, 3), complex), 0.0)
-    model = SimpleNamespace(lens=LENS, sens=sens, diameter_um=diameter, count=count)
+    model = SimpleNamespace(
+        pillars=spread_model.Pillars(LENS.proxy, LENS.wavelength_um, sens), diameter_um=diameter, count=count
+    )
     phase, light = tolerance._pillar_change(model, Draw({"bias_nm": 2.0}).state())
     share = count / count.sum()
     before, after = ((PROXY.phase_rad(d, 0.85), PROXY.transmission(d, 0.85)) for d in (diameter, diameter + 2e-3))

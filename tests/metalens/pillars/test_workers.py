@@ -1,6 +1,5 @@
 """Workers: what comes back is what was computed, refusals keep their class, a death is an error with its cause."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from metalens.cell.record import Cell, Index
 from metalens.ground import executor
 from metalens.ground.errors import MaterialError, WorkerError
 from metalens.pillars import engines, workers
+from tests.lost_worker import losing_one
 
 CELL = Cell(0.30, 0.7, Index(3.6))
 TASK = workers.points_task(CELL, Light(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa")
@@ -73,19 +73,9 @@ def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(t
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path)
-    ) as cluster:
-        tasks = [
-            workers.points_task(CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa") for i in range(6)
-        ]
-        found = {}
-        with executor.on(cluster.scheduler_address):
-            for index, result in workers.run(tasks):
-                if not found:
-                    os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
-                found[index] = result
+    tasks = [workers.points_task(CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa") for i in range(6)]
+    with losing_one(tmp_path) as address, executor.on(address):
+        found = dict(workers.run(tasks))
     assert found == dict(workers.run(tasks))
 
 
