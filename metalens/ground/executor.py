@@ -28,7 +28,7 @@ _PLACE: ContextVar[Place | None] = ContextVar("_PLACE", default=None)
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # safe path: what lies in the current folder is never imported, whatever its name
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
-_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "inf"  # what a large lens takes is no leak to end a worker for
+_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"  # what a large lens takes is no leak to end a worker for
 _CONNECT_S = 10
 
 
