@@ -4,7 +4,7 @@ from pathlib import Path
 
 from layout.files import Window
 from layout.process import Process
-from layout.solid import readback
+from layout.solid import readback, readback_meshes
 from layout.solid import verbs as solid
 from layout.solid.module import COLOURS
 from metalens.lens import Lens
@@ -16,6 +16,9 @@ def differences(lens: Lens, process: Process, target: Path, window: Window) -> d
     count = len(pillars.kind)
     if (path := target / "pillars.stl").is_file():
         found[path.name] = count, readback.stl_differences(path, pillars)
+    for name, read in (("3mf", readback_meshes.differences_3mf), ("glb", readback_meshes.differences_gltf)):
+        if (path := target / f"pillars.{name}").is_file():
+            found[path.name] = count, read(path, pillars)
     if (path := target / "pillars.step").is_file():
         found[path.name] = count, readback.step_differences(path, pillars)
     if (path := target / "module.step").is_file():
