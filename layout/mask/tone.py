@@ -2,7 +2,8 @@
 
 The exposed area is the die without pillars, marks, verniers and labels. It is written as lattice squares without their
 pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around the marks and labels without
-these, each on its own layer, and the rest of the die (FRAME). All of them abut; none overlaps another.
+these, each on its own layer, and the rest of the die (FRAME). All of them abut; none overlaps another. Without a die a
+frame one pitch wide (RIM) goes around the lattice: the squares of its last pillars would end in slits half a gap wide.
 """
 
 import dataclasses
@@ -34,7 +35,7 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
     classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     clear = [box for lattice in plan.lattices for box in _empty(lattice, square)]
-    figures = _surroundings(plan, process, boxes)
+    figures = _surroundings(plan, process, boxes) or [_rim(boxes, square[2] - square[0], process)]
     if clear:
         figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
     kept = [figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)]
@@ -108,6 +109,17 @@ def _surroundings(plan: MaskPlan, process: Process, boxes: list[Array]) -> list[
         made.append(Figure(figure.name, left))
     rest = region.without_holes(region.difference(die, [*taken, *standing]), grid=plan.grid)
     return [*made, Figure("FRAME", {process.layers.pillar: tuple(rest)})]
+
+
+def _rim(boxes: list[Array], width: int, process: Process) -> Figure:
+    """A frame around lattices of their own, four rectangles each."""
+    shapes: list[Array] = []
+    for box in boxes:
+        (left, bottom), (right, top) = box.min(0).tolist(), box.max(0).tolist()
+        x0, y0, x1, y1 = left - width, bottom - width, right + width, top + width
+        sides = (x0, y0, x1, bottom), (x0, top, x1, y1), (x0, bottom, left, top), (right, bottom, x1, top)
+        shapes += [rectilinear.corners(np.array(side)) for side in sides]
+    return Figure("RIM", {process.layers.pillar: tuple(shapes)})
 
 
 def _grown(shape: Array, margin: int) -> Array:

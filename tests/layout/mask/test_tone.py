@@ -116,8 +116,11 @@ def test_a_streamed_lens_is_inverted_too():
     large = build.stream(
         lambda a, b: source.diameter_um[a:b], process, shape=(19, 23), pitch_um=0.4, range_um=(0.1, 0.3)
     )
-    shapes = [sorted(map(np.ndarray.tolist, p.figures[0].polygons[1, 0])) for p in (small, large)]
-    assert shapes[0] == shapes[1]
+    assert [f.name for f in small.figures] == [f.name for f in large.figures] == ["RIM", "CLEAR"]
+    for one, two in zip(small.figures, large.figures, strict=True):
+        assert [sorted(map(np.ndarray.tolist, f.polygons[1, 0])) for f in (one, two)] == [
+            sorted(map(np.ndarray.tolist, one.polygons[1, 0]))
+        ] * 2
 
 
 def bare(figures=(), pitch=400, diameter=200):

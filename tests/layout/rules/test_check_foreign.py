@@ -291,6 +291,27 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(tmp_p
     assert found["minimum_feature_nm"] == pytest.approx(planned.minimum_feature_nm)
 
 
+def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
+    """Pillars of 250 nm every 330 leave walls of 80, and 40 to the end of their squares: a frame makes these whole."""
+    size = np.full((5, 9), 0.25)
+    size[2, 7:] = 0.0
+    process = tmp_path / "p.toml"
+    process.write_text('tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n')
+    rules = processes.load(process)
+    plan = build.prepare(DiameterMap(size, 0.33), rules, furniture="none").plan
+    layout.write_gdsii(plan, tmp_path / "m.gds")
+    assert drc.check(plan, rules.rules).ok
+    assert cli.main(["check", str(tmp_path / "m.gds"), "--process", str(process), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["violations"]["gap"] == 0
+    read_back = db.Layout()
+    read_back.read(str(tmp_path / "m.gds"))
+    drawn = db.Region(read_back.top_cell().begin_shapes_rec(read_back.find_layer(1, 0)))
+    assert drawn.bbox().width() == 9 * 330 + 2 * 330
+    assert drawn.width_check(79).is_empty()
+    drawn.merged_semantics = False
+    assert sum(p.area() for p in drawn.each()) == drawn.merged().area()  # no shape overlaps another
+
+
 def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
     """Their rounded corners leave dents of parts of a unit; chords of them are no widths."""
     made = db.Layout()
