@@ -13,7 +13,7 @@ from metalens.ground import report, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
 from metalens.ground.store import Provenance
-from metalens.image import Grid, imager
+from metalens.image import Grid, Imager, imager
 from metalens.lens import Lens
 from metalens.psf import Source
 
@@ -43,6 +43,26 @@ class Imaged:
     parts: dict[str, float]
 
 
+def margin_of(pitch_um: float) -> int:
+    """Samples around a frame that are blurred into it."""
+    return math.ceil(BLUR_UM / pitch_um)
+
+
+def lens_imager(
+    lens: Lens, camera: Camera, depths_um: tuple[float, float], *, fwhm_nm: float = 0.0, tolerance: float = TOLERANCE
+) -> Imager:
+    """The true image of a lens file on the samples of a camera, for frames with a margin (:func:`margin_of`) that hold
+    these depths.
+
+    Raises:
+        SceneError: see :func:`metalens.image.imager`.
+    """
+    margin = margin_of(camera.pitch_um)
+    grid = Grid((camera.pixels, camera.pixels), camera.pitch_um, depths_um, margin, 2 * margin + 1)
+    source = Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
+    return imager(lens, grid, spectrum=source, tolerance=tolerance)
+
+
 @torch.no_grad()
 def imaged(
     lens: Lens, camera: Camera, rig: Rig, rendered: Callable[[Camera, Rig], Rendered], *, fwhm_nm: float = 0.0
@@ -50,20 +70,19 @@ def imaged(
     """Image the first frames.
 
     Args:
-        camera: samples of the sensor. rendered: gives the frames of a camera and a rig, whose lens is as far from its
-            sensor as this one. fwhm_nm: width of the light; 0 for one wavelength.
+        camera: samples of the sensor. rendered: gives the frames of a camera and a rig, whose pinhole is as far from
+            its sensor as this lens through its films (:attr:`metalens.lens.Lens.reduced_um`). fwhm_nm: width of the
+            light; 0 for one wavelength.
 
     Raises:
         SceneError: the lens cannot be imaged over this field to 3 %; see :func:`metalens.image.imager`.
     """
-    margin = math.ceil(BLUR_UM / camera.pitch_um)
+    margin = margin_of(camera.pitch_um)
     wide = Camera(camera.pixels + 2 * margin, camera.pitch_um)
-    made = rendered(wide, replace(rig, sensor_distance_um=lens.sensor_distance_um))
+    made = rendered(wide, replace(rig, sensor_distance_um=lens.reduced_um))
     seen = made.frames.depth_um[made.frames.coverage > 0]
     reach = 0.98 * float(seen.min()), 1.02 * float(seen.max())
-    grid = Grid((camera.pixels, camera.pixels), camera.pitch_um, reach, margin, 2 * margin + 1)
-    source = Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
-    optics = imager(lens, grid, spectrum=source, tolerance=TOLERANCE)
+    optics = lens_imager(lens, camera, reach, fwhm_nm=fwhm_nm)
     inside = slice(margin, margin + camera.pixels)
     plain, light = made.pinhole()[:, inside, inside], optics(made.frames)
     if not float(light.sum()) > 0:
@@ -76,8 +95,8 @@ def imaged(
         (light * (plain.sum() / light.sum())).numpy().astype(np.float32),
         psf.numpy().astype(np.float32),
         optics.plan.depths_um.numpy()[depths],
-        np.degrees(np.arctan(y_um / lens.sensor_distance_um)),
-        np.degrees(np.arctan(x_um / lens.sensor_distance_um)),
+        np.degrees(np.arctan(y_um / lens.reduced_um)),
+        np.degrees(np.arctan(x_um / lens.reduced_um)),
         camera.pitch_um,
         optics.error,
         {name: float(value) for name, value in optics.parts.items()},

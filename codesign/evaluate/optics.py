@@ -227,12 +227,12 @@ def scene_energies(
     if not lenses:
         raise SceneError("no lens to evaluate; give at least one")
     settings = settings or Scenes()
-    distance = lenses[0].sensor_distance_um
+    distance = lenses[0].reduced_um
     for number, lens in enumerate(lenses):
-        if abs(lens.sensor_distance_um / distance - 1) > 1e-3:
+        if abs(lens.reduced_um / distance - 1) > 1e-3:
             raise SceneError(
-                f"lens {number + 1} is made for a sensor at {lens.sensor_distance_um} um, the first for {distance} um: "
-                "their images differ in size; compare lenses of one sensor distance"
+                f"lens {number + 1} is made for a sensor at {lens.reduced_um:g} um (through films: reduced), the first "
+                f"for {distance:g} um: their images differ in size; compare lenses of one sensor distance"
             )
     views = views or scene_views(states, settings, sensor_distance_um=distance)
     out = []

@@ -27,14 +27,15 @@ from codesign.batches import (
     fill,
     irradiance,
 )
+from codesign.evaluate.imaged import lens_imager, margin_of
+from codesign.eye import Camera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.train import Scenes, read_out
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Table
-from metalens.image import Grid, Imager, Sensor, UniformImager, imager
+from metalens.image import Imager, Sensor, UniformImager
 from metalens.lens import Lens
-from metalens.psf import Source
 
 SHARE = 0.9  # of the intervals
 
@@ -75,8 +76,13 @@ class ReaderConfig:
 
     @property
     def margin(self) -> int:
-        """Samples around the frames: 144 um, half a window of the PSFs."""
-        return math.ceil(144.0 / self.pitch_um)
+        """Samples around the frames that are blurred into them."""
+        return margin_of(self.pitch_um)
+
+    @property
+    def camera(self) -> Camera:
+        """Samples of the frames."""
+        return Camera(self.pixels, self.pitch_um)
 
     @property
     def sensor(self) -> Sensor:
@@ -163,15 +169,6 @@ def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
     pools = {stream: fill(one, config.test if stream != EXPERIMENT else config.pool) for stream, one in of.items()}
     kept = {s: PoolScenes(p, config.margin, scenes.scale, config.seed + s) for s, p in pools.items()}
     return Scenery(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
-
-
-def lens_imager(lens: Lens, config: ReaderConfig) -> Imager:
-    """The true image of a lens file for the reader's frames."""
-    low, high = config.depths_mm
-    window = 2 * config.margin + 1
-    grid = Grid((config.pixels, config.pixels), config.pitch_um, (low * 1e3, high * 1e3), config.margin, window)
-    source = Source(lens.wavelength_um * 1e3, config.fwhm_nm) if config.fwhm_nm else None
-    return imager(lens, grid, spectrum=source, tolerance=config.tolerance)
 
 
 def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) -> Read:
@@ -286,14 +283,16 @@ def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str,
     """Every lens by name, on the same scenes.
 
     Raises:
-        ConfigError: lenses of different sensor distances, whose frames differ in size.
+        ConfigError: lenses of different sensor distances (through films: reduced), whose frames differ in size.
     """
-    distances = {name: lens.sensor_distance_um for name, lens in lenses.items()}
+    distances = {name: lens.reduced_um for name, lens in lenses.items()}
     if max(distances.values()) > min(distances.values()) * 1.001:
         raise ConfigError(f"lenses of different sensor distances {distances} um: compare lenses of one distance")
     seen = scenery(config, sensor_distance_um=next(iter(distances.values())))
+    near, far = config.depths_mm
+    about = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
     for name, lens in lenses.items():
-        yield name, read(lens_imager(lens, config), seen, config)
+        yield name, read(lens_imager(lens, config.camera, (near * 1e3, far * 1e3), **about), seen, config)
 
 
-__all__ = ["Read", "ReaderConfig", "ReferenceReader", "judged", "lens_imager", "read", "scenery", "table"]
+__all__ = ["Read", "ReaderConfig", "ReferenceReader", "judged", "read", "scenery", "table"]

@@ -79,6 +79,11 @@ class Lens:
         object.__setattr__(self, "layers", replace(self.layers, cover=cover))
         check_gaps(self.layers, self.sensor_distance_um, self.source_distance_um)
 
+    @property
+    def reduced_um(self) -> float:
+        """Σ thickness / index from the pillars to the sensor: samples at x um show directions of tangent x over it."""
+        return self.layers.after(self.sensor_distance_um, self.wavelength_um).reduced_um
+
     def seen(self, light: Literal["x", "y"]) -> "Lens":
         """The lens for light polarised along x or y, where it focuses that."""
         if self.pairs is None or self.light == light:

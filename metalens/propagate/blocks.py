@@ -21,6 +21,7 @@ from metalens.propagate.paths import from_source, to_sensor
 LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  # of rows, of columns
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
 ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding of the path itself
+ROUNDED = 2e-14  # of the longest path: what the polynomials' coefficients round to in float64 (up to 1.3e-14 was found)
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
 PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
 TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
@@ -136,7 +137,7 @@ def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
     got = _powers(case, reference, (y, half), x, ORDER[itemsize])
     want = carrier_turns(case, reference, x, y + half * rows.along[:, None])
     error = np.abs(rows.along[:, None] ** np.arange(ORDER[itemsize]) @ got - want).max()
-    return bool(error <= ACCURACY[itemsize] + 4e-15 * np.abs(want).max())
+    return bool(error <= ACCURACY[itemsize] + ROUNDED * np.abs(want).max())
 
 
 def _powers(case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int) -> Array:
@@ -163,6 +164,13 @@ class Carrier:
     reference: float
     rows: Blocks
     chunk: int
+
+    @property
+    def rounding_rad(self) -> float:
+        """Standard deviation of the phase from what its polynomials round, a tenth of the largest."""
+        y, x = (half * np.array([-1.0, 0.0, 1.0]) for half in self.case.half_size_um)
+        longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
+        return float(2 * np.pi * ROUNDED / 10 * longest)
 
     def table(self, start: int, stop: int, dtype: Any) -> Array:
         """(block, chunk, order, column) coefficients of block rows start to stop; whole turns are left out."""

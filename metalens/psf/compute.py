@@ -172,7 +172,7 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
                 _check(maps, case, sum(powers), gathered)
                 power = lit.power(case, powers, maps[1])
                 at = None if pupils is None else pupils(*made.judged_um)
-                noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(_noisy(powers, at), case)
+                noise = _phasor(dtype, tolerance, made) * _incoherent(_noisy(powers, at), case)
                 moments = gathered.cpu().numpy().astype(complex)
                 samples[index].append(Sample(window, weight, moments, noise, made.layout.parts, pupils=at))
                 here = weight * light
@@ -184,6 +184,11 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
         total = total + torch.cat(rows, -2)
     result = _judged(total, samples, seen, (lit.cases, lit.weights, given), choice)
     return _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
+
+
+def _phasor(dtype: torch.dtype, tolerance: float, made: Any) -> float:
+    """Standard deviation of a pillar's phasor: arithmetic, interpolation inside blocks, polynomials of long paths."""
+    return math.hypot(ROUNDING[dtype], tolerance / SHARE, made.moments.carrier.rounding_rad)
 
 
 def _noisy(powers: list[float], at: Any) -> float:
@@ -202,7 +207,7 @@ def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Res
         light, gathered, powers = light_wide(maps, made, pupils)
         _check(maps, case, sum(powers), gathered)
         at = None if pupils is None else pupils(*made.nodes_um)
-        noise = math.hypot(ROUNDING[dtype], tolerance / SHARE) * _incoherent(_noisy(powers, at), case)
+        noise = _phasor(dtype, tolerance, made) * _incoherent(_noisy(powers, at), case)
         given = gathered.cpu().numpy().astype(complex)
         samples.append(Sample(case, weight, given, noise, 1, made.nodes_um, at))
         light = light if weight == 1 else light * weight

@@ -16,7 +16,9 @@ from codesign.commands import view
 from codesign.evaluate import imaged
 from codesign.eye import Camera, Rig, dataset, render
 from metalens import cli, lens
+from metalens.cell import Film, Index
 from metalens.ground.store import Provenance
+from metalens.lens import Layers
 
 CAMERA = Camera(24, 3.0)
 RIG = replace(Rig(), elevation_rad=0.6)
@@ -50,10 +52,28 @@ def test_psfs_are_those_of_the_middle_and_the_rim(found):
     assert found.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert found.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert np.all(np.diff(found.depth_um) > 0)
-    assert found.psf.shape[:3] == (3, 3, 3)
+    assert found.psf.shape == (3, 3, 3, 97, 97)  # first, middle and last; 288 um about a sample
     # a lens that is alike to both sides: left and right PSFs are each other's mirror images, to the nodes' own error
     left, right = found.psf[1, 1, 0], found.psf[1, 1, 2][:, ::-1]
     assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(left)
+
+
+def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
+    """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field angles alike."""
+    behind = replace(m.small(), layers=Layers(behind=(Film(Index(1.5), 60.0),)))
+    states, seen = dataset.states_at(torch.arange(1), 5), []
+
+    def rendered(camera, rig):
+        seen.append(rig.sensor_distance_um)
+        return render(states, rig=rig, camera=camera)
+
+    made = imaged.imaged(behind, Camera(16, 4.0), RIG, rendered)
+    assert seen == [pytest.approx(280.0)]
+    beside = 36  # samples of 4 um: half a window of 288 um
+    rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 4.0 / 280.0))
+    assert made.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
+    assert made.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
+    assert made.psf.shape[3:] == (73, 73)
 
 
 def test_what_is_written_is_what_is_shown(found, tmp_path):

@@ -86,7 +86,7 @@ def test_impossible_readers_are_refused(change, message):
 def test_lenses_of_different_sensor_distances_are_refused():
     class Lens:
         def __init__(self, distance):
-            self.sensor_distance_um = distance
+            self.reduced_um = distance
 
     with pytest.raises(ConfigError, match="compare lenses of one distance"):
         next(reader.judged({"a": Lens(2000.0), "b": Lens(1000.0)}, TINY))

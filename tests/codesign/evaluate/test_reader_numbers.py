@@ -1,15 +1,24 @@
 """What the reference reader tells, on answers typed in: intervals by rank and bootstrap, depths of windows."""
 
 import math
+import sys
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
 from codesign.evaluate import reader
 from codesign.evaluate.reader import Frames, Read, ReaderConfig
 from codesign.network import blur
+from metalens.cell import Film, Index
+from metalens.ground.errors import ConfigError
+from metalens.lens import Layers
 
 
 def frames(count, seed):
@@ -181,18 +190,19 @@ def test_what_the_reader_s_sensor_is():
     assert blur.FEATURES == 9 * 16 + 1
 
 
-def test_a_lens_is_imaged_truly_over_its_depths_in_micrometres(monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        reader, "imager", lambda lens, grid, *, spectrum, tolerance: seen.append((grid, spectrum, tolerance))
-    )
-    lens = SimpleNamespace(wavelength_um=0.81)
-    config = ReaderConfig(pixels=48, pitch_um=13.0, depths_mm=(14.0, 37.0), fwhm_nm=25.0, tolerance=0.02)
-    reader.lens_imager(lens, config)
-    reader.lens_imager(lens, ReaderConfig(pixels=48, pitch_um=13.0))
-    (grid, spectrum, tolerance), (plain, none, usual) = seen
-    assert (grid.samples, grid.step_um, grid.depths_um) == ((48, 48), 13.0, (14e3, 37e3))
-    assert (grid.margin, grid.window) == (12, 25)
-    assert (spectrum.peak_nm, spectrum.fwhm_nm) == (pytest.approx(810.0), 25.0)
-    assert tolerance == 0.02
-    assert (none, usual, plain.depths_um) == (None, 0.03, (12e3, 50e3))
+def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometres(monkeypatch):
+    """The reader itself left out: what it is given to look through is the image of a lens file."""
+    made = []
+    monkeypatch.setattr(reader, "scenery", lambda config, *, sensor_distance_um: sensor_distance_um)
+    monkeypatch.setattr(reader, "read", lambda optics, seen, config: made.append((optics, seen)))
+    config = ReaderConfig(pixels=32, pitch_um=9.0, depths_mm=(2.1, 3.4), tolerance=0.2)
+    glass = Layers(behind=(Film(Index(1.5), 60.0),))
+    behind = replace(m.small(), layers=glass)
+    assert [name for name, _ in reader.judged({"glass": behind}, config)] == ["glass"]
+    ((optics, seen),) = made
+    assert seen == pytest.approx(240.0 + 60.0 / 1.5)
+    grid = optics.grid
+    assert (grid.samples, grid.step_um, grid.depths_um) == ((32, 32), 9.0, (2.1e3, 3.4e3))
+    assert (grid.margin, grid.window) == (16, 33)  # 144 um
+    with pytest.raises(ConfigError, match="different sensor distances"):  # 300 and 280 um
+        list(reader.judged({"glass": behind, "air": m.small()}, config))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from metalens import propagate
 from metalens.ground import legendre
 from metalens.propagate import Case, blocks, choice, operators, window
 
@@ -64,11 +65,11 @@ def test_coefficients_that_move_are_those_of_the_basis():
 
 @pytest.mark.parametrize(("itemsize", "least"), [(4, 2e-8), (8, 1e-11)])
 def test_a_carrier_is_a_polynomial_where_that_is_as_exact_as_asked(monkeypatch, itemsize, least):
-    """An error put into one row of one block is refused from the limit on: in turns, and 4e-15 of the largest path."""
+    """An error put into one row of one block is refused from the limit on: in turns, and 2e-14 of the largest path."""
     case = replace(CASE, shape=(96, 41))
     real = blocks._powers
     x, y = case.pillars_um[1], case.pillars_um[0]
-    limit = least + 4e-15 * np.abs(blocks.carrier_turns(case, 1 / 800, x, y[:, None])).max()
+    limit = least + 2e-14 * np.abs(blocks.carrier_turns(case, 1 / 800, x, y[:, None])).max()
     for sign in (1, -1):
         for off, kept in ((0.5, True), (2.0, False)):
 
@@ -80,6 +81,22 @@ def test_a_carrier_is_a_polynomial_where_that_is_as_exact_as_asked(monkeypatch, 
             monkeypatch.setattr(blocks, "_powers", powers)
             found = blocks._carried(case, 1 / 800, 2, itemsize)
             assert found == kept
+
+
+def test_rounding_of_long_paths_keeps_no_block_from_being_used():
+    """A 10 mm lens, paths of 2600 waves: polynomials over two rows leave nothing but rounding, 2.4e-11 turns, which is
+    above what is asked of a carrier. Its standard deviation is what the estimate reckons with, within a factor of 3."""
+    given = dict(pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=2e4, depths_um=[2e4], angle_rad=0.35)
+    case = propagate.case((25000, 25000), **given, window_um=10, samples=4)
+    assert blocks._carried(case, 1 / 2e4, 2, 8)
+    rows = blocks.Blocks(25000, 64, 64)
+    x, y = case.pillars_um[1][::2500], rows.middles_um(0.4)[[0, 40, -1], None, None]
+    half = 63 / 2 * 0.4
+    got = rows.along[:, None] ** np.arange(9) @ blocks._powers(case, 1 / 2e4, (y, half), x, 9)
+    error = (got - blocks.carrier_turns(case, 1 / 2e4, x, y + half * rows.along[:, None])) * 2 * np.pi
+    assert np.abs(error).max() > 2 * np.pi * 1e-11
+    made = blocks.Carrier(case, 1 / 2e4, rows, 512).rounding_rad
+    assert made / 3 < error.std() < made
 
 
 def test_both_corners_of_a_window_need_a_plan(monkeypatch):

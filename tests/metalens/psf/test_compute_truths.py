@@ -12,6 +12,7 @@ from metalens.psf import compute
 from metalens.psf.compute import Result
 
 CASE = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400, 1 / 900), (14.0, -8.5), 0.6, (9, 11))
+SIMPLE = SimpleNamespace(carrier=SimpleNamespace(rounding_rad=0.0))
 OTHER = Case((30, 41), 0.37, 0.79, 62.0, (0.21, -0.13), (1 / 400, 1 / 900), (14.0, -8.5), 0.6, (9, 11))
 
 
@@ -129,7 +130,9 @@ def test_a_wide_window_tells_noise_brightness_and_transforms(monkeypatch):
     power = {0.85: 900.0, 0.79: 700.0}
     bright = torch.ones(2, 9, 11, dtype=SINGLE)
     bright[:, 3, 4] = 21.0
-    monkeypatch.setattr(compute, "plan_wide", lambda case, *_: SimpleNamespace(nodes_um=None, case=case))
+    monkeypatch.setattr(
+        compute, "plan_wide", lambda case, *_: SimpleNamespace(nodes_um=None, case=case, moments=SIMPLE)
+    )
     monkeypatch.setattr(
         compute,
         "light_wide",
