@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import Arrangement, At, Wafer, apart, joined, readback, wafer
-from layout.commands import arranged_page
+from layout.commands import arranged_page, make
 from layout.commands import placed as standing
 from layout.commands.check import read
 from layout.commands.job import Options
@@ -115,7 +115,7 @@ def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path]
     with work.stages(f"write {name}"):
         write(made, path)
     with work.stages(f"read back {name}"):
-        found = readback.differences(made, read(path, standing.MOST_READ, keep=standing.KEPT))
+        found = readback.differences(made, read(path, make.MOST_READ, keep=make.KEPT))
     work.failures += [f"{name} does not read back as planned: {text}" for text in found]
     work.unlike |= {name} if found else set()
     work.written[name] = path.stat().st_size

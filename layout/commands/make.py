@@ -31,8 +31,8 @@ from metalens.ground.units import nm
 from metalens.lens import Lens
 
 MOST_MADE = 1 << 24  # sites of a lens whose predicted diameters are handed on as made.h5
-_KEPT = 1 << 16  # placements of a cell that are kept when a file is read back; of more only sums are
-_MOST_READ = 2**40
+KEPT = 1 << 16  # placements of a cell that are kept when a file is read back; of more only sums are
+MOST_READ = 2**40
 
 
 def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") -> Job:
@@ -135,7 +135,7 @@ def _write_solids(job: Job, target: Path) -> None:
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
     with job.stages(f"read back {path.suffix[1:]}"):
-        content = read(path, limit=_MOST_READ, keep=_KEPT)
+        content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = verify.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)

@@ -21,9 +21,6 @@ from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
 from metalens.lens import Lens
 
-MOST_READ = 2**40
-KEPT = 1 << 16  # placements of a cell that are kept when a mask is read back; of more only sums are
-
 
 @dataclass(eq=False, slots=True)
 class Work:
@@ -78,7 +75,7 @@ def lens_part(work: Work, part: LensPart) -> parts.Part:
     for stage, seconds in job.seconds.items():
         work.stages.seconds[f"{part.name}: {stage}"] = seconds
     path = next(path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file())
-    content, lattices = read(path, MOST_READ, keep=KEPT), oasis_write.placed_lattices(job.plan)
+    content, lattices = read(path, make.MOST_READ, keep=make.KEPT), oasis_write.placed_lattices(job.plan)
     corrected = job.made.dose is not None
     return parts.of_plan(part.name, job.plan, content, work.process, corrected=corrected, lattices=lattices)
 
@@ -147,7 +144,7 @@ def _written(work: Work, made: build.MadePlan) -> parts.Part:
         work.broken(name, check.check(plan, process.rules))
     path = work.folder / f"{name}.oas"
     oasis_write.write(plan, path)
-    content = read(path, MOST_READ)
+    content = read(path, make.MOST_READ)
     path.unlink()
     work.failures += [f"{name}: {text}" for text in verify.compare(plan, content).differences]
     if made.dose is not None and process.exposure.csv is None:
