@@ -78,11 +78,11 @@ def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
             [e["mmacs"] for e in births],
             [e["error"] for e in births],
             "million MACs",
-            "slippage error on validation frames / mm",
+            "slippage error / mm",
             [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
             front,
             notes=notes,
-            caption="Pick a network to read its layers.",
+            caption="Errors are of the validation frames. Pick a network to read its layers.",
         )
     ]
 

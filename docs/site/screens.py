@@ -22,7 +22,7 @@ SHOWN = {  # artefact of the demo: name of the picture
     "lens.h5": "lens",
     "psf.h5": "psf",
     "mask": "mask",
-    "shots": "captures",
+    "captures": "captures",
     "asbuilt.h5": "asbuilt",
     "run": "run",
     "image/image.h5": "image",

@@ -114,8 +114,8 @@ async function images(panel, section) {
   const figure = element("figure", views, { style: "margin:0" });
   const canvas = element("canvas", figure, { class: "image", width: nx, height: ny, tabindex: 0, role: "img", "aria-label": `${panel.title}; arrow keys move the cross` });
   const readout = element("p", section, { class: "readout", "aria-live": "polite" });
-  const right = element("div", views, { class: "plot" }), profile = plot(right, "Along the cross", `x / ${panel.across}`, panel.unit, false);
-  const optics = panel.optics ? { mtf: plot(right, "MTF", "cycles / mm", "contrast", false), energy: plot(right, "Encircled energy", "radius / µm", "share", false) } : null;
+  const right = element("div", views, { class: "plot" }), beside = () => element("div", right, { class: "plot" }), profile = plot(beside(), "Along the cross", `x / ${panel.across}`, panel.unit, false);
+  const optics = panel.optics ? { mtf: plot(beside(), "MTF", "cycles / mm", "contrast", false), energy: plot(beside(), "Encircled energy", "radius / µm", "share", false) } : null;
   let cross = [Math.floor(ny / 2), Math.floor(nx / 2)], log = false, own = true;
   const table = panel.signed ? TABLE(SIGNED) : TABLE(CIVIDIS), ends = bar(figure, table);
   let all = 0;
