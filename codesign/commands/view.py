@@ -11,6 +11,7 @@ from codesign.commands import budget as budgets
 from codesign.network import Architecture
 from codesign.train import Candidate, pareto
 from metalens.ground import report, store
+from metalens.ground.arrays import Array
 from metalens.ground.errors import StoreError
 from metalens.view import Axis, Curves, Images, Numbers, Panel, Points, at_brightest, lens_panels
 
@@ -60,7 +61,20 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
     lines = {name: np.array([entry.get(name, np.nan) for entry in steps], float) for name in names}
     said = {name: report.in_words(name) for name in names}
     moving = [name for name in names if np.ptp(lines[name]) > 0]
-    return [Curves(f"Training: {said[name]}", x, "step", {said[name]: lines[name]}, "") for name in moving]
+    budgets = list(dict.fromkeys(entry["budget_mmacs"] for entry in entries if "budget_mmacs" in entry))
+    shown = {name: {said[name]: lines[name]} for name in moving}
+    if "mmacs" in shown and len(budgets) > 1:
+        shown["mmacs"] = _in_turn(x, lines["mmacs"], budgets)
+    return [Curves(f"Training: {said[name]}", x, "step", curves, "") for name, curves in shown.items()]
+
+
+def _in_turn(step: Array, values: Array, budgets: list[float]) -> dict[str, Array]:
+    """A curve for each budget, of what is of a step for each in turn; between its steps the last value stands."""
+    curves = {}
+    for i, budget in enumerate(budgets):
+        last = np.maximum.accumulate(np.where((step - 1) % len(budgets) == i, np.arange(len(step)), -1))
+        curves[f"budget {budget:g}"] = np.where(last >= 0, values[last], np.nan)
+    return curves
 
 
 def _searched(entries: list[dict[str, Any]]) -> list[Panel]:

@@ -56,6 +56,16 @@ def test_networks_of_the_searches_are_points_to_pick_with_the_pareto_set_among_t
     assert view.panels(tmp_path)[0].notes == [{}]
 
 
+def test_the_cost_of_budgets_that_take_turns_is_a_curve_each(tmp_path):
+    costs = [1.9, 3.1, 1.8, 3.3, 1.7]
+    lines = [json.dumps({"kind": "step", "step": i + 1, "mmacs": cost}) for i, cost in enumerate(costs)]
+    born = [birth(1.9, 0.8, 5, budget=2.0), birth(3.0, 0.6, 5, budget=3.5)]
+    (tmp_path / "log.jsonl").write_text("\n".join([*lines, *born]))
+    curves = view.panels(tmp_path)[0].lines
+    np.testing.assert_array_equal(curves["budget 2"], [1.9, 1.9, 1.8, 1.8, 1.7])
+    np.testing.assert_array_equal(curves["budget 3.5"], [np.nan, 3.1, 3.1, 3.3, 3.3])
+
+
 def test_answers_stand_beside_the_truth(tmp_path):
     rng = np.random.default_rng(5)
     arrays = {
