@@ -61,6 +61,7 @@ depths = [2]
 budgets_mmacs = [2.0]
 pitch_um = 3.0
 """
+FRAMES = " --subjects 1 --grid 4 4"  # of the virtual experiment
 TRAINED = "retrain run0 --asbuilt asbuilt.h5 -o out --insist --draws 2 --judge 1 --test-batches 1"
 VERBS = {
     "design": ("design design{}.toml -o out.h5 --skip-focus-check", "out.h5"),
@@ -77,8 +78,8 @@ VERBS = {
     "check": ("check mask0/mask.gds --process rules{}.toml -o out.lyrdb", "out.lyrdb"),
     "view": ("view lens{}.h5 -o out.html", "out.html"),
     "evaluate": ("evaluate optics lens{}.h5 --config optics.toml -o out", "out"),
-    "budget": ("budget wide{}.h5 -o out.h5 --depths 3", "out.h5"),
-    "plan": ("plan --gaze-error 5deg --config plan{}.toml -o out", "out"),
+    "budget": ("budget wide{}.h5 -o out.h5 --depths 3" + FRAMES, "out.h5"),
+    "plan": ("plan --gaze-error 5deg --config plan{}.toml -o out" + FRAMES, "out"),
     "codesign": ("codesign run{}.toml -o out", "out"),
     "retrain": (TRAINED + " --steps 1{}", "out"),
     "demo": ("demo out --config chain{}.toml", "out"),

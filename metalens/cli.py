@@ -7,8 +7,10 @@ own; its ``part_of(word)`` may name the one that a path is meant for.
 """
 
 import atexit
+import dataclasses
 import importlib
 import io
+import math
 import os
 import shutil
 import signal
@@ -19,7 +21,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from metalens.ground import console, lock
-from metalens.ground.errors import FitRefused, MetalensError, missing_extra, nearest
+from metalens.ground.errors import ConfigError, FitRefused, MetalensError, missing_extra, nearest
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -90,6 +92,7 @@ VIEWS = {
 # and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``
 TOLD = {"mask": "layout.commands.info"}
 
+_LARGEST = 1e9  # size of a number among options, in its unit
 _AGAIN_S = 0.02  # after which a dropped interrupt comes again
 _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
@@ -253,8 +256,28 @@ def _dispatch(verb: str, words: list[str]) -> int:
     except BrokenPipeError:  # whoever was shown the help went away
         console.silence()
         return SUCCESS
+    _refuse_beyond_reach(options)
     work = importlib.import_module(getattr(module, "WORK", module.__name__))
     return int(work.run(options))
+
+
+def _refuse_beyond_reach(options: Any) -> None:
+    """The rule of settings files (:func:`metalens.ground.config.load`) for the numbers among options.
+
+    Raises:
+        ConfigError: one that is not finite, or too large to mean anything.
+    """
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            _refuse_beyond_reach(value)
+        if repr(value) == repr(field.default):
+            continue
+        for number in value if isinstance(value, tuple) else (value,):
+            collimated = number == math.inf and field.metadata.get("may_be_inf")
+            if isinstance(number, float) and not abs(number) <= _LARGEST and not collimated:
+                name = field.name.replace("_", "-")
+                raise ConfigError(f"--{name} {number:g}: need a finite number of at most {_LARGEST:g} in size")
 
 
 def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:

@@ -1,6 +1,8 @@
 """What a command will need is checked before its work begins."""
 
+import dataclasses
 import importlib
+import typing
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +13,7 @@ import layout
 from characterize.captures import capture as captures
 from layout.gdsii import read as gdsii_read
 from layout.process import Process
-from metalens import lens
+from metalens import cli, lens
 from metalens.cell.record import Cell, Index
 from metalens.cli import BAD_INPUT, main
 from metalens.commands import design
@@ -137,6 +139,42 @@ def test_no_command_begins_where_its_output_cannot_stand(inputs, monkeypatch, ca
         assert tree(inputs) == before
 
 
+def numbers(options):
+    """(option, how many values it takes) of the numbers with a point, those of tables within left out."""
+    for name, hint in typing.get_type_hints(options).items():
+        text = str(hint)
+        if "float" in text and not dataclasses.is_dataclass(hint):
+            listed = "..." not in text and "tuple" in text
+            yield f"--{name.replace('_', '-')}", text.count("float") if listed else 1
+
+
+@pytest.mark.parametrize("verb", sorted(NEEDS))
+def test_no_command_begins_with_a_number_out_of_this_world(inputs, monkeypatch, capsys, verb):
+    words, work = NEEDS[verb]
+    module, _, name = work.partition(":")
+    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
+    module = importlib.import_module(cli.VERBS[verb][0])
+    first, *rest = [verb, *words.split()]
+    parts = getattr(module, "PARTS", {})
+    options = (importlib.import_module(parts[rest[0]][0]) if parts else module).Options
+    before = tree(inputs)
+    for option, count in numbers(options):
+        for bad in ("nan", "inf", "-inf", "1e20"):
+            if (option, bad) in {("--sources-mm", "inf"), ("--reference-e", "nan")}:  # a plane wave; the default
+                continue
+            assert main([first, *rest, option, *[bad] * count, "-o", NAMES.get(verb, "o")]) == BAD_INPUT
+            told = capsys.readouterr().err
+            assert option in told, told
+            assert "need a finite number" in told
+            assert tree(inputs) == before
+
+
+def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(inputs, monkeypatch, capsys):
+    monkeypatch.setattr("codesign.budget.links.entries", lambda *_, **__: pytest.fail("the work began"))
+    assert main(["budget", "lens.h5", "--led-fwhm-nm", "-1", "-o", "o.h5"]) == BAD_INPUT
+    assert "--led-fwhm-nm -1: need 0 or more" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("verb", ["library", "study", "capture", "layout"])
 def test_no_command_begins_where_its_workers_cannot_be_had(inputs, monkeypatch, capsys, verb):
     words, work = NEEDS[verb]
@@ -144,7 +182,8 @@ def test_no_command_begins_where_its_workers_cannot_be_had(inputs, monkeypatch, 
     monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
     words = [verb, *words.split(), *(["--study"] if verb == "layout" else []), "-o", NAMES.get(verb, "o")]
     asked = {
-        "--workers 0": "0 workers: need 1 or more",
+        "--workers 0": "0 workers: need 1 to 1024",
+        "--workers 4611686018427387904": "4611686018427387904 workers: need 1 to 1024",
         "--workers 2 --scheduler tcp://127.0.0.1:9": "ask for one",
         "--scheduler nowhere://": "no dask scheduler at 'nowhere://'",
     }

@@ -86,6 +86,8 @@ def text(rows: list[Entry]) -> str:
 
 
 def _given(options: Options) -> Given:
+    if options.led_fwhm_nm < 0:
+        raise ConfigError(f"--led-fwhm-nm {options.led_fwhm_nm:g}: need 0 or more")
     wide = options.led_fwhm_nm > 0
     numerics = Numerics(options.depths, options.wavelengths if wide else 1, options.tolerance, options.kernels)
     return Given(

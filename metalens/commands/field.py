@@ -11,7 +11,7 @@ import tyro
 from metalens.cell import Cell, Light, Polarization
 from metalens.commands.common import Common, Output
 from metalens.commands.library import CellFile
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import canvas, png
@@ -132,7 +132,7 @@ def run(options: Options) -> int:
     with options.claim(options.output, beside=(".png",)) as draft:
         found = near_fields(wanted.cell, wanted.diameter_um, wanted.light, wanted.grids(), tolerance=wanted.tolerance)
         files = (options.config, *workers.material_files(wanted.cell))
-        save(draft.path, wanted, found, {file.name: store.sha256(file) for file in files})
+        save(draft.path, wanted, found, {file.name: reading.sha256(file) for file in files})
         store.write_bytes(draft.path.with_suffix(".png"), picture(wanted, found))
     names = (*CUTS, "xy")
     values: dict[str, Any] = {

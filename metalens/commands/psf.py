@@ -5,7 +5,7 @@ An interruption leaves what stood at the output; the same command begins anew.
 
 import importlib
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -74,7 +74,7 @@ class Options(Common):
     output: MaybeOutput = None
     config: Path | None = None
     depths_mm: tuple[float, float, float] | None = None
-    sources_mm: tuple[float, ...] | None = None
+    sources_mm: tuple[float, ...] | None = field(default=None, metadata={"may_be_inf": True})
     angles_deg: tuple[float, ...] | None = None
     angles_y_deg: tuple[float, ...] | None = None
     window_um: float | None = None

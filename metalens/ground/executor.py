@@ -29,7 +29,7 @@ _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 # safe path: what lies in the current folder is never imported, whatever its name
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
 _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"  # what a large lens takes is no leak to end a worker for
-_CONNECT_S = 10
+_CONNECT_S, _MOST = 10, 1024  # seconds; processes of one machine
 
 
 def cores() -> int:
@@ -44,10 +44,10 @@ def on(scheduler: str | None = None, *, processes: int | None = None) -> Iterato
     With neither, each verb has its own way: :func:`run` a process a core, :func:`gather` threads of this process.
 
     Raises:
-        ConfigError: both are asked for, or fewer than 1 process. WorkerError: no cluster at the address.
+        ConfigError: both are asked for, or no such number of processes. WorkerError: no cluster at the address.
     """
-    if processes is not None and processes < 1:
-        raise ConfigError(f"{processes} workers: need 1 or more")
+    if processes is not None and not 1 <= processes <= _MOST:
+        raise ConfigError(f"{processes} workers: need 1 to {_MOST}; more machines are reached by a scheduler")
     if processes is not None and scheduler is not None:
         raise ConfigError("workers are processes of this machine, the cluster of a scheduler has its own: ask for one")
     with contextlib.ExitStack() as held:
