@@ -125,9 +125,9 @@ def _window(rng: np.random.Generator, kind: str, half: float, wavelength: float)
     return {"window_um": width, "samples": samples, "offset_um": tuple(away)}
 
 
-def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, float, str]]:
-    """(estimate, true relative error, method) in every precision; nothing where the engine refuses the case."""
-    found: list[tuple[float, float, str]] = []
+def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, float, str, bool]]:
+    """(estimate, true relative error, method, whether the estimate is above the tolerance) in every precision."""
+    found: list[tuple[float, float, str, bool]] = []
     drawing = np.random.default_rng(9)
     points: Any = None
     chance: Any = None
@@ -145,7 +145,7 @@ def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, fl
         wrong = (raw - want) / energy
         wrong = wrong - light[:, points] * (wrong / chance).sum(1, keepdims=True)
         true = math.sqrt((wrong**2 / chance).sum() / (light**2).sum())
-        found.append((stack.error, true, stack.reason.split(":")[0]))
+        found.append((stack.error, true, stack.reason.split(":")[0], not stack.converged))
     return found
 
 
@@ -174,7 +174,7 @@ def _plain(case: Drawn, stack: psf.PsfStack, points: Array) -> Array:
 def study(count: int, seed: int) -> list[Row]:
     """Both precisions on the same cases."""
     rng, dtypes = np.random.default_rng(seed), (torch.float32, torch.float64)
-    found: list[tuple[str, list[tuple[float, float, str]]]] = []
+    found: list[tuple[str, list[tuple[float, float, str, bool]]]] = []
     refused, start = 0, time.perf_counter()
     while len(found) < count:
         case = drawn(rng)
@@ -193,6 +193,7 @@ def _row(found: list[Any], i: int, dtype: str, about: tuple[int, int, float]) ->
     ratios = np.array([results[i][1] / results[i][0] for _, results in found])
     kinds = np.array([kind for kind, _ in found])
     wide = sum(results[i][2].startswith("wide") for _, results in found)
+    above = sum(results[i][3] for _, results in found)
     parts = [
         f"{kind} {int((ratios[kinds == kind] > 1).sum())} of {int((kinds == kind).sum())} (largest "
         f"{ratios[kinds == kind].max():.2f})"
@@ -201,6 +202,7 @@ def _row(found: list[Any], i: int, dtype: str, about: tuple[int, int, float]) ->
     ]
     text = f"{int((ratios > 1).sum())} of {len(ratios)} estimates below the error: {', '.join(parts)}; median estimate "
     text += f"{1 / float(np.median(ratios)):.1f} errors, {wide} by Fourier transforms, {refused} more refused"
+    text += f", {above} above the tolerance"
     return Row(
         case=f"PSFs at random, {dtype}, seed {seed}: {text}",
         method="windowed",
