@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands import placed
+from layout.commands import make
 from layout.files import QUARTERS, Assembly, CellContent, Copies, doses
 from layout.gdsii import assemble as gdsii_assemble
 from metalens import cli, lens
@@ -98,7 +98,7 @@ def planned(name):
 @pytest.mark.parametrize("kept", [1 << 16, 40])  # placements of a cell in memory: all, or rows of lattices as they go
 def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_path, capsys, monkeypatch, kept):
     db = pytest.importorskip("klayout.db")
-    monkeypatch.setattr(placed, "KEPT", kept)
+    monkeypatch.setattr(make, "KEPT", kept)
     assert run(folder, WAFER, tmp_path / "m", "--json") == 0
     values = json.loads(capsys.readouterr().out)
     table = np.loadtxt(tmp_path / "m" / "dies.csv", delimiter=",", skiprows=1)
@@ -140,7 +140,7 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
 
 @pytest.mark.parametrize("kept", [1 << 16, 40])
 def test_a_lens_goes_into_a_file_whose_cells_stay(folder, tmp_path, capsys, monkeypatch, kept):
-    monkeypatch.setattr(placed, "KEPT", kept)
+    monkeypatch.setattr(make, "KEPT", kept)
     text = '[[lens]]\nfile = "b.h5"\nname = "B"\n[[lens.at]]\nx_um = -60.4\n[into]\nfile = "pads.gds"\ncell = "CHIP"\n'
     assert run(folder, text, tmp_path / "m", "--oasis", "--gds") == 0
     assert "The mask passes its own checks." in capsys.readouterr().out
