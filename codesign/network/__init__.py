@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from codesign.network import blur as blur
     from codesign.network import cost as cost
     from codesign.network import losses as losses
+    from codesign.network import running as running
     from codesign.network.architecture import Architecture as Architecture
     from codesign.network.architecture import Space as Space
     from codesign.network.architecture import active as active
@@ -43,6 +44,7 @@ __getattr__, __dir__, __all__ = attach(
         "make": "baselines",
         "mutate": "architecture",
         "recalibrate": "supernet",
+        "running": "",
         "sample": "architecture",
         "smallest": "architecture",
     },

@@ -46,6 +46,11 @@ def macs(size: int) -> int:
     return along_x + along_y + GRID**2 * layers
 
 
+def content_macs(channels: int) -> int:
+    """Multiply-accumulates that :class:`InformedBranch` adds, for frames of any size."""
+    return GRID**2 * (channels * HIDDEN[0] + HIDDEN[1] * 2)
+
+
 @functools.lru_cache(maxsize=64)
 def filters(size: int) -> tuple[Tensor, Tensor]:
     """Real and imaginary waves under their Hann weight: (2 COLUMNS, 1, 1, w) along x, (2 ROWS, 2, w, 1) along y.
@@ -110,6 +115,19 @@ def window_vergence(depth_um: Tensor) -> Tensor:
     return rows @ vergence @ columns.mT
 
 
+def window_content(maps: Tensor) -> Tensor:
+    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y, x) of the whole frame.
+
+    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is two of them wide.
+    """
+    height, width = (int(n) for n in maps.shape[-2:])
+    steps, sides = GRID + 1, (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
+    coarse = F.avg_pool2d(maps, sides)
+    if tuple(coarse.shape[-2:]) != (steps, steps):
+        coarse = F.interpolate(coarse, size=(steps, steps), mode="bilinear", align_corners=False)
+    return F.avg_pool2d(coarse, 2, 1)
+
+
 def depth_mm(vergence: Tensor) -> Tensor:
     """Depth in mm of vergences in the units of the branch, between 5 mm and 1 m."""
     return 1e3 / (vergence * VERGENCE_UNIT_PER_M + VERGENCE_PER_M).clamp(1, 200)
@@ -157,14 +175,48 @@ class BlurBranch(nn.Module):
         self.register_buffer("place", torch.stack([x, y, x**2, y**2, x * y])[None].clone(), persistent=False)
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        weighed, mean = self._weighed(frames)
+        return self._told(self.depth(self._read(weighed)), mean)
+
+    def _weighed(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID, GRID), and its mean."""
         power, mean = spectra(frames)
         told = self.norm(torch.cat([torch.log(power + FLOOR), mean], 1))
         told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
-        seen = F.hardswish(self.first(told) * self.gain + self.offset)
-        out = self.depth(F.hardswish(self.second(self.around(seen))))
+        return self.first(told) * self.gain + self.offset, mean
+
+    def _read(self, weighed: Tensor) -> Tensor:
+        """(batch, HIDDEN[1], GRID, GRID) of every window with its neighbours."""
+        read: Tensor = F.hardswish(self.second(self.around(F.hardswish(weighed))))
+        return read
+
+    def _told(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
         spread = out[:, 1].clamp(-3, 2)
         depth = torch.stack([out[:, 0], spread], 1)
         trust = torch.exp(-2 * spread)
         total = trust.sum((1, 2))
         means = torch.stack([(trust * depth[:, 0]).sum((1, 2)) / total, spread.mean((1, 2))], 1)
         return depth, torch.cat([depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1)], 1)
+
+
+class InformedBranch(BlurBranch):
+    """The branch that is told what a window shows: ``forward(frames, content) -> (depth, features, axial)``.
+
+    content: (batch, channels, y, x) of the whole frame, as the pupil's mask is decoded from. A power spectrum is that
+    of texture times blur; whoever knows a pupil's edge from a lash knows the texture, and reads the blur from fewer
+    frames. axial: (batch,) axial slippage, in units of its scale: every window's own estimate, with the shares that
+    the windows claim (their softmax). What the calibration head makes of the depths is added to it.
+    """
+
+    def __init__(self, norm: nn.Module, channels: int) -> None:
+        """``norm``: normalises the FEATURES channels. ``channels``: of the content."""
+        super().__init__(norm)
+        self.content = nn.Conv2d(channels, HIDDEN[0], 1)
+        self.vote = nn.Conv2d(HIDDEN[1], 2, 1)
+
+    def forward(self, frames: Tensor, content: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        weighed, mean = self._weighed(frames)
+        read = self._read(weighed + self.content(window_content(content)))
+        estimate, claim = self.vote(read).flatten(2).unbind(1)
+        depth, features = self._told(self.depth(read), mean)
+        return depth, features, (torch.softmax(claim, 1) * estimate).sum(1)

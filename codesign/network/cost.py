@@ -70,6 +70,7 @@ def network(space: Space, architecture: Architecture) -> Cost:
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
     heads = (SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES) * SLIP_HIDDEN + SLIP_HIDDEN * (2 * SLIP_HIDDEN + 6)
+    heads += blur.content_macs(MASK_CHANNELS)
     return Cost(per_pixel, body.constant + heads, blur=True)
 
 

@@ -18,6 +18,7 @@ from codesign.batches import parallel
 from codesign.network import blur
 from codesign.network.architecture import Architecture, Block, Space, blocks, largest, stem_channels
 from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
+from codesign.network.running import RunningNorm
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
@@ -136,7 +137,7 @@ class ElasticBlock(nn.Module):
 
 
 class PerceptionHead(nn.Module):
-    """Pupil mask from the last features of every stride, added up from coarse to fine."""
+    """Pupil mask from the last features of every stride, added up from coarse to fine; and what it is decoded from."""
 
     def __init__(self, channels: list[int]) -> None:
         super().__init__()
@@ -144,13 +145,13 @@ class PerceptionHead(nn.Module):
         self.smooth = SlicedConv(MASK_CHANNELS, MASK_CHANNELS, 3, depthwise=True)
         self.mask = nn.Conv2d(MASK_CHANNELS, 1, 1)
 
-    def forward(self, features: list[Tensor]) -> Tensor:
+    def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor]:
         total = F.hardswish(self.laterals[-1](features[-1], MASK_CHANNELS))
         for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
             total = F.interpolate(total, size=feature.shape[-2:], mode="nearest")
             total = total + F.hardswish(lateral(feature, MASK_CHANNELS))
-        logits: Tensor = self.mask(F.hardswish(self.smooth(total, MASK_CHANNELS, kernel=3)))
-        return logits[:, 0]
+        decoded = F.hardswish(self.smooth(total, MASK_CHANNELS, kernel=3))
+        return self.mask(decoded)[:, 0], decoded
 
 
 class CalibrationHead(nn.Module):
@@ -191,7 +192,7 @@ class Supernet(nn.Module):
         self.stages = nn.ModuleList(nn.ModuleList(ElasticBlock(b) for b in row) for row in rows)
         self.perception = PerceptionHead([rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)])
         self.calibration = CalibrationHead(rows[-1][-1].outputs)
-        self.blur = blur.BlurBranch(SlicedNorm(blur.FEATURES))
+        self.blur = blur.InformedBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
         seen = scaled(frames, architecture.resolution)
@@ -203,9 +204,10 @@ class Supernet(nn.Module):
                 x = module(x, block)
             if i in kept:
                 features.append(x)
-        logits = self.perception(features)
-        depth, told = self.blur(seen)
+        logits, decoded = self.perception(features)
+        depth, told, axial = self.blur(seen, decoded)
         slip, spread = self.calibration(x, told)
+        slip = slip + F.pad(axial[:, None], (2, 0))
         return Prediction(logits, soft_argmax(logits), slip, depth, spread)
 
     def counts(self, architecture: Architecture, sizes: Array) -> Array:
@@ -250,9 +252,12 @@ def soft_argmax(logits: Tensor) -> Tensor:
 def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]) -> None:
     """Measure the batch statistics of one architecture from a reset, on fixed batches; leaves eval mode.
 
+    Running means (:class:`codesign.network.running.RunningNorm`) belong to all architectures and stay.
+
     Raises:
         TrainingError: no batch was given.
     """
+    net.eval()
     norms = [m for m in net.modules() if isinstance(m, SlicedNorm)]
     for norm in norms:
         norm.mean.zero_()
@@ -269,7 +274,6 @@ def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Te
             norm.measuring = False
     if count == 0:
         raise TrainingError("recalibration needs at least one batch of frames, found none")
-    net.eval()
 
 
 def modules_of(stage: nn.Module) -> Iterator[Any]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from codesign.batches import Batch, Flat, PoolScenes, Scenes, depth_um, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, blur, cost, losses, smallest
+from codesign.network import Architecture, Baseline, blur, cost, losses, running, smallest
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train.ahead import Ahead
@@ -195,6 +195,7 @@ class Trainer:
 
     def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
         """A step of every optimiser on what is given."""
+        means = running.kept(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
         total, macs = task + self.inner.optics_weight * optics_loss, each.mean()
@@ -203,7 +204,10 @@ class Trainer:
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.step, self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
-        self._apply(rates, finite=math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite())
+        finite = math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite()
+        if not finite:
+            running.put_back(means)
+        self._apply(rates, finite=finite)
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
         loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of([float(v.detach()) for v in values])
