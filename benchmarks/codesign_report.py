@@ -34,8 +34,8 @@ scores 1.67 mm. Equal frames, network, noise and schedule for every lens.
   100 electrons. `p9dim`: 400 electrons. `p9field`: 10 degrees off axis. `p18small`: `p18long` with half the width.
   `p18nvgaze`, `p18popovic`, `p18de2gaze`: `p18long` with the networks of those papers in place of ours. `p9wide`:
   networks of `p9` tested on four times as many frames. `p18blur`, `p18blurlong`: `p18` and `p18long` with the
-  branch that reads blur and half the backbone's width, in steps of 8 frames that are each rendered anew; other cases:
-  networks without the branch, and a pool of 4096 frames.
+  branch that reads blur and half the backbone's width, in steps of 8 frames that are each rendered anew (`p18blur16`:
+  16); other cases: networks without the branch, and a pool of 4096 frames.
 
 Ratios with 95 % intervals of a paired bootstrap over pairs of frames and over runs; with one seed, over frames alone.
 The best focus is the fixed lens of one focus (`hyperF`, `obliqueF`) of least error on natural frames. Made by

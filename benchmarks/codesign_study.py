@@ -75,6 +75,7 @@ CASES = {
     "p9": Case(9.0),
     "p18": Case(18.0),
     "p18blur": Case(18.0, steps=3200, width=0.25, depth=3, batch=8, fresh=True),
+    "p18blur16": Case(18.0, steps=1600, width=0.25, depth=3, batch=16, fresh=True),
     "p18blurlong": Case(18.0, steps=9600, width=0.25, depth=3, batch=8, fresh=True),
     "p18long": Case(18.0, steps=2400),
     "p18dim": Case(18.0, electrons=100.0),
