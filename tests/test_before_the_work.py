@@ -175,6 +175,13 @@ def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(inputs, monk
     assert "--led-fwhm-nm -1: need 0 or more" in capsys.readouterr().err
 
 
+def test_options_that_would_do_nothing_are_refused(inputs, capsys):
+    assert main(["export", "lens.h5", "-o", "o.npz", "--samples", "31"]) == BAD_INPUT
+    assert "--samples 31: counts the points of a .dat" in capsys.readouterr().err
+    assert main(["check", "mask.gds", "--ignore", "-3"]) == BAD_INPUT
+    assert "--ignore -3: need numbers of layers" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("verb", ["library", "study", "capture", "layout"])
 def test_no_command_begins_where_its_workers_cannot_be_had(inputs, monkeypatch, capsys, verb):
     words, work = NEEDS[verb]

@@ -45,6 +45,8 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Check the mask; exit 1 where a rule is broken."""
+    if min(options.ignore, default=0) < 0:
+        raise MaskFileError(f"--ignore {min(options.ignore)}: need numbers of layers, 0 or more")
     process = processes.Process() if options.process is None else processes.load(options.process)
     if not options.mask.is_file():
         raise MaskFileError(f"{options.mask}: {reading.absent(options.mask)}; need a GDSII or OASIS mask")

@@ -8,6 +8,7 @@ import tyro
 from metalens import lens
 from metalens.commands.common import Common, Output
 from metalens.ground import transaction
+from metalens.ground.errors import LensError
 from metalens.lens import export
 
 
@@ -30,6 +31,8 @@ class Options(Common):
 def run(options: Options) -> int:
     """Write the file; exit 0."""
     export.check(options.output)
+    if options.samples != Options.samples and options.output.suffix.lower() in export.ARRAYS:
+        raise LensError(f"--samples {options.samples}: counts the points of a .dat; arrays hold every pillar")
     with options.claim(options.output) as draft:
         made = lens.load(options.lens)
         grid = options.output.suffix.lower() == export.GRID

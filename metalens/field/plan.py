@@ -302,7 +302,10 @@ class _Known:
         missing = [i for i in places if i not in self.kept]
         if missing:
             found = self.at(torch.tensor(missing, dtype=torch.float64))
-            self.kept.update(zip(missing, found / found.sum((-1, -2), keepdim=True), strict=True))
+            light = found.sum((-1, -2), keepdim=True)
+            if not bool((light > 0).all()):
+                raise SceneError("a PSF has no light within its window at some place, depth or wavelength of the scene")
+            self.kept.update(zip(missing, found / light, strict=True))
         return torch.stack([self.kept[i] for i in places])
 
 

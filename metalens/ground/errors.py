@@ -87,7 +87,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 EXTRAS = {
     "torch": "optics",
-    "colour": "optics",
     "nlopt": "optics",
     "astropy": "fits",
     "cv2": "bench",

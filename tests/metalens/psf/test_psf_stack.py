@@ -1,6 +1,7 @@
 """The PSF record: normalisation, angles, wavelengths, files, pixels, metrics; answers in closed form."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import propagate, psf
-from metalens.ground.errors import PropagationError, StoreError
+from metalens.ground.errors import MaterialError, PropagationError, StoreError
 from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
@@ -185,6 +186,27 @@ def test_diode_line_has_its_peak_and_width():
     assert half[-1] - half[0] == pytest.approx(0.03, abs=6e-4)
     thin = spectrum.weight(spectrum.Source(850.0, 30.0))[1]
     assert (thin * um).sum() < (share * um).sum()  # thin silicon sees less of the red side
+
+
+@pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(633.4, 0.1), (940.0, 1e-3), (850.3, 2.3)])
+def test_a_narrow_line_keeps_its_peak_and_width(peak_nm, fwhm_nm):
+    """Cut at 2.5 FWHM a Gaussian loses 4e-9; silicon, below 2 % a nm, moves the mean by that times its variance."""
+    um, share = spectrum.weight(spectrum.Source(peak_nm, fwhm_nm))
+    mean = (um * share).sum() * 1e3
+    sigma = fwhm_nm / math.sqrt(8 * math.log(2))
+    assert mean == pytest.approx(peak_nm, abs=0.02 * sigma**2 + 1e-9)
+    assert math.sqrt(((um * 1e3 - mean) ** 2 * share).sum()) == pytest.approx(sigma, rel=2e-4)
+
+
+def test_a_line_narrower_than_any_lens_resolves_is_refused():
+    with pytest.raises(PropagationError, match=r"fwhm_nm=1e-300.* one wavelength"):
+        spectrum.Source(850.0, 1e-300)
+
+
+@pytest.mark.parametrize(("fwhm_nm", "word"), [(250.0, "Si at 0.225 um"), (1e9, "wavelength")])
+def test_a_line_beyond_the_data_of_silicon_is_refused(fwhm_nm, word):
+    with pytest.raises(MaterialError, match=word):
+        spectrum.weight(spectrum.Source(850.0, fwhm_nm))
 
 
 def test_as_many_wavelengths_as_the_tolerance_needs():
