@@ -84,7 +84,7 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     Raises:
         LensError: the run's lens is another than the one given.
     """
-    setting = replace(setting or TaskSetting(), sensor_distance_um=lens.sensor_distance_um)
+    setting = replace(setting or TaskSetting(), sensor_distance_um=lens.reduced_um)  # as the true image maps directions
     eyes, aperture, n = task.views(setting), Aperture(lens), given.numerics
     finest = Numerics(
         min(2 * n.depth_count, 64),

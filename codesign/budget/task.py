@@ -36,7 +36,7 @@ class TaskSetting:
     scenes: eyes, from ``seed``. pixels: along a side, of ``pitch_um``; margin: rendered beyond them.
     sensor: noise and exposure; its own pitch is replaced by ``pitch_um``.
     mismatch: share of the light of a pixel by which no subject of the population looks like the one that is seen.
-    sensor_distance_um: of the lens.
+    sensor_distance_um: of the lens, behind films the reduced one.
     pitch_um: of the sensor's pixels. seed: of the eyes.
     """
 

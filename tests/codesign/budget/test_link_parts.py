@@ -220,7 +220,7 @@ def test_numerics_change_one_setting_of_the_finest_each(monkeypatch):
 )
 def test_the_finest_numerics_are_twice_the_depths_and_ten_times_the_tolerances(monkeypatch, numerics, fwhm, want):
     made = {}
-    lens = SimpleNamespace(sensor_distance_um=1900.0, wavelength_um=0.81, layers="layers")
+    lens = SimpleNamespace(sensor_distance_um=1900.0, reduced_um=1733.0, wavelength_um=0.81, layers="layers")
     eyes = SimpleNamespace(depths_um=(15e3, 31e3))
     monkeypatch.setattr(task, "views", lambda setting: eyes)
     aperture = SimpleNamespace(designed=lambda: "t", maps=lambda table: ("phase", "level"))
@@ -236,7 +236,7 @@ def test_the_finest_numerics_are_twice_the_depths_and_ten_times_the_tolerances(m
     assert (got.finest.depth_count, got.finest.wavelength_count) == (want.depth_count, want.wavelength_count)
     assert got.finest.psf_tolerance == pytest.approx(want.psf_tolerance)
     assert got.finest.basis_tolerance == pytest.approx(want.basis_tolerance)
-    assert got.setting.sensor_distance_um == 1900.0
+    assert got.setting.sensor_distance_um == 1733.0  # the eyes are seen as behind the films
     grid = made["grid"]
     assert (grid.samples, grid.step_um, grid.depths_um) == ((44, 44), 13.0, (15e3, 31e3))
     assert (grid.margin, grid.window) == (7, 15)
