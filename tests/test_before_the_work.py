@@ -66,7 +66,7 @@ NEEDS = {
     "field": ("cell.toml --diameter-um 0.12", "metalens.commands.field:near_fields"),
     "design": ("design.toml", "metalens.commands.design:_make"),
     "psf": ("lens.h5", "metalens.commands.psf:_make"),
-    "export": ("lens.h5 --samples 9", "metalens.lens.export:write"),
+    "export": ("lens.h5", "metalens.lens.export:write"),
     "scene": ("scene.toml", "codesign.commands.scene:_make"),
     "layout": ("lens.h5", "layout.commands.make:_prepare"),
     "capture": ("lens.h5 --truth truth.toml", "characterize.bench.bench:shoot"),

@@ -87,7 +87,7 @@ def test_a_bar_above_the_tolerance_is_a_failure(here, monkeypatch, capsys):
     [
         ("--samples 7", "samples = 7: need 8 to 400"),
         ("--around-um -1", "around_um = -1"),
-        ("--heights-um nan", "heights_um = [nan]"),
+        ("--heights-um nan", "--heights-um nan: need a finite number"),
         ("--wavelength-nm 0", "wavelength_um = 0.0"),
         ("--angle-deg 90", "need finite angles"),
         ("--diameter-um 0.5", "touches its neighbour"),
