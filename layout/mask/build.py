@@ -76,7 +76,7 @@ def prepare(
         lattices=(lattice,),
         unit_nm=UNIT_NM,
         grid=process.rules.grid_nm,
-        layer_names={process.layers.pillar: "pillar"},
+        layer_names={process.layers.pillar: _word(source)},
         doses={process.layers.pillar: 1.0},
         axis=axis,
     )
@@ -92,6 +92,11 @@ def prepare(
         bare, solution = dosed.corrected(bare, process)
     _check_layers(bare, process)
     return MadePlan(bare, found, solution, radius_um)
+
+
+def _word(source: Lens | DiameterMap) -> str:
+    """What the drawn shapes of a lens are called."""
+    return "opening" if isinstance(source, Lens) and source.cell.shape.hole else "pillar"
 
 
 def surroundings(

@@ -1,7 +1,8 @@
 """Pillars that are not round, or turned one by one: a class for every drawn size and turn.
 
-All edges of a pillar move alike, by the bias of the process at its size; its turn is rounded to a step, its corners to
-the grid. Rounding of the corners by the etch is not made up for.
+Of a film with openings the openings are drawn. All edges of a pillar (or opening) move alike, by the bias of the
+process at its size; its turn is rounded to a step, its corners to the grid. Rounding of the corners by the etch is not
+made up for.
 """
 
 import math
@@ -25,6 +26,7 @@ from metalens.pillars.axes import sized
 _BLOCK_SITES = 1 << 20
 _FLAT = 1e-9
 _LENGTHS = 1 << 20  # above any drawn size in nm
+_TABLED = 1 << 20  # keys below are counted and numbered by a table, others by sorting
 
 
 def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, tuple[PillarClass, ...]]:
@@ -39,7 +41,7 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
     turns = _turns(cell, d, process)
     counts: dict[int, int] = {}
     for _, block in _keys(d, process, turns):
-        for key, count in zip(*np.unique(block, return_counts=True), strict=True):
+        for key, count in zip(*_counted(block), strict=True):
             counts[int(key)] = counts.get(int(key), 0) + int(count)
     used = np.array(sorted(key for key in counts if key), np.int64)
     if not len(used):
@@ -49,10 +51,7 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
             f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
         )
     kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
-    numbered = (
-        (first, np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind))
-        for first, block in _keys(d, process, turns)
-    )
+    numbered = ((first, _numbered(block, used, kind)) for first, block in _keys(d, process, turns))
     sites = hold(d.diameter_um.shape, kind, numbered)
     made = tuple(_class(cell, int(key), process, turns, unit_nm) for key in used)
     across = np.array([2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made])
@@ -65,7 +64,7 @@ def _check(cell: Cell, process: Process) -> None:
     corners = outline.parts[0].vertices(32)
     edge = np.roll(corners, -1, axis=0) - corners
     bend = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
-    if len(outline.parts) > 1 or bend.min() < -_FLAT or getattr(cell.shape, "hole", False):
+    if len(outline.parts) > 1 or bend.min() < -_FLAT:
         raise ProcessError(
             f"a mask of {cell.described}: pillars are drawn in one part without hollows (the rules are checked between "
             "convex shapes); need a circle, square, rectangle, ellipse, or a convex polygon"
@@ -101,6 +100,24 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
             degrees = np.degrees(np.asarray(d.angle_rad[first : first + size], float))
             turn = np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
         yield first, np.where(design > 0, drawn * turns + turn, 0)
+
+
+def _counted(block: Array) -> tuple[Array, Array]:
+    """Keys of a block, ascending, and how often each stands in it."""
+    if block.max(initial=0) >= _TABLED:
+        return np.unique(block, return_counts=True)
+    found = np.bincount(block.ravel())
+    keys = np.flatnonzero(found)
+    return keys, found[keys]
+
+
+def _numbered(block: Array, used: Array, kind: np.dtype[Any]) -> Array:
+    """Place of every key among those in use, from 1; 0 for no pillar."""
+    if used[-1] >= _TABLED:
+        return np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind)
+    table = np.zeros(used[-1] + 1, kind)
+    table[used] = np.arange(1, len(used) + 1)
+    return table[block]
 
 
 def _steps(size_nm: Array, design_nm: Array, process: Process) -> Array:

@@ -9,13 +9,13 @@ import pytest
 from layout.files import verify
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
-from layout.mask import build
+from layout.mask import build, shaped
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from layout.rules import check as drc
 from metalens.cell import Cell, Lattice
-from metalens.cell.shapes import Cross, Ellipse, Rectangle, Ring, Square
+from metalens.cell.shapes import Circle, Cross, Ellipse, Rectangle, Ring, Square
 from metalens.ground.errors import ProcessError
 from metalens.lens import DiameterMap, Lens, Pairs
 from metalens.pillars import Proxy
@@ -192,3 +192,27 @@ def test_what_is_not_drawn_is_refused_by_name(made, change, words):
 def test_a_step_of_turns_divides_half_a_turn():
     with pytest.raises(ProcessError, match="angle_step_deg"):
         processes.Rules(angle_step_deg=7.0)
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+@pytest.mark.parametrize("open_", [Square(hole=True), Circle(hole=True), Ellipse(0.7, 0.4, hole=True)])
+def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(open_, suffix, tmp_path):
+    plan, found = written(lens(open_, turned=False), tmp_path, suffix)
+    size = 0.24e3  # nm, drawn as it is: the default process has no bias
+    area = {"square": 1.0, "circle": math.pi / 4, "ellipse": math.pi / 4 * 0.7}[open_.kind] * size**2
+    assert len(found) == (lens(open_, turned=False).diameters.diameter_um > 0).sum()
+    for *_, corners in found:
+        x, y = corners.T
+        shoelace = abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
+        # corners on a grid of 1 nm: half a unit along at most four edges of 240 nm, and the n-gon's area for arcs
+        assert shoelace == pytest.approx(area, rel=0.01)
+    assert plan.layer_names[1, 0] == "opening"
+    assert drc.check(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok is False  # walls of 160 to 240 nm
+
+
+def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypatch):
+    table = build.plan(lens(), PROCESS, furnished=False)
+    monkeypatch.setattr(shaped, "_TABLED", 0)
+    by_sorting = build.plan(lens(), PROCESS, furnished=False)
+    assert [c.name for c in table.classes] == [c.name for c in by_sorting.classes]
+    np.testing.assert_array_equal(table.lattices[0].whole(), by_sorting.lattices[0].whole())
