@@ -21,7 +21,7 @@ from metalens.propagate.paths import from_source, to_sensor
 LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  # of rows, of columns
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
 ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding of the path itself
-ROUNDED = 2e-14  # of the longest path: what the polynomials' coefficients round to in float64 (up to 1.3e-14 was found)
+ROUNDED = 5e-15  # of the longest path: what path and polynomial round to in float64 (up to 3.5e-15 was found)
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
 PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
 TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
@@ -141,10 +141,17 @@ def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
 
 
 def _powers(case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int) -> Array:
-    """(block, order, x) power coefficients of the carrier in turns along the rows of blocks at ``rows`` middles."""
+    """(block, order, x) power coefficients of the carrier in turns along the rows of blocks at ``rows`` middles.
+
+    Of the differences to the middle node, u = 0: the transform would round thousands of turns that all nodes share, by
+    its large entries.
+    """
     u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
     values = carrier_turns(case, reference, x, rows[0] + rows[1] * u[:, None])
-    return np.asarray(_to_powers(order) @ values)
+    middle = values[..., order // 2 : order // 2 + 1, :]
+    found = np.asarray(_to_powers(order) @ (values - middle))
+    found[..., :1, :] += middle
+    return found
 
 
 @functools.cache
