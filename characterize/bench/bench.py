@@ -177,20 +177,26 @@ class _Task:
 
 @dataclass(eq=False, slots=True)
 class _Made:
-    """The hidden lens; light of its pillars for the colour and incidence that were asked for last is kept."""
+    """The hidden lens; light of its pillars for the colour and incidence that were asked for last is kept.
+
+    noise_um: (y, x) errors of the diameters, drawn by whoever needs them first: a seed travels lighter than a map.
+    """
 
     lens: Lens
     truth: Truth
     response: Sensitivity
     kept: tuple[tuple[bytes, float], Array] | None = None
+    noise_um: Array | None = None
 
     def pillars(self, x: Array, incidence_rad: float) -> Array:
         """(y, x) complex transmission."""
         key = x.tobytes(), incidence_rad
         if self.kept is None or self.kept[0] != key:
-            noise = np.random.default_rng(self.truth.seed + 1).standard_normal(self.lens.diameters.diameter_um.shape)
-            noise *= self.truth.diameter_noise_nm * 1e-3
-            t = made.pillars(self.lens, self.response, x, noise_um=noise, angle_rad=incidence_rad)
+            if self.noise_um is None:
+                random = np.random.default_rng(self.truth.seed + 1)
+                noise = random.standard_normal(self.lens.diameters.diameter_um.shape)
+                self.noise_um = np.asarray(noise) * (self.truth.diameter_noise_nm * 1e-3)
+            t = made.pillars(self.lens, self.response, x, noise_um=self.noise_um, angle_rad=incidence_rad)
             self.kept = key, t
         return self.kept[1]
 
