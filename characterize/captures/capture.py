@@ -169,7 +169,7 @@ def _load_file(path: Path) -> Capture:
         position if len(position) == n else np.full(n, np.nan),
         np.zeros((n, 2)),
         np.full(n, np.nan),
-        tuple(f"{path.name}[{i}]" for i in range(n)),
+        tuple(f"{reading.shown(path.name)}[{i}]" for i in range(n)),
         bits,
         pixel_um=about.pop("pixel_um", tags.pixel_um),
         wavelength_um=about.pop("wavelength_um", math.nan),
@@ -222,7 +222,7 @@ def _all_frames(files: Sequence[Path], folder: Path, channel: object) -> tuple[t
         images = read_images(path, channel)
         names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
         stacks.append(images)
-    return tuple(names), _join(stacks, files)
+    return tuple(map(reading.shown, names)), _join(stacks, files)
 
 
 def _listed_frames(folder: Path, rows: stage.Rows, channel: object) -> Array:

@@ -19,7 +19,7 @@ from metalens import lens as lenses
 from metalens.design import Focus
 from metalens.design.free_form import Fisher, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Figure, Section, write
 from metalens.lens import Lens
@@ -46,7 +46,7 @@ def run(options: Options) -> int:
     if options.scenes is not None:
         settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
     made = [lenses.load_plain(path) for path in options.lenses]
-    names = distinct([path.stem for path in options.lenses])
+    names = distinct([reading.shown(path.stem) for path in options.lenses])
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)

@@ -12,7 +12,7 @@ from codesign.adapt import train as retraining
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
 from codesign.optics import formed
-from metalens.ground import report, store
+from metalens.ground import reading, report, store
 from metalens.ground.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
@@ -55,7 +55,7 @@ def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
 
 def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
     """Names of the folders, numbered where they repeat."""
-    stems = [path.resolve().name for path in paths]
+    stems = [reading.shown(path.resolve().name) for path in paths]
     return tuple(s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems))
 
 

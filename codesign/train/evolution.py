@@ -118,7 +118,7 @@ def affordable(space: Space, count: Count, budget: float) -> None:
     least = count(smallest(space))
     if least > budget:
         raise TrainingError(
-            f"budget of {budget / 1e6:.1f} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
             "raise the budget or the pixel pitch"
         )
 

@@ -102,7 +102,7 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except ValueError as error:  # of TOML, or an integer of thousands of digits
-        raise ConfigError(f"{where}: not valid TOML: {error}") from None
+        raise ConfigError(f"{where}: not valid TOML: {str(error).partition('; use sys')[0]}") from None
     except RecursionError:
         raise ConfigError(f"{where}: not valid TOML: nested too deep") from None
 

@@ -235,9 +235,23 @@ def _child(read: Callable[[], object], room: int, into: int) -> None:
         _limit(room)
         read()
     except BaseException as error:  # noqa: BLE001 (told to the parent)
-        os.write(into, f"{type(error).__name__}\n{error}".encode("utf-8", "backslashreplace")[:_MOST_WORDS])
+        os.write(into, shown(f"{type(error).__name__}\n{error}").encode()[:_MOST_WORDS])
     finally:
         os._exit(0)
+
+
+def shown(text: str) -> str:
+    """A text whose every character is one of UTF-8, of one that may hold names of files in bytes of no known locale.
+
+    Python keeps such bytes as lone surrogates. Where they are UTF-8 they become what they stand for; others, codes.
+
+    >>> shown("gr\\udcc3\\udcb6sse \\udcff")
+    'grösse \\\\xff'
+    """
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # surrogates that stand for no byte
+        return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _limit(room: int) -> None:

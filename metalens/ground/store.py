@@ -120,7 +120,7 @@ def _umask() -> int:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file (UTF-8) whole or not at all."""
-    write_bytes(path, text.encode())
+    write_bytes(path, reading.shown(text).encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
@@ -140,7 +140,7 @@ def append_line(path: Path, line: str) -> None:
         if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
             file.seek(0)
             file.truncate(file.read().rfind(b"\n") + 1)
-        file.write(line.encode() + b"\n")
+        file.write(reading.shown(line).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
@@ -296,7 +296,7 @@ def _write(
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
     if array.dtype.kind == "U":
-        encoded = np.char.encode(array, "utf-8")
+        encoded = np.array([reading.shown(text).encode() for text in array.flat], "S").reshape(array.shape)
         array = encoded.astype(h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1)))
     if array.nbytes <= _SMALL:
         inside = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -312,7 +312,7 @@ def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> No
 def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
     """Text goes in at its own length, inside the header; text of any length would lie apart, without a checksum."""
     if isinstance(value, str):
-        encoded = value.encode()
+        encoded, name = reading.shown(value).encode(), reading.shown(name)
         item.attrs.create(name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1)))
     else:
         item.attrs[name] = value
