@@ -17,13 +17,13 @@ def _place() -> Path:
     return Path(home) / "metalens-hardness"
 
 
-def inputs(texts: dict[str, str]) -> Path:
-    """Folder of the inputs that are made from these settings."""
-    return _place() / f"inputs-{_short(_bytes(texts))}"
+def inputs(of: str) -> Path:
+    """Folder of the inputs that are made from these sources."""
+    return _place() / f"inputs-{of}"
 
 
 def sources(texts: dict[str, str]) -> str:
-    """What results depend on: the code that makes them and the settings."""
+    """What inputs and results depend on: the code that makes them and the settings."""
     code = [path for name in _PACKAGES for path in sorted((_ROOT / name).rglob("*.py"))]
     return _short(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in code) + _bytes(texts))
 

@@ -59,14 +59,15 @@ class Bench:
     def prepare(self) -> None:
         """Inputs, and the two whole results of every verb, kept aside; what an earlier bench made is taken from it."""
         texts = commands.settings(self.folder)
-        cached = kept.inputs(texts)
+        sources = kept.sources(texts)
+        cached = kept.inputs(sources)
         for words in commands.inputs(self.verbs):
             output = words.partition(" -o ")[2].split()[0]
             if not (self.folder / output).exists() and not kept.taken(cached / output, self.folder / output):
                 self._must(words)
                 kept.put(self.folder / output, cached / output)
+        commands.found(self.folder, self.verbs)
         commands.load(kept.modules())
-        sources = kept.sources(texts)
         for verb in [verb for verb in self.verbs if verb not in self.known]:
             about = kept.results(sources, verb, VERBS[verb][0])
             if not kept.taken(about, self.aside / verb):

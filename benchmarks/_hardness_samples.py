@@ -169,10 +169,11 @@ def _psf() -> psf.PsfStack:
     return psf.PsfStack(light, np.ones((1, 1)), *axis, 0.75, np.zeros((1, 2)), 2000.0, 1e-4, 1e-5, "x")
 
 
-def _asbuilt() -> asbuilt.AsBuilt:
+def asbuilt_of(design: Lens, response: Sensitivity) -> asbuilt.AsBuilt:
+    """What a fit might have found of a lens, written down by hand."""
     one, frames = np.ones(2), np.ones((2, 4, 4))
     return asbuilt.AsBuilt(
-        design=_lens(), response=Sensitivity(np.zeros((3, 6)), 0.15), names=("bias_nm", "height_nm"), value=one,
+        design=design, response=response, names=("bias_nm", "height_nm"), value=one,
         covariance=np.eye(2), information=np.eye(2), held={"index": 0.0}, depth_um=one, angle_rad=np.zeros((2, 2)),
         pixel_um=3.0, measured=frames, predicted=frames, nominal=frames, residual_sigma=frames, chi2_per_dof=1.0,
         converged=True, reason="made up",
@@ -184,7 +185,7 @@ def _artefacts(folder: Path) -> None:
     library.save(folder / "library" / "f.h5", _library())
     psf.save(folder / "psf" / "f.h5", _psf())
     psf.save(folder / "info" / "f.h5", _psf())
-    asbuilt.save(folder / "asbuilt" / "f.h5", _asbuilt())
+    asbuilt.save(folder / "asbuilt" / "f.h5", asbuilt_of(_lens(), Sensitivity(np.zeros((3, 6)), 0.15)))
     budgets.save(folder / "budget" / "f.h5", [Entry("grid", 0.1, 0.2, 1e-4, "rounded")], store.Provenance())
     light = np.zeros((1, 2, 4, 4), np.uint8)
     about = {"radiance": light, "coverage": light[:, 0], "depth_um": light.astype(np.uint16), "pupil": light[:, 0]}

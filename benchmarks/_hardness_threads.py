@@ -19,7 +19,8 @@ _VARIABLES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "M
 
 def differing(folder: Path) -> Iterator[tuple[str, list[str]]]:
     """(verb, files of its result that depend on the number of threads without its saying so)."""
-    for words in commands.inputs(folder, VERBS):
+    commands.settings(folder)
+    for words in commands.inputs(VERBS):
         _run(folder, words, 2)
     for verb in VERBS:
         words, output = commands.VERBS[verb]
