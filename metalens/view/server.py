@@ -1,13 +1,15 @@
 """Pages of a file or a folder that grows: served to this machine alone, made anew when what they show has changed."""
 
 import html
+import os
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
-from urllib.parse import quote, unquote, urlsplit
+from urllib.parse import quote, unquote_to_bytes, urlsplit
 
+from metalens.ground import reading
 from metalens.ground.errors import ConfigError, MetalensError, OutputError
 
 Make = Callable[[Path], str]
@@ -55,8 +57,8 @@ class Server(ThreadingHTTPServer):
         """The artefact that a page's path names; None: there is none."""
         if path == HOME:
             return self.root
-        named = {f"/{quote(one.relative_to(self.root).as_posix())}": one for one in self.listed()}
-        return named.get(quote(unquote(path)))
+        named = {f"/{_link(one.relative_to(self.root).as_posix())}": one for one in self.listed()}
+        return named.get(quote(unquote_to_bytes(path)))
 
     def page(self, path: str) -> str | None:
         """The page of a path, made anew if its files have changed; what cannot be read says why."""
@@ -98,7 +100,7 @@ class _Handler(BaseHTTPRequestHandler):
         if text is None:
             self.send_error(HTTPStatus.NOT_FOUND, "no artefact of this folder")
             return
-        content = text.encode()
+        content = reading.shown(text).encode()
         self.send_response(HTTPStatus.OK)
         for name, value in (("Content-Type", f"{kind}; charset=utf-8"), ("Content-Length", str(len(content))),
                             ("Cache-Control", "no-store"), ("Content-Security-Policy", _POLICY)):  # fmt: skip
@@ -144,8 +146,13 @@ def serve(root: Path, make: Make, listed: Callable[[], list[Path]], *, port: int
 
 def _list(root: Path, listed: list[Path]) -> str:
     names = [one.relative_to(root).as_posix() for one in listed]
-    rows = "".join(f'<li><a href="/{quote(name)}">{html.escape(name)}</a></li>' for name in names)
+    rows = "".join(f'<li><a href="/{_link(name)}">{html.escape(name)}</a></li>' for name in names)
     return _plain(root.resolve().name, f"<p>{len(names)} to look at; the page follows the folder.</p><ul>{rows}</ul>")
+
+
+def _link(name: str) -> str:
+    """A name of a file, whatever its bytes, as part of an address."""
+    return quote(os.fsencode(name))
 
 
 def _plain(title: str, body: str) -> str:

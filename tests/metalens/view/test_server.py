@@ -73,6 +73,14 @@ def test_only_artefacts_of_the_folder_and_only_this_machine(tmp_path):
         assert _get(server, "/", host=f"localhost:{server.server_address[1]}")[0] == 200
 
 
+def test_a_file_whose_name_is_in_no_encoding_is_listed_and_shown(tmp_path):
+    inside = tmp_path / "gr\udcf6\udcdfe.h5"
+    inside.write_text("it")
+    with _served(tmp_path, lambda path: f"<body>{path.name} {path.read_text()}</body>", lambda: [inside]) as server:
+        assert '<a href="/gr%F6%DFe.h5">gr\\xf6\\xdfe.h5</a>' in _get(server, "/")[1]
+        assert _get(server, "/gr%F6%DFe.h5")[1].startswith("<body>gr\\xf6\\xdfe.h5 it")
+
+
 def test_a_file_half_written_is_said_and_shown_when_it_is_whole(tmp_path):
     file = tmp_path / "lens.h5"
     _lens(file, 0.2)
