@@ -92,6 +92,9 @@ VIEWS = {
 # and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``
 TOLD = {"mask": "layout.commands.info"}
 
+# files that a verb reads a part of, and who knows the whole: "module:function" that refuses it
+WHOLE = {"budget": {"process": "layout.process.process:load"}, "retrain": {"process": "layout.process.process:load"}}
+
 _LARGEST = 1e9  # size of a number among options, in its unit
 _AGAIN_S = 0.02  # after which a dropped interrupt comes again
 _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
@@ -257,6 +260,10 @@ def _dispatch(verb: str, words: list[str]) -> int:
         console.silence()
         return SUCCESS
     _refuse_beyond_reach(options)
+    for name, where in WHOLE.get(verb, {}).items():
+        if getattr(options, name) is not None:
+            place, _, load = where.partition(":")
+            getattr(importlib.import_module(place), load)(getattr(options, name))
     work = importlib.import_module(getattr(module, "WORK", module.__name__))
     return int(work.run(options))
 

@@ -175,6 +175,17 @@ def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(inputs, monk
     assert "--led-fwhm-nm -1: need 0 or more" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", ["budget lens.h5 -o o.h5", "retrain run --asbuilt asbuilt.h5 -o o"])
+def test_a_process_is_refused_whole_by_those_who_read_a_part_of_it(inputs, capsys, words):
+    """A misspelt table would be a budget without it; the matrix of bad values holds the rest."""
+    for text, told in (("[spraed]\n", "unknown key 'spraed'; did you mean 'spread'?"), ("tone = 7\n", "tone")):
+        (inputs / "p.toml").write_text(text)
+        assert main([*words.split(), "--process", "p.toml"]) == BAD_INPUT
+        said = capsys.readouterr().err
+        assert said.startswith("metalens: error: p.toml: ")
+        assert told in said
+
+
 def test_options_that_would_do_nothing_are_refused(inputs, capsys):
     assert main(["export", "lens.h5", "-o", "o.npz", "--samples", "31"]) == BAD_INPUT
     assert "--samples 31: counts the points of a .dat" in capsys.readouterr().err
