@@ -26,9 +26,8 @@ from metalens.rcwa import anchored
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
-SEEN = 1e-3  # layer modes weaker than this over the height have no part in the error estimate by wavenumbers
 COMPARED, STEP = 2, 2.0  # rungs before, and times the change from them: for cells unlike those of lenses
-MOST = 8  # and of the others at most so many, the least decaying
+MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimate follows: the next move it by 1e-4
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -151,8 +150,7 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
     if any((half.admittance != other).any() for half, other in zip(halves, plain, strict=True)):
         other, _, ports, _ = matched(None)
         grazing = float(np.abs(matrix - other.matrix[ports][:, ports] * sign).max())
-    travelling = np.flatnonzero(np.abs(match.travel) > SEEN)
-    travelling = travelling[np.argsort(-(q[travelling] ** 2).real, kind="stable")][:MOST]
+    travelling = np.argsort(-(q**2).real, kind="stable")[:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
     moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
     moved = moved[:0] if magnetic else moved

@@ -263,6 +263,13 @@ def test_dose_test_layers_keep_clear_of_the_others():
         layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=layers))
 
 
+def test_doses_of_the_test_array_are_datatypes_of_one_layer():
+    """From 0.8 in steps of 0.05, on 16/20 and the eight that follow."""
+    plan = layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=Layers(dose=(16, 20))))
+    found = {made.layer: made.dose for made in plan.classes if made.layer[0] == 16}
+    assert found == pytest.approx({(16, 20 + k): 0.8 + 0.05 * k for k in range(9)})
+
+
 def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independent_reader_sees_them(tmp_path):
     """One pillar right of the axis and one at positive y, read back by KLayout: neither axis is mirrored."""
     db = pytest.importorskip("klayout.db")

@@ -211,6 +211,8 @@ def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
     assert thin.minimum_feature_nm == 20
     assert narrow.counts["gap"] == before.counts["gap"] + 1
     assert narrow.minimum_gap_nm == 35
+    for found, rule, limit in ((thin, "feature", 80), (narrow, "gap", 70)):
+        assert {v.limit for v in found.violations if v.rule == rule and "figures" in v.text} == {limit}
 
 
 def test_feet_that_nearly_meet_are_found():

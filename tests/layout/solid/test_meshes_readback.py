@@ -3,6 +3,7 @@
 The files themselves are read by strangers: lib3mf, the format's own library, and the glTF reader of the CAD kernel.
 """
 
+import dataclasses
 import json
 import re
 import struct
@@ -51,6 +52,46 @@ def test_3mf_is_whole_and_every_damage_is_told(tmp_path, pattern, text, told):
     assert differences_3mf(path, PILLARS) == ()
     edited(path, pattern, text)
     assert any(told in line for line in differences_3mf(path, PILLARS)), differences_3mf(path, PILLARS)
+
+
+@pytest.mark.parametrize(
+    ("unit", "um"),
+    [("micron", 1), ("millimeter", 1e3), ("centimeter", 1e4), ("meter", 1e6), ("inch", 25.4e3), ("foot", 12 * 25.4e3)],
+)
+def test_3mf_in_any_unit_of_the_format_is_the_same(tmp_path, unit, um):
+    path = tmp_path / "a.3mf"
+    mesh.write_3mf(path, PILLARS)
+    with zipfile.ZipFile(path) as file:
+        model = file.read("3D/3dmodel.model").decode()
+
+    def shorter(numbers):
+        return " ".join(repr(float(n) / um) for n in numbers.split())
+
+    model = model.replace('unit="micron"', f'unit="{unit}"')
+    model = re.sub(r' ([xyz])="([^"]*)"', lambda m: f' {m[1]}="{shorter(m[2])}"', model)
+    model = re.sub(r'(transform="1 0 0 0 1 0 0 0 1) ([^"]*)"', lambda m: f'{m[1]} {shorter(m[2])}"', model)
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("3D/3dmodel.model", model)
+    assert differences_3mf(path, PILLARS) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (dict(height_um=0.7 * (1 + 4e-6)), ""),  # six digits hold 5e-6 of a number
+        (dict(height_um=0.7 * (1 + 6e-6)), "high, planned 0 to 0.7"),
+        (dict(height_um=0.7 * (1 + 16e-6)), "volume"),  # a volume is of three
+        (dict(foot_um=PILLARS.foot_um * (1 + 1e-5)), ""),
+        (dict(foot_um=PILLARS.top_um, top_um=PILLARS.foot_um), "corners of its foot lie"),  # upside down: 1.25 wider
+        (dict(x_um=PILLARS.x_um + 0.8e-4), ""),
+        (dict(x_um=PILLARS.x_um + 1.2e-4), "a copy stands 0.00012 um off its place"),
+    ],
+)
+def test_a_plan_that_differs_by_more_than_the_digits_of_the_file_is_told(tmp_path, change, told):
+    path = tmp_path / "a.3mf"
+    mesh.write_3mf(path, PILLARS)
+    found = differences_3mf(path, dataclasses.replace(PILLARS, **change))
+    assert any(told in line for line in found) if told else found == ()
 
 
 def rewritten(path, edit):

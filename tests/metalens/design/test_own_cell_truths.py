@@ -70,6 +70,16 @@ def test_the_error_of_unlike_neighbours_adds_truncation_rows_and_a_fifth_of_the_
     assert len(counts) == 1
 
 
+@pytest.mark.parametrize(
+    ("aperture", "counts"),
+    [(0.93, (2, 3, 4)), (0.74, (3, 5, 6)), (0.45, (5, 8, 10)), (0.2, (6, 9, 12)), (3.0, (2, 3, 4))],
+)
+def test_three_rows_are_asked_for_from_the_zone_of_the_rim_to_half_its_slope(aperture, counts):
+    """Three fix a and b of 1 + a s + b s² with one to spare, whose absence is the error. Zones of the rim: 0.85 / 0.37
+    pitches over the sine; a row has two pillars or more, to tell both sides apart, and twelve at most."""
+    assert own_cell._counts(LENS, aperture) == counts
+
+
 def test_rough_neighbours_err_by_all_that_they_take():
     sine, weight = own_cell._rings(LENS, 80.0)
     factor = 1 + (0.057 - 0.289j) * sine + (-0.523 + 0.054j) * sine**2

@@ -198,9 +198,18 @@ def test_a_narrow_line_keeps_its_peak_and_width(peak_nm, fwhm_nm):
     assert math.sqrt(((um * 1e3 - mean) ** 2 * share).sum()) == pytest.approx(sigma, rel=2e-4)
 
 
-def test_a_line_narrower_than_any_lens_resolves_is_refused():
-    with pytest.raises(PropagationError, match=r"fwhm_nm=1e-300.* one wavelength"):
-        spectrum.Source(850.0, 1e-300)
+@pytest.mark.parametrize("fwhm_nm", [1e-300, 9.9e-4])
+def test_a_line_narrower_than_any_lens_resolves_is_refused(fwhm_nm):
+    with pytest.raises(PropagationError, match=rf"fwhm_nm={fwhm_nm}.* one wavelength"):
+        spectrum.Source(850.0, fwhm_nm)
+
+
+def test_the_narrowest_line_is_one_wavelength_to_a_lens_of_a_millimetre():
+    """Of 1 mm of path the contrast is 1 - (pi path width / wavelength²)² / (4 ln 2) = 1 - 6.8e-6."""
+    found = spectrum.nodes(spectrum.Source(850.0, 1e-3), path_um=1e3, tolerance=1e-5)
+    assert found.wavelengths_um == pytest.approx([0.85], abs=1e-8)
+    turn = math.pi * 1e3 * 1e-6 / 0.85**2
+    assert found.error == pytest.approx(turn**2 / (4 * math.log(2)), rel=0.02)
 
 
 @pytest.mark.parametrize(("fwhm_nm", "word"), [(250.0, "Si at 0.225 um"), (1e9, "wavelength")])
