@@ -71,6 +71,11 @@ def _reopen(handle: int, path: str) -> None:
     os.close(other)
 
 
+def size(folder: Path) -> int:
+    """Bytes of all files below a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 def copied(folder: Path, place: Path, stem: str, *, linked: bool) -> None:
     """Copy what belongs to an output; link the rest, or copy that too."""
     for path in folder.iterdir():

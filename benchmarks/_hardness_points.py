@@ -34,7 +34,7 @@ SHARES = {"torn": 0.25, "signal": 1.0, "refused": 1.0, "full": 0.25, "second": 0
 DEAREST = 0.6  # seconds of work that any trial may take; dearer ones come as seldom as they take longer
 PATIENCE = 120.0
 ANEW, LEAST_ANEW = 40.0, 6  # seconds of runs of their own in a sweep, and the least number of them
-_DISK = 16 << 20
+_DISK = 16 << 20  # beside what is copied to it
 Answer = dict[str, Any]
 Strike = tuple[str, str, Callable[[], object], int]  # kind, how, what is done, bytes left of the disk (-1: all)
 
@@ -233,7 +233,7 @@ class Tracer:
         place = self.bench.folder.with_name(f"place{self.count}")
         place.mkdir()
         if spare >= 0:
-            mounts.memory(place, _DISK)
+            mounts.memory(place, _DISK + mounts.size(self.bench.folder))
         mounts.copied(self.bench.folder, place, Path(VERBS[self.verb][1]).stem, linked=spare < 0)
         if spare >= 0:
             self.bench.filler(spare, place)()
