@@ -3,6 +3,7 @@
 Every step draws its frames, architectures, noise and lens errors from the seed and the step's number alone, so a run
 that is stopped anywhere goes on bit for bit. Optics, pitch and weights have their own rates, clips and schedules: the
 gradients of phase coefficients are a hundred times smaller than those of weights, and one shared clip never acts.
+The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`), on the schedule of the weights.
 """
 
 import math
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from codesign.batches import Batch, Flat, PoolScenes, Scenes, depth_um, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, blur, cost, losses, running, smallest
+from codesign.network import Architecture, Baseline, blur, cost, losses, running, smallest, soap
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train.ahead import Ahead
@@ -129,13 +130,18 @@ class Trainer:
         self.light = Light(
             optics, stacks, refresh=inner.refresh, draws=inner.draws, seed=inner.seed, draw=self._lens_error
         )
+        reading = soap.layers(made.net)
+        others = [p for p in made.net.parameters() if all(p is not q for q in reading)]
         self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
-            "weights": (inner.weights, list(made.net.parameters())),
+            "weights": (inner.weights, others),
+            "reading": (inner.weights, reading),
             "optics": (inner.optics, [made.coefficients_rad] if made.coefficients_rad.numel() else []),
             "pitch": (inner.pitch, [made.log_pitch]),
         }
-        self.optimisers = {
-            name: torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True)
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            name: soap.Soap(parameters, weight_decay=0.01)
+            if name == "reading"
+            else torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True)
             for name, (_, parameters) in self.groups.items()
             if parameters
         }

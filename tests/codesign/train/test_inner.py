@@ -245,4 +245,4 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
 def test_only_the_weights_of_the_network_decay():
     """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would shrink."""
     decay = {name: made.param_groups[0]["weight_decay"] for name, made in _trainer().optimisers.items()}
-    assert decay == {"weights": 0.01, "optics": 0.0, "pitch": 0.0}
+    assert decay == {"weights": 0.01, "reading": 0.01, "optics": 0.0, "pitch": 0.0}

@@ -1,0 +1,135 @@
+"""Adam along the eigenvectors of a layer's gradients: what turning buys, what it leaves alone, and that it resumes."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from codesign.network import soap
+from codesign.network.architecture import Space
+from codesign.network.soap import GATHER, LEAST, TURN, Soap
+from codesign.network.supernet import Supernet
+
+
+def _gradients(count, shape=(9, 13), seed=3):
+    """Gradients whose rows and columns go together, of no symmetry."""
+    draw = np.random.default_rng(seed)
+    left, right = (draw.normal(size=(n, n)) * np.geomspace(1, 0.05, n) for n in shape)
+    made = [left @ draw.normal(size=shape) @ right.T + 0.3 * draw.normal(size=shape) for _ in range(count)]
+    return [torch.tensor(g, dtype=torch.float32) for g in made]
+
+
+def _moved(gradients, weight, **settings):
+    optimiser = Soap([weight], **settings)
+    for gradient in gradients:
+        weight.grad = gradient.clone()
+        optimiser.step()
+    return optimiser
+
+
+def test_it_moves_as_the_formulas_of_its_heading_by_numpy_in_double_precision():
+    """Directions by orthogonal iteration, written anew: of a conv's weight too, whose trailing sides are 1."""
+    gradients, lr, decay = _gradients(2 * TURN + 3), 0.013, 0.21
+    weight = nn.Parameter(torch.linspace(-1.3, 2.1, 117).view(9, 13, 1, 1).clone())
+    want = weight.detach().double().numpy()[..., 0, 0].copy()
+    _moved([g[..., None, None] for g in gradients], weight, lr=lr, weight_decay=decay)
+    mean, square = np.zeros((9, 13)), np.zeros((9, 13))
+    moments, turns = [np.zeros((n, n)) for n in (9, 13)], [np.eye(n) for n in (9, 13)]
+    for count, one in enumerate(gradients, start=1):
+        g = one.double().numpy()
+        moments = [0.98 * m + 0.02 * new for m, new in zip(moments, (g @ g.T, g.T @ g), strict=True)]
+        if count in (GATHER, GATHER + TURN, GATHER + 2 * TURN):
+            for _ in range(10 if count == GATHER else 1):
+                turns = [
+                    np.linalg.qr((m + LEAST**2 * np.trace(m) / len(m) * np.eye(len(m))) @ q)[0]
+                    for m, q in zip(moments, turns, strict=True)
+                ]
+        mean = 0.9 * mean + 0.1 * g
+        if count > GATHER:
+            square = 0.98 * square + 0.02 * (turns[0].T @ g @ turns[1]) ** 2
+            spread = np.sqrt(square / (1 - 0.98 ** (count - GATHER)))
+            spread = spread + LEAST * np.sqrt(np.mean(spread**2)) + 1e-8
+            along = turns[0].T @ (mean / (1 - 0.9**count)) @ turns[1] / spread
+            want = want * (1 - lr * decay) - lr * turns[0] @ along @ turns[1].T
+    found = weight.detach().numpy()[..., 0, 0]
+    assert found == pytest.approx(want, abs=2e-4)  # single precision through 12 QRs; a step of all directions is 0.14
+
+
+def test_a_regression_on_inputs_that_rise_and_fall_together_is_learned_in_fewer_steps_than_by_adam():
+    """Inputs of condition 400 and an answer across the common direction: the least error there is, is 0."""
+    draw = torch.Generator().manual_seed(5)
+    common = torch.randn(4000, 1, generator=draw) * 10
+    inputs = common + torch.randn(4000, 24, generator=draw) * torch.linspace(0.3, 0.6, 24)
+    mix = torch.randn(24, 8, generator=draw)
+    wanted = (inputs - inputs.mean(1, keepdim=True)) @ mix
+
+    def error(make):
+        weight = nn.Parameter(torch.zeros(8, 24))
+        optimiser = make([weight])
+        for i in range(200):
+            part = slice(20 * i, 20 * i + 20)
+            optimiser.param_groups[0]["lr"] = 0.1 * (1 - i / 200)
+            optimiser.zero_grad()
+            (inputs[part] @ weight.T - wanted[part]).square().mean().backward()
+            optimiser.step()
+        return float((inputs @ weight.detach().T - wanted).square().mean() / wanted.square().mean())
+
+    turned, plain = error(Soap), error(lambda w: torch.optim.AdamW(w, betas=(0.9, 0.98), weight_decay=0.0))
+    assert turned < 0.25 * plain
+
+
+def test_a_step_along_every_direction_is_as_long_as_the_rate():
+    """Gradients of one direction a side, and a million times stronger: the step is the rate all the same."""
+    one = torch.outer(torch.linspace(0.5, -1.7, 11), torch.linspace(1.9, 0.3, 12)) * 3.7e-6
+    for scale in (1.0, 1e6):
+        weight = nn.Parameter(torch.zeros(11, 12))
+        _moved([scale * one] * (GATHER + 3), weight, lr=0.02)
+        assert float(weight.detach().norm()) == pytest.approx(3 * 0.02, rel=2e-3)  # LEAST: 1e-4; 1e-8 beside 1e-5: 1e-3
+
+
+def test_directions_are_orthogonal_and_found_from_fewer_gradients_than_a_side_has():
+    weight = nn.Parameter(torch.zeros(40, 90))
+    optimiser = _moved(_gradients(GATHER + TURN, (40, 90)), weight)
+    for side, size in (("left", 40), ("right", 90)):
+        turn = optimiser.state[weight][f"turn_{side}"]
+        assert (turn.T @ turn).numpy() == pytest.approx(np.eye(size), abs=1e-5)
+
+
+def test_a_weight_whose_gradients_are_zero_stays_and_a_wide_side_keeps_its_axes():
+    still, wide = nn.Parameter(torch.full((8, 9), 0.7)), nn.Parameter(torch.zeros(8, soap.WIDEST + 1))
+    _moved([torch.zeros(8, 9)] * (GATHER + TURN + 1), still, weight_decay=0.0)
+    assert torch.equal(still.detach(), torch.full((8, 9), 0.7))
+    optimiser = _moved(_gradients(GATHER + 1, wide.shape), wide)
+    assert "turn_left" in optimiser.state[wide]
+    assert "turn_right" not in optimiser.state[wide]
+
+
+def test_it_goes_on_to_the_same_bytes_from_what_it_tells():
+    gradients = _gradients(GATHER + TURN + 4)
+    whole, part = (nn.Parameter(torch.linspace(0, 1, 117).view(9, 13).clone()) for _ in range(2))
+    _moved(gradients, whole, lr=0.01)
+    state = copy.deepcopy(_moved(gradients[:9], part, lr=0.01).state_dict())
+    going = Soap([part])
+    going.load_state_dict(state)
+    for gradient in gradients[9:]:
+        part.grad = gradient.clone()
+        going.step()
+    assert torch.equal(part, whole)
+
+
+def test_the_layers_are_the_dense_ones_that_every_member_uses_whole():
+    net = Supernet(Space(widths=(0.5,), depths=(2,), expansions=(3,), kernels=(3,), resolution=(1.0,)))
+    names = {id(p): name for name, p in net.named_parameters()}
+    assert [names[id(p)] for p in soap.layers(net)] == [
+        "blur.first.weight", "blur.around.0.mix.weight", "blur.around.1.mix.weight", "blur.second.weight",
+        "blur.depth.weight", "blur.content.weight", "calibration.hidden.weight", "calibration.depths.weight",
+        "calibration.joined.weight",
+    ]  # fmt: skip
+    assert soap.layers(nn.Linear(20, 20)) == []  # no part of it reads blur
+
+
+def test_a_closure_is_refused():
+    with pytest.raises(ValueError, match="no closure"):
+        Soap([nn.Parameter(torch.zeros(8, 8))]).step(lambda: 0.0)
