@@ -127,3 +127,33 @@ def test_light_unlike_that_of_the_rows_has_its_own_terms_with_the_factor_of_unli
     want = math.sqrt((0.2 * change) ** 2 + 0.4 * far[0] ** 2 + 0.6 * far[1] ** 2)
     assert left(light=(np.array([0.7, 0.8]), np.array([0.4, 0.6]))) == pytest.approx(want, rel=1e-6)
     assert "1 solved rows at 0.85 um and normal incidence" in budget.LeftOut(known).words
+
+
+def test_the_scalar_leaves_out_that_fields_along_and_across_the_slope_are_told_apart():
+    """J = mean + half the difference times (cos 2φ, sin 2φ): light of the second turns twice about the axis, J2, and
+    adds to that of the first. A row along the lattice, one along its diagonal, whose absence counts beside it."""
+    aperture = 0.5
+    factor = np.array([[0.8 + 0.1j, 0.85 - 0.2j], [1.5 - 0.5j, 1.3 + 0.4j]])
+    known = Neighbours(np.array([0.6, 0.55]), np.array([False, True]), factor, factor, np.zeros(2), 0.85)
+    radius = np.linspace(0, 30 / aperture, 240)
+
+    node, weight = np.polynomial.legendre.leggauss(200)
+    p = aperture * (node + 1) / 2
+
+    def light(of, order=0):
+        return np.abs((weight * p / (1 - p * p) * of(p)) @ special.jv(order, np.outer(p, radius))) ** 2
+
+    def difference(p):
+        along, across = (known.at(p, 0.0) + known.at(p, math.pi / 4)) / 2  # the mean over azimuths
+        return (along - across) / 2
+
+    mean, plain = light(known.mean), light(lambda p: 1.0 + 0j)
+    (other,) = known.others
+    left = apart(light(other.mean), mean, radius) + 0.2 * apart(plain, mean, radius)
+    about = dict(aperture=aperture, has_angles=True, ghost=0.0, incidence_rad=0.0, left_out=budget.LeftOut(known))
+    flux = budget.with_model(Budget(0.0), polarisation="flux", **about)
+    assert flux.neighbours == pytest.approx(left, rel=1e-6)
+    scalar = budget.with_model(Budget(0.0), polarisation="scalar", **about)
+    aside = apart(mean + light(difference, 2), mean, radius)
+    assert scalar.neighbours == pytest.approx(math.hypot(left, aside), rel=1e-6)
+    assert aside > 0.1 * left  # it counts

@@ -1,0 +1,44 @@
+"""The PSFs of a lens as built are asked for at its own wavelength and distance, window and angle."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.model import made, vector
+from metalens import psf
+
+
+def test_psfs_are_those_of_the_wavelength_in_nm_and_the_distance_in_um_beside_the_design(monkeypatch):
+    asked, lens = [], b.lens()
+    stack = psf.PsfStack(
+        np.full((1, 1, 4, 4), 1 / 16),
+        np.ones((1, 1)),
+        depths_um=np.array([600.0]),
+        angles_rad=np.zeros((1, 2)),
+        wavelengths_um=np.array([0.85]),
+        weights=np.ones(1),
+        step_um=1.0,
+        centres_um=np.zeros((1, 2)),
+        sensor_distance_um=1.0,
+        tolerance=1e-3,
+        error=1e-4,
+        reason="typed",
+    )
+    monkeypatch.setattr(psf, "psf_stack", lambda phase, level, **about: asked.append((phase, level, about)) or stack)
+    x = vector({"wavelength_nm": 1.7, "distance_um": -3.1, "bias_nm": 4.0})
+    view = psf.View((600.0,), ((0.02, -0.01), (0.0, 0.03)), 24.0, 4, offset_um=(0.7, -0.4))
+    found = made.psf_stack(lens, b.RESPONSE, x, view, offset_um=(1.1, 2.3), tolerance=3e-3)
+    assert found.intensity.shape == (2, 1, 4, 4)
+    for (phase, level, about), angle in zip(asked, view.angles_rad, strict=True):
+        t = made.pillars(lens, b.RESPONSE, x, angle_rad=made.incidence_rad(lens.proxy, angle))
+        assert level * np.exp(1j * phase) == pytest.approx(t, abs=1e-5)  # single precision
+        assert about["wavelength_um"] == pytest.approx(lens.wavelength_um + 1.7e-3, rel=1e-12)
+        assert about["sensor_distance_um"] == pytest.approx(lens.sensor_distance_um - 3.1, rel=1e-12)
+        assert (about["angle_rad"], about["tolerance"]) == ([list(angle)], 3e-3)
+        assert about["offset_um"] == pytest.approx((1.8, 1.9))
+        assert about["pitch_um"] == lens.diameters.pitch_um
