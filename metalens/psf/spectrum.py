@@ -156,7 +156,7 @@ def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
     """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1 (Lanczos, Golub and Welsch)."""
     count = min(count, len(points))
     basis, diagonal, beside = np.zeros((count, len(points))), np.zeros(count), np.zeros(count)
-    q = np.sqrt(share)
+    q = np.sqrt(share / share.sum())
     for i in range(count):
         basis[i] = q
         r = points * q
