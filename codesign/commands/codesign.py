@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from codesign.batches import parallel
 from codesign.commands.options.codesign import Options
@@ -22,6 +21,7 @@ from codesign.train import (
     Run,
     RunConfig,
     best,
+    checkpoint,
     device_of,
     finished,
     pareto,
@@ -214,9 +214,7 @@ def _weights(folder: Path, going: Run, ends: list[End]) -> None:
         net, budget = end.model.net, end.row["budget_mmacs"]
         kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
         name = going.settings.network if budget is None else f"subnet_{budget:g}"
-        with store.replacing(folder / f"{name}.safetensors") as part:
-            tensors = {k: v.contiguous() for k, v in kept.state_dict().items()}
-            save_file(tensors, str(part), metadata={"kind": "subnet"})
+        checkpoint.save_network(folder / f"{name}.safetensors", kept)
 
 
 def _named(budget_mmacs: float | None) -> str:

@@ -5,8 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save_file
-
 from characterize.bench import Truth
 from characterize.inference import asbuilt
 from codesign.adapt import Lenses, RetrainConfig, Source, correction
@@ -172,8 +170,7 @@ def _keep(folder: Path, target: Path, trained: tuple[Source, Trainer], story: re
     source, going = trained
     retraining.settle(going, source)
     cut = Subnet(retraining.network(going), source.architecture)
-    with store.replacing(folder / "subnet_retrained.safetensors") as part:
-        save_file(cut.state_dict(), str(part), metadata={"kind": "subnet", "version": "1"})
+    checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
     retrain_report.write(folder / "report.html", story)
     store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
     store.write_text(folder / RESULT, json.dumps(_values(story, target), indent=1) + "\n")

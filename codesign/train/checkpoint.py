@@ -6,7 +6,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from metalens.ground import config
 from metalens.ground.errors import TrainingError
@@ -31,12 +31,25 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
     tensors: dict[str, Tensor] = {}
     tree = _split(state, "", tensors)
     about = {"kind": "checkpoint", "version": VERSION, "state": tree, "settings": config.dumps(settings)}
-    metadata = {ABOUT: json.dumps(about)}  # one entry: the file format does not keep the order of several
+    _write(Path(path), tensors, ABOUT, json.dumps(about))
+
+
+def save_network(path: str | Path, net: nn.Module) -> None:
+    """Write the weights of a network alone; the same weights give the same bytes.
+
+    Raises:
+        OSError: the target cannot be written, the disk is full (the old file stays).
+    """
+    _write(Path(path), {name: weight.contiguous() for name, weight in net.state_dict().items()}, "kind", "subnet")
+
+
+def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None:
+    """Of what is said about the tensors there is one entry: the writer puts several into an order drawn by chance."""
     with replacing(path) as part:
         try:
-            save_file(tensors, str(part), metadata=metadata)
+            save_file(tensors, str(part), metadata={key: value})
         except SafetensorError as error:
-            raise OSError(f"{path}: cannot write the checkpoint ({error})") from error
+            raise OSError(f"{path}: cannot be written ({error})") from error
 
 
 def load(path: str | Path, *, settings: object) -> dict[str, Any]:

@@ -58,6 +58,31 @@ class Stage:
     pictures: tuple[tuple[str, str], ...] = ()
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Laid:
+    """What a chain's folder holds before its first stage.
+
+    files: the settings, by name in the folder. contents: {path in the folder: bytes} of them and all that they name.
+    """
+
+    files: ChainFiles
+    contents: dict[str, bytes]
+
+    def write(self, folder: Path) -> None:
+        """Put them into the folder."""
+        for name, content in self.contents.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            store.write_bytes(folder / name, content)
+
+    def stands_in(self, folder: Path) -> bool:
+        """Whether a folder holds these settings, no others, and the same tables and maps."""
+        settings = {name for name in self.contents if "/" not in name and name.endswith(".toml")}
+        paths = [(folder / name, content) for name, content in self.contents.items()]
+        return settings == {path.name for path in folder.glob("*.toml")} and all(
+            path.is_file() and path.read_bytes() == content for path, content in paths
+        )
+
+
 def shipped() -> ChainFiles:
     """The demo's own settings, as names of files that :func:`lay_out` writes."""
     return _named(SHIPPED, budget=False)  # a minute more: asked for with a CHAIN.toml, or metalens budget
@@ -77,7 +102,14 @@ def load(path: Path) -> ChainFiles:
 
 
 def lay_out(folder: Path, files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> ChainFiles:
-    """Copy the settings into the chain's folder under plain names, and the tables and maps that they name; the files.
+    """Write what :func:`laid` gives into the chain's folder; the files under their plain names."""
+    here = laid(files, source, aperture_mm=aperture_mm)
+    here.write(folder)
+    return here.files
+
+
+def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> Laid:
+    """The settings under plain names, and the tables and maps that they name.
 
     Args:
         source: folder that the files lie in; None for the shipped ones.
@@ -86,21 +118,22 @@ def lay_out(folder: Path, files: ChainFiles, source: Path | None, *, aperture_mm
     Raises:
         ConfigError: a file that is named lies above its settings file, or two files have one name.
     """
+    contents: dict[str, bytes] = {}
     for name, value in _given(files):
         if source is None:
             text = resources.files("metalens").joinpath("data", "demo", value.name).read_text(encoding="utf-8")
         else:
             text = (source / value).read_text(encoding="utf-8-sig")
-            _bring(folder, source / value)
+            _bring(contents, source / value)
         if name == "design" and aperture_mm is not None:
             lines = [line for line in text.splitlines() if not line.startswith("aperture_mm")]
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
-        store.write_text(folder / f"{name}.toml", text)
-    return _named(tuple(name for name, _ in _given(files)), budget=files.budget)
+        contents[f"{name}.toml"] = text.encode()
+    return Laid(_named(tuple(name for name, _ in _given(files)), budget=files.budget), contents)
 
 
-def _bring(folder: Path, settings: Path) -> None:
-    """Copy what a settings file names beside or below it, or in the current folder.
+def _bring(contents: dict[str, bytes], settings: Path) -> None:
+    """Take along what a settings file names beside or below it, or in the current folder.
 
     Whole paths are left as they are, and files that the chain makes.
     """
@@ -110,11 +143,9 @@ def _bring(folder: Path, settings: Path) -> None:
             continue
         if ".." in Path(word).parts:
             raise ConfigError(f"{settings}: {word!r} lies above it; put it beside it, or give its whole path")
-        content, target = found[0].read_bytes(), folder / word
-        if target.is_file() and target.read_bytes() != content:
+        content = found[0].read_bytes()
+        if contents.setdefault(Path(word).as_posix(), content) != content:
             raise ConfigError(f"{settings}: {word!r} is not the file of that name beside other settings; rename it")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        store.write_bytes(target, content)
 
 
 def _words(value: Any) -> Iterator[str]:

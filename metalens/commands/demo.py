@@ -3,7 +3,6 @@
 import contextlib
 import io
 import json
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,15 +55,14 @@ def run(options: Options) -> int:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
     wanted = chain.shipped() if options.config is None else chain.load(options.config)
     source = None if options.config is None else options.config.parent
+    laid = chain.laid(wanted, source, aperture_mm=options.aperture_mm)
     with options.claim_work(options.output, keep=(OUTCOMES,), resume=options.resume) as draft:
         folder = draft.path
-        with tempfile.TemporaryDirectory() as aside:  # nothing of other settings gets beside what is done
-            chain.lay_out(Path(aside), wanted, source, aperture_mm=options.aperture_mm)
-            if (folder / OUTCOMES).is_file() and not _same(Path(aside), folder):
-                raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
-        files = chain.lay_out(folder, wanted, source, aperture_mm=options.aperture_mm)
+        if (folder / OUTCOMES).is_file() and not laid.stands_in(folder):  # of other settings nothing gets beside it
+            raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
+        laid.write(folder)
         outcomes: list[Outcome] = []
-        for outcome in _chain(folder, files):
+        for outcome in _chain(folder, laid.files):
             outcomes.append(outcome)
             words, verdict = " ".join(outcome.stage.words), "ok" if outcome.status == 0 else "FAILED"
             options.console.say(f"{outcome.seconds:6.1f} s  metalens {words}  {verdict}")
@@ -73,13 +71,6 @@ def run(options: Options) -> int:
     values = {_name(o.stage): {"status": o.status, "seconds": o.seconds, **o.values} for o in outcomes}
     options.console.result({"report": str(page), **values}, f"open {page}")
     return next((o.status for o in outcomes if o.status), 0)
-
-
-def _same(laid: Path, folder: Path) -> bool:
-    """Whether a chain's folder holds these settings, no others, and the same tables and maps."""
-    here, there = ({path.name for path in place.glob("*.toml")} for place in (laid, folder))
-    pairs = [(path, folder / path.relative_to(laid)) for path in laid.rglob("*") if path.is_file()]
-    return here == there and all(b.is_file() and a.read_bytes() == b.read_bytes() for a, b in pairs)
 
 
 def _name(stage: Stage) -> str:

@@ -1,6 +1,8 @@
 """``metalens retrain``: its files, what it overwrites, what a resume refuses."""
 
 import json
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +16,15 @@ from layout.process import process
 from metalens import lens
 from metalens.cli import main
 
+DIES = """
+import os, signal, sys
+from metalens.cli import main
+def meet(event, arguments):
+    if event == "os.rename" and os.path.basename(arguments[1]) == "nominal.safetensors":
+        os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(meet)
+main(sys.argv[1:])
+"""
 TRUTH = "depths_um = [3000.0]\n" + "".join(f'[[parameter]]\nname = "{n}"\nvalue = {v}\n' for n, v in m.TRUE.items())
 SHORT = ["--steps", "2", "--draws", "2", "--judge", "1", "--test-batches", "1"]
 
@@ -52,6 +63,24 @@ def test_files_report_and_rules_of_overwriting(folder, capsys):
     assert (folder / "out" / "retrained.safetensors").read_bytes() == kept
     assert _retrain(folder, *truth, "--resume", "--rate", "0.5") == 2
     assert "settings.rate: 0.0015 -> 0.5" in capsys.readouterr().err
+
+
+def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the_same_bytes(folder, monkeypatch):
+    words = ["retrain", str(folder / "run"), "--asbuilt", str(folder / "asbuilt.h5"), "-o", "out", *SHORT, "--quiet"]
+    for name in ("whole", "killed"):
+        (folder / name).mkdir()
+    monkeypatch.chdir(folder / "whole")
+    assert main(words) == 0
+    monkeypatch.chdir(folder / "killed")
+    assert subprocess.run([sys.executable, "-c", DIES, *words], check=False).returncode == -signal.SIGKILL
+    assert [path.name[:20] for path in Path("out.unfinished").glob(".*.part")] == [".nominal.safetensors"]
+    assert main([*words, "--resume"]) == 0
+    whole, resumed = (
+        {path.name: path.read_bytes() for path in (folder / name / "out").iterdir() if path.name != "manifest.json"}
+        for name in ("whole", "killed")
+    )  # the manifest has the words of the command, --resume among them
+    assert resumed == whole
+    assert [path.name for path in Path().iterdir()] == ["out"]
 
 
 def test_refusals_leave_nothing_behind(folder, capsys):

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codesign.train import checkpoint
+from metalens.commands import info
 from metalens.ground.errors import TrainingError
 
 
@@ -91,22 +92,42 @@ def test_what_cannot_be_kept_is_named(tmp_path):
     assert not (tmp_path / "c").exists()
 
 
-def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(tmp_path):
+def _checkpointed(path, size):
+    checkpoint.save(path, {"w": torch.ones(size)}, settings=Settings())
+
+
+def _exported(path, size):
+    checkpoint.save_network(path, torch.nn.Linear(size, 1))
+
+
+@pytest.mark.parametrize("write", [_checkpointed, _exported])
+def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, write):
     """A file-size limit stands for the disk: the write fails part-way, as on a full one."""
     import resource
     import signal
 
     path = tmp_path / "c"
-    checkpoint.save(path, {"w": torch.ones(4)}, settings=Settings())
+    write(path, 4)
     before = path.read_bytes()
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
     try:
-        with pytest.raises(OSError, match=r"cannot write|File too large"):
-            checkpoint.save(path, {"w": torch.ones(100_000)}, settings=Settings())
+        with pytest.raises(OSError, match=r"cannot be written|File too large"):
+            write(path, 100_000)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+def test_a_networks_file_is_the_same_at_every_writing(tmp_path):
+    """Two entries about the tensors came in an order drawn by chance: one of two contents, each as often."""
+    net, found = torch.nn.Linear(5, 3), set()
+    for _ in range(24):  # all alike by chance: 2^-23
+        checkpoint.save_network(tmp_path / "n.safetensors", net)
+        found.add((tmp_path / "n.safetensors").read_bytes())
+    assert len(found) == 1
+    told = info.network(tmp_path / "n.safetensors")
+    assert (told["kind"], told["version"], told["arrays"]["weight"]) == ("subnet", "1", "F32 (3, 5)")

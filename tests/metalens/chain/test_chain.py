@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -105,15 +106,20 @@ def test_tables_and_maps_that_settings_name_are_laid_out_with_them(tmp_path):
     assert (target / "cell.toml").read_text() == cell
 
 
-def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path, monkeypatch):
+def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path):
     (tmp_path / "up.csv").write_text("x")
     with pytest.raises(ConfigError, match=r"'\.\./up\.csv' lies above"):
         laid_out(tmp_path, **{"c.toml": 'n = "../up.csv"\n'})
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"'up\.csv' is not the file of that name"):
-        laid_out(tmp_path, **{"c.toml": 'n = "up.csv"\n'}) and laid_out(
-            tmp_path, **{"c.toml": 'n = "up.csv"\n', "up.csv": "y"}
-        )
+    for name, text in (("a", "x"), ("b", "y")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "s.toml").write_text('n = "table.csv"\n')
+        (tmp_path / name / "table.csv").write_text(text)
+    (tmp_path / "p.toml").write_text("")
+    files = ChainFiles(Path("a/s.toml"), Path("b/s.toml"), Path("p.toml"))
+    with pytest.raises(ConfigError, match=r"s\.toml: 'table\.csv' is not the file of that name"):
+        chain.laid(files, tmp_path, aperture_mm=None)
+    (tmp_path / "b" / "table.csv").write_text("x")
+    assert chain.laid(files, tmp_path, aperture_mm=None).contents["table.csv"] == b"x"
 
 
 def test_the_shipped_settings_are_laid_out(tmp_path):
@@ -170,6 +176,14 @@ def test_settings_that_differ_are_refused_at_every_resume(tmp_path, monkeypatch)
     assert len(seen) == 3
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
     assert seen[3] == "psf"
+
+
+def test_nothing_is_written_but_beside_the_output(tmp_path, monkeypatch):
+    """Settings that were compared in the folder for temporary files stayed there when the chain was killed."""
+    begun(tmp_path, monkeypatch)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
+    assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
