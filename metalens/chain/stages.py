@@ -123,8 +123,8 @@ def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -
         if source is None:
             text = resources.files("metalens").joinpath("data", "demo", value.name).read_text(encoding="utf-8")
         else:
+            _bring(contents, source / value)  # refuses what is no settings file
             text = (source / value).read_text(encoding="utf-8-sig")
-            _bring(contents, source / value)
         if name == "design" and aperture_mm is not None:
             lines = [line for line in text.splitlines() if not line.startswith("aperture_mm")]
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"

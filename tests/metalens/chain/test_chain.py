@@ -122,6 +122,13 @@ def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path):
     assert chain.laid(files, tmp_path, aperture_mm=None).contents["table.csv"] == b"x"
 
 
+def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
+    for name, content in (("c", b'n = "\xff"\n'), ("d", b""), ("p", b"")):
+        (tmp_path / f"{name}.toml").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"c\.toml"):
+        chain.laid(ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), tmp_path, aperture_mm=None)
+
+
 def test_the_shipped_settings_are_laid_out(tmp_path):
     chain.lay_out(tmp_path, chain.shipped(), None, aperture_mm=0.25)
     assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
