@@ -109,6 +109,24 @@ def test_rounding_of_long_paths_keeps_no_block_from_being_used():
     assert made / 8 < error.std() < made
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("tangents", "centre_um"), [((0.31, -0.06), (55.0, 3.0)), ((-0.05, 0.27), (-4.0, -61.0))])
+@pytest.mark.parametrize("shape", [(30, 410), (380, 41)])
+def test_the_rounding_of_a_carrier_is_that_of_its_longest_path(sign, tangents, centre_um, shape):
+    """A tenth of 5e-15 of it, in rad; the longest by plain distances over all pillars of a lens that is no square, with
+    a window beside the axis: at the rim on one side of the axis and not on the other."""
+    tangents, centre_um = (tuple(sign * v for v in pair) for pair in (tangents, centre_um))
+    case = replace(CASE, shape=shape, tangents=tangents, centre_um=centre_um)
+    y, x = np.meshgrid(*case.pillars_um[::-1], indexing="xy")[::-1]
+    z, d = 777.0, case.sensor_distance_um
+    source = np.sqrt((x + z * tangents[0]) ** 2 + (y + z * tangents[1]) ** 2 + z**2)
+    sensor = np.sqrt((x - centre_um[0]) ** 2 + (y - centre_um[1]) ** 2 + d**2)
+    path = source - z * np.sqrt(1 + np.hypot(*tangents) ** 2) + sensor - np.hypot(d, np.hypot(*centre_um))
+    want = 2 * np.pi * 5e-16 * np.abs(path).max() / 0.85
+    made = blocks.Carrier(case, 1 / 777.0, blocks.Blocks(shape[0], 16, 16), 512).rounding_rad
+    assert made == pytest.approx(want, rel=0.02)  # half a pillar more at the rim: 0.19 of 76 um
+
+
 def test_both_corners_of_a_window_need_a_plan(monkeypatch):
     for missing in ((0, 0), (-1, -1)):
         asked = []

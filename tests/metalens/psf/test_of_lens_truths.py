@@ -122,3 +122,36 @@ def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
     assert asked["incidence_rad"] == pytest.approx(math.atan(math.hypot(math.tan(0.2), math.tan(-0.15))))
     assert (asked["polarisation"], asked["has_angles"], asked["left_out"]) == ("vector", False, "rough")
     assert asked["ghost"] == lens().layers.ghost(0.85)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "spectrum", "left", "dtype"),
+    [
+        (1.7e-3, 8e-4, 1.5e-3, "float32"),
+        (1.7e-3, 1.5e-3, 8.5e-4, "float32"),  # 0.8e-3 would be left: half of it all is kept
+        (1.7e-3, 0.3, 8.5e-4, "float32"),
+        (1.0e-6, 0.0, 1.0e-6, "float32"),
+        (0.9e-6, 0.0, 0.9e-6, "float64"),
+    ],
+)
+def test_sums_get_what_the_spectrum_s_error_leaves_of_the_tolerance(monkeypatch, tolerance, spectrum, left, dtype):
+    """Errors that know nothing of each other add in squares: 8² + 15² = 17². What is left is never below a half, since
+    no sum can make up for a spectrum; single precision rounds to 1e-7 and serves from 1e-6 on."""
+    asked = []
+
+    def summed(phase, level, **about):
+        asked.append((phase, about["tolerance"], about["wavelength_um"], about["weights"], about["angle_rad"]))
+        return SimpleNamespace(numpy=lambda: stack(tuple(about["angle_rad"][0]), 2e-4, (1.0, 2.0)))
+
+    made, nodes = lens(), Nodes(np.array([0.84, 0.87]), np.array([0.3, 0.7]), spectrum)
+    made.diameters.grid = SimpleNamespace(_asdict=dict)
+    made.neighbours = None
+    monkeypatch.setattr(of_lens, "psf_stack", summed)
+    monkeypatch.setattr(of_lens, "_all_maps", lambda lens, nodes, angle, dtype, scalar: ((str(dtype), None), None))
+    monkeypatch.setattr(of_lens, "_budget", lambda *_: Budget(2e-4))
+    view = of_lens.View((2e3, 5e3), ((0.0, 0.1), (0.2, 0.0)))
+    found = of_lens.from_lens(made, view, tolerance=tolerance, spectrum=nodes)
+    assert [one[0] for one in asked] == [f"torch.{dtype}"] * 2
+    assert [one[1] for one in asked] == pytest.approx([left] * 2, rel=1e-12)
+    assert [one[2:] for one in asked] == [([0.84, 0.87], [0.3, 0.7], [list(angle)]) for angle in view.angles_rad]
+    assert found.tolerance == tolerance

@@ -1,0 +1,183 @@
+"""The bars of a result, put together by hand: intervals, the gain's share, causes that nobody stated, draws, words."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.captures import Gain
+from characterize.inference import estimate, knowable, verdict
+from characterize.inference.asbuilt import WithinModel
+from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.missing import Unstated
+from characterize.inference.posterior import Profile
+from characterize.model import NAMES, PLACE, vector
+
+RNG = np.random.default_rng(57)
+Z = 1.959963984540054  # of 95 %
+FITTED = ("bias_nm", "log_gain", "height_nm", "background_e")
+VALUE = np.array([2.3, 9.1, -4.7, 23.0])
+OWN = np.array(
+    [[0.49, 0.001, -0.3, 0.05], [0.001, 4e-4, 0.002, -0.01], [-0.3, 0.002, 2.6, 0.2], [0.05, -0.01, 0.2, 0.7]]
+)
+LOW, HIGH = VALUE - np.array([1.1, 0.9, 3.7, 1.2]), VALUE + np.array([1.9, 0.02, 2.6, 9.0])
+GAIN = Gain(3.1, 0.4, 2.0)
+SHARE = 0.4 / 3.1
+WITH_GAIN = OWN + np.outer([0, SHARE, 0, 23 * SHARE], [0, SHARE, 0, 23 * SHARE])
+SHIFTS = np.array([[0.8, 0.003, -1.3, 0.4], [0.1, -0.02, 2.1, 0.9]])  # of two causes, one sigma each
+UNSTATED = Unstated(("glass", "wall"), np.abs(SHIFTS), SHIFTS.T @ SHIFTS, np.outer(SHIFTS[0], SHIFTS[0]))
+WIDE = np.full(4, 99.0)
+
+
+def posterior(**more):
+    best = SimpleNamespace(
+        value=VALUE,
+        information=np.diag([3.0, 5.0, 7.0, 11.0]),
+        image=np.full((2, 3, 4), 31.0),
+        residual_sigma=np.full((2, 3, 4), 0.3),
+        chi2_per_dof=1.07,
+        converged=True,
+        reason="made",
+    )
+    about = dict(best=best, low=LOW, high=HIGH, covariance=OWN, draws=np.empty((0, 4)), profiles={})
+    return SimpleNamespace(**(about | more))
+
+
+def test_within_the_model_the_gain_widens_what_is_counted_in_electrons_and_nothing_else():
+    """Gain and background to 1.96 sigma with the gain's error where that lies farther out than the profile's end; of
+    bias and height the profile's ends, though their 1.96 sigma lie farther out on one side."""
+    found = posterior(draws=RNG.normal(size=(7, 4)))
+    within = estimate._within(found, WITH_GAIN, FITTED)
+    light, dark = Z * math.sqrt(4e-4 + SHARE**2), Z * math.sqrt(0.7 + (23 * SHARE) ** 2)
+    assert Z * 0.7 > 1.1  # of the bias: beyond its profile's lower end
+    assert within.low == pytest.approx([LOW[0], 9.1 - 0.9, LOW[2], 23 - dark], rel=1e-6)
+    assert within.high == pytest.approx([HIGH[0], 9.1 + light, HIGH[2], 23 + 9.0], rel=1e-6)
+    assert within.covariance is WITH_GAIN
+    assert within.draws is found.draws
+
+
+def test_draws_scatter_by_what_nobody_stated_and_stay_inside_the_bounds():
+    """Each about its own place, with the second moment of the shifts; cut at the bounds of the prior."""
+    places = np.tile([[1.0, -2.0, 0.5, 3.0], [-6.0, 4.0, 2.0, -1.0]], (30_000, 1))
+    task = SimpleNamespace(prior=Prior(np.zeros(4), WIDE, -WIDE, WIDE))
+    moved = estimate._drawn(task, places, UNSTATED) - places
+    size = np.sqrt(np.diag(UNSTATED.covariance))
+    assert np.abs(moved.mean(0) / size).max() < 0.025  # 60 000 draws: 0.004
+    assert np.abs((moved.T @ moved / len(moved) - UNSTATED.covariance) / np.outer(size, size)).max() < 0.035  # 0.006
+    low, high = np.array([-6.3, -2.0, -99.0, -1.1]), np.array([99.0, 4.2, 0.9, 3.0])
+    cut = SimpleNamespace(prior=Prior(np.zeros(4), WIDE, low, high))
+    assert estimate._drawn(cut, places, UNSTATED) == pytest.approx(np.clip(moved + places, low, high), abs=1e-12)
+    nothing = np.empty((0, 4))
+    assert estimate._drawn(task, nothing, UNSTATED) is nothing
+
+
+@pytest.fixture
+def stubbed(monkeypatch):
+    """A result whose words come from elsewhere; asks: what the parts were asked."""
+    asks = {}
+    monkeypatch.setattr(estimate.explore, "words", lambda *_: ["bent"])
+    monkeypatch.setattr(estimate, "_nominal", lambda task, fitted: fitted)
+    monkeypatch.setattr(verdict, "problems", lambda *_: [])
+    monkeypatch.setattr(verdict, "held_back", lambda *_: ["held back"])
+    monkeypatch.setattr(verdict, "structure", lambda *_: ["structure"])
+    monkeypatch.setattr(estimate, "_verdicts", lambda *given: asks.setdefault("verdicts", given) and ("psf", "known"))
+    monkeypatch.setattr(knowable, "identifiable", lambda *given: asks.setdefault("identifiable", given) and ["one"])
+    monkeypatch.setattr(knowable, "degeneracies", lambda *given: asks.setdefault("pairs", given) and ["pair"])
+    return asks
+
+
+def result(found, gain):
+    model = SimpleNamespace(
+        modes=np.empty(0), lens="lens", response="response", setting=SimpleNamespace(depth_um=1, angle_rad=2)
+    )
+    image = found.best.image
+    data = Data(image + 1.0, np.ones(image.shape, bool), np.zeros(image.shape, bool), image, np.full(image.shape, 1.7))
+    start = RNG.normal(size=len(NAMES))
+    prior = Prior(np.zeros(4), np.array([3.0, 5.0, 8.0, 9.0]), -WIDE, WIDE)
+    task = SimpleNamespace(model=model, data=data, names=FITTED, start=start, prior=prior)
+    looked = SimpleNamespace(reckoned=lambda: UNSTATED, leans=[])
+    return task, estimate._result(SimpleNamespace(pixel_um=1.5), task, found, ["before"], gain, looked)
+
+
+def test_a_result_adds_variances_and_holds_intervals_in_quadrature(stubbed):
+    """Own, the gain's and what nobody stated: three variances of one sum; each end by itself."""
+    curve = Profile(1.0, 2.0, np.array([1.0, 2.0, 4.0]), np.array([3.0, 0.0, 5.0]), parabolic=False)
+    draws = np.tile(VALUE, (5, 1)) + RNG.normal(size=(5, 4))
+    found = posterior(draws=draws, profiles={"bias_nm": curve})
+    task, built = result(found, GAIN)
+    within = estimate._within(found, WITH_GAIN, FITTED)
+    more = Z * np.hypot(*SHIFTS)
+    assert built.covariance == pytest.approx(WITH_GAIN + SHIFTS.T @ SHIFTS, rel=1e-12)
+    assert built.within.covariance == pytest.approx(WITH_GAIN, rel=1e-12)
+    assert built.low == pytest.approx(VALUE - np.sqrt((VALUE - within.low) ** 2 + more**2), rel=1e-6)
+    assert built.high == pytest.approx(VALUE + np.sqrt((within.high - VALUE) ** 2 + more**2), rel=1e-6)
+    assert built.draws == pytest.approx(estimate._drawn(task, draws, UNSTATED))
+    assert isinstance(built.within, WithinModel)
+    assert built.held == {name: task.start[PLACE[name]] for name in NAMES if name not in FITTED}
+    assert built.nominal == dict(zip(FITTED, VALUE, strict=True))
+    assert built.curves["bias_nm"].tolist() == [[1.0, 2.0, 4.0], [3.0, 0.0, 5.0]]
+    assert (built.causes, built.by_cause, built.bench) == (UNSTATED.causes, UNSTATED.by_cause, UNSTATED.bench)
+    assert stubbed["identifiable"][1] is found.best.information
+    assert stubbed["verdicts"][1:2] + stubbed["verdicts"][3:] == (found, UNSTATED)
+    assert math.isnan(stubbed["verdicts"][2])  # two frames: too few to leave any out
+    assert stubbed["pairs"][1] == pytest.approx(WITH_GAIN, rel=1e-12)
+    assert built.degeneracies == ("bent", "pair")
+    assert built.problems == ("held back",)
+    assert built.cautions == ("before", "structure")
+    assert built.verdicts == ("psf", "known")
+    assert built.measured == pytest.approx(found.best.image + 1)
+    assert (built.chi2_per_dof, built.converged, built.reason) == (1.07, True, "made")
+
+
+def test_without_a_known_gain_nothing_is_said_of_the_residuals_and_electrons_are_of_any_size(stubbed):
+    """Chi-square has no scale then; gain and background are known to themselves."""
+    _, built = result(posterior(), Gain(1.0, np.inf, 2.0, known=False))
+    by = np.array([0, 1.0, 0, 23.0])
+    assert built.covariance == pytest.approx(OWN + np.outer(by, by) + SHIFTS.T @ SHIFTS, rel=1e-12)
+    assert built.cautions == ("before",)
+    assert len(built.draws) == 0
+
+
+def test_the_psf_s_verdict_has_both_errors_and_frames_left_out_where_there_are_enough():
+    short = "the PSF is known to 1.2% at the captured depths and 4.6% between them"
+    assert estimate._psf_verdict((0.0123, 0.0456), math.nan) == short
+    longer = short + "; frames left out agree within 1.31 times their noise"
+    assert estimate._psf_verdict((0.0123, 0.0456), 1.31) == longer
+
+
+def test_the_lens_as_designed_is_seen_through_the_bench_that_was_fitted():
+    """Gain, background, place and blur as found; the pillars, the stage and a phase that is left as at the start."""
+    asked = []
+    plain = SimpleNamespace(images=lambda x: asked.append(x) or ("images", None))
+    model = SimpleNamespace(with_residual=lambda modes, basis: plain if not len(modes) else None)
+    start = vector({"height_nm": 4.0, "distance_um": 7.0, "log_gain": 3.0, "decentre_x_um": 0.2})
+    found = {"log_gain": 9.1, "background_x_e": 2.0, "decentre_x_um": 1.7, "crosstalk_px": 0.6}
+    lens = {"bias_nm": 5.0, "distance_um": -31.0, "stage_zero_um": 8.0}
+    assert estimate._nominal(SimpleNamespace(model=model, start=start), found | lens) == "images"
+    want = start.copy()
+    for name, value in found.items():
+        want[PLACE[name]] = value
+    assert asked[0] == pytest.approx(want)
+
+
+@pytest.mark.parametrize(("ratio", "taken"), [(0.96, True), (0.98, False)])
+def test_more_is_fitted_where_it_explains_the_frames_better_by_three_hundredths(monkeypatch, ratio, taken):
+    """Of chi-square a pixel: 3 % are beyond chance (2 % of 5000 pixels)."""
+    usual, wide = SimpleNamespace(chi2_per_dof=2.9, value="usual"), SimpleNamespace(chi2_per_dof=2.9 * ratio)
+    monkeypatch.setattr(estimate.search, "search", lambda task: [usual])
+    monkeypatch.setattr(estimate.search, "wider", lambda task, start: [wide] if start == "all of usual" else None)
+    monkeypatch.setattr(verdict, "explained", lambda end, gain: False)
+
+    def task(free):
+        of = SimpleNamespace(names=(*FITTED, *free), free=free, all_of=lambda value: f"all of {value}")
+        return of
+
+    monkeypatch.setattr(estimate.dataclasses, "replace", lambda task_, free: task(free))
+    cautions = []
+    found, ends = estimate._ends(task(("index",)), GAIN, cautions)
+    assert ends == ([wide] if taken else [usual])
+    assert found.free == (("index", *estimate.MORE) if taken else ("index",))
+    assert len(cautions) == taken
+    every = task(("index", *estimate.MORE))
+    assert estimate._ends(every, GAIN, cautions) == (every, [usual])
