@@ -34,7 +34,7 @@ HARMONICS = 2
 def rows() -> Iterator[Row]:
     """Both lenses and polarisations: light in the focus and the PSF, with the factor and without."""
     for na, distance, counts in LENSES:
-        lens = _lens(distance)
+        lens = lens_at(distance)
         found = neighbours(lens, counts=counts, harmonics=HARMONICS)
         for place, (polarization, along) in enumerate((("x", "along"), ("y", "across"))):
             start = time.perf_counter()
@@ -55,7 +55,7 @@ def _words(ratio: complex) -> str:
     return f"x{abs(ratio):.3f}, {math.atan2(ratio.imag, ratio.real):+.3f} rad"
 
 
-def _lens(distance_um: float) -> Lens:
+def lens_at(distance_um: float) -> Lens:
     """The lens of the example, from its cell file, for this sensor distance."""
     file = config.load(FILE, CellFile)
     proxy = library.proxy_of(library.sweep(file.cell, file.sweep))

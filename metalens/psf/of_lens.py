@@ -143,6 +143,7 @@ def _budget(
         ghost=lens.layers.ghost(lens.wavelength_um),
         left_out=left_out,
         light=(nodes.wavelengths_um, nodes.weights),
+        lit=lens.diameters.pillars * lens.diameters.site_um2 / lens.wavelength_um**2,
     )
 
 

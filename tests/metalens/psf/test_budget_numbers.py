@@ -157,3 +157,35 @@ def test_the_scalar_leaves_out_that_fields_along_and_across_the_slope_are_told_a
     aside = apart(mean + light(difference, 2), mean, radius)
     assert scalar.neighbours == pytest.approx(math.hypot(left, aside), rel=1e-6)
     assert aside > 0.1 * left  # it counts
+
+
+def test_light_that_neighbours_scatter_meets_the_focus_in_any_phase():
+    """Speckle of the power that C takes from the focus, drawn over the shadow of the lens: its beat with the PSF."""
+    aperture, lit, step, factor = 0.4, 900.0, 0.2, 0.9
+    known = Neighbours(np.array([0.5]), np.zeros(1, bool), *2 * [np.full((2, 1), factor + 0j)], np.zeros(1), 0.85)
+    given = dict(aperture=aperture, polarisation="flux", has_angles=True, ghost=0.0, incidence_rad=0.0)
+    found, endless = (
+        budget.with_model(Budget(0.0), **given, left_out=budget.LeftOut(known), lit=area).neighbours
+        for area in (lit, math.inf)
+    )
+    kept = _power_kept(known, aperture)
+    side = np.arange(-5, 5, step)  # wavelengths: 20 rings
+    across = np.hypot(*np.meshgrid(side, side)).ravel()
+    radii = np.linspace(0, across.max(), 400)
+    profile = [radial(aperture, 2 * math.pi * r, 0, lambda p: 1 / (1 - p * p)) for r in radii]
+    light = np.interp(across, radii, profile)
+    light *= math.sqrt(kept / (light @ light * step**2))
+    draw = np.random.default_rng(5).normal(size=(2, 400, len(light)))
+    speckle = (draw[0] + 1j * draw[1]) * math.sqrt((1 - kept) / lit / 2)
+    beat = 2 * (light * speckle).real
+    want = math.sqrt((beat**2).sum(1).mean() / (light**4).sum())
+    assert math.sqrt(found**2 - endless**2) == pytest.approx(want, rel=0.05)  # light beyond 5 wavelengths; 400 draws
+
+
+def _power_kept(known, aperture):
+    """Mean of |C|² over the light of a perfect lens: r dr = f² p dp / (1 - p²)²."""
+    power = [
+        integrate.quad(lambda p, of=of: of(p) * p / (1 - p * p) ** 2, 0, aperture)[0]
+        for of in (lambda p: float(abs(known.mean(p)) ** 2), lambda p: 1.0)
+    ]
+    return power[0] / power[1]

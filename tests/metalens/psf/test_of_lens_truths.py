@@ -22,7 +22,7 @@ def lens(knows_angles=0.0):
         layers=Layers(),
         sensor_distance_um=700.0,
         wavelength_um=0.85,
-        diameters=SimpleNamespace(radius_um=200.0, pitch_um=0.4),
+        diameters=SimpleNamespace(radius_um=200.0, pitch_um=0.4, pillars=700_000, site_um2=0.16),
         proxy=SimpleNamespace(max_angle_rad=knows_angles),
         hand="",
         pairs=None,
@@ -122,6 +122,7 @@ def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
     assert asked["incidence_rad"] == pytest.approx(math.atan(math.hypot(math.tan(0.2), math.tan(-0.15))))
     assert (asked["polarisation"], asked["has_angles"], asked["left_out"]) == ("vector", False, "rough")
     assert asked["ghost"] == lens().layers.ghost(0.85)
+    assert asked["lit"] == pytest.approx(700_000 * 0.16 / 0.85**2, rel=1e-12)
 
 
 @pytest.mark.parametrize(
