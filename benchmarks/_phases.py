@@ -21,8 +21,8 @@ PHASES = (  # what it is, the module that calls it, the name that it calls it by
     ("residual phase", _HOME + "residual", "attempt"),
     ("profiles and draws", _HOME + "explore", "explore"),
     ("causes that are not fitted", _HOME + "missing", "look"),
-    ("frames left out", _HOME + "explore", "left_out"),
-    ("predicted error", _HOME + "explore", "predicted_error"),
+    ("frames left out", _HOME + "verdict", "left_out"),
+    ("predicted error", _HOME + "verdict", "predicted_error"),
 )
 MODEL = "characterize.model.forward", "ForwardModel"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.inference import AsBuilt, invert, posterior
+from characterize.inference import AsBuilt, invert, knowable
 from characterize.model import PARAMETERS, PLACE
 from characterize.pupil import PupilFit
 from metalens.ground import report, store
@@ -118,8 +118,8 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         within = result.curves[name]
         axis.set_axis_on()
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
-        axis.plot(at, posterior.density(_stretched(result, name, within), at), color="#1f6feb", linewidth=1.2)
-        axis.plot(at, posterior.density(within, at), color="#1f6feb", linewidth=0.6, linestyle=(0, (3, 2)))
+        axis.plot(at, knowable.density(_stretched(result, name, within), at), color="#1f6feb", linewidth=1.2)
+        axis.plot(at, knowable.density(within, at), color="#1f6feb", linewidth=0.6, linestyle=(0, (3, 2)))
         if len(result.draws):
             drawn = result.draws[:, result.names.index(name)]
             axis.hist(drawn, bins=24, range=(at[0], at[-1]), density=True, color="#999", alpha=0.5)

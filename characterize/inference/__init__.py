@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from characterize.inference import asbuilt as asbuilt
+    from characterize.inference import knowable as knowable
     from characterize.inference import leastsquares as leastsquares
     from characterize.inference import posterior as posterior
     from characterize.inference.asbuilt import AsBuilt as AsBuilt
@@ -29,6 +30,7 @@ __getattr__, __dir__, __all__ = attach(
         "asbuilt": "",
         "fit": "estimate",
         "invert": "leastsquares",
+        "knowable": "",
         "leastsquares": "",
         "posterior": "",
     },

@@ -196,7 +196,7 @@ def _rearranged(data: Data, found: Arrangement) -> Data:
 
 def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
-    fitted, unseen = dict(zip(names, solution.value.tolist(), strict=True)), explore.left_out(task, solution)
+    fitted, unseen = dict(zip(names, solution.value.tolist(), strict=True)), verdict.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
@@ -261,7 +261,7 @@ def _nominal(task: Task, fitted: dict[str, float]) -> Array:
 
 def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
     known = verdict.process_verdict(task.names, found.low, found.high, _told(task, found), unstated)
-    return _psf_verdict(explore.predicted_error(task, found), unseen), known
+    return _psf_verdict(verdict.predicted_error(task, found), unseen), known
 
 
 def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.inference import posterior, residual, walk
+from characterize.inference import posterior, walk
 from characterize.inference.leastsquares import Solution
 from characterize.inference.posterior import Profile, Valley
 from characterize.inference.search import Task, distinct, mirrored, refine
 from characterize.inference.walk import Walk
-from characterize.model import ForwardModel
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -25,7 +24,7 @@ _LOST, _LOWER = 3.0, 0.5  # sigma of bend from which on a parameter is walked; m
 _OF_THE_BENCH = ("log_gain", "background")
 _BESIDE = 8  # profiles side by side, whatever the number of cores; the next ones know the slopes that these met
 _POINTS = 61  # of the curve of a walk
-_SHOWN = 24  # draws whose images give the predicted error at depths in between
+_MODE = -1  # place of the mode among the stops of a walk
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,8 +85,8 @@ def _walk(task: Task, modes: list[Solution], name: str) -> Walk:
     return walk.walk(task, modes, name, widened=max(1.0, modes[0].chi2_per_dof))
 
 
-def _valley(task: Task, mode: Solution) -> Valley:
-    return Valley(task.problem(), task.data, mode.value, task.prior, known=(mode.image, mode.slopes))
+def _valley(task: Task, at: Solution, above: tuple[Array, float] | None = None) -> Valley:
+    return Valley(task.problem(), task.data, at.value, task.prior, known=(at.image, at.slopes), above=above)
 
 
 def _profiles(
@@ -100,11 +99,13 @@ def _profiles(
     found: dict[str, Profile] = {}
     places = [one.value[np.argmin(one.rise)] for one in walks.values() if one.rise.min() < -_LOWER]
     named = [i for i, name in enumerate(task.names) if not name.startswith(_OF_THE_BENCH)]
+    valleys = {_MODE: valley} | _stops(task, mode, walks, named)
     for first in range(0, len(named), _BESIDE):
-        some = [(i, copy.copy(valley)) for i in named[first : first + _BESIDE]]
+        some = [(i, {k: copy.copy(one) for k, one in valleys.items()}) for i in named[first : first + _BESIDE]]
         ends = threads.each(functools.partial(_profile, mode, walks), some)
-        known = len(valley.met)
-        valley.met += tuple(itertools.chain.from_iterable(part.met[known:] for _, part in some))
+        for k, shared in valleys.items():
+            known = len(shared.met)
+            shared.met += tuple(itertools.chain.from_iterable(own[k].met[known:] for _, own in some))
         for (i, _), (one, better) in zip(some, ends, strict=True):
             found[task.names[i]] = one
             places += [] if better is None else [better]
@@ -116,23 +117,68 @@ def _profiles(
     return found, None
 
 
-def _profile(mode: Solution, walks: Mapping[str, Walk], one: tuple[int, Valley]) -> tuple[Profile, Array | None]:
+def _level(mode: Solution) -> float:
+    """Rise of -2 ln L at the end of a 95 % interval."""
+    return posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
+
+
+def _stops(task: Task, mode: Solution, walks: Mapping[str, Walk], named: Sequence[int]) -> dict[int, Valley]:
+    """The misfit about the stops of a walk from which parameters go farthest; none where there is no walk."""
+    for one in walks.values():
+        known = {k for i in named for sign in (-1, 1) for k, _ in one.outermost(i, sign, _level(mode))}
+        return {k: _valley(task, one.stops[k], (mode.value, float(one.rise[k]))) for k in sorted(known)}
+    return {}
+
+
+def _profile(
+    mode: Solution, walks: Mapping[str, Walk], one: tuple[int, dict[int, Valley]]
+) -> tuple[Profile, Array | None]:
     """Of a parameter, by its place among the others; second: a place below the mode, if one was met."""
-    i, valley = one
-    level = posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
-    by = next((w for w in walks.values() if i == w.index or valley.bend(i, w.index) < posterior.BENT), None)
-    if by is not None:
+    i, valleys = one
+    valley, level = valleys[_MODE], _level(mode)
+    by = next(iter(walks.values()), None)
+    if by is None:
+        return posterior.profile(valley, i, level=level)
+    if i == by.index or (by.alike(i, level) and valley.bend(i, by.index) < posterior.BENT):
         return _along(by, i, mode, float(valley.sigma[i]), level), None
-    return posterior.profile(valley, i, level=level)
+    return _from(by, i, mode, valleys, level)
+
+
+def _from(
+    one: Walk, i: int, mode: Solution, valleys: Mapping[int, Valley], level: float
+) -> tuple[Profile, Array | None]:
+    """Of any parameter by descents to its ends, each from the stop of a walk from where it goes farthest."""
+    goal, better, sides, ends, box = math.sqrt(level), None, [], [], one.interval(level)
+    for sign in (-1, 1):
+        found: list[posterior.End] = []
+        for k, begin in one.outermost(i, sign, level):
+            if not found or sign * begin[i] > sign * found[0].place:
+                found.append(posterior.end(valleys[k], i, sign, goal, begin))
+        better = next((end.lower for end in found if end.lower is not None), better)
+        last = max(found, key=lambda end: sign * end.place)
+        sides.append(np.array(last.seen))
+        ends.append(last.place if last.reached else float(box[0 if sign < 0 else 1][i]))
+    inner = np.column_stack(one.profile_of(i, np.linspace(-1, 1, _POINTS)))
+    near = one.value[one.rise < level, i]  # beyond its stops a walk knows the others' parabola only
+    least, most = max(sides[0][:, 0].max(), near.min()), min(sides[1][:, 0].min(), near.max())
+    inner = inner[(inner[:, 0] >= least) & (inner[:, 0] <= most)]
+    value, rise = np.array(sorted(np.concatenate([*sides, inner]).tolist())).T
+    plain = _plain(ends[0], ends[1], float(mode.value[i]), goal * float(valleys[_MODE].sigma[i]))
+    return Profile(ends[0], ends[1], value, rise, plain), better
 
 
 def _along(one: Walk, i: int, mode: Solution, sigma: float, level: float) -> Profile:
     """Of any parameter by a walk along another, those left over straight."""
     low, high = (float(end[i]) for end in one.interval(level))
     value, rise = one.profile() if i == one.index else one.profile_of(i, np.linspace(-1, 1, _POINTS))
-    ratio = np.array([high - mode.value[i], mode.value[i] - low]) / (math.sqrt(level) * sigma)
-    plain = bool(((ratio > posterior.PARABOLIC[0]) & (ratio < posterior.PARABOLIC[1])).all())
+    plain = _plain(low, high, float(mode.value[i]), math.sqrt(level) * sigma)
     return Profile(low, high, value, rise, plain)
+
+
+def _plain(low: float, high: float, middle: float, reach: float) -> bool:
+    """Whether an interval is nearly that of the parabola."""
+    ratio = np.array([high - middle, middle - low]) / reach
+    return bool(((ratio > posterior.PARABOLIC[0]) & (ratio < posterior.PARABOLIC[1])).all())
 
 
 def _joined(
@@ -257,81 +303,3 @@ def words(task: Task, found: Posterior) -> list[str]:
             f"probability {share:.0%}): {values}; frames farther from focus on both sides tell them apart"
         )
     return out
-
-
-def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
-    """Expected NRMSE of the as-built images: at the captured depths, and half-way between them."""
-    model = task.model
-    rng = np.random.default_rng(0)
-    if len(found.draws):
-        values = found.draws[:_SHOWN]
-    else:
-        size, vectors = np.linalg.eigh(found.covariance)
-        normal = rng.standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
-        values = found.best.value + normal @ vectors.T
-    values = np.clip(values, task.prior.low, task.prior.high)
-    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
-
-
-def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> float:
-    """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
-    images = residual.problem(model, task.names, task.start)
-    dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
-
-    def light(x: Array) -> Array:
-        x = x.copy()
-        x[dark] = 0.0
-        return np.asarray(images(x, False)[0])
-
-    mean = light(best)
-
-    def away(x: Array) -> float:
-        one = light(x)
-        one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
-        return float(((one - mean) ** 2).sum())
-
-    return float(np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum()))
-
-
-def between(model: ForwardModel) -> ForwardModel:
-    """The model half-way, in 1/z, between neighbouring depths at each angle; the farthest frame moves inwards."""
-    part, s = copy.copy(model), model.setting
-    depth = s.depth_um.copy()
-    for group in model.groups:
-        order = group.index[np.argsort(s.depth_um[group.index], kind="stable")]
-        if len(order) > 1:
-            inverse = 1 / s.depth_um[order]
-            middle = (inverse[1:] + inverse[:-1]) / 2
-            depth[order] = 1 / np.append(middle, middle[-1])
-    part.setting = dataclasses.replace(s, depth_um=depth)
-    return part
-
-
-def left_out(task: Task, mode: Solution) -> float:
-    """Chi-square a pixel of frames left out, every second depth and then the others, over that of the full fit.
-
-    About 1 + parameters over pixels where model and intervals hold; nan with fewer than four frames.
-    """
-    n = len(task.data.electrons)
-    if n < 4:
-        return float("nan")
-    order = np.argsort(task.model.setting.depth_um, kind="stable")
-    halves = [(np.sort(seen), np.sort(hidden)) for seen, hidden in itertools.permutations((order[::2], order[1::2]))]
-    total, count = np.sum(threads.each(functools.partial(_unseen, task, mode), halves), 0)
-    return float(total / max(count, 1))
-
-
-def _unseen(task: Task, mode: Solution, part: tuple[Array, Array]) -> tuple[float, int]:
-    """(chi-square, pixels) of the second frames by what the first say."""
-    seen, hidden = part
-    images = residual.problem(task.model.only(seen), task.names, task.start)
-    known = mode.image[seen], mode.slopes[:, seen]
-    valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
-    value, _ = valley.descend(mode.value, rounds=6)
-    rest = task.data.planes(hidden)
-    image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
-    keep = rest.usable & ~rest.saturated
-    slopes = mode.slopes[:, hidden][:, keep]
-    known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
-    variance = rest.variance(image)[keep] + known_e2
-    return float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()), int(keep.sum())

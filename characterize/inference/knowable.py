@@ -1,4 +1,4 @@
-"""What the frames can tell and what they cannot: identifiable combinations and degeneracies, in words."""
+"""What the frames can tell and what they cannot: identifiable combinations, degeneracies in words, densities."""
 
 import numpy as np
 
@@ -79,3 +79,20 @@ def directions(names: tuple[str, ...], information: Array) -> tuple[Array, Array
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     return np.maximum(values, 0), vectors
+
+
+def density(curve: Array, at: Array) -> Array:
+    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its profile (2, points) by value.
+
+    The signed root of the rise, straight where the valley is a parabola, runs linearly between the points and beyond.
+    """
+    value, keep = np.unique(curve[0], return_index=True)
+    root = np.sqrt(np.maximum(curve[1][keep], 0.0))
+    root = np.where(np.arange(len(value)) < int(np.argmin(root)), -root, root)
+    ends = (root[1] - root[0]) / (value[1] - value[0]), (root[-1] - root[-2]) / (value[-1] - value[-2])
+    seen = np.interp(at, value, root)
+    seen = np.where(at < value[0], root[0] + ends[0] * (at - value[0]), seen)
+    seen = np.where(at > value[-1], root[-1] + ends[1] * (at - value[-1]), seen)
+    fine = np.linspace(value[0], value[-1], 2001)
+    whole = np.trapezoid(np.exp(-(np.interp(fine, value, root) ** 2) / 2), fine)
+    return np.asarray(np.exp(-(seen**2) / 2) / whole)

@@ -24,7 +24,7 @@ BENT = 0.25  # sigma by which images may miss their linear prediction at 2 sigma
 PARABOLIC = (0.85, 1.18)  # end of an interval over that of the parabola
 DRAWS = 96
 _HOLDS = 0.4  # sigma by which slopes put together may miss what the images are from the mode on
-_CLOSE, _ROUNDS, _CHECKS, _SOLVES = 0.08, 5, 4, 5
+_CLOSE, _OVER, _ROUNDS, _CHECKS, _SOLVES = 0.08, 1.0, 5, 4, 5
 _HUBER = Settings().huber
 
 
@@ -57,15 +57,24 @@ class Valley:
     """The misfit about a mode: -2 ln posterior less a constant, with the noise held.
 
     known: image and Jacobian at the mode, where they have been computed.
+    above: of a place that is no mode, the mode (p,) and the rise of -2 ln L from there.
     met: ways from the mode to where slopes were computed, and how they change on them; a copy goes on with its own.
     """
 
     def __init__(
-        self, model: Model, data: Data, mode: Array, prior: Prior, *, known: tuple[Array, Array] | None = None
+        self,
+        model: Model,
+        data: Data,
+        mode: Array,
+        prior: Prior,
+        *,
+        known: tuple[Array, Array] | None = None,
+        above: tuple[Array, float] | None = None,
     ) -> None:
         image, jacobian = model(mode, True) if known is None else known
         noise = np.sqrt(data.variance(image))
         self._model, self._data, self.prior, self.mode = model, data, prior, np.array(mode, float)
+        self.above: tuple[Array, float] = above or (self.mode, 0.0)
         self._root = np.where(data.usable, 1 / noise, 0.0).ravel()
         first = np.abs(self._pixels(image))
         self._root *= np.sqrt(np.minimum(1, _HUBER / np.maximum(first, _HUBER)))
@@ -99,6 +108,10 @@ class Valley:
         counted = (slopes * dark[..., None]).reshape(-1, p)
         spread = flat.T @ flat + floor.T @ floor - counted.T @ counted
         return np.asarray(self.covariance @ spread @ self.covariance)
+
+    def rise(self, spot: Spot) -> float:
+        """Of -2 ln L from the mode to a spot."""
+        return spot.misfit - self.least + self.above[1]
 
     def along(self, i: int) -> Array:
         """(p,) how all parameters go when one is moved by one sigma and the rest are fitted, by the parabola."""
@@ -232,13 +245,12 @@ def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile
     points, better, ends = [(float(mode[i]), 0.0)], None, []
     straight = valley.bend(i) < BENT
     for sign in (-1, 1):
-        end = mode[i] + sign * goal * sigma
-        bound = float(valley.prior.low[i] if sign < 0 else valley.prior.high[i])
+        place = float(valley.inside(mode + sign * goal * sigma)[i])
         if not straight:
-            end, seen, lower = _end(valley, i, sign, goal)
-            points += seen
-            better = lower if better is None else better
-        ends.append(float(max(end, bound) if sign < 0 else min(end, bound)))
+            found = end(valley, i, sign, goal)
+            place, better = found.place, found.lower if better is None else better
+            points += found.seen
+        ends.append(place)
     if straight:
         points += [(float(mode[i] + s * sigma), s * s) for s in (-2.5, -1.96, -1.0, 1.0, 1.96, 2.5)]
     points.sort()
@@ -248,50 +260,45 @@ def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile
     return Profile(ends[0], ends[1], value, rise, plain), better
 
 
-def density(curve: Array, at: Array) -> Array:
-    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its profile (2, points) by value.
+@dataclass(frozen=True, eq=False, slots=True)
+class End:
+    """Of a profile: place, points met (value, rise), a place below the mode if one was met, whether it was reached."""
 
-    The signed root of the rise, straight where the valley is a parabola, runs linearly between the points and beyond.
-    """
-    value, keep = np.unique(curve[0], return_index=True)
-    root = np.sqrt(np.maximum(curve[1][keep], 0.0))
-    root = np.where(np.arange(len(value)) < int(np.argmin(root)), -root, root)
-    ends = (root[1] - root[0]) / (value[1] - value[0]), (root[-1] - root[-2]) / (value[-1] - value[-2])
-    seen = np.interp(at, value, root)
-    seen = np.where(at < value[0], root[0] + ends[0] * (at - value[0]), seen)
-    seen = np.where(at > value[-1], root[-1] + ends[1] * (at - value[-1]), seen)
-    fine = np.linspace(value[0], value[-1], 2001)
-    whole = np.trapezoid(np.exp(-(np.interp(fine, value, root) ** 2) / 2), fine)
-    return np.asarray(np.exp(-(seen**2) / 2) / whole)
+    place: float
+    seen: list[tuple[float, float]]
+    lower: Array | None = None
+    reached: bool = True
 
 
-def _end(valley: Valley, i: int, sign: int, goal: float) -> tuple[float, list[tuple[float, float]], Array | None]:
-    """Where the profile crosses ``goal`` squared on one side: (place, points met, a better mode)."""
-    mode, sigma = valley.mode, float(valley.sigma[i])
-    bound = valley.prior.low[i] if sign < 0 else valley.prior.high[i]
-    beside = valley.beside(i)
-    here = _spot(valley, mode + sign * goal * valley.along(i)) if beside is None else beside[0 if sign > 0 else 1]
-    held = False  # the slopes are those that hold at the end, once it is near
+def end(valley: Valley, i: int, sign: int, goal: float, begin: Array | None = None) -> End:
+    """Where the profile crosses ``goal`` squared on one side; from (p,) ``begin``, or where the parabola goes."""
+    lowest, bound = float(valley.above[0][i]), valley.prior.low[i] if sign < 0 else valley.prior.high[i]
+    beside = valley.beside(i) if begin is None else None
+    begin = valley.mode + sign * goal * valley.along(i) if begin is None else begin
+    here = beside[0 if sign > 0 else 1] if beside else _spot(valley, begin)
+    held = False  # the slopes are those that hold here
     seen: list[tuple[float, float]] = []
     for turn in range(_ROUNDS + _CHECKS):
-        here = valley.lowered(here, held=i)
-        x, rise = here.x, here.misfit - valley.least
+        before, here = here, valley.lowered(here, held=i)
+        found, x, rise = here, here.x, valley.rise(here)
+        held = held and float(np.linalg.norm(here.rest - before.rest)) < _OVER
         seen.append((float(x[i]), max(rise, 0.0)))
         if rise < -0.5:
-            return float(x[i]), seen, x
+            return End(float(x[i]), seen, x)
         root = math.sqrt(max(rise, 1e-6))
         done = abs(root - goal) < _CLOSE or (x[i] == bound and root < goal)
         if held and done:
             break
-        if not held and (done or turn == _ROUNDS - 1):  # the same place again, with the slopes that hold there
+        if not held and (done or root > goal + _OVER / 2 or turn == _ROUNDS - 1):  # again, with slopes that hold there
             here, seen, held = Spot(x, here.rest, valley.slopes_at(x, here.rest)), [], True
         else:
-            here = _spot(valley, x + _onwards(here, i, float(x[i] - mode[i]), (root, goal)), here.slopes)
-    place, roots = np.array([p for p, _ in seen]), np.sqrt([r for _, r in seen])
-    nearest = int(np.argmin(np.abs(roots - goal)))
-    gained = goal / max(float(roots[nearest]), 1e-3)
-    end = mode[i] + (place[nearest] - mode[i]) * float(np.clip(gained, 0.8, 1.25))
-    return float(end if np.isfinite(end) else mode[i] + sign * goal * sigma), seen, None
+            held = held and abs(root - goal) < _OVER / 2
+            here = _spot(valley, x + _onwards(here, i, float(x[i] - lowest), (root, goal)), here.slopes)
+    gone = float(found.x[i]) - lowest  # 0 where the mode is on the bound
+    more = np.clip(_onwards(found, i, gone, (root, goal))[i] / gone, -0.2, 0.25) if gone else 0.0
+    place = lowest + gone * (1 + float(more))
+    place = float(np.clip(place, valley.prior.low[i], valley.prior.high[i]))
+    return End(place, seen or [(float(found.x[i]), max(rise, 0.0))], reached=done or abs(root - goal) < _OVER / 2)
 
 
 def _spot(valley: Valley, x: Array, slopes: Array | None = None) -> Spot:
@@ -339,8 +346,5 @@ def shares(valleys: Sequence[Valley]) -> Array:
 
 def half_volume(valley: Valley) -> float:
     """Half the log determinant of a parabola's covariance."""
-    return float(np.linalg.slogdet(_unit(valley))[1] / 2 + np.log(valley.sigma).sum())
-
-
-def _unit(valley: Valley) -> Array:
-    return np.asarray(valley.covariance / np.outer(valley.sigma, valley.sigma))
+    unit = valley.covariance / np.outer(valley.sigma, valley.sigma)
+    return float(np.linalg.slogdet(unit)[1] / 2 + np.log(valley.sigma).sum())

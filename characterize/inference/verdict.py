@@ -1,18 +1,27 @@
 """What a finished fit is worth: checks with their causes, structure in the residuals, and two verdicts in words."""
 
+import copy
+import dataclasses
+import functools
+import itertools
 import math
 
 import numpy as np
 
 from characterize.captures import Gain
+from characterize.inference import residual
+from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.missing import Unstated
-from characterize.inference.search import WAVES_RAD
-from characterize.model import PARAMETERS, PLACE
+from characterize.inference.posterior import Valley
+from characterize.inference.search import WAVES_RAD, Task
+from characterize.model import PARAMETERS, PLACE, ForwardModel
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
+_SHOWN = 24  # draws whose images give the predicted error at depths in between
 _STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a thousand frames of noise reach 4
 
 
@@ -165,3 +174,81 @@ def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array
     middle, reach = (low + high) / 2, 1.96 * whole
     wide = ", ".join(f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}" for i in open_)
     return f"the process is known to {known}" + (f"; loosely: {wide}" if wide else "") + more
+
+
+def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
+    """Expected NRMSE of the as-built images: at the captured depths, and half-way between them."""
+    model = task.model
+    rng = np.random.default_rng(0)
+    if len(found.draws):
+        values = found.draws[:_SHOWN]
+    else:
+        size, vectors = np.linalg.eigh(found.covariance)
+        normal = rng.standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
+        values = found.best.value + normal @ vectors.T
+    values = np.clip(values, task.prior.low, task.prior.high)
+    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
+
+
+def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> float:
+    """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
+    images = residual.problem(model, task.names, task.start)
+    dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
+
+    def light(x: Array) -> Array:
+        x = x.copy()
+        x[dark] = 0.0
+        return np.asarray(images(x, False)[0])
+
+    mean = light(best)
+
+    def away(x: Array) -> float:
+        one = light(x)
+        one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
+        return float(((one - mean) ** 2).sum())
+
+    return float(np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum()))
+
+
+def between(model: ForwardModel) -> ForwardModel:
+    """The model half-way, in 1/z, between neighbouring depths at each angle; the farthest frame moves inwards."""
+    part, s = copy.copy(model), model.setting
+    depth = s.depth_um.copy()
+    for group in model.groups:
+        order = group.index[np.argsort(s.depth_um[group.index], kind="stable")]
+        if len(order) > 1:
+            inverse = 1 / s.depth_um[order]
+            middle = (inverse[1:] + inverse[:-1]) / 2
+            depth[order] = 1 / np.append(middle, middle[-1])
+    part.setting = dataclasses.replace(s, depth_um=depth)
+    return part
+
+
+def left_out(task: Task, mode: Solution) -> float:
+    """Chi-square a pixel of frames left out, every second depth and then the others, over that of the full fit.
+
+    About 1 + parameters over pixels where model and intervals hold; nan with fewer than four frames.
+    """
+    n = len(task.data.electrons)
+    if n < 4:
+        return float("nan")
+    order = np.argsort(task.model.setting.depth_um, kind="stable")
+    halves = [(np.sort(seen), np.sort(hidden)) for seen, hidden in itertools.permutations((order[::2], order[1::2]))]
+    total, count = np.sum(threads.each(functools.partial(_unseen, task, mode), halves), 0)
+    return float(total / max(count, 1))
+
+
+def _unseen(task: Task, mode: Solution, part: tuple[Array, Array]) -> tuple[float, int]:
+    """(chi-square, pixels) of the second frames by what the first say."""
+    seen, hidden = part
+    images = residual.problem(task.model.only(seen), task.names, task.start)
+    known = mode.image[seen], mode.slopes[:, seen]
+    valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
+    value, _ = valley.descend(mode.value, rounds=6)
+    rest = task.data.planes(hidden)
+    image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
+    keep = rest.usable & ~rest.saturated
+    slopes = mode.slopes[:, hidden][:, keep]
+    known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
+    variance = rest.variance(image)[keep] + known_e2
+    return float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()), int(keep.sum())

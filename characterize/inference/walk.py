@@ -26,7 +26,7 @@ WALKED = ("bias_nm",)
 REACH = 2.5  # prior sigma to either side of what is thought
 SHOWN = 14.0  # rise of -2 ln L up to which a walk is a profile, a probability of 1e-3; beyond it, it looks for valleys
 _WIDEST = 0.35  # of the prior sigma: a step at most
-_VALLEYS, _AGAIN = 3, 3
+_VALLEYS, _AGAIN, _BRANCHES, _ALIKE = 3, 3, 2, 1.5
 _NEAR = Settings(iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False)
 _FAR = Settings(iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False)
 _FINE, _ON_IT = 1201, 3.0
@@ -41,7 +41,7 @@ class Walk:
     index: of the parameter. value: (k, p) all parameters, the walked one's rising.
     rise: (k,) of -2 ln L above the best.
     spread: (k, p, p) covariance of the others with this one held; 0 in its row and column.
-    shown: rise up to which it is a profile.
+    shown: rise up to which it is a profile. stops: (k) fits there.
     """
 
     index: int
@@ -49,6 +49,7 @@ class Walk:
     rise: Array
     spread: Array
     shown: float = SHOWN
+    stops: tuple[Solution, ...] = ()
 
     @classmethod
     def of(
@@ -60,7 +61,7 @@ class Walk:
             if not order or one.value[index] > order[-1].value[index]:
                 order.append(one)
         value, rise = np.array([one.value for one in order]), np.array([one.merit for one in order]) - least
-        return cls(index, value, rise, np.array([_held(task, one, index) for one in order]), shown)
+        return cls(index, value, rise, np.array([_held(task, one, index) for one in order]), shown, tuple(order))
 
     def minima(self) -> list[int]:
         """Places lower than their neighbours, the lowest first."""
@@ -94,6 +95,25 @@ class Walk:
             nearest = value[np.argmin(rise)]
             return nearest, nearest
         return (value - room)[inside].min(0), (value + room)[inside].max(0)
+
+    def outermost(self, i: int, sign: int, level: float) -> list[tuple[int, Array]]:
+        """From where another parameter goes farthest to one side with a rise of ``level``: (stop, (p,) place there).
+
+        One or two stops, each farther than its neighbours, farthest first. A stop where the other is hardly held, as
+        between valleys, is followed as far as a usual one.
+        """
+        inside, size = self.rise < level, np.sqrt(self.spread[:, i, i])
+        step = np.sqrt(np.maximum(level - self.rise, 0.0)) * np.minimum(size, 2 * np.median(size[inside]))
+        far = np.concatenate([[-math.inf], np.where(inside, sign * self.value[:, i] + step, -math.inf), [-math.inf]])
+        peaks = np.flatnonzero((far[1:-1] > far[:-2]) & (far[1:-1] >= far[2:]))
+        best = peaks[np.argsort(-far[1:-1][peaks])][:_BRANCHES]
+        along = self.spread[:, :, i] / np.maximum(size**2, 1e-300)[:, None]
+        return [(int(k), self.value[k] + sign * step[k] * along[k]) for k in best]
+
+    def alike(self, i: int, level: float) -> bool:
+        """Whether another parameter is held as closely all along the walk, up to a rise of ``level``."""
+        size = np.sqrt(self.spread[self.rise < level, i, i])
+        return bool(size.max() < _ALIKE * size.min())
 
     def draws(self, count: int, *, widened: float, rng: np.random.Generator) -> Array:
         """(count, p) of the posterior along the walk; ``widened``: factor of all variances."""

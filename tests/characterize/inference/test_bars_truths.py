@@ -122,9 +122,9 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance():
     problem = lambda *_: lambda x, jacobian: (light + x[0] * picture, None)  # noqa: E731
     want = 0.3 * math.sqrt((picture**2).sum() / (light**2).sum())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(explore.residual, "problem", problem)
-        patch.setattr(explore, "between", lambda model: model)
-        here, _ = explore.predicted_error(task, found)
+        patch.setattr(verdict.residual, "problem", problem)
+        patch.setattr(verdict, "between", lambda model: model)
+        here, _ = verdict.predicted_error(task, found)
     assert here == pytest.approx(want, rel=0.45)
 
 

@@ -110,9 +110,9 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
     def problem(model, names, start):
         return lambda x, jacobian: (bright + x[0] * picture + x[1] * 100, None)
 
-    monkeypatch.setattr(explore.residual, "problem", problem)
-    monkeypatch.setattr(explore, "between", lambda model: model)
-    monkeypatch.setattr(explore, "_SHOWN", 4000)
+    monkeypatch.setattr(verdict.residual, "problem", problem)
+    monkeypatch.setattr(verdict, "between", lambda model: model)
+    monkeypatch.setattr(verdict, "_SHOWN", 4000)
     wide = np.full(2, np.inf)
     covariance = np.diag([0.09, 4.0])
     prior = Prior(np.zeros(2), wide, -wide, wide)
@@ -122,9 +122,9 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
     angle = np.arctan2(RNG.normal(0.7, 0.3, 10**6) * 1.7, 2.0) - math.atan2(0.7 * 1.7, 2.0)
     want = math.sqrt(np.mean(np.sin(angle) ** 2))
     # 4000 draws of a square: 1.1 % of its root
-    assert explore.predicted_error(about, found) == pytest.approx((want, want), rel=0.05)
+    assert verdict.predicted_error(about, found) == pytest.approx((want, want), rel=0.05)
     about.prior = Prior(np.zeros(2), wide, np.array([0.7, -9.0]), np.array([0.7, 9.0]))
-    assert explore.predicted_error(about, found) == pytest.approx((0, 0), abs=1e-12)
+    assert verdict.predicted_error(about, found) == pytest.approx((0, 0), abs=1e-12)
 
 
 def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not_at_all():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from characterize.inference import explore, leastsquares, posterior, residual
+from characterize.inference import explore, leastsquares, posterior, residual, verdict
 from characterize.inference.leastsquares import Data, Prior
 from characterize.model import MODES, PLACE, prior_rad
 from characterize.model.forward import Setting
@@ -100,12 +100,12 @@ def test_predicted_error_is_the_sine_between_the_images():
     found = SimpleNamespace(draws=drawn, best=SimpleNamespace(value=np.array([0.0, 0.0, 5.0])))
     q2 = (picture[0] ** 2).sum() / (bright**2).sum()
     want = np.sqrt(np.mean(drawn[:, 0] ** 2 * q2 / (1 + drawn[:, 0] ** 2 * q2)))
-    assert explore.predicted_error(task(Straight(bright, picture)), found) == pytest.approx((want, want), rel=1e-9)
+    assert verdict.predicted_error(task(Straight(bright, picture)), found) == pytest.approx((want, want), rel=1e-9)
 
 
 def test_frames_in_between_lie_half_way_in_inverse_depth():
     model = Straight(np.ones((5, 2, 2)), np.ones((3, 5, 2, 2)))
-    got = explore.between(model).setting.depth_um
+    got = verdict.between(model).setting.depth_um
     rising = np.sort(DEPTH)
     middle = 2 / (1 / rising[1:] + 1 / rising[:-1])
     want = dict(zip(rising, [*middle, middle[-1]], strict=True))
@@ -122,7 +122,7 @@ def test_frames_left_out_are_judged_with_what_the_others_know():
     model = Straight(bright, pictures)
     value = np.array([0.4, -0.9, 1.1])
     image = bright + np.tensordot(value, pictures, 1)
-    got = explore.left_out(task(model, data), SimpleNamespace(value=value, image=image, slopes=pictures))
+    got = verdict.left_out(task(model, data), SimpleNamespace(value=value, image=image, slopes=pictures))
     order, total = np.argsort(DEPTH), 0.0
     for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         a, b = (pictures[:, part].reshape(3, -1).T for part in (seen, hidden))
@@ -131,7 +131,7 @@ def test_frames_left_out_are_judged_with_what_the_others_know():
         variance = sigma**2 + np.einsum("ni,ij,nj->n", b, covariance, b)
         total += (((frames - bright)[hidden].ravel() - b @ value) ** 2 / variance).sum()
     assert got == pytest.approx(total / bright.size, rel=1e-4)  # a descent ends within 0.02 of the misfit
-    assert np.isnan(explore.left_out(task(model.only(np.arange(3)), data.planes(np.arange(3))), None))
+    assert np.isnan(verdict.left_out(task(model.only(np.arange(3)), data.planes(np.arange(3))), None))
 
 
 def test_modes_of_a_phase_that_nobody_knows_take_information_away():

@@ -1,0 +1,79 @@
+"""A posterior that closes to a ring: bias and its gradient seen through their product and the difference of squares."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference import explore, leastsquares, residual
+from characterize.inference.leastsquares import Data, Prior
+from characterize.model import NAMES, PLACE
+from characterize.model.setting import Setting
+
+NAMED = ("bias_nm", "bias_y_nm", "background_e")
+DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
+RNG = np.random.default_rng(8)
+BRIGHT = RNG.uniform(3, 9, (5, 4, 3))
+PICTURES = np.linalg.qr(RNG.standard_normal((60, 3)))[0].T.reshape(3, 5, 4, 3)  # of unit length, at right angles
+PRODUCT, SQUARES, NOISE = 0.043, 0.013, 0.4
+START = np.zeros(len(NAMES))
+PRIOR = Prior(np.array([1.7, 0.0, 0.0]), np.array([15.0, np.inf, np.inf]), np.full(3, -40.0), np.full(3, 40.0))
+
+
+class Ring:
+    """(b + ig)², its parts on two pictures: two lenses alike, (b, g) and (-b, -g), with a ring between them."""
+
+    def __init__(self, index=None):
+        self.index = index = np.arange(5) if index is None else index
+        self.setting = Setting(DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3)
+        self.groups = [SimpleNamespace(index=np.arange(len(index)))]
+
+    def only(self, index):
+        return Ring(self.index[index])
+
+    def rough(self, tolerance):
+        return self
+
+    def images(self, x, names=None):
+        b, g, level = (x[PLACE[name]] for name in NAMED)
+        one, two, three = PICTURES[:, self.index]
+        image = BRIGHT[self.index] + PRODUCT * b * g * one + SQUARES * (b * b - g * g) * two + level * three
+        slopes = PRODUCT * g * one + 2 * SQUARES * b * two, PRODUCT * b * one - 2 * SQUARES * g * two, three
+        return image, None if names is None else np.stack(slopes)
+
+
+def rise(b, g, seen):
+    """-2 ln posterior less the background's part, which is fitted whatever the others are."""
+    parts = (PRODUCT * b * g - seen[0]) ** 2 + (SQUARES * (b * b - g * g) - seen[1]) ** 2
+    return parts / NOISE**2 + ((b - PRIOR.mean[0]) / PRIOR.sigma[0]) ** 2
+
+
+@pytest.mark.parametrize("seen", [(0.55, 0.2), (0.62, -0.2)])
+def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
+    """The gradient's ends lie far from where any walk of the bias stops; the least over a fine grid is the profile.
+
+    A search ends within 0.08 of the root of the rise and goes on by its slope; the noise is held, and alike.
+    """
+    model = Ring()
+    frames = BRIGHT + seen[0] * PICTURES[0] + seen[1] * PICTURES[1] + 1.3 * PICTURES[2]
+    everywhere = np.ones(frames.shape, bool)
+    data = Data(frames, everywhere, ~everywhere, np.full(frames.shape, NOISE**2), np.full(frames.shape, 1e15))
+
+    def problem(index=None):
+        return residual.problem(model if index is None else model.only(index), NAMED, START)
+
+    about = SimpleNamespace(model=model, data=data, names=NAMED, prior=PRIOR, start=START, problem=problem)
+    begin = np.array([4.0, 5.0, 0.0])
+    found = explore.explore(about, [leastsquares.fit(about.problem(), data, begin, prior=PRIOR)])
+
+    fine = np.linspace(-25, 25, 2501)
+    whole = rise(*np.meshgrid(fine, fine, indexing="ij"), seen)
+    for name, low, high, axis in zip(NAMED, found.low, found.high, (1, 0), strict=False):
+        curve = whole.min(axis) - whole.min()
+        ends = fine[curve < 3.8415][[0, -1]]
+        room = 0.02 * np.ptp(ends)
+        assert low < ends[0] + room, name
+        assert high > ends[1] - room, name
+    followed = found.profiles["bias_y_nm"]
+    assert (followed.low, followed.high) == pytest.approx(tuple(ends), abs=room)
+    assert not followed.parabolic
