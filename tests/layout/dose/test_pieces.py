@@ -70,3 +70,22 @@ def test_too_many_pieces_are_refused_by_name(monkeypatch):
     monkeypatch.setattr(pieces, "MOST_PIECES", 100)
     with pytest.raises(ProcessError, match=r"more than 100 pieces .* backscatter ranges 5 um"):
         pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=beam(5.0), tolerance=0.01)
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(-1, 0), (1, 0), (0, -1), (0, 1), (0.6, 0.8), (-0.8, 0.6), (0.6, -0.8)])
+def test_pieces_are_an_eighth_of_the_range_within_three_ranges_of_a_lens(dx, dy):
+    """To each side of a lens of 40 x 20 um and over its corners; of two ranges the shorter one where both reach."""
+    lens, size, step_um = (30.0, 50.0, 70.0, 70.0), (4.0, 6.0), 0.001
+    point = PointExposure(np.array([2.0, 5.0]), np.array([0.7, 0.3]))
+
+    def longest(distance_um):
+        """Of a box that many um from the lens, in this direction."""
+        left = lens[2] + dx * distance_um if dx > 0 else lens[0] + dx * distance_um - size[0] if dx < 0 else 45.0
+        bottom = lens[3] + dy * distance_um if dy > 0 else lens[1] + dy * distance_um - size[1] if dy < 0 else 55.0
+        box = np.rint(np.array([[left, bottom, left + size[0], bottom + size[1]]]) / step_um).astype(np.int64)
+        part = pieces._Pieces(box, np.ones((1, 4), bool), np.zeros(1, int))
+        return float(pieces._longest(part, np.array([lens]), step_um, point, 8.0)[0])
+
+    assert longest(5.9) == 2.0 / 8
+    assert longest(6.1) == longest(14.9) == 5.0 / 8
+    assert longest(15.1) == 8.0
