@@ -89,3 +89,33 @@ def test_pieces_are_an_eighth_of_the_range_within_three_ranges_of_a_lens(dx, dy)
     assert longest(5.9) == 2.0 / 8
     assert longest(6.1) == longest(14.9) == 5.0 / 8
     assert longest(15.1) == 8.0
+
+
+def test_the_change_of_the_background_is_that_along_outer_sides_and_across_to_the_opposite_one():
+    """Half of the range over ends and middle of a side that the shape has, and half of the difference between two
+    opposite ones, of a box with other boxes on no side alike; by products of differences of erf."""
+    every = np.array(
+        [[0, 0, 3_000, 5_000], [3_400, -900, 6_000, 900], [-2_600, 3_800, -300, 4_700], [1_100, 5_100, 2_000, 7_000]]
+    )
+    point = PointExposure(np.array([1.3, 2.9]), np.array([0.6, 0.4]))
+    (left, bottom, right, top), boxes = every[0] * STEP_UM, every * STEP_UM
+    xs, ys = (left, (left + right) / 2, right), (bottom, (bottom + top) / 2, top)
+    field = by_boxes(np.array([[x, y] for y in ys for x in xs]), boxes, point).reshape(3, 3)
+    below, above, at_left, at_right = (
+        float(np.ptp(line)) / 2 for line in (field[0], field[2], field[:, 0], field[:, 2])
+    )
+    over = float(np.abs(field[:, 2] - field[:, 0]).max()) / 2
+    up = float(np.abs(field[2] - field[0]).max()) / 2
+    assert len({round(v, 3) for v in (below, above, at_left, at_right)}) == 4
+    for outer, x, y in (
+        ((1, 0, 0, 0), 0, at_left),
+        ((0, 1, 0, 0), below, 0),
+        ((0, 0, 1, 0), 0, at_right),
+        ((0, 0, 0, 1), above, 0),
+        ((1, 0, 1, 0), over, max(at_left, at_right)),
+        ((0, 1, 0, 1), max(below, above), up),
+        ((1, 1, 1, 1), max(below, above, over), max(at_left, at_right, up)),
+    ):
+        part = pieces._Pieces(every[:1], np.array([outer], bool), np.zeros(1, int))
+        # boxes beyond the reach of their Gaussians are left out, which gives less than 1e-4
+        assert pieces._change(part, every, STEP_UM, point)[0] == pytest.approx([x, y], abs=2e-4)

@@ -212,3 +212,40 @@ def test_pillars_that_their_own_dose_hardly_reaches_are_refused(own, refused):
         assert bodies.table(DIAMETER, GOAL, number, point=point, ranges=near, pitch_um=PITCH).own[1] == pytest.approx(
             own
         )
+
+
+def others(width, pitch):
+    """Sum over the other sites of exp(-r²/width²), by Poisson: (√π w/p Σ exp(-π²k²w²/p²))² less the site's own 1."""
+    k = np.arange(-40, 41)
+    return (math.sqrt(math.pi) * width / pitch * np.exp(-((math.pi * k * width / pitch) ** 2)).sum()) ** 2 - 1
+
+
+@pytest.mark.parametrize(("widths", "by_sum"), [((0.75, 0.5), True), ((0.75, 0.9), True), ((1.1, 1.4), False)])
+def test_what_neighbours_give_is_bounded_by_their_sum_or_by_what_a_site_would_give_itself(widths, by_sum):
+    """Widths in pitches: the sum of narrow ones is less than a site's own; of wide ones the own is the bound."""
+    middle = PointExposure(np.array(widths) * PITCH, np.array([0.2, 0.07]))
+    scale = middle.weights / (math.pi * middle.widths_um**2)
+    total = sum(s * others(w, PITCH) for s, w in zip(scale, middle.widths_um, strict=True))
+    assert (total < scale.sum()) == by_sum
+    # sites beyond five widths: exp(-25) each
+    assert bodies._beside(middle, PITCH) == pytest.approx(min(total, scale.sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.88, False), (0.92, True)])
+def test_pillars_to_whom_neighbours_give_nine_tenths_of_their_own_are_refused(share, refused):
+    """The smaller pillar of two: what neighbours give goes with the area, its own less so; the other is far below."""
+    number, core = np.array([0, 5, 30, 0]), PointExposure(np.array([0.4]), np.array([1.0]))
+    nothing = PointExposure(np.zeros(0), np.zeros(0))
+    area, own = math.pi / 4 * DIAMETER**2, np.array([float(rim_of_own_disc(d, 0.4)) for d in DIAMETER])
+    worst = (area[1:3] / own[1:3]).max()
+    one = area[1] / own[1], area[2] / own[2]
+    assert max(one) > 1.05 * min(one)  # so that one of them alone is refused
+    width = 2.0 * PITCH
+    weight = share / worst * math.pi * width**2  # a wide one: bounded by what a site would give itself
+    ranges = bodies.Ranges(nothing, PointExposure(np.array([width]), np.array([weight])), core)
+    about = dict(point=core, ranges=ranges, pitch_um=PITCH)
+    if refused:
+        with pytest.raises(ProcessError, match="less than its neighbours do"):
+            bodies.table(DIAMETER, GOAL, number, **about)
+    else:
+        assert bodies.table(DIAMETER, GOAL, number, **about).own[1:3] == pytest.approx(own[1:3], rel=1e-9)
