@@ -179,14 +179,15 @@ def _neighbours(
         factor = 1 + known[0] * p + known[1] * p * p
         used = _scalar(aperture, factor)
         return math.hypot(_difference(used, _scalar(aperture)), _scattered(aperture, factor, used, seen.lit))
-    used = _scalar(aperture, known.mean(p))
+    factor = known.mean(p)
+    used = _scalar(aperture, factor)
     less = [_difference(_scalar(aperture, other.mean(p)), used) for other in known.others]
     left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(less, default=0.0)
     left += math.hypot(CURVED, seen.slanted) * _difference(_scalar(aperture), used)
     for wave, weight in zip(*(seen.light or ((), ())), strict=True):
         away = _difference(_scalar(aperture, known.mean(p * (wave / known.wavelength_um))), used)
         left = math.hypot(left, math.sqrt(weight) * away)
-    left = math.hypot(left, _scattered(aperture, known.mean(p), used, seen.lit))
+    left = math.hypot(left, _scattered(aperture, factor, used, seen.lit))
     along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
     aside = _scalar(aperture, (along - across) / 2, order=2)
     return left if polarisation != "scalar" else math.hypot(left, _difference(used + aside, used))
@@ -198,7 +199,7 @@ def _scattered(aperture: float, factor: Array, used: Array, lit: float) -> float
 
         |U + n|² - |U|² ≈ 2 Re U* n,   ‖2 Re U* n‖² = 2 <|n|²> ∫|U|²,   <|n|²> = P / area
 
-    A lens of few wavelengths has few places for it: 0.09 at 20 um² and NA 0.4, 1e-3 for 1 mm.
+    A lens of few wavelengths has few places for it: 0.09 on a square of 7 um at NA 0.4, 5e-4 for 1 mm.
     """
     p, weight, radius = _nodes(aperture)
     power = weight / (1 - p * p) ** 2
