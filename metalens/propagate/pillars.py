@@ -162,15 +162,17 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
     along, shares, (row_bases, column_bases) = _fixed(plan, out.numpy().dtype)
     for panel in plan.panels:
         table = _table(plan, panel, along.dtype)
-        count, begin = panel.stop - panel.start, panel.start * rows.length
+        count = panel.stop - panel.start
         nodes = torch.zeros((count * rows.nodes, 2, columns.count * columns.nodes), dtype=out.dtype)
         view = nodes.numpy()
-        few = [np.asarray(one[begin : panel.stop * rows.length], along.dtype) for one in maps]
-        bases = row_bases[panel] - begin, column_bases
 
-        def work(a: int, b: int, few: Any = few, table: Any = table, bases: Any = bases, view: Any = view) -> None:
-            part = view[a * rows.nodes : b * rows.nodes]
-            powers.append(kernel(*few, table[a:b], along, shares, bases, a, part))
+        def work(a: int, b: int, first: int = panel.start, table: Any = table, view: Any = view) -> None:
+            for i in range(a, b):  # maps of another dtype are brought to this one a block row at a time
+                begin = (first + i) * rows.length
+                few = [np.asarray(one[begin : begin + rows.length], along.dtype) for one in maps]
+                bases = row_bases[first + i : first + i + 1] - begin, column_bases
+                part = view[i * rows.nodes : (i + 1) * rows.nodes]
+                powers.append(kernel(*few, table[i : i + 1], along, shares, bases, 0, part))
 
         split(count, work)
         sums = (nodes.flatten(0, 1) @ plan.columns).view(-1, 2 * n)
