@@ -6,6 +6,9 @@ other. Scaled along the eigenvectors of the gradients' own second moments they a
 2024, arXiv:2409.11321):
 
     L = <G Gᵀ>,  R = <Gᵀ G>,  U = Q_Lᵀ G Q_R,  step = Q_L (<U> / √<U²>) Q_Rᵀ    for a gradient G (outputs, inputs)
+
+The first gradient turns at once: <U²> gathered along other axes would hold the common direction in each of them, and
+keep every step short for the hundred steps after.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -15,10 +18,8 @@ import torch
 from torch import Tensor, nn
 
 SMALLEST, WIDEST = 8, 600  # sides: smaller layers are left to Adam; wider sides keep their axes: moments cost too much
-GATHER = 5  # steps that the first directions are found from; nothing moves in them
-FIRST = 10  # steps of orthogonal iteration that find them
 LEAST = 1e-3  # of a layer's root mean square: where gradients are rounding, rounding is not blown up
-TURN = 10  # steps after which the directions follow: one step of orthogonal iteration, continuous in them
+TURN = 10  # steps from turn to turn, one step of orthogonal iteration each: fewer follow better, and cost a QR a side
 
 
 def layers(net: nn.Module) -> list[nn.Parameter]:
@@ -78,10 +79,8 @@ class Soap(torch.optim.Optimizer):
         count = int(state["step"])
         _follow(state, gradient, count, slow)
         state["mean"].lerp_(gradient, 1 - fast)
-        if count <= GATHER:
-            return
         state["square"].lerp_(_turned(state, gradient) ** 2, 1 - slow)
-        spread = (state["square"] / (1 - slow ** (count - GATHER))).sqrt_()
+        spread = (state["square"] / (1 - slow**count)).sqrt_()
         spread.add_(LEAST * spread.square().mean().sqrt() + group["epsilon"])
         along = _turned(state, state["mean"] / (1 - fast**count)) / spread
         weight.mul_(1 - group["lr"] * group["weight_decay"])
@@ -106,9 +105,8 @@ def _follow(state: dict[str, Tensor], gradient: Tensor, count: int, slow: float)
     for side, _ in _sides(gradient):
         moment = state[f"moment_{side}"]
         moment.lerp_(gradient @ gradient.T if side == "left" else gradient.T @ gradient, 1 - slow)
-        if count >= GATHER and count % TURN == GATHER % TURN:
-            for _ in range(FIRST if count == GATHER else 1):
-                state[f"turn_{side}"] = _nearer(moment, state[f"turn_{side}"])
+        if (count - 1) % TURN == 0:
+            state[f"turn_{side}"] = _nearer(moment, state[f"turn_{side}"])
 
 
 def _nearer(moment: Tensor, turn: Tensor) -> Tensor:
