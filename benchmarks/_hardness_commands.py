@@ -206,6 +206,7 @@ def _child(folder: Path, told: Path, words: str, each: Each) -> None:
     """Run the command in this forked process and end it."""
     status, begun = _UNTYPED, time.process_time()
     hook = Hook(str(folder), each, told)
+    _heard()
     try:
         os.chdir(folder)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -228,6 +229,13 @@ def _child(folder: Path, told: Path, words: str, each: Each) -> None:
     finally:
         sys.stderr.flush()
         os._exit(status)
+
+
+def _heard() -> None:
+    """Signals are answered as in a terminal, also where a shell that began the benchmark aside let them be ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _count_writes(hook: Hook) -> None:

@@ -45,12 +45,15 @@ def fork() -> int:
 def enter(place: Path, folder: Path) -> None:
     """Put ``place`` where ``folder`` is, for this process; its open files become those of the copy, locks too.
 
+    The current folder, in it, becomes that of the copy.
+
     Raises:
         OSError: it cannot be mounted.
     """
+    current = os.getcwd()
     if _LIBC.unshare(_NEW_NAMESPACE) or _LIBC.mount(os.fsencode(place), os.fsencode(folder), None, _BIND, None):
         raise OSError(ctypes.get_errno(), "a copy cannot be mounted", str(folder))
-    os.chdir(folder)
+    os.chdir(current)
     for name in os.listdir("/proc/self/fd"):
         link = f"/proc/self/fd/{name}"
         path = os.readlink(link) if os.path.islink(link) else ""

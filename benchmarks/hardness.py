@@ -5,7 +5,7 @@
     python -m benchmarks.hardness --kills 40 --verbs design scene       # of some commands alone
     python -m benchmarks.hardness --mutations 100000 --kinds tiff png   # more damaged files, of some kinds alone
     python -m benchmarks.hardness --points 2 --verbs psf layout         # every file operation of so many runs each
-    python -m benchmarks.hardness --values --threads
+    python -m benchmarks.hardness --values --threads --seeds
 
 The error of a row is the number of failures: mixed results, files lost, scratch left, untyped ends, crashes; each is
 printed with what it needs to be had again. Trials of commands are numbered; those that failed are tried again first.
@@ -29,6 +29,7 @@ from benchmarks import (
     _hardness_points,
     _hardness_runs,
     _hardness_samples,
+    _hardness_seeds,
     _hardness_threads,
     _hardness_values,
 )
@@ -53,7 +54,8 @@ TRIALS = RESULT.with_name("hardness_trials.json")
 def rows() -> list[Row]:
     """All parts at their small size."""
     asked = {"kills": KILLS, "writers": WRITERS, "disks": DISKS}
-    return [*runs(asked, tuple(_hardness_commands.VERBS)), mutations(MUTATIONS), bad_values(), threads()]
+    verbs = tuple(_hardness_commands.VERBS)
+    return [*runs(asked, verbs), mutations(MUTATIONS), bad_values(), threads(), seeds(verbs)]
 
 
 def runs(asked: dict[str, int], verbs: tuple[str, ...], seconds: float = math.inf) -> list[Row]:
@@ -185,6 +187,16 @@ def threads() -> Row:
     return _row(case, "bytes of all files", math.nan, failures, "other bytes, not said")
 
 
+def seeds(verbs: tuple[str, ...]) -> Row:
+    """Commands whose results differ with the interpreter that runs them."""
+    with tempfile.TemporaryDirectory() as name:
+        found = dict(_hardness_seeds.differing(Path(name), verbs))
+    print("\n".join(f"{verb}: other bytes in {', '.join(names)}" for verb, names in found.items() if names))
+    case = f"{', '.join(found)} in two interpreters"
+    method = "bytes of all files; other hash seeds, loops compiled and cached, clocks that agree"
+    return _row(case, method, math.nan, sum(map(bool, found.values())), "other bytes")
+
+
 def _row(case: str, method: str, seconds: float, failures: int, against: str) -> Row:
     return Row(case, method, seconds, float(failures), against, goal=f"0: {'met' if failures == 0 else 'missed'}")
 
@@ -218,7 +230,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in (*AGAINST, "mutations", "points"):
         parser.add_argument(f"--{name}", type=int, default=0)
-    for name in ("values", "threads"):
+    for name in ("values", "threads", "seeds"):
         parser.add_argument(f"--{name}", action="store_true")
     parser.add_argument("--seconds", type=float, default=math.inf, help="no new trial of a command after so long")
     parser.add_argument("--verbs", nargs="*", choices=list(_hardness_commands.VERBS), default=())
@@ -235,6 +247,7 @@ def main() -> None:
     found += [mutations(asked.mutations, asked.kinds)] if asked.mutations else []
     found += [bad_values()] if asked.values else []
     found += [threads()] if asked.threads else []
+    found += [seeds(tuple(asked.verbs) or tuple(_hardness_commands.VERBS))] if asked.seeds else []
     print(table(found))
     keep(found)
 

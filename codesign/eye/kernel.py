@@ -2,6 +2,10 @@
 
 The source of :mod:`codesign.eye.model` is compiled twice by numba, with two sets of elementary functions. Pixels are
 shaded in tiles, in passes over all lanes of a tile; a pass that no pixel of the tile needs is left out.
+
+All passes are put into the one function that loops over tiles. A function that is called is optimised by itself, and
+once more inside the library of its caller; a process that has just compiled them runs the first, one that takes them
+from the cache the second, and with sums in any order (``fastmath``) these round otherwise.
 """
 
 import inspect
@@ -17,9 +21,9 @@ from codesign.eye import inline as render_inline
 from codesign.eye import lanes as render_lanes
 from codesign.eye import model
 from codesign.eye.lanes import SETTINGS, f32, inside
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
-_jit = numba.njit(**SETTINGS)
 COLUMNS = 16  # of a tile: a vector register of float32, or two
 ROWS, DUAL_ROWS = 4, 2  # of a tile: independent work for a processor's pipelines, within its nearest cache
 SAMPLES = 4  # texture samples in a pass, at most
@@ -75,7 +79,7 @@ def _tile(operations: Callable[[int], render_lanes.Operations], rows: int, *, du
         scope = dict(space)
         text = render_inline.loops(source, at, lanes=lanes, dual=dual)
         exec(compile(text, "<pass of the scene model>", "exec"), scope)
-        passes.append(_jit(scope["run"]))
+        passes.append(inside(scope["run"]))
     return _Tile(lanes, at, len(NAMES) * width, 2 * SAMPLES * lanes, _shading(passes, at, lanes))
 
 
@@ -84,7 +88,7 @@ def _shading(passes: list[Any], at: dict[str, int], lanes: int) -> Any:
     face, skin, globe, iris, white, light = passes
     seen, met, disc, first, last = (at[name] for name in ("seen", "inside", "disc", FIRST_SHADED, LAST_SHADED))
 
-    @_jit  # type: ignore[untyped-decorator]
+    @inside  # type: ignore[untyped-decorator]
     def shade(p: Any, t: Any, x: Any, words: Any) -> None:
         for lane in range(first, last):
             x[lane] = f32(0)
@@ -154,20 +158,16 @@ def _frames(stamp: int) -> Any:
         tile.at[name] for name in ("seen", "bare", "front", "near", "far", "back", "hole")
     )
 
-    @numba.njit(parallel=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
+    @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
     def frames(
-        parameters: Array, scale: Array, bank: Array, u: Array, w: Array,
+        first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array, w: Array,
         light: Array, cover: Array, depth: Array, pupil: Array,
     ) -> None:  # fmt: skip
-        """Render frames: parameters (n, COUNT), scale (n,) of the depths, tangents u (x,), w (y,).
-
-        Fills light, cover, depth (n, 2, y, x) and pupil (n, 1, y, x). Sheet 0 is skin, sheet 1 the eye; light is
-        multiplied by the coverage. What is hidden is not shaded.
-        """
+        """Strips of frames from the first to before the end; see :func:`render`. What is hidden is not shaded."""
         if stamp == 0:
             return
         strips = (len(w) + ROWS - 1) // ROWS
-        for job in numba.prange(parameters.shape[0] * strips):
+        for job in range(first, end):
             n, row = job // strips, job % strips * ROWS
             x, words = np.empty(size, np.float32), np.empty(count, np.int32)
             for column in range(0, len(u), COLUMNS):
@@ -192,16 +192,13 @@ def _tangents(stamp: int) -> Any:
     size, count, lanes = tile.size, tile.words, tile.lanes
     near, far, seen, front, back = (tile.at[name] for name in ("near", "far", "seen", "front", "back"))
 
-    @numba.njit(parallel=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
-    def tangents(parameters: Array, bank: Array, u: Array, w: Array, out: Array) -> None:
-        """Frames and two directional derivatives: parameters (n, 3, COUNT) hold values and two tangents.
-
-        Fills out (n, 3 * 5, y, x): light of skin and eye, coverage of the eye, depth of skin and eye; their tangents.
-        """
+    @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
+    def tangents(first: int, end: int, parameters: Array, bank: Array, u: Array, w: Array, out: Array) -> None:
+        """Strips of frames from the first to before the end; see :func:`differentiate`."""
         if stamp == 0:
             return
         strips = (len(w) + DUAL_ROWS - 1) // DUAL_ROWS
-        for job in numba.prange(parameters.shape[0] * strips):
+        for job in range(first, end):
             n, row = job // strips, job % strips * DUAL_ROWS
             x, words = np.zeros(size, np.float32), np.empty(count, np.int32)
             for column in range(0, len(u), COLUMNS):
@@ -219,3 +216,25 @@ def _tangents(stamp: int) -> Any:
 
 _stamp = 1 + zlib.crc32("".join(map(inspect.getsource, (model, render_inline, render_lanes))).encode())
 frames, tangents = _frames(_stamp), _tangents(_stamp)
+
+
+def render(
+    parameters: Array, scale: Array, bank: Array, u: Array, w: Array, light: Array, cover: Array, depth: Array,
+    pupil: Array,
+) -> None:  # fmt: skip
+    """Render frames: parameters (n, COUNT), scale (n,) of the depths, tangents u (x,), w (y,).
+
+    Fills light, cover, depth (n, 2, y, x) and pupil (n, 1, y, x). Sheet 0 is skin, sheet 1 the eye; light is
+    multiplied by the coverage.
+    """
+    rest = (parameters, scale, bank, u, w, light, cover, depth, pupil)
+    threads.split(len(parameters) * -(-len(w) // ROWS), lambda first, end: frames(first, end, *rest))
+
+
+def differentiate(parameters: Array, bank: Array, u: Array, w: Array, out: Array) -> None:
+    """Frames and two directional derivatives: parameters (n, 3, COUNT) hold values and two tangents.
+
+    Fills out (n, 3 * 5, y, x): light of skin and eye, coverage of the eye, depth of skin and eye; their tangents.
+    """
+    rest = (parameters, bank, u, w, out)
+    threads.split(len(parameters) * -(-len(w) // DUAL_ROWS), lambda first, end: tangents(first, end, *rest))

@@ -106,7 +106,7 @@ def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int) -> 
     sheets = [np.empty((n, 2, size, size), np.float32) for _ in range(3)]
     pupil = np.empty((n, 1, size, size), np.float32)
     values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    render_kernel.frames(values, factor, textures.pairs(seed), t, t, *sheets, pupil)
+    render_kernel.render(values, factor, textures.pairs(seed), t, t, *sheets, pupil)
     return Frames(*map(torch.from_numpy, sheets)), torch.from_numpy(pupil[:, 0])
 
 
@@ -179,7 +179,7 @@ def sensitivities(
     n, size = len(states), camera.pixels
     t = camera.tangents(rig).astype(np.float32)
     out = np.empty((n, 3, 5, size, size), np.float32)
-    render_kernel.tangents(
+    render_kernel.differentiate(
         packed.numpy().astype(np.float32), textures.pairs(texture_seed), t, t, out.reshape(n, 15, size, size)
     )
     scale = states.scale.to(torch.float32)[:, None, None, None]

@@ -15,7 +15,7 @@ from metalens.chain import ChainFiles, Stage, module_view
 from metalens.chain import stages as chain
 from metalens.cli import main as run_verb
 from metalens.commands.common import Common
-from metalens.ground import report, store
+from metalens.ground import manifest, report, store
 from metalens.ground.errors import ConfigError, MetalensError
 
 OUTCOMES = "outcomes.jsonl"
@@ -58,9 +58,11 @@ def run(options: Options) -> int:
     laid = chain.laid(wanted, source, aperture_mm=options.aperture_mm)
     with options.claim_work(options.output, keep=(OUTCOMES,), resume=options.resume) as draft:
         folder = draft.path
-        if (folder / OUTCOMES).is_file() and not laid.stands_in(folder):  # of other settings nothing gets beside it
-            raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
-        laid.write(folder)
+        if not laid.stands_in(folder):  # of other settings nothing gets beside it
+            if (folder / OUTCOMES).is_file():
+                raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
+            manifest.empty(folder)
+            laid.write(folder)
         outcomes: list[Outcome] = []
         for outcome in _chain(folder, laid.files):
             outcomes.append(outcome)

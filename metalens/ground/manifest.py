@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,15 @@ def files(folder: Path) -> Iterator[str]:
         here = Path(place).relative_to(folder)
         yield from ((here / n).as_posix() for n in names if (here / n).as_posix() != NAME)
         yield from ((here / n).as_posix() for n in folders if os.path.islink(os.path.join(place, n)))
+
+
+def empty(folder: Path) -> None:
+    """Remove all that is in a folder but its manifest."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != NAME:
+            path.unlink()
 
 
 def foreign(path: Path) -> str:

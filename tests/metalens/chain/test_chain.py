@@ -13,7 +13,7 @@ from metalens.chain import stages as chain
 from metalens.chain.stages import ChainFiles
 from metalens.commands import demo
 from metalens.commands.design import Design
-from metalens.ground import config
+from metalens.ground import config, manifest
 from metalens.ground.errors import ConfigError
 
 
@@ -209,6 +209,23 @@ def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     (tmp_path / "table.csv").write_text("1,2\n")
     assert demo.run(again) == 0
     assert seen[3] == "psf"
+
+
+def test_nothing_of_other_settings_stays_where_no_stage_was_finished(tmp_path, monkeypatch):
+    """After a kill in the first stage: a bench that the second chain has not would stand in the finished folder."""
+    for name, more in (("long", 'bench_truth = "b.toml"\nbench_design = "d.toml"\n'), ("short", "")):
+        files = "".join(f'{key} = "{key[0]}.toml"\n' for key in ("cell", "design", "process"))
+        (tmp_path / f"{name}.toml").write_text(f"{files}budget = false\n{more}")
+    for name, text in (("c", 'n = "table.csv"\n'), ("d", ""), ("p", ""), ("b", "")):
+        (tmp_path / f"{name}.toml").write_text(text)
+    (tmp_path / "table.csv").write_text("1,2\n")
+    begun(tmp_path, monkeypatch, config=tmp_path / "long.toml")
+    for name in (demo.OUTCOMES, "process.toml"):
+        (tmp_path / "out.unfinished" / name).unlink()
+    (tmp_path / "c.toml").write_text("n = 1.5\n")
+    assert demo.run(demo.Options(tmp_path / "out", config=tmp_path / "short.toml", resume=True, quiet=True)) == 0
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert made == {"cell.toml", "design.toml", "process.toml", demo.OUTCOMES, manifest.NAME}
 
 
 def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch):
