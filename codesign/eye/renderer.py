@@ -103,11 +103,11 @@ def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int) -> 
 
     n, size = len(p), camera.pixels
     t = camera.tangents(rig).astype(np.float32)
-    sheets = [np.empty((n, 2, size, size), np.float32) for _ in range(3)]
+    light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
     pupil = np.empty((n, 1, size, size), np.float32)
     values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    render_kernel.render(values, factor, textures.pairs(seed), t, t, *sheets, pupil)
-    return Frames(*map(torch.from_numpy, sheets)), torch.from_numpy(pupil[:, 0])
+    render_kernel.render(values, factor, textures.pairs(seed), t, t, light, cover, depth, pupil)
+    return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(pupil[:, 0])
 
 
 def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera) -> Labels:
