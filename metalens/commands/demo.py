@@ -56,7 +56,8 @@ def run(options: Options) -> int:
     wanted = chain.shipped() if options.config is None else chain.load(options.config)
     source = None if options.config is None else options.config.parent
     laid = chain.laid(wanted, source, aperture_mm=options.aperture_mm)
-    with options.claim_work(options.output, keep=(OUTCOMES,), resume=options.resume) as draft:
+    whole = options.output.absolute()  # stages run in another folder, also as an interrupt finds them
+    with options.claim_work(whole, keep=(OUTCOMES,), resume=options.resume) as draft:
         folder = draft.path
         if not laid.stands_in(folder):  # of other settings nothing gets beside it
             if (folder / OUTCOMES).is_file():

@@ -19,7 +19,7 @@ def plain(a: Tensor) -> bool:
     return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
 def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-untyped-def]
     """Sheets weighted for kernels: ``patches.lagrange`` between the depths, row by row.
 

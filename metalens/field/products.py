@@ -2,7 +2,8 @@
 
 A patch is less than half as wide as its transform, which therefore is two products with cosines and sines that never
 touch the zeros beside it. As many kernels are taken at once as a processor's cache holds, and sheets that hold nothing
-in a patch are left out. Frames and patches are grouped the same way on any number of threads: so are the sums.
+in a patch are left out. Frames and patches are grouped the same way on any number of threads: so are the sums. What the
+loop calls is put into it (``forceinline``), or it would round otherwise where it comes from numba's cache.
 """
 
 import functools
@@ -158,7 +159,7 @@ def _convolved(content, place, held, tables, lit, kernels, axes, room, out):  # 
                 seen[row, column] += image[row, column]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
 def _halve(kernels, out):  # type: ignore[no-untyped-def]
     """Of spectra T (kernels, Y, X // 2 + 1): (kernels, F, [E, D], 2 G) of E = T(f) + T(-f) and D = i (T(f) - T(-f))."""
     out[:] = 0
@@ -172,7 +173,7 @@ def _halve(kernels, out):  # type: ignore[no-untyped-def]
                 out[k, f, 1, real], out[k, f, 1, imaginary] = minus.imag - plus.imag, plus.real - minus.real
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
 def _mix(whole, halves, mixed):  # type: ignore[no-untyped-def]
     """Add sheets times kernels: what multiplies the cosines along y is C E - S D, and the sines C D + S E.
 

@@ -268,7 +268,7 @@ def _curved(light, e, x, numbers, inverse, re, im):  # type: ignore[no-untyped-d
                 re[i, z, j], im[i, z, j] = a * c - b * s, a * s + b * c
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def _kernel_row(X, Y, dy, x, numbers, re, im):  # type: ignore[no-untyped-def]
     """Kernel of the plan module from a row of lens nodes to the window offset (X, Y)."""
     distance, wavelength = numbers[5], numbers[6]

@@ -1,6 +1,7 @@
 """The chain from one file: which stages it asks for, its settings laid out, its module drawn."""
 
 import json
+import os
 import re
 import sys
 import tempfile
@@ -209,6 +210,23 @@ def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     (tmp_path / "table.csv").write_text("1,2\n")
     assert demo.run(again) == 0
     assert seen[3] == "psf"
+
+
+def test_an_interrupt_on_the_way_back_from_the_folder_leaves_no_scratch(tmp_path, monkeypatch):
+    """The chain's folder stays the current one then, and what was claimed by a relative path was looked for in it."""
+    change = os.chdir
+
+    def interrupted(path):
+        if os.fspath(path) == str(tmp_path):
+            raise KeyboardInterrupt
+        change(path)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(demo, "run_verb", lambda words: 0)
+    monkeypatch.setattr(os, "chdir", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        demo.run(demo.Options(Path("out"), quiet=True))
+    assert [path.name for path in tmp_path.iterdir()] == ["out.unfinished"]
 
 
 def test_nothing_of_other_settings_stays_where_no_stage_was_finished(tmp_path, monkeypatch):
