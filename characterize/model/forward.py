@@ -104,7 +104,9 @@ class ForwardModel:
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
         bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
-        window = (max(setting.rows, setting.columns) + 2 * setting.margin) * setting.pixel_um + 20.0
+        window = (
+            max(setting.rows, setting.columns) + setting.margin
+        ) * setting.pixel_um + 20.0  # half of the margin is seen
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
@@ -218,7 +220,7 @@ class ForwardModel:
         lens = self._pupil(x, group, bool(names))
         operators, lit = self._operators(x, group), lens[0] * phasor
         coarse = operators.coarse(lit, self.cut)
-        field = operators.finer(coarse)
+        field = operators.envelope(coarse)
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
@@ -231,7 +233,7 @@ class ForwardModel:
             changed = bases.changed(factors[name])
             same = np.vdot(lit, changed) / power
             changed = changed - same * lit
-            rate = operators.field(changed, _SLOPE_TOLERANCE)
+            rate = operators.envelope(operators.coarse(changed, _SLOPE_TOLERANCE))
             if moves := factors[name].moves:
                 beside = float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
                 rate = rate + factors[name].um * operators.rates(lit, moves, _SLOPE_TOLERANCE, beside=beside)

@@ -16,7 +16,7 @@ import numpy as np
 
 from characterize.model.detector import Grid, Sums
 from characterize.model.kernel import Kernel
-from characterize.model.window import STEP, Turned
+from characterize.model.window import STEP, Turned, weighted
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 
@@ -26,6 +26,7 @@ WHOLE: Cut = (slice(None), slice(None))
 _DEGREE = 5
 _PLACES = 4  # of the window along each axis where coefficients are computed
 _ACROSS = 15  # places of the lens along each axis that they are fitted to
+_BLOCK = 40  # rows of fine samples whose derivatives are formed at once
 _MISSED = 5e-3  # of a factor, where no polynomial is close enough: its parameter is computed by itself
 _COARSE_PIXEL = 7e-3  # of the lens's radius: pixels across which coefficients change too much
 
@@ -129,24 +130,57 @@ def _seen(
 ) -> dict[str, Array]:
     """{base: (frames, powers, rows, columns)} conj(E) times the derivatives of a base field, through the pixels."""
     most = max(needed.values(), default=0)
-    y, x = turned.ways(most)
-    frames = len(bases["lit"])
+    ways, frames = turned.ways(most), len(bases["lit"])
     out = {
         base: np.empty((frames, len(powers(degree)), grid.rows, grid.columns), bases["lit"].dtype)
         for base, degree in needed.items()
     }
+    order = {degree: [powers(degree).index(one) for one in _by_rows(degree)] for degree in needed.values()}
+    turns = {degree: np.array([1j ** (a % 2 + b % 2) for a, b in _by_rows(degree)]) for degree in needed.values()}
 
     def some(first: int, last: int) -> None:
         for i in range(first, last):
-            conjugate = (y[0] @ bases["lit"][i] @ x[0].T).conj()
+            light = bases[LIT][i]
+            conjugate = weighted(ways[0][0], weighted(ways[1][0], light.T).T).conj()
             for base, degree in needed.items():
-                across = [bases[base][i] @ along.T for along in x[: degree + 1]]
-                for n, (a, b) in enumerate(powers(degree)):
-                    out[base][i, n] = grid.sample(conjugate * (y[b] @ across[a]), blur)
+                found = _through(blur, conjugate, bases[base][i], ways, degree)
+                out[base][i, order[degree]] = found * turns[degree][:, None, None]
 
     with threads.one_blas_thread():
         threads.split(frames, some)
     return out
+
+
+def _by_rows(degree: int) -> list[tuple[int, int]]:
+    """:func:`powers` in the order of :func:`_through`."""
+    return [(a, b) for b in range(degree + 1) for a in range(degree + 1 - b)]
+
+
+def _through(blur: Sums, conjugate: Array, field: Array, ways: tuple[Array, Array], degree: int) -> Array:
+    """(powers, rows, columns) conj(E) times the derivatives of a field (Y, X), in the order of :func:`_by_rows`.
+
+    Weights reach over a few samples only: blocks of rows leave out those that are zero for all of them.
+    """
+    y, x = (way[: degree + 1] for way in ways)
+    fine, count = x.shape[1], len(_by_rows(degree))
+    across = weighted(x.reshape(-1, x.shape[2]), field.T).reshape(degree + 1, fine, -1).transpose(2, 0, 1)
+    out: Array | float = 0.0
+    for first in range(0, y.shape[1], _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        seen = np.flatnonzero(y[0, rows].any(0))
+        part = slice(int(seen[0]), int(seen[-1]) + 1)
+        turned = np.concatenate(
+            [
+                weighted(y[b, rows, part], across[part, : degree + 1 - b].reshape(part.stop - part.start, -1))
+                for b in range(degree + 1)
+            ],
+            1,
+        ).reshape(-1, count, fine)
+        turned *= conjugate[rows, None]
+        down = [weighted(py[:, rows], turned.reshape(len(turned), -1)) for py, _ in blur.pairs]
+        out = out + np.stack([one.reshape(-1, count, fine) for one in down])
+    sums = [one @ px.T.astype(one.dtype) for one, (_, px) in zip(np.asarray(out), blur.pairs, strict=True)]
+    return np.asarray(sum(sums)).transpose(1, 0, 2)
 
 
 def _tables(
