@@ -95,7 +95,7 @@ class Kernel:
     def rest(self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64) -> Array:
         """What the three factors leave, with the amplitude, as ``kind`` complex numbers; arguments broadcast."""
         path, r = self._left(p, q, X, Y)
-        real = np.empty(0, kind).real.dtype
+        real = real_of(kind)
         size = (self.distance_um / (2 * np.pi * r**2)).astype(real)
         fade = (1 / r).astype(real) - np.dtype(kind).type(1j * self.k)
         return np.asarray(size * fade * turns(self.k * path, kind))
@@ -149,6 +149,11 @@ def precision(tolerance: float) -> Any:
     if not 1e-9 <= tolerance < 1:
         raise FitError(f"tolerance {tolerance:g} of the field: need 1e-9 to 1; the pillars are not known better")
     return np.complex64 if tolerance >= SINGLE else np.complex128
+
+
+def real_of(kind: Any) -> Any:
+    """Real numbers in the precision of complex ones."""
+    return np.empty(0, kind).real.dtype
 
 
 def least_tolerance(table: Array) -> float:

@@ -7,6 +7,7 @@ low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pill
 sum for every smooth f.
 """
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from characterize.model import gather
-from characterize.model.kernel import Kernel, Span, digits, factors, precision, turns
+from characterize.model.kernel import Kernel, Span, digits, factors, precision, real_of, turns
 from characterize.model.pillars import Pillars
 from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, Ways, turned, ways
 from metalens.ground import legendre, threads
@@ -28,7 +29,7 @@ from metalens.ground.paths import sensor_path, source_path
 from metalens.lens import Lens
 
 _KEPT = 12  # operators: of a place that each of some threads is at
-_BAND = 1.01  # bands are rounded up to its powers: weights of one serve all distances and wavelengths of a fit
+_SPARE, _WIDER = 1.05, 1.25  # of bands over the nominal ones, and from there on: one serves all distances of a fit
 _BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when the low-rank terms are chosen
 
 
@@ -65,6 +66,7 @@ class Reduced:
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
+        self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
         self._directions(depths_um)
         self.gathered = self._gather(lens, pillars).astype(self.kind)
@@ -127,8 +129,9 @@ class Reduced:
         x, y = d.x_um, d.y_um
         hy, hx = self.half_um
         n, r = self.nodes + 6, len(pillars.basis)
-        real_kind = np.empty(0, self.kind).real.dtype
-        across, along = (legendre.interpolation(n, t).astype(real_kind) for t in (x / hx, y / hy))
+        real_kind = real_of(self.kind)
+        pull = self._pull(n)
+        across, along = (_at(n, pull, (-h, h), t).astype(real_kind) for h, t in ((hx, x), (hy, y)))
         table = np.ascontiguousarray(pillars.table().astype(self.kind).T)
         block = max(1, 100_000 // len(x))
         parts = [slice(start, start + block) for start in range(0, len(y), block)]
@@ -150,7 +153,7 @@ class Reduced:
     def _to_directions(self, fields: Array, n: int) -> Array:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
         hy, hx = self.half_um
-        x, y = legendre.mapped(n, -hx, hx), legendre.mapped(n, -hy, hy)
+        x, y = (_even(n, self._pull(n), -h, h) for h in (hx, hy))
         (cx, cy), d, m = self.center_um, self.bench.distance_um, self.nodes
         p = (x[None] - cx) / np.sqrt((x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2)
         at = functools.partial(_at, m, self._pull(m))
@@ -190,7 +193,9 @@ class Reduced:
             2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
         )
         reach = [float(np.abs(axis).max()) for axis in axes_um]
-        bands = [_BAND ** math.ceil(math.log(band, _BAND)) for band in kernel.bands(reach[0], reach[1])]
+        nominal = dataclasses.replace(kernel, k=self.k, distance_um=self.bench.distance_um)
+        pairs = zip(nominal.bands(reach[0], reach[1]), kernel.bands(reach[0], reach[1]), strict=True)
+        bands = [_SPARE * usual * _WIDER ** math.ceil(math.log(band / usual / _SPARE, _WIDER)) for usual, band in pairs]
         about: dict[str, Any] = {"k": kernel.k, "tolerance": self.tolerance, "step_um": STEP * distance_um}
         about["rim_um"] = edge_um
         y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
@@ -205,9 +210,8 @@ class Reduced:
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
         def bent(degree: int) -> tuple[Array, Array]:
-            real = np.empty(0, kind).real.dtype
             down, across = (turned(*one, degree) for one in zip(axes_um, (y, x), bands, strict=True))
-            return down.astype(real), across.astype(real)
+            return down.astype(real_of(kind)), across.astype(real_of(kind))
 
         few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
         terms = self._terms(kernel, [kernel], (1.0,), (y, x), inner)
@@ -244,13 +248,20 @@ class Reduced:
         mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
         some = int((mixed > MIXED * self.tolerance).sum())
         amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.pitch_um**2
-        iy, ix = legendre.interpolation(w, y / wy), legendre.interpolation(w, x / wx)
-        to_p = legendre.interpolation(m, _even(self.nodes, self._pull(self.nodes), -1.0, 1.0))
+        iy, ix = (_on_even(w, float(a[0] / r), float(a[-1] / r), len(a)) for a, r in ((y, wy), (x, wx)))
+        to_p = self._to_nodes(m)
         shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)
-        window = np.einsum("Yj,jir,Xi->YrX", iy, shown, ix, optimize=True) * kernel.window(x, y[:, None])[:, None]
+        spread = (iy @ shown.reshape(w, -1)).reshape(len(y), w, -1).transpose(0, 2, 1) @ ix.T
+        window = spread * kernel.window(x, y[:, None])[:, None]
         arrays = [one.astype(self.kind) for one in (across[:some] @ to_p.T, np.tensordot(to_p, amounts, 1), window)]
         whole = float(np.linalg.norm(table)) / math.sqrt(table.size)
         return Terms(arrays[0], arrays[1], arrays[2], remainder, mixed[:some], whole)
+
+    def _to_nodes(self, count: int) -> Array:
+        """(nodes, count) from Legendre nodes of the directions; kept."""
+        if count not in self._from_few:
+            self._from_few[count] = legendre.interpolation(count, _even(self.nodes, self._pull(self.nodes), -1.0, 1.0))
+        return self._from_few[count]
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
@@ -258,9 +269,15 @@ class Reduced:
         return self.center_um[0] + r * p, self.center_um[1] + r * q
 
 
+@functools.lru_cache(maxsize=16)
+def _on_even(count: int, first: float, last: float, samples: int) -> Array:
+    """(samples, count) from Legendre nodes on [-1, 1] to even places; treat as read-only."""
+    return legendre.interpolation(count, np.linspace(first, last, samples))
+
+
 def _as(way: Ways, kind: Any) -> Ways:
     """In numbers of a kind."""
-    fine = way.fine.astype(np.empty(0, kind).real.dtype)
+    fine = way.fine.astype(real_of(kind))
     moved = functools.cache(lambda name: way.moved(name).astype(kind))
     return Ways(way.to.astype(kind), fine, way.carrier.astype(kind), moved)
 
