@@ -3,8 +3,8 @@
 E(X, Y) = sum over nodes of G_pq f_pq K, where the nodes are direction cosines (p, q) seen from the window's centre,
 G is the lens without its known focusing phase, f is whatever acts smoothly over the aperture, and
 K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) is a factor of (p, X), one of (q, Y), one of (X, Y) and a smooth rest of
-low rank (:mod:`kernel`). The adjoint of Legendre interpolation gathers the pillars, so the result is that of the full
-sum for every smooth f.
+low rank (:mod:`kernel`). The adjoint of interpolation between nodes gathers the pillars, so the result is that of the
+full sum for every smooth f.
 """
 
 import dataclasses
@@ -97,8 +97,8 @@ class Reduced:
         self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
 
     def _pull(self, count: int) -> float:
-        """Of :func:`_even`: its branch, at the end of the nodes over ``pull``, leaves a thousandth of the tolerance."""
-        return 1 / math.cosh(math.log(1e3 / self.tolerance) / count)
+        """Of :func:`_even`: how near its branch may come to the ends of the nodes, for a wave as steep as they hold."""
+        return 1 / math.cosh((math.log(1e5 / self.tolerance) + count / 60) / count)
 
     def _density(self, count: int) -> float:
         """Of the nodes in the middle over that of Gauss-Legendre nodes."""
@@ -287,7 +287,7 @@ def _pair(values: Array) -> tuple[Array, Array]:
 
 
 def _even(count: int, pull: float, low: float, high: float) -> Array:
-    """(count,) places on [low, high], nearly even: arcsin(pull t) of Gauss-Legendre nodes t (Kosloff and Tal-Ezer 1993).
+    """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre nodes t (Kosloff and Tal-Ezer 1993).
 
     A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at the ends; pulled apart, 0.7 n.
     """

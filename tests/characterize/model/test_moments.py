@@ -34,7 +34,7 @@ STEPS = {
 
 
 def test_powers_of_the_direction_are_derivatives_of_the_field():
-    """A wave of one direction t within the band: t^a times itself, to 3e-4 with 24 samples 1.3 times as fine as needed."""
+    """A wave of one direction t within the band: t^a times itself, to 3e-4; 24 samples 1.3 times as fine as needed."""
     step = math.pi / BAND / 1.3
     coarse, fine = (np.arange(44) - 21.5) * step, np.linspace(-9.3, 8.1, 37)
     ways = turned(fine, coarse, BAND, 4)
