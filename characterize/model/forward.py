@@ -12,7 +12,7 @@ import numpy as np
 
 from characterize.model import detector, moments
 from characterize.model.glass import extra_path
-from characterize.model.kernel import turns
+from characterize.model.kernel import real_of, turns
 from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
@@ -104,9 +104,7 @@ class ForwardModel:
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
         bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
-        window = (
-            max(setting.rows, setting.columns) + setting.margin
-        ) * setting.pixel_um + 20.0  # half of the margin is seen
+        window = (max(setting.rows, setting.columns) + setting.margin) * setting.pixel_um + 20.0  # margin: half is seen
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
@@ -285,7 +283,7 @@ class ForwardModel:
         the wavelength per nm."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
-        bias = np.clip(bias, -reach, reach).astype(np.empty(0, group.reduced.kind).real.dtype)
+        bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
         weight, rate = group.pillars.weights(bias)
         values = group.pillars.coefficients(change(x), self._lean_um)
         pupil = group.reduced.combined(weight, values)
@@ -348,5 +346,5 @@ class ForwardModel:
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
         blur, source = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]]
-        kind = np.empty(0, group.reduced.kind).real.dtype
-        return detector.transfers(self.grid, blur, source * shrink, shrink, sized="pinhole_um" in names, kind=kind)
+        how = {"sized": "pinhole_um" in names, "kind": real_of(group.reduced.kind)}
+        return detector.transfers(self.grid, blur, source * shrink, shrink, **how)
