@@ -17,12 +17,14 @@ from benchmarks._hardness_commands import VERBS
 from metalens.ground import store
 
 SEEDS = ("1", "4294967295")
-# seconds pass by the call, so that no rate is infinite; not for threads beside, which come when they come
+# seconds pass by the call, so that no rate is infinite; not for threads beside, which come when they come, nor for
+# libraries, whose compiler looks at the clock where it compiles
 _STILL = """
 import sys, threading, time
-passed = [0.0]
+ours, passed = ("metalens", "layout", "characterize", "codesign"), [0.0]
 def seconds():
-    passed[0] += (threading.current_thread() is threading.main_thread()) / 1024
+    asks = sys._getframe(1).f_globals.get("__name__", "").split(".")[0]
+    passed[0] += (asks in ours and threading.current_thread() is threading.main_thread()) / 1024
     return passed[0]
 time.perf_counter, time.time = seconds, lambda: 1.7e9
 from metalens.cli import main
