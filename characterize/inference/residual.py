@@ -70,6 +70,7 @@ def attempt(
         value=found.value[:p],
         covariance=found.covariance[:p, :p],
         information=_without_modes(found.information, p),
+        beyond=found.beyond[:p],
         slopes=found.slopes[:p],
     )
     return Attempt(physical, found.value[p:], scores[0] / count, scores[1] / count)

@@ -84,7 +84,6 @@ def shots_of(lens, peak_e=8000.0):
     return b.capture(light * (peak_e / light.max()) + bench.background(b.truth()))
 
 
-@pytest.mark.slow
 def test_a_patch_of_wrong_pillars_is_kept_as_a_phase_that_unseen_frames_confirm(tmp_path):
     found = characterize.fit(
         shots_of(bumped(12.0)), b.lens(), dataclasses.replace(USUAL, insist=True), response=b.RESPONSE
