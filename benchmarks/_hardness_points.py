@@ -216,7 +216,7 @@ class Tracer:
         number, code, spare = chance.choice(SIGNALS), chance.choice(REFUSALS), int(10 ** chance.uniform(2, 5.5))
         if wanted["signal"]:
             yield "kills", number.name, commands.signalled(number), -1
-        numbered = operation.event == "os.rename" and any(
+        numbered = operation.event in ("os.rename", "fsync") and any(
             ready.stat().st_size for ready in self.bench.folder.glob(".*.part-*/ready")
         )  # a folder that is known by its number, which its copy has not: tests of transactions refuse these
         if wanted["refused"] and operation.writes and cheap and not numbered:
