@@ -77,8 +77,10 @@ def _measure(options: Options, folder: Path) -> None:
         options.console.say("measuring: optics")
         order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
         lenses = tuple(_named(folder, name, path) for name, path in order)
+        asked_of = folder / "optics.toml"
+        store.write_text(asked_of, f"[scenes]\nimage_tolerance = {paper_runs.image_tolerance(options.runs)}\n")
         optics = optics_options.Options(
-            lenses=lenses, output=folder / "optics", scenes=options.scenes, quiet=True, force=True
+            lenses=lenses, output=folder / "optics", config=asked_of, scenes=options.scenes, quiet=True, force=True
         )
         command_evaluate_optics.run(optics)
 

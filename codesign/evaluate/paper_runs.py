@@ -43,6 +43,11 @@ def kind_of(folder: Path) -> Kind:
     return Kind(str(told.get("network", "supernet")), tuple(told.get("frozen", ())))
 
 
+def image_tolerance(folders: Sequence[Path]) -> float:
+    """Of the true image that lenses of these runs are compared by: the largest that one of them is imaged at."""
+    return max(runs.load(folder / "run.toml").optics.image_tolerance for folder in folders)
+
+
 @torch.no_grad()
 def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5) -> list[dict[str, Any]]:
     """Gaze errors of every network of a finished run on people whom training never saw; least compute first.

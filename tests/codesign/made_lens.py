@@ -95,10 +95,10 @@ def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
     )
 
 
-def finished_run(folder):
+def finished_run(folder, text=TINY):
     """The files of a run whose search ended, its network untrained."""
     folder.mkdir(parents=True)
-    (folder / "run.toml").write_text(TINY)
+    (folder / "run.toml").write_text(text)
     settings = run.load(folder / "run.toml")
     going = run.start(settings)
     chosen = smallest(settings.space)

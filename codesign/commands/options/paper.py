@@ -21,7 +21,7 @@ class Options(Common):
             result.json tells which it is.
         output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
         subjects: of the experiment.
-        scenes: of Table 1.
+        scenes: of Table 1; imaged at the largest ``optics.image_tolerance`` of the runs.
         measure: measure what is not in the folder yet; without it only what is there is used.
     """
 
