@@ -14,8 +14,7 @@ def lit(table: Array, place: Array, turns: Array) -> Array:
     Args:
         table: (entries, r) complex. place: (rows, columns) entries. turns: (rows, columns), of the table's kind.
     """
-    real = np.empty(0, table.dtype).real.dtype
-    out = np.empty((*place.shape, 2 * table.shape[1]), real)
+    out = np.empty((*place.shape, 2 * table.shape[1]), table.real.dtype)
     _lit(np.ascontiguousarray(table.real), np.ascontiguousarray(table.imag), place, turns, out)
     return out
 

@@ -22,7 +22,7 @@ from metalens.propagate.geometry import Case
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth factors on the light of several
 # maps: light on the window is Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
 Pupils = Callable[[Array, Array], tuple[Array, Array]]
-KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once
+KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once, and of maps' copies in a thread
 DEVICE_ROWS = 256
 
 
@@ -160,6 +160,8 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
     kernel: Any = gather
     powers: list[float] = []
     along, shares, (row_bases, column_bases) = _fixed(plan, out.numpy().dtype)
+    # block rows at once, where maps of another dtype are copied
+    step = max(1, int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * along.itemsize)))
     for panel in plan.panels:
         table = _table(plan, panel, along.dtype)
         count = panel.stop - panel.start
@@ -167,12 +169,13 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
         view = nodes.numpy()
 
         def work(a: int, b: int, first: int = panel.start, table: Any = table, view: Any = view) -> None:
-            for i in range(a, b):  # maps of another dtype are brought to this one a block row at a time
+            for i in range(a, b, step):
+                end = min(i + step, b)
                 begin = (first + i) * rows.length
-                few = [np.asarray(one[begin : begin + rows.length], along.dtype) for one in maps]
-                bases = row_bases[first + i : first + i + 1] - begin, column_bases
-                part = view[i * rows.nodes : (i + 1) * rows.nodes]
-                powers.append(kernel(*few, table[i : i + 1], along, shares, bases, 0, part))
+                few = [np.asarray(one[begin : (first + end) * rows.length], along.dtype) for one in maps]
+                bases = row_bases[first + i : first + end] - begin, column_bases
+                part = view[i * rows.nodes : end * rows.nodes]
+                powers.append(kernel(*few, table[i:end], along, shares, bases, 0, part))
 
         split(count, work)
         sums = (nodes.flatten(0, 1) @ plan.columns).view(-1, 2 * n)
