@@ -12,6 +12,7 @@ nearest pillar (Schuster et al. 2007), both orders of it averaged, so that energ
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -60,6 +61,12 @@ class _Sector:
     def signs(self) -> tuple[int, int]:
         return (1 if self.along == "even" else -1), (1 if self.across == "even" else -1)
 
+    def mirrors(self) -> Iterator[tuple[int, int, int]]:
+        """(±1, ±1) of m and n, with the sign of a field there."""
+        for x in (1, -1):
+            for y in (1, -1):
+                yield x, y, (self.signs[0] if x < 0 else 1) * (self.signs[1] if y < 0 else 1)
+
 
 def solve(cell: Cell, diameters_um: Array, wavelength_um: float, *, harmonics: int = 2) -> Light:
     """Light along x at normal incidence from the substrate through (K, K) upright round pillars without films.
@@ -83,9 +90,9 @@ def solve(cell: Cell, diameters_um: Array, wavelength_um: float, *, harmonics: i
         for name in (cell.substrate, cell.cover)
     )
     thickness = 2 * np.pi / wavelength_um * cell.height_um
-    out, back = _matched(p, q, (below, above), thickness)
     incident = np.zeros(len(p))
     incident[0] = 1.0
+    out, back = _matched(p, q, (below, above), thickness, incident)
     power = [_power(fields, medium, len(ee.m)) for fields, medium in ((incident, below), (out, above), (back, below))]
     return _orders(out, (ee, oo), wavelength_um / width, cell, wavelength_um, (power[1] + power[2]) / power[0])
 
@@ -143,10 +150,8 @@ def _same(to: _Sector, of: _Sector, value: Array) -> Array:
 def _product(table: Array, to: _Sector, of: _Sector) -> Array:
     """(to, of) of the product with a function of these real coefficients over m, n from -2 reach to 2 reach."""
     middle, total = len(table) // 2, 0.0
-    for x in (1, -1):
-        for y in (1, -1):
-            sign = (of.signs[0] if x < 0 else 1) * (of.signs[1] if y < 0 else 1)
-            total = total + sign * table[to.m[:, None] - x * of.m + middle, to.n[:, None] - y * of.n + middle]
+    for x, y, sign in of.mirrors():
+        total = total + sign * table[to.m[:, None] - x * of.m + middle, to.n[:, None] - y * of.n + middle]
     return np.asarray(4 * to.size[:, None] * of.size * total)
 
 
@@ -205,14 +210,12 @@ def _forward(kz: Array) -> Array:
     return np.asarray(np.where(kz.real + kz.imag < 0, -kz, kz))
 
 
-def _matched(p: Array, q: Array, media: tuple[Array, Array], thickness: float) -> tuple[Array, Array]:
-    """E above, and reflected E below, of a unit wave in the first order."""
+def _matched(p: Array, q: Array, media: tuple[Array, Array], thickness: float, incident: Array) -> tuple[Array, Array]:
+    """E above, and reflected E below, of the incident E."""
     below, above = media
     square, modes = linalg.eig(p @ q, overwrite_a=True, check_finite=False)
     decay = -1j * _forward(np.sqrt(-square.astype(complex)))
     fields, fall = -(q @ modes) / decay, np.exp(-decay * thickness)
-    incident = np.zeros(len(p))
-    incident[0] = 1.0
     foot, top = below @ modes, above @ modes
     system = np.block([[foot + fields, (foot - fields) * fall], [(top - fields) * fall, top + fields]])
     right = np.concatenate([2 * below @ incident, np.zeros(len(incident))])
@@ -238,10 +241,8 @@ def _orders(
     full = []
     for sector, part in ((ee, out[: len(ee.m)]), (oo, out[len(ee.m) :])):
         square = np.zeros((2 * reach + 1, 2 * reach + 1), complex)
-        for x in (1, -1):
-            for y in (1, -1):
-                sign = (sector.signs[0] if x < 0 else 1) * (sector.signs[1] if y < 0 else 1)
-                np.add.at(square, (x * sector.m + reach, y * sector.n + reach), sign * sector.size * part)
+        for x, y, sign in sector.mirrors():
+            np.add.at(square, (x * sector.m + reach, y * sector.n + reach), sign * sector.size * part)
         full.append(square)
     m, n = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1), indexing="ij")
     travels = np.hypot(m, n) * step < index

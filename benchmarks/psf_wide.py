@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks.psf import DEPTHS, GEOMETRY, WINDOW, error, forward, lens, peak_mb, textbook
+from benchmarks._psf_case import DEPTHS, GEOMETRY, WINDOW, error, forward, lens, peak_mb, textbook
 from metalens import propagate
 from metalens.propagate.direct import transfer
 from metalens.propagate.grids import FIELDS

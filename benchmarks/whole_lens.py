@@ -27,40 +27,40 @@ PILLARS = 21
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Orders:
-    """Light in the orders of the square. light: (2, n) amplitudes of p and s whose squares are power."""
+class Directions:
+    """Orders of the square by their sines along x and y, (n,) each."""
 
     sx: Array
     sy: Array
-    light: Array
 
     @property
     def sine(self) -> Array:
         """(n,) of the angle to the axis."""
         return np.hypot(self.sx, self.sy)
 
-    def psf(self, focus_um: float, na: float) -> Array:
-        """(y, x) |E|² about the focus, of sum 1, ten widths of the spot wide."""
+    @property
+    def azimuth(self) -> tuple[Array, Array]:
+        """Cosine and sine of it, (n,) each; along x on the axis."""
+        safe = np.where(self.sine > 0, self.sine, 1.0)
+        return np.where(self.sine > 0, self.sx / safe, 1.0), np.where(self.sine > 0, self.sy / safe, 0.0)
+
+    def light(self, ex: Array, ey: Array, *, transverse: bool) -> Array:
+        """(2, n) amplitudes of p and s whose squares are power, of transverse fields or of such amplitudes."""
+        c, s = self.azimuth
+        root = np.sqrt(np.sqrt(1 - self.sine**2)) if transverse else 1.0
+        return np.stack([(c * ex + s * ey) / root, (c * ey - s * ex) / root])
+
+    def psf(self, light: Array, focus_um: float, na: float) -> Array:
+        """(y, x) |E|² of such light about the focus, of sum 1, ten widths of the spot wide."""
         cosine = np.sqrt(1 - self.sine**2)
-        c, s = self._azimuth()
-        p, q = self.light * np.exp(2j * np.pi / WAVELENGTH_UM * cosine * focus_um)
+        c, s = self.azimuth
+        p, q = light * np.exp(2j * np.pi / WAVELENGTH_UM * cosine * focus_um)
         root = np.sqrt(cosine)
         fields = (c * p * root - s * q / root, s * p * root + c * q / root, -p * self.sine / root)
         at = np.linspace(-2.5, 2.5, 61) * WAVELENGTH_UM / na
         across, down = (np.exp(2j * np.pi / WAVELENGTH_UM * np.outer(at, sine)) for sine in (self.sx, self.sy))
         spot = sum(np.abs((down * one) @ across.T) ** 2 for one in fields)
         return np.asarray(spot / spot.sum())
-
-    def of(self, ex: Array, ey: Array, *, transverse: bool) -> "Orders":
-        """Light of these components in its orders: transverse fields, or amplitudes whose squares are power."""
-        c, s = self._azimuth()
-        p, q = c * ex + s * ey, c * ey - s * ex
-        root = np.sqrt(np.sqrt(1 - self.sine**2)) if transverse else 1.0
-        return Orders(self.sx, self.sy, np.stack([p / root, q * root]))
-
-    def _azimuth(self) -> tuple[Array, Array]:
-        safe = np.where(self.sine > 0, self.sine, 1.0)
-        return np.where(self.sine > 0, self.sx / safe, 1.0), np.where(self.sine > 0, self.sy / safe, 0.0)
 
 
 def rows() -> Iterator[Row]:
@@ -79,11 +79,12 @@ def _row(lens: Lens, found: Neighbours, na: float, start: float) -> Row:
     sizes = np.asarray(lens.proxy.diameter_um(phase, WAVELENGTH_UM, within_um=printed(lens), gap="nearest"))
     whole = _whole.solve(lens.cell, sizes, WAVELENGTH_UM, harmonics=HARMONICS)
     seconds = time.perf_counter() - start
-    solved = Orders(whole.sx, whole.sy, np.empty(0)).of(whole.ex, whole.ey, transverse=True)
-    ideal, apart, said = _one_by_one(lens, found, (x, phase, sizes), solved)
-    inside = np.where(solved.sine < na, ideal.light, 0)
-    one, power, told = (abs(np.vdot(inside, some.light)) ** 2 for some in (apart, solved, said))
-    psfs = [some.psf(focus, na) for some in (solved, said, apart)]
+    orders = Directions(whole.sx, whole.sy)
+    solved = orders.light(whole.ex, whole.ey, transverse=True)
+    ideal, apart, said = _one_by_one(lens, found, (x, phase, sizes), orders)
+    inside = np.where(orders.sine < na, ideal, 0)
+    one, power, told = (abs(np.vdot(inside, some)) ** 2 for some in (apart, solved, said))
+    psfs = [orders.psf(some, focus, na) for some in (solved, said, apart)]
     with_, without = (float(np.linalg.norm(some - psfs[0]) / np.linalg.norm(psfs[0])) for some in psfs[1:])
     stated = _stated(lens, found, na)
     return Row(
@@ -98,8 +99,8 @@ def _row(lens: Lens, found: Neighbours, na: float, start: float) -> Row:
 
 
 def _one_by_one(
-    lens: Lens, found: Neighbours, made: tuple[Array, Array, Array], orders: Orders
-) -> tuple[Orders, Orders, Orders]:
+    lens: Lens, found: Neighbours, made: tuple[Array, Array, Array], orders: Directions
+) -> tuple[Array, Array, Array]:
     """Light of an ideal lens, of pillars one by one, and of these among solved neighbours, along x before the lens."""
     x, phase, sizes = made
     about = {"polarization": "x", "harmonics": HARMONICS}
@@ -110,9 +111,9 @@ def _one_by_one(
     factor = among.jones(map_rad, torch.ones_like(map_rad), found, lens.cell.pitch_um)
     across, down = (np.exp(-2j * np.pi / WAVELENGTH_UM * np.outer(sine, x)) / len(x) for sine in (orders.sx, orders.sy))
 
-    def of(ex: Array, ey: Array) -> Orders:
+    def of(ex: Array, ey: Array) -> Array:
         light = [np.einsum("ni,ij,nj->n", across, one, down, optimize=True) for one in (ex, ey)]
-        return orders.of(*light, transverse=False)
+        return orders.light(*light, transverse=False)
 
     # the map's last axis is x for the factor, the first here: its xx is the yy of pillars
     own = of(alone * factor.yy.numpy(), alone * factor.xy.numpy())
