@@ -107,7 +107,9 @@ def look(task: Task, mode: Solution) -> Looked:
     fitted = (np.asarray(slopes) * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
-    fit = Fitted(task.names, fitted, known, rest / math.sqrt(spread), task.data.shared(image) * root)
+    pull = (mode.value - task.prior.mean) * task.prior.sigma**-2.0
+    over = math.sqrt(spread)
+    fit = Fitted(task.names, fitted, known, rest / over, task.data.shared(image) * root, pull / over)
     found, unstated = [], {}
     roughly: set[str] = set()
     of_mask: set[str] = set()
@@ -148,7 +150,8 @@ def untold(found: list[Lean]) -> list[str]:
 class Fitted:
     """The fit at its mode: slopes (p, pixels) over the noise, their information with the priors, and the residuals.
 
-    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the noise.
+    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the noise. pull: (p,) of the
+    priors, which the residuals along the slopes balance at the mode.
     """
 
     names: tuple[str, ...]
@@ -156,6 +159,7 @@ class Fitted:
     known: Array
     rest: Array
     shared: Array
+    pull: Array
 
     def lean(self, cause: str, changes: Array) -> Lean:
         """Score test of (k, pixels) changes; directions of which the fit takes up all but a thousandth are left out."""
@@ -174,9 +178,13 @@ class Fitted:
         return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
     def left(self, changes: Array) -> tuple[Array, Array]:
-        """(k, pixels) what the fit does not take up of changes, and (k,) how much of it is in the residuals."""
-        left = changes - self.moved_by(changes).T @ self.slopes
-        return left, left @ self.rest
+        """(k, pixels) what the fit does not take up of changes G, and (k,) their scores Gᵀr.
+
+        As G'ᵀr + Mᵀ pull, which is the same at the mode and feels no small step that the fit is off it.
+        """
+        moved = self.moved_by(changes).T
+        left = changes - moved @ self.slopes
+        return left, left @ self.rest + moved @ self.pull
 
     def moved_by(self, changes: Array) -> Array:
         """(p, k) shift M of the parameters by (k, pixels) changes."""

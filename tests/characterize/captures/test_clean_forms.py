@@ -8,6 +8,7 @@ from scipy import optimize
 
 from characterize.captures import electrons as clean
 from characterize.captures.capture import Capture
+from metalens.ground.errors import CaptureError
 
 NY, NX = 12, 14
 CHEQUER = np.where(np.add.outer(np.arange(NY), np.arange(NX)) % 2, 1.0, -1.0)
@@ -332,3 +333,28 @@ def test_a_full_well_is_masked_and_said():
     assert found.saturated[:, 4, 5:8].all()
     assert found.saturated.sum() == 9
     assert any("saturated" in note for note in found.corrections)
+
+
+def test_noise_of_frames_of_two_pixels_is_half_the_square_of_the_difference_of_their_steps():
+    """Steps are 6 and -3 counts; their variance about 1.5 is 2 x 4.5² of one degree, halved for one frame.
+
+    One pixel has no step but the common one: no noise, so no gain."""
+    flat = np.array([[[500.0, 501.0]], [[506.0, 498.0]]])
+    found = clean.photon_transfer(flat)
+    assert found.gain_e == pytest.approx((503 + 499.5) / 2 / (2 * 4.5**2 / 2), rel=1e-12)
+    with pytest.raises(CaptureError, match="without noise or light"):
+        clean.photon_transfer(flat[:, :, :1])
+
+
+@pytest.mark.parametrize(("step", "noisy"), [(-4.4, False), (-4.1, True), (4.4, False), (4.1, True)])
+def test_a_step_of_dark_frames_of_few_bits_is_noise_up_to_six_halves_of_a_count(step, noisy):
+    """Frames that are alike have a robust sigma of 0, and half a count is taken: 3 = 4.24 / √2, either way."""
+    dark = np.full((2, NY, NX), 60.0)
+    dark[1, 4, 5] += step
+    found = clean.clean(capture(np.full((1, NY, NX), 300), dark=dark, flat=None))
+    steps = np.zeros(NY * NX)
+    steps[0] = step / math.sqrt(2)
+    n = NY * NX
+    steps -= steps.mean()
+    floor = ((steps if noisy else steps[1:]) ** 2).mean() * n / (n - 1)
+    assert found.gain.read_noise_e == pytest.approx(math.sqrt(floor), rel=1e-9)

@@ -54,11 +54,11 @@ def test_what_is_said_to_go_unseen_is_what_would_not_be_named():
     slopes = PICTURES[:2].reshape(2, -1) * np.array([[40.0], [7.0]])
     change = 0.6 * slopes[0] + 33.0 * PICTURES[2].ravel()  # 33 sigma of it are left
     known = slopes @ slopes.T + np.diag([0.0, 2.0])
-    said = Fitted(("one", "two"), slopes, known, np.zeros(198), np.zeros((2, 2, 9, 11)))
+    said = Fitted(("one", "two"), slopes, known, np.zeros(198), np.zeros((2, 2, 9, 11)), np.zeros(2))
     amount = float(said.taken(change, 2.6, "{:.6f} um").split()[0])
     for times, named in ((0.9, False), (1.3, True)):
         score = times * amount / 2.6 * 33.0
-        found = Fitted(said.names, slopes, known, score * PICTURES[2].ravel(), said.shared)
+        found = Fitted(said.names, slopes, known, score * PICTURES[2].ravel(), said.shared, said.pull)
         assert bool(missing.words([found.lean("any", change[None])])) == named, score
 
 

@@ -33,6 +33,51 @@ def test_a_combination_is_told_where_frames_halve_what_was_known():
     assert len(knowable.identifiable(NAMES, information, 0.2 * SCALE)) == 1  # 0.105 is more than half of 0.2
 
 
+def turned(main, others):
+    """(p, p) orthogonal, its last column along ``main``."""
+    return np.linalg.qr(np.column_stack([main, np.eye(len(main))[:, others]]))[0][:, ::-1]
+
+
+@pytest.mark.parametrize(("ratio", "told"), [(0.49, True), (0.51, False)])
+def test_what_was_known_of_a_combination_adds_its_parts_as_variances(ratio, told):
+    """Of u = 0.6 bias - 0.8 distance: √((0.6 x 0.3)² + (0.8 x 0.7)²) before, in units; half of that is needed after."""
+    prior, along = np.array([0.3, 1.9, 0.7]), np.array([0.6, 0.0, -0.8])
+    known = ratio * np.hypot(0.6 * 0.3, 0.8 * 0.7)
+    turn = turned(along, [1, 0])
+    values = np.array([0.1, 0.2, known**-2])
+    found = knowable.identifiable(NAMES, (turn * values) @ turn.T / np.outer(SCALE, SCALE), prior * SCALE)
+    assert len(found) == told
+    assert all(line.endswith(f" to {known:.2g}") for line in found)
+
+
+def test_a_combination_without_a_prior_is_told_however_little_is_known():
+    """Half of infinity is far off; eigenvalues below 1 count as they are."""
+    for value in (0.04, 0.3):
+        values, _ = knowable.directions(NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2)
+        assert values == pytest.approx([value, 1.1, 2.3])
+        found = knowable.identifiable(NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2, np.full(3, np.inf))
+        assert found[-1].rsplit(" to ", 1)[1] == f"{value**-0.5:.2g}"
+
+
+@pytest.mark.parametrize(
+    ("along", "parts"),
+    [
+        ((0.16, -0.78, 0.05, 0.29, -0.53), (1, 4, 3)),  # the three largest, though a fourth is above 0.15
+        ((0.97, -0.19, 0.13, 0.03, 0.04), (0, 1)),  # none below 0.15
+        ((-0.14, 0.02, 0.05, -0.17, 0.97), (4, 3)),
+    ],
+)
+def test_the_words_of_a_combination_name_its_large_parts_first(along, parts):
+    names = (*NAMES, "coma_x_rad", "wavelength_nm")
+    scale = np.array([PARAMETERS[PLACE[name]].scale for name in names])
+    along = np.array(along) / np.linalg.norm(along)
+    information = 900 * np.outer(along, along) / np.outer(scale, scale)
+    (line,) = knowable.identifiable(names, information, 3 * scale)
+    sign = 1 if line.startswith(f"{along[parts[0]]:+.2f}") else -1
+    want = " ".join(f"{sign * along[i]:+.2f} {names[i]}/{scale[i]:g}" for i in parts)
+    assert line == f"{want} to 0.033"
+
+
 def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
     sigma = np.array([0.3, 2.0, 5.0])
     correlation = np.array([[1, -0.91, 0.2], [-0.91, 1, 0.89], [0.2, 0.89, 1.0]])

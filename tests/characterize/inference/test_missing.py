@@ -30,8 +30,8 @@ ALONE = np.zeros((2, 9, 10, 10))
 def fit_of(rest, shared=ALONE):
     """The residuals at the mode of a linear problem: data less what the least squares take, priors included."""
     known = SLOPES @ SLOPES.T + PRIOR
-    left = rest - SLOPES.T @ np.linalg.solve(known, SLOPES @ rest)
-    return Fitted(("one", "two", "three", "four"), SLOPES, known, left, shared)
+    mode = np.linalg.solve(known, SLOPES @ rest)
+    return Fitted(("one", "two", "three", "four"), SLOPES, known, rest - SLOPES.T @ mode, shared, PRIOR @ mode)
 
 
 def test_where_nothing_is_missing_the_score_is_chi_square():

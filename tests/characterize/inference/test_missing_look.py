@@ -20,9 +20,9 @@ def looked(monkeypatch, chi2_per_dof):
         usable=USABLE, saturated=FULL, variance=lambda image: 2.5 * image + 9.0, shared=lambda image: SHARED
     )
     model = SimpleNamespace(images=lambda x, names: (IMAGE, SLOPES))
-    prior = SimpleNamespace(sigma=np.array([0.3, 2.1]))
+    prior = SimpleNamespace(sigma=np.array([0.3, 2.1]), mean=np.array([-0.4, 1.3]))
     task = SimpleNamespace(model=model, data=data, prior=prior, names=("one", "two"), all_of=lambda value: value)
-    mode = SimpleNamespace(value=np.zeros(2), residual_sigma=RESIDUAL, chi2_per_dof=chi2_per_dof)
+    mode = SimpleNamespace(value=np.array([0.2, -3.0]), residual_sigma=RESIDUAL, chi2_per_dof=chi2_per_dof)
     monkeypatch.setattr(missing.causes, "changes", lambda *_: ())
     monkeypatch.setattr(missing, "_ghost", lambda *_: missing.Lean("ghost", 0.0, 0, 1.0))
     return missing.look(task, mode)
@@ -35,6 +35,7 @@ def test_residuals_are_counted_in_the_noise_that_they_show_but_never_in_less_tha
     made = looked(monkeypatch, chi2_per_dof)
     counted = (USABLE & ~FULL).ravel()
     assert made.fit.rest == pytest.approx(np.clip(RESIDUAL, -6, 6).ravel() * counted / noise, rel=1e-12)
+    assert made.fit.pull == pytest.approx(np.array([0.6 / 0.09, -4.3 / 4.41]) / noise, rel=1e-12)
     assert not made.leans
     assert made.reckoned().sigma.tolist() == [0.0, 0.0]
 

@@ -81,14 +81,16 @@ def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spr
     prior = 0.4
     model = SimpleNamespace(images=lambda x, names: (image, slope[None]))
     task = SimpleNamespace(
-        model=model, all_of=lambda x: x, data=data, names=("bias_nm",), prior=SimpleNamespace(sigma=np.array([prior]))
-    )
-    mode = SimpleNamespace(value=np.zeros(1), residual_sigma=off, chi2_per_dof=chi2)
+        model=model, all_of=lambda x: x, data=data, names=("bias_nm",),
+        prior=SimpleNamespace(sigma=np.array([prior]), mean=np.array([0.7])),
+    )  # fmt: skip
+    mode = SimpleNamespace(value=np.array([0.3]), residual_sigma=off, chi2_per_dof=chi2)
     monkeypatch.setattr(causes, "changes", lambda *_: [causes.Change("made", change[None])])
     monkeypatch.setattr(missing, "_ghost", lambda *_: Lean("ghost", 0.0, 0, 1.0))
     (lean,) = missing.look(task, mode).leans
     own = other - fitted * (fitted @ other) / (fitted @ fitted + prior**-2)
-    want = (own @ rest) ** 2 / spread / (own @ other)
+    moved = fitted @ other / (fitted @ fitted + prior**-2)
+    want = (own @ rest + moved * (0.3 - 0.7) / prior**2) ** 2 / spread / (own @ other)
     assert lean.chi2 == pytest.approx(want, rel=1e-9)
     assert lean.chance == pytest.approx(stats.chi2.sf(want, 1), rel=1e-9)
 
