@@ -27,6 +27,8 @@ WHOLE = 2  # of them on all rows, before
 ROUNDING = 1e-14  # of the largest element
 SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
 SLOW = 4  # the rows of the lowest quarter of the levels go on alone
+ROUGH = 1e-6  # of the lowest level: what single precision is asked for
+STRIPS = 4  # of rows of a product whose other half is a mirror image
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -121,39 +123,68 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
     """X with X² = square and eigenvalues in the right half plane, near the root of its diagonal; None if it is not.
 
     signs: of growth, with respect to which the square is symmetric. least: levels of the diagonal below it are
-    lifted to it. The rows of the lowest levels converge last: they are watched, and after the first steps go on alone.
+    lifted to it. In single precision as far as it goes, half the time of double, which ends it.
     """
-    n, slow = len(square), max(1, len(square) // SLOW)
+    n = len(square)
     diagonal = np.sqrt(np.maximum(np.diag(square), least))
     order = np.argsort(diagonal)
     diagonal, ordered = diagonal[order], signs[order]
     weight = 1 / (diagonal[:, None] + diagonal)
     rest = square[order[:, None], order] * weight
     rest.ravel()[:: n + 1] -= diagonal / 2
-    mirror = ordered[:slow] * ordered[:, None]
     aim = max(accuracy * diagonal[0], ROUNDING * diagonal[-1])
-    e, change, first, whole = rest, np.inf, np.inf, np.inf
+    rough = rest.astype(np.float32), weight.astype(np.float32)
+    near = settled(rough[0], rough, ordered, max(aim, ROUGH * diagonal[0]), whole=WHOLE)
+    e = None if near is None else settled(near.astype(float), (rest, weight), ordered, aim, whole=1)
+    if e is None:
+        return None
+    e.ravel()[:: n + 1] += diagonal
+    back = np.argsort(order)
+    return np.asarray(e[back[:, None], back])
+
+
+def settled(
+    e: np.ndarray, fixed: tuple[np.ndarray, np.ndarray], signs: np.ndarray, aim: float, *, whole: int
+) -> np.ndarray | None:
+    """E = rest - weight E² from a start, for ``fixed`` = (rest, weight); None where the steps do not shrink.
+
+    The rows of the lowest levels converge last: they are watched until they move by less than ``aim``, and after
+    ``whole`` steps go on alone until all rows are worth another.
+    """
+    rest, weight = fixed
+    slow = max(1, len(e) // SLOW)
+    mirror = (signs[:slow] * signs[:, None]).astype(e.dtype)
+    change, first, last = np.inf, np.inf, np.inf
     for step in range(STEPS):
-        if step < WHOLE or change < max(aim, SETTLED * whole):
-            after = e @ e
+        if step < whole or change < max(aim, SETTLED * last):
+            after = squared(e, signs)
             after *= weight
             np.subtract(rest, after, out=after)
-            whole = change = np.abs(after[:slow] - e[:slow]).max()
+            last = change = float(np.abs(after[:slow] - e[:slow]).max())
             e = after
             if change < aim:
-                e.ravel()[:: n + 1] += diagonal
-                back = np.argsort(order)
-                return np.asarray(e[back[:, None], back])
+                return e
         else:
             rows = e[:slow] @ e
             rows *= weight[:slow]
             np.subtract(rest[:slow], rows, out=rows)
-            change = np.abs(rows - e[:slow]).max()
+            change = float(np.abs(rows - e[:slow]).max())
             e[:slow], e[:, :slow] = rows, mirror * rows.T
         first = change if step == 0 else first
         if not change <= 2 * first:
             return None
     return None
+
+
+def squared(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """e @ e of a matrix that is symmetric with respect to the signs: strips of rows from the diagonal on, and their
+    mirror images."""
+    n, found = len(e), np.empty_like(e)
+    for start in range(0, n, -(-n // STRIPS)):
+        rows, beyond = slice(start, start - (-n // STRIPS)), slice(start - (-n // STRIPS), n)
+        found[rows, start:] = e[rows] @ e[:, start:]
+        found[beyond, rows] = (signs[beyond, None] * signs[rows]).astype(e.dtype) * found[rows, beyond].T
+    return found
 
 
 def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:

@@ -11,9 +11,8 @@ from metalens.cell import Blend, Cell, Light, Material, check_subwavelength, ind
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError
-from metalens.pillars import curve as reduced
 from metalens.pillars import engines, workers
-from metalens.pillars.curve import Curve, Nodes
+from metalens.pillars.curve import Curve
 from metalens.pillars.record import PLAIN
 from metalens.pillars.stretch import REACH
 from metalens.pillars.workers import Journal
@@ -128,9 +127,10 @@ def _judged(study: Study, cases: list[tuple[Cell, float]], journal: Journal, con
     for cell, wavelength in cases:
         span = _span(study, cell)
         engine = engines.choose(cell)
-        tasks.append(workers.curve_task(cell, Light(wavelength), span, tolerance=study.tolerance, engine=engine))
+        tasks.append(workers.curves_task(cell, [Light(wavelength)], span, tolerance=study.tolerance, engine=engine))
     found = journal.run(tasks, console, "cells")
-    return [judge(study, *case, curve_of(one, study.tolerance)) for case, one in zip(cases, found, strict=True)]
+    made = [workers.curves(one, tolerance=study.tolerance)[0] for one in found]
+    return [judge(study, *case, curve) for case, curve in zip(cases, made, strict=True)]
 
 
 def _span(study: Study, cell: Cell) -> tuple[float, float]:
@@ -146,15 +146,6 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
             f"{high:g} um, below min_diameter_um = {low:g}"
         )
     return low, high
-
-
-def curve_of(result: workers.Result, tolerance: float) -> Curve:
-    """The rational curve behind a worker's answer."""
-    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
-    error, energy = np.array(result["error"]), np.array(result["energy"])
-    diameter = np.array(result["diameter_um"])
-    nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, result["converged"], result["reason"])
-    return reduced.curve(nodes, tolerance=workers.FIT_SHARE * tolerance)
 
 
 def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdict:

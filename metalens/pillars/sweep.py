@@ -1,20 +1,19 @@
 """Run a library sweep: one rational curve t(D) for every wavelength, angle and polarisation, on all cores."""
 
 import dataclasses
-import functools
+import itertools
 import math
 from pathlib import Path
 
 import numpy as np
 
 from metalens.cell import Cell, Light
-from metalens.ground import config
+from metalens.ground import config, executor
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.store import Provenance
-from metalens.pillars import curve as reduced
 from metalens.pillars import engines, few_nodes, workers
-from metalens.pillars.curve import Curve, Nodes
+from metalens.pillars.curve import Curve
 from metalens.pillars.few_nodes import Rows
 from metalens.pillars.record import PillarLibrary, Sweep, check
 from metalens.pillars.workers import Journal, Result, Task
@@ -23,6 +22,7 @@ AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where
 FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
 MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
+TASKS_A_CORE = 4  # at least, where both polarisations are solved in one
 WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
 
 
@@ -64,8 +64,11 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
     normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
 
     def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
-        tasks = [workers.curve_task(cell, light, span, tolerance=sweep.tolerance, engine=engine) for light in lights]
-        return dict(zip(lights, map(functools.partial(_curve, sweep), journal.run(tasks, console, label)), strict=True))
+        groups = _together(lights)
+        tasks = [workers.curves_task(cell, some, span, tolerance=sweep.tolerance, engine=engine) for some in groups]
+        results = journal.run(tasks, console, label)
+        made = [curve for one in results for curve in workers.curves(one, tolerance=sweep.tolerance)]
+        return dict(zip(itertools.chain(*groups), made, strict=True))
 
     first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg), normal)
     curves = solved(first, "curves")
@@ -80,15 +83,19 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
         full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
     extra = _points(cell, sweep, engine, diameters, full)
     for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
-        _replace(full[Light(*task["light"])], diameters, result)
+        _replace(full[Light(*task["lights"][0])], diameters, result)
     solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(len(t["diameters_um"]) for t in extra)
     made = _library(cell, sweep, (engine, solves), diameters, curves, full, normal)
     journal.finish()
     return made
 
 
-def _curve(sweep: Sweep, result: Result) -> Curve:
-    return reduced.curve(_nodes(result), tolerance=workers.FIT_SHARE * sweep.tolerance)
+def _together(lights: list[Light]) -> list[list[Light]]:
+    """Those of one wavelength and direction in one task, where that leaves every core some tasks."""
+    groups: dict[tuple[float, float], list[Light]] = {}
+    for one in lights:
+        groups.setdefault((one.wavelength_um, one.angle_rad), []).append(one)
+    return list(groups.values()) if len(groups) >= TASKS_A_CORE * executor.cores() else [[one] for one in lights]
 
 
 def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
@@ -97,14 +104,6 @@ def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
 
 def _misses(row: Array, sweep: Sweep) -> Array:
     return np.asarray(row[2].real > sweep.tolerance)
-
-
-def _nodes(result: Result) -> Nodes:
-    t, r = (np.array(result[name]) @ (1, 1j) for name in ("t", "r"))
-    error, energy = np.array(result["error"]), np.array(result["energy"])
-    return Nodes(
-        np.array(result["diameter_um"]), np.stack([t, r], 1), error, energy, result["converged"], result["reason"]
-    )
 
 
 def _evaluate(curve: Curve, diameters: Array) -> Array:

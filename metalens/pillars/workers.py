@@ -1,8 +1,8 @@
-"""Tasks of sweeps, solves of one curve or of some diameters, as JSON types alone; the journal that keeps those done."""
+"""Tasks of sweeps, solves of curves or of some diameters, as JSON types alone; the journal that keeps those done."""
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from metalens.cell import Cell, Light, Response, materials
 from metalens.ground import config, executor, manifest, reading, store
 from metalens.ground.console import Console
 from metalens.pillars import curve as reduced
+from metalens.pillars.curve import Curve, Nodes
 from metalens.pillars.engines import precise, smooth
 
 SOLVE_SHARE, FIT_SHARE = 0.5, 0.4  # of an entry's tolerance: for the solver, and for the rational fit
@@ -20,37 +21,69 @@ Task = dict[str, Any]
 Result = dict[str, Any]
 
 
-def curve_task(cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str) -> Task:
-    """Exact solves of one curve t(D), chosen adaptively (:func:`metalens.pillars.curve.explore`)."""
-    return _task("curve", cell, light, tolerance, engine) | {"span_um": list(span_um)}
+def curves_task(
+    cell: Cell, lights: Sequence[Light], span_um: tuple[float, float], *, tolerance: float, engine: str
+) -> Task:
+    """Exact solves of one curve t(D) a light, chosen adaptively (:func:`metalens.pillars.curve.explore`).
+
+    Lights of one wavelength and direction share the homogeneous modes at the diameters that every curve begins with.
+    """
+    return _task("curves", cell, lights, tolerance, engine) | {"span_um": list(span_um)}
 
 
 def points_task(cell: Cell, light: Light, diameters_um: list[float], *, tolerance: float, engine: str) -> Task:
     """Exact solves at given diameters, each refined to the tolerance."""
-    return _task("points", cell, light, tolerance, engine) | {"diameters_um": diameters_um}
+    return _task("points", cell, [light], tolerance, engine) | {"diameters_um": diameters_um}
 
 
 def jones_task(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float, reach: int) -> Task:
     """Both polarisations of one pillar at normal incidence, at a fixed truncation; the result has a row an element."""
     light = Light(wavelength_um)
-    return _task("jones", cell, light, tolerance, "rcwa") | {"size_um": size_um, "harmonics": reach}
+    return _task("jones", cell, [light], tolerance, "rcwa") | {"size_um": size_um, "harmonics": reach}
 
 
 def work(task: Task) -> Result:
     """Do one task; the result holds only JSON types."""
     cell = config.loads(task["cell"], Cell, where="task")
-    light = Light(*task["light"])
+    lights = [Light(*one) for one in task["lights"]]
     if task["kind"] == "jones":
-        return _both_polarizations(cell, task["size_um"], light, task["harmonics"])
+        return _both_polarizations(cell, task["size_um"], lights[0], task["harmonics"])
     about: dict[str, Any] = {"tolerance": task["tolerance"], "engine": task["engine"]}
     if task["kind"] == "points":
-        solve = precise(cell, light, **about)
+        solve = precise(cell, lights[0], **about)
         return _listed(task["diameters_um"], [solve(d) for d in task["diameters_um"]])
     low, high = task["span_um"]
-    solve = smooth(cell, light, (low, high), **(about | {"tolerance": SOLVE_SHARE * task["tolerance"]}))
-    nodes = reduced.explore(solve, low, high, tolerance=FIT_SHARE * task["tolerance"])
+    about["tolerance"] *= SOLVE_SHARE
+    solves = [smooth(cell, light, (low, high), **about) for light in lights]
+    for diameter in reduced.starts(low, high):  # every curve begins with them: one after the other they share modes
+        for solve in solves:
+            solve(diameter)
+    return _joined([_explored(solve, (low, high), FIT_SHARE * task["tolerance"]) for solve in solves])
+
+
+def _explored(solve: Callable[[float], Response], span_um: tuple[float, float], tolerance: float) -> Result:
+    nodes = reduced.explore(solve, *span_um, tolerance=tolerance)
     order = nodes.diameter_um.tolist()
-    return _listed(order, [solve(d) for d in order]) | {"converged": nodes.converged, "reason": nodes.reason}
+    return _listed(order, [solve(d) for d in order]) | {"converged": [nodes.converged], "reason": [nodes.reason]}
+
+
+def _joined(parts: list[Result]) -> Result:
+    """One listing of several, and how many entries each has."""
+    whole = {name: [one for part in parts for one in part[name]] for name in parts[0]}
+    return whole | {"counts": [len(part["diameter_um"]) for part in parts]}
+
+
+def curves(result: Result, *, tolerance: float) -> list[Curve]:
+    """The curves of a task of curves, of this tolerance, one a light."""
+    columns = [np.array(result["diameter_um"]), *(np.array(result[name]) @ (1, 1j) for name in ("t", "r"))]
+    columns += [np.array(result[name]) for name in ("error", "energy")]
+    made = []
+    for place, stop in enumerate(np.cumsum(result["counts"]).tolist()):
+        diameter, t, r, error, energy = (one[stop - result["counts"][place] : stop] for one in columns)
+        end = result["converged"][place], result["reason"][place]
+        nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, *end)
+        made.append(reduced.curve(nodes, tolerance=FIT_SHARE * tolerance))
+    return made
 
 
 def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) -> Result:
@@ -72,9 +105,9 @@ def run(tasks: list[Task], *, processes: int | None = None) -> Iterator[tuple[in
     return executor.run(work, tasks, processes=processes)
 
 
-def _task(kind: str, cell: Cell, light: Light, tolerance: float, engine: str) -> Task:
-    wave = [light.wavelength_um, light.angle_rad, light.polarization, light.azimuth_rad]
-    return {"kind": kind, "cell": config.dumps(cell), "light": wave, "tolerance": tolerance, "engine": engine}
+def _task(kind: str, cell: Cell, lights: Sequence[Light], tolerance: float, engine: str) -> Task:
+    waves = [[one.wavelength_um, one.angle_rad, one.polarization, one.azimuth_rad] for one in lights]
+    return {"kind": kind, "cell": config.dumps(cell), "lights": waves, "tolerance": tolerance, "engine": engine}
 
 
 def _listed(diameters_um: Iterable[float], made: list[Response]) -> Result:

@@ -8,7 +8,7 @@ from metalens.cell.record import Cell, Index
 from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
-from metalens.modal.few_modes import few_modes, root
+from metalens.modal.few_modes import few_modes, root, squared
 from metalens.modal.homogeneous import below, definite_inverse, eigen_pairs, modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
@@ -98,6 +98,28 @@ def test_root_of_a_matrix_near_a_diagonal():
     assert np.abs(found @ found - square).max() < 1e-11 * level.max()
     assert (np.linalg.eigvals(found).real > 0).all()
     assert np.abs(signs[:, None] * found - (signs[:, None] * found).T).max() < 1e-11 * np.sqrt(level.max())
+
+
+def test_root_of_levels_wider_apart_than_single_precision_counts():
+    random = np.random.default_rng(5)
+    level = np.geomspace(10.0, 1e12, 24)  # the roots of single precision are 0.1 off at the upper end
+    signs = np.where(np.arange(24) % 3, 1.0, -1.0)
+    rest = 0.2 * random.uniform(-1, 1, (24, 24)) * np.sqrt(np.minimum(level[:, None], level))
+    square = np.diag(level) + signs[:, None] * (rest + rest.T)
+    found = root(square, signs, 1.0, 1e-12)
+    off = np.abs(found @ found - square)[:6, :6]  # of the rows that carry: 1e-12 of the roots, times the rows they meet
+    assert off.max() < 1e-9 * level[:6].max()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [1, 3, 11, 24])
+def test_a_product_by_strips_is_the_whole_product(n, dtype):
+    random = np.random.default_rng(n)
+    signs = np.where(random.random(n) < 0.4, 1.0, -1.0)
+    half = random.integers(-9, 10, (n, n))
+    e = (signs[:, None] * (half + half.T)).astype(dtype)  # whole numbers, whose products have no rounding
+    assert (squared(e, signs) == e @ e).all()
+    assert squared(e, signs).dtype == dtype
 
 
 def test_root_refuses_what_is_far_from_a_diagonal():

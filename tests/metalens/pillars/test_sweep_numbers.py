@@ -40,7 +40,7 @@ def test_entries_above_the_tolerance_are_solved_eight_at_a_time():
     rows = {Light(0.85): np.stack([d, d, error]).astype(complex), Light(0.9): np.stack([d, d, 0 * d]).astype(complex)}
     tasks = sweep._points(DEFAULT_CELL, settings, "modal", d, rows)
     assert [task["diameters_um"] for task in tasks] == [d[bad[:8]].tolist(), d[bad[8:]].tolist()]
-    assert all(Light(*task["light"]) == Light(0.85) for task in tasks)
+    assert all(task["lights"] == [[0.85, 0.0, "x", 0.0]] for task in tasks)
 
 
 def test_single_solves_stand_where_they_are_better():

@@ -100,7 +100,7 @@ def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
         return [level("coarse", False), level("fine", True), level("finest", True)]
 
     monkeypatch.setattr(engines, "_modal_levels", levels)
-    found = workers.work(workers.curve_task(CELL, engines.Light(0.85), (0.07, 0.23), tolerance=1e-3, engine="modal"))
+    found = workers.work(workers.curves_task(CELL, [engines.Light(0.85)], (0.07, 0.23), tolerance=1e-3, engine="modal"))
     failed, nodes = [d for name, d in asked if name == "coarse"], [d for name, d in asked if name != "coarse"]
     assert len(failed) == 2
     assert len(nodes) == len(set(nodes))
@@ -129,3 +129,20 @@ def test_beside_a_resonance_alone_the_next_mesh_takes_over(monkeypatch, finer_er
     assert (at(0.12).reason, at(0.12).t_error) == ("coarse", 1e-5)
     assert at(0.22).t_error == min(bar, finer_error)
     assert at(0.22).reason == ("fine" if finer_error < bar else "coarse")
+
+
+def test_curves_of_one_task_are_those_of_tasks_of_their_own():
+    """Both polarisations share modes and are told one after the other: the same bits as each by itself."""
+    span, about = (0.1, 0.14), {"tolerance": 2e-2, "engine": "modal"}
+    both = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
+    joined = workers.work(workers.curves_task(CELL, both, span, **about))
+    alone = [workers.work(workers.curves_task(CELL, [one], span, **about)) for one in both]
+    assert joined["counts"] == [len(one["diameter_um"]) for one in alone]
+    for made, one in zip(workers.curves(joined, tolerance=2e-2), alone, strict=True):
+        (same,) = workers.curves(one, tolerance=2e-2)
+        assert (made.nodes.diameter_um == same.nodes.diameter_um).all()
+        assert (made.nodes.response == same.nodes.response).all()
+        assert (made.nodes.error == same.nodes.error).all()
+        assert made.nodes.reason == same.nodes.reason
+    s, p = (made.nodes.response[0, 0] for made in workers.curves(joined, tolerance=2e-2))
+    assert abs(s - p) > 0.01  # and not one of them twice
