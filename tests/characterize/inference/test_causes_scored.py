@@ -86,9 +86,9 @@ def test_what_a_cause_would_be_taken_for_is_said_in_sigma_the_largest_first():
     size = np.array([4.0, 0.5, 20.0, 7.0, 3.0])
     slopes = size[:, None] * np.eye(5, PIXELS)
     fit = Fitted((*NAMES, "five"), slopes, slopes @ slopes.T, np.zeros(PIXELS), ALONE, np.zeros(5))
-    moved = np.array([0.6, 7.0, 0.36, -0.2, 0.3])  # 2.4, 3.5, 7.2, 1.4 and 0.9 sigma
+    moved = np.array([0.6, -7.0, 0.36, -0.2, 0.3])  # 2.4, 3.5, 7.2, 1.4 and 0.9 sigma
     told = fit.taken(moved @ slopes, 2.5, "{:.3g} um")
-    want = "three +0.36 (7.2 sigma), two +7 (3.5 sigma), one +0.6 (2.4 sigma)"
+    want = "three +0.36 (7.2 sigma), two -7 (3.5 sigma), one +0.6 (2.4 sigma)"
     assert told == f"2.5 um would be taken for {want}; state it if there is any"
     told = fit.taken(np.array([0.0, 0.0, 0.07, -0.13, 0.3]) @ slopes, 2.5, "{:.3g} um")  # 1.4, 0.91 and 0.9 sigma
     assert told == "2.5 um would be taken for three +0.07 (1.4 sigma); state it if there is any"
@@ -102,14 +102,17 @@ def test_three_more_causes_are_named_beside_the_likeliest():
     assert "cause 1, cause 2 would" in missing.words(leans[:3])[0]
 
 
+ALONG = 40 * RNG.normal(size=(2, *SHAPE))
+
+
 def looked(monkeypatch, changes):
-    image, slopes = RNG.uniform(20, 90, SHAPE), RNG.normal(size=(2, *SHAPE))
+    image = RNG.uniform(20, 90, SHAPE)
     data = SimpleNamespace(
         usable=np.ones(SHAPE, bool), saturated=np.zeros(SHAPE, bool), variance=lambda light: 2.5 * light + 9.0,
         shared=lambda light: ALONE,
     )  # fmt: skip
     task = SimpleNamespace(
-        model=SimpleNamespace(images=lambda x, names: (image, slopes)), data=data, all_of=lambda value: value,
+        model=SimpleNamespace(images=lambda x, names: (image, ALONG)), data=data, all_of=lambda value: value,
         prior=SimpleNamespace(sigma=np.array([0.3, 2.1]), mean=np.zeros(2)), names=("one", "two"),
     )  # fmt: skip
     mode = SimpleNamespace(value=np.zeros(2), residual_sigma=RNG.normal(size=SHAPE), chi2_per_dof=1.0)
@@ -121,10 +124,11 @@ def looked(monkeypatch, changes):
 def test_causes_are_reckoned_with_by_their_sigma_and_what_kind_they_are(monkeypatch):
     """One sigma for all changes of a cause or one each; none is not reckoned with; some are not looked for alone."""
     many = RNG.normal(size=(4, 2, *SHAPE))
+    many[2] += 3 * ALONG
     changes = [
         Change("a plate", many[0], sigma=2.7, roughly=True),
         Change("a wall", many[1], sigma=np.array([0.4, 3.3]), of_mask=True, sought=False, told="{:g} um"),
-        Change("a lamp", many[2]),
+        Change("a lamp", many[2], amount=1.6, told="{:.4f} V"),
         Change("a drift", many[3], sigma=np.array([0.0, 1.9]), frees=("light_x",)),
     ]
     found, root = looked(monkeypatch, changes)
@@ -135,6 +139,9 @@ def test_causes_are_reckoned_with_by_their_sigma_and_what_kind_they_are(monkeypa
     assert found.roughly == {"a plate"}
     assert found.of_mask == {"a wall"}
     assert {one.cause for one in found.leans} == {"a plate", "a lamp", "a drift", "a ghost"}
+    lamp = {one.cause: one for one in found.leans}["a lamp"].taken
+    assert lamp == found.fit.taken((many[2][0] * root).ravel(), 1.6, "{:.4f} V")
+    assert " V would be taken for " in lamp
     assert [one.chance for one in found.leans] == sorted(one.chance for one in found.leans)
     assert {one.cause: one.frees for one in found.leans}["a drift"] == ("light_x",)
 
@@ -154,7 +161,7 @@ def test_light_is_moved_by_whole_pixels(shift):
     assert np.array_equal(missing._moved(light, shift), by_hand(light, *shift))
 
 
-def ghost(rows, columns, shift, amount=1.0, taken=False):
+def ghost(rows, columns, shift, amount=1.0, taken=False, dark=0.0):
     """(the lean, chi-square of the copy by itself) where the residuals are a copy of the light with that of 20."""
     x = vector({"background_e": 41.0, "background_x_e": 13.0, "background_y_e": -7.0})
     setting = SimpleNamespace(rows=rows, columns=columns)
@@ -164,7 +171,7 @@ def ghost(rows, columns, shift, amount=1.0, taken=False):
     copy = (by_hand(light, *shift) * root).ravel()
     rest = amount * math.sqrt(20.0) * copy / np.linalg.norm(copy)
     slopes = copy[None] if taken else np.zeros((1, copy.size))
-    fit = Fitted(("one",), slopes, slopes @ slopes.T + 1e-9, rest, np.zeros((2, 2, rows, columns)), np.zeros(1))
+    fit = Fitted(("one",), slopes, slopes @ slopes.T + 1e-9, rest, dark * np.ones((2, 2, rows, columns)), np.zeros(1))
     task = SimpleNamespace(model=SimpleNamespace(setting=setting))
     return missing._ghost(task, x, light + plane, root, fit)
 
@@ -192,6 +199,11 @@ def test_a_copy_of_the_light_is_found_where_it_is_and_counted_as_the_best_of_man
 def test_what_is_no_ghost_is_not_found(shift, more):
     """Nearer than 3 pixels it is blur; farther than it can be seen; a lack of light; what a parameter takes up."""
     assert ghost(13, 17, shift, **more).chi2 < 15
+
+
+def test_a_ghost_is_judged_by_the_scatter_that_frames_have_in_common():
+    """Both frames share 0.6 of the dark's and of the flat's error: less is beyond chance than of 20."""
+    assert ghost(13, 17, (3, -4), dark=0.6).chi2 < 16
 
 
 def test_a_frame_without_room_for_a_ghost_says_so():

@@ -3,12 +3,15 @@
 import dataclasses
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
+from characterize.model import pillar_slopes
 from characterize.model.pillar_slopes import slopes
 from metalens import rcwa
 from metalens.cell.record import Cell, Film, Index
@@ -42,3 +45,17 @@ def test_cells_with_films_are_solved_too_and_impossible_ones_fall_back():
     assert slopes(dataclasses.replace(lens_of(film), diameters=thin)).error < 0.1
     absorbing = dataclasses.replace(CELL, substrate=Index(1.5, 0.1))
     assert np.array_equal(slopes(lens_of(absorbing)).coefficients, sensitivity(lens_of(absorbing)).coefficients)
+
+
+def test_a_slope_that_no_solver_knows_is_a_difference_where_it_is_wanted(monkeypatch):
+    """Of a t whose logarithm follows the wall by 0.03 - 0.7i a degree, and by as much of its cube; told a radian."""
+    rate = 0.03 - 0.7j
+
+    def solved(cell, diameter_um, wavelength_um):
+        lean = np.degrees(cell.sidewall_rad)
+        return SimpleNamespace(t=np.exp(0.2 + rate * (lean + lean**3)))
+
+    monkeypatch.setattr(pillar_slopes.rcwa, "derivatives", solved)
+    found = pillar_slopes._exact(CELL, 0.11, 0.85, {"sidewall_deg"}, None)
+    assert found[2] == pytest.approx(rate * 1.25 * 180 / np.pi, rel=1e-9)  # (0.5 + 0.125) / 0.5
+    assert pillar_slopes._exact(CELL, 0.11, 0.85, (), None) == [*found[:2], 0]

@@ -8,7 +8,8 @@ import torch
 
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import LensError
+from codesign.optics.lens_errors import TURN, WAVELENGTH_UM, LensError, LensErrors
+from metalens.pillars import DEFAULT_CELL
 
 SETTINGS = optics.OpticsConfig()
 
@@ -55,3 +56,48 @@ def test_variance_of_a_bowed_bias_by_plain_quadrature():
     c, answers = lens_errors._answers()[1], state.answers()
     want = c[0, 0] * (bias**2).mean() + 2 * bias.mean() * c[0, 1:] @ answers + answers @ c[1:, 1:] @ answers
     assert lens_errors.variance_rad2(state) == pytest.approx(want, rel=1e-4)  # rings: 1 / 400² of the curvature
+
+
+def test_errors_are_correlated_as_they_are_said_to_be():
+    """The first three entries of the five that vary."""
+    said = (1.0, 0.3, -0.6, 0.3, 1.0, 0.2, -0.6, 0.2, 1.0)
+    errors = LensErrors(focus_um=1.7, tilt_waves=0.3, astigmatism_waves=0.08, bias_nm=2.9, index=0.01, correlation=said)
+    size = np.array([1.7, 0.3, 0.08])
+    found = errors.covariance
+    assert found[:3, :3] == pytest.approx(np.reshape(said, (3, 3)) * size[:, None] * size, rel=1e-12)
+    rest = dict(zip(lens_errors.ENTRIES, np.diag(found), strict=True))
+    assert (rest["bias_nm"], rest["index"]) == pytest.approx((2.9**2, 1e-4))
+    assert np.count_nonzero(found) == 9 + 2
+    generator = torch.Generator().manual_seed(5)
+    drawn = [errors.draw(generator) for _ in range(3000)]
+    values = np.array([[one.amounts[name] for name in lens_errors.ENTRIES] for one in drawn])
+    scale = np.sqrt(np.maximum(np.diag(found), 1e-30))
+    assert np.abs((np.cov(values.T) - found) / np.outer(scale, scale)).max() < 0.11  # four sigma of √(2 / 3000)
+    turn = np.array([one.turn_rad for one in drawn])
+    assert turn.min() > 0
+    assert turn.max() < 2 * math.pi
+    assert turn.mean() == pytest.approx(math.pi, abs=0.14)  # four sigma of 2π / √12 / √3000
+    assert turn.std() == pytest.approx(2 * math.pi / math.sqrt(12), rel=0.05)
+
+
+def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
+    """By the mean of d phase / d diameter over a turn of phases, here the turn over the range that it takes."""
+    state = LensError({"bias_nm": 6.0, "gradient_nm": 3.1, "bow_nm": -1.7}, 0.7).state()
+    u, v = torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64), torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64)
+    turn, lens = TURN.phase_rad, np.linspace(*TURN.domain_um, 40_001)
+    phase = np.asarray(turn(lens, WAVELENGTH_UM))
+    inside = phase - phase[0] <= 2 * math.pi
+    rate = np.gradient(phase, lens)[inside]
+    mean = np.trapezoid(rate, phase[inside]) / (2 * math.pi)  # phases fill the turn evenly
+    bias = state.bias_um(u.numpy(), v.numpy())
+    got = lens_errors.wave_front_rad(state, u, v).numpy()
+    assert got[0] == pytest.approx(0, abs=1e-12)
+    assert got == pytest.approx(mean * (bias - bias[0]), rel=0.01, abs=1e-12)  # 400 phases of the turn
+
+
+def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have():
+    """phase = k n_eff h: a height off by d turns each by d / h of its phase. Phases fill a turn evenly, so about what
+    they share they scatter by 2π / √12 of d / h (400 phases of the turn: 0.3 %)."""
+    state = LensError({"height_nm": 8.0}).state()
+    want = (2 * math.pi / math.sqrt(12) * 8e-3 / DEFAULT_CELL.height_um) ** 2
+    assert lens_errors.variance_rad2(state) == pytest.approx(want, rel=0.01)
