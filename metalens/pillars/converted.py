@@ -88,6 +88,7 @@ def _widest(data: Data, middle: int, wanted: Wanted) -> Proxy:
         met &= proxy.max_transmission_error <= wanted.transmission_tolerance
         if met or count <= LEAST_ENTRIES:
             return proxy
-        reach = max(LEAST_ENTRIES // 2, int(0.9 * reach))
-        if 2 * reach + 1 <= LEAST_ENTRIES:
+        nearer = max(LEAST_ENTRIES // 2, int(0.9 * reach))
+        if nearer >= reach:
             return proxy
+        reach = nearer

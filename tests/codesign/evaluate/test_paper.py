@@ -50,6 +50,31 @@ def test_all_of_the_paper_is_there_once():
     assert len(keys) == len(set(keys))
 
 
+def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angles(tmp_path):
+    """Information summed over the channels of its first row; scenes with their own intervals."""
+
+    def lens(scene, *angles):
+        return {"scene_ratios": {"axial": scene}, "information_per_mm2": [[one, [9.0, 7.0]] for one in angles]}
+
+    told = {
+        "angles_deg": [0, 12.5], "normalisation": "light",
+        "lenses": {
+            "proposed": lens([1.7, 1.4, 2.3], [3.0, 5.0], [2.0, 1.5]),
+            "hyperbolic": lens([1.0, 0.9, 1.2], [1.5, 0.5], [4.0, 1.0]),
+        },
+    }  # fmt: skip
+    path = tmp_path / "optics.json"
+    path.write_text(json.dumps(told))
+    found = paper.of_optics(path)
+    assert found["scenes/axial/proposed"] == Measured(1.7, 1.4, 2.3, "same states, images of equal light")
+    assert found["information/0/proposed"].value == pytest.approx(8.0 / 2.0)
+    assert found["information/12.5/proposed"].value == pytest.approx(3.5 / 5.0)
+    assert found["information/12.5/hyperbolic"].value == 1
+    del told["lenses"]["hyperbolic"]
+    path.write_text(json.dumps(told))
+    assert set(paper.of_optics(path)) == {"scenes/axial/proposed"}
+
+
 def test_what_was_not_measured_says_how_to_and_what_was_has_a_ratio():
     told = {line.claim.key: line for line in paper.lines({"iou/proposed": Measured(0.47, 0.4, 0.5, "here")})}
     assert told["iou/proposed"].ratio == pytest.approx(0.5)

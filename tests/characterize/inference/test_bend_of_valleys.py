@@ -1,0 +1,45 @@
+"""How far a valley is from a parabola, in closed form: two sigma either way, of what is left when another is held."""
+
+import numpy as np
+import pytest
+
+from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.posterior import Valley
+
+RNG = np.random.default_rng(13)
+SIGMA, BENT, SHAPE = 0.37, 0.07, (2, 5, 7)
+PICTURES = RNG.normal(size=(3, *SHAPE)) + 0.6 * RNG.normal(size=SHAPE)  # overlap: parameters are correlated
+CURVE = RNG.normal(size=SHAPE)
+MODE = np.array([0.0, 1.7, -0.4])
+
+
+def model(x, jacobian):
+    image = 50.0 + SIGMA * (np.tensordot(x, PICTURES, 1) + BENT * x[0] ** 2 * CURVE)
+    slopes = SIGMA * PICTURES.copy()
+    slopes[0] += SIGMA * 2 * BENT * x[0] * CURVE
+    return image, slopes if jacobian else None
+
+
+def valley(**bounds):
+    everywhere = np.ones(SHAPE, bool)
+    data = Data(model(MODE, False)[0], everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15))
+    free = Prior.none(MODE)
+    return Valley(model, data, MODE, Prior(free.mean, free.sigma, bounds.get("low", free.low), free.high))
+
+
+@pytest.mark.parametrize("held", [None, 1, 2])
+def test_a_quadratic_term_is_missed_by_four_times_itself_at_two_sigma(held):
+    """BENT (2 s)² of its picture on either side; s from the information, the held parameter's rows left out."""
+    flat = PICTURES.reshape(3, -1)
+    left = [k for k in range(3) if k != held]
+    sigma = np.sqrt(np.linalg.inv(flat[left] @ flat[left].T)[0, 0])
+    want = BENT * (2 * sigma) ** 2 * np.linalg.norm(CURVE)
+    assert valley().bend(0, held) == pytest.approx(want, rel=1e-6)
+
+
+def test_what_is_held_stays_where_it_is_and_a_bound_between_is_told():
+    flat = PICTURES.reshape(3, -1)
+    pair = np.linalg.inv(flat[[0, 2]] @ flat[[0, 2]].T)
+    reach = 2 * np.sqrt(pair[0, 0])
+    assert valley(low=np.array([-0.99 * reach, 1.69, -99.0])).bend(0, 1) == np.inf
+    assert np.isfinite(valley(low=np.array([-1.01 * reach, 1.6999, -99.0])).bend(0, 1))  # the second does not move
