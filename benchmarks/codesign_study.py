@@ -124,18 +124,23 @@ def oblique(settings: OpticsConfig) -> torch.Tensor:
     Paths from source and image point, less those of the hyperbolic lens, by least squares over the aperture; what 35
     polynomials leave of it at 10 degrees is 2e-5 rad rms.
     """
-    axial = replace(settings, angle_deg=0.0)
-    pupil = axial.pupil
+    pupil = settings.pupil
     x, y = coordinates(pupil)
-    inside = torch.hypot(x, y) <= pupil.radius_um
     field = Field(math.radians(settings.angle_deg))
     (tx, ty), flat = field.tangents, (0.0, 0.0)
     ends = ((-tx, -ty), 1 / pupil.sensor_distance_um), ((tx, ty), 1e-3 / settings.focus_mm)
     paths = sum(source_path(x, y, slope, inverse) - source_path(x, y, flat, inverse) for slope, inverse in ends)
-    wanted = -2 * math.pi / pupil.wavelength_um * torch.as_tensor(paths)
+    return fitted(settings, -2 * math.pi / pupil.wavelength_um * torch.as_tensor(paths))
+
+
+def fitted(settings: OpticsConfig, wanted_rad: torch.Tensor) -> torch.Tensor:
+    """(polynomials,) nearest to a phase (nodes, nodes) over the aperture, a constant left free; by least squares."""
+    axial = replace(settings, angle_deg=0.0)
+    x, y = coordinates(axial.pupil)
+    inside = torch.hypot(x, y) <= axial.pupil.radius_um
     unit = torch.eye(settings.polynomials, dtype=torch.float64)
     modes = torch.stack([added_phase(axial, one)[inside] for one in unit] + [torch.ones_like(x)[inside]], 1)
-    return torch.linalg.lstsq(modes, wanted[inside][:, None]).solution[:-1, 0]
+    return torch.linalg.lstsq(modes, wanted_rad[inside][:, None]).solution[:-1, 0]
 
 
 def architecture_of(case: Case) -> Architecture:

@@ -94,7 +94,7 @@ def test_lenses_of_different_sensor_distances_are_refused():
 
 def test_the_table_names_every_lens_and_the_light():
     one = reader.Read(
-        torch.tensor([0.4, 0.6]), torch.tensor([0.2, 0.3]), torch.tensor([1.0, 1.4]), 2.7, 0.91, 1.3, 0.02
+        torch.tensor([0.4, 0.6]), torch.tensor([0.2, 0.3]), torch.tensor([1.0, 1.4]), 2.7, 0.91, 1.3, 0.02, 0.9
     )
     lines = reader.table({"mine": one}, replace(TINY, fwhm_nm=30.0)).text.splitlines()
     assert "30 nm of light" in lines[0]

@@ -28,6 +28,7 @@ def frames(count, seed):
     slip = torch.from_numpy(rng.normal(0, 1, (count, 3)))
     answer = torch.from_numpy(np.concatenate([rng.normal(0, 1, (count, 3)), rng.uniform(-5, 3, (count, 3))], 1))
     told = vergence + torch.from_numpy(rng.normal(0, 0.3, (count, 7, 7)))
+    told = torch.stack([told, torch.from_numpy(rng.uniform(-2, 1, (count, 7, 7)))], 1)
     pixels = torch.arange(count, dtype=torch.float64)[:, None, None, None] + 1000 * seed
     return Frames(pixels, vergence, slip), answer, told
 
@@ -40,7 +41,7 @@ class Stand:
 
     def branch(self, pixels):
         found = [self.answers[float(p)] for p in pixels]
-        return torch.stack([torch.stack([t, 9 + 0 * t]) for _, t in found]), torch.stack([a for a, _ in found])
+        return torch.stack([t for _, t in found]), torch.stack([a for a, _ in found])
 
     def slip(self, features):
         return features
@@ -70,8 +71,11 @@ def test_intervals_are_calibrated_by_rank_and_judged_on_others(count):
     assert got.image_error == 0.043
     made, _, told = judged
     depth = 1e3 / (45 + 8 * made.vergence.numpy())
-    read = 1e3 / np.clip(45 + 8 * told.numpy(), 1, 200)
+    read = 1e3 / np.clip(45 + 8 * told[:, 0].numpy(), 1, 200)
     assert got.window_mm.numpy() == pytest.approx(np.abs(read - depth).mean((1, 2)), rel=1e-9)
+    unsure = (read**2 * np.exp(told[:, 1].numpy())).ravel()  # |dz| = z² |d(1/z)|
+    surest = np.abs(read - depth).ravel()[np.argsort(unsure)[: unsure.size // 2]]
+    assert got.trusted_mm == pytest.approx(surest.mean(), rel=1e-6)
     middle = np.sort(depth.ravel())[(depth.size - 1) // 2]  # torch: the lower of two
     assert got.guess_mm == pytest.approx(np.abs(depth - middle).mean(), rel=1e-9)
 
@@ -89,12 +93,13 @@ def test_few_frames_to_spare_take_their_largest_ratio():
 def test_the_interval_of_the_mean_is_a_bootstrap_over_frames():
     """Of 400 errors: ± 1.96 sigma / √400 about the mean, to the 5 % of 1000 draws."""
     error = torch.from_numpy(np.random.default_rng(6).gamma(3.0, 0.2, 400))
-    values = Read(error, 2 * error, 3 * error, 2.5, 0.9, 1.1, 0.01).values()
+    values = Read(error, 2 * error, 3 * error, 2.5, 0.9, 1.1, 0.01, 0.7).values()
     mean, half = float(error.mean()), 1.96 * float(error.std()) / 20
     assert values["axial_mm"] == pytest.approx(mean)
     assert values["axial_low_mm"] == pytest.approx(mean - half, abs=0.15 * half)
     assert values["axial_high_mm"] == pytest.approx(mean + half, abs=0.15 * half)
     assert (values["lateral_mm"], values["window_mm"]) == pytest.approx((2 * mean, 3 * mean))
+    assert values["trusted_mm"] == 0.7
 
 
 def test_batches_are_of_their_own_rows_and_the_rate_rises_and_falls():

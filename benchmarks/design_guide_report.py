@@ -1,0 +1,245 @@
+"""The table of the design guide: errors with 95 % intervals over seeds, ratios paired by seed."""
+
+import json
+import math
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from benchmarks import kept_lines
+from benchmarks.design_guide import (
+    CHOICE,
+    DESIGNERS,
+    DESIGNS,
+    DEVICE,
+    FIELDS,
+    FOCI,
+    KNOBS,
+    TRAINED,
+    TRAINING,
+    cell_of,
+    compared,
+    done,
+    plan,
+)
+from metalens.ground import store
+
+ROOT = Path(__file__).parents[1]
+RESULT, PAGE = ROOT / "benchmarks" / "results" / "design_guide.json", ROOT / "docs" / "codesign" / "guide.md"
+MEASURES = ("axial_mm", "lateral_mm", "window_mm", "trusted_mm")
+NETWORKS = {"codesign_study_p18blur": "25 600 frames", "codesign_study_p18blurlong": "76 800 frames"}
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A mean over seeds with its 95 % interval, nan with one seed."""
+
+    mean: float
+    low: float
+    high: float
+    seeds: int
+
+    def __str__(self) -> str:
+        if self.seeds < 2:
+            return f"{self.mean:.2f} (one seed)"
+        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+def interval(values: list[float]) -> Interval:
+    """Student's interval of a mean: m ± t s / √n."""
+    mean, count = float(np.mean(values)), len(values)
+    if count < 2:
+        return Interval(mean, math.nan, math.nan, count)
+    half = float(student.ppf(0.975, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
+    return Interval(mean, mean - half, mean + half, count)
+
+
+def ratio(one: dict[int, float], other: dict[int, float]) -> Interval:
+    """Geometric mean of the ratios of the seeds that both have, with Student's interval of their logarithm.
+
+    Raises:
+        ValueError: they share no seed.
+    """
+    both = sorted(set(one) & set(other))
+    if not both:
+        raise ValueError(f"no seed in common: {sorted(one)} and {sorted(other)}")
+    logs = interval([math.log(one[s] / other[s]) for s in both])
+    return Interval(math.exp(logs.mean), math.exp(logs.low), math.exp(logs.high), logs.seeds)
+
+
+def by_cell(lines: dict[str, dict[str, Any]]) -> dict[str, dict[int, dict[str, Any]]]:
+    """{cell: {seed: line}} without the runs that chose."""
+    found: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
+    for name, line in lines.items():
+        cell, _, seed = name.rpartition("/")
+        if int(seed) != CHOICE:
+            found[cell][int(seed)] = line
+    return dict(found)
+
+
+def measured(runs: dict[int, dict[str, Any]], name: str) -> dict[int, float]:
+    """{seed: value} of one measure."""
+    return {seed: float(line[name]) for seed, line in runs.items()}
+
+
+def knob_rows(runs: dict[str, dict[int, dict[str, Any]]]) -> list[dict[str, Any]]:
+    """A row a cell that changes one knob of the base, in the order of the plan; those without a run are left out."""
+    names = [name for knob in KNOBS if (name := cell_of(knob).name) in runs]
+    return [row_of(runs, name, "base") for name in names]
+
+
+def row_of(runs: dict[str, dict[int, dict[str, Any]]], name: str, base: str) -> dict[str, Any]:
+    """Intervals of all measures of a cell, and its ratios to another."""
+    row: dict[str, Any] = {"cell": name, "guess_mm": float(np.mean(list(measured(runs[name], "guess_mm").values())))}
+    for measure in MEASURES:
+        mine = measured(runs[name], measure)
+        row[measure] = interval(list(mine.values()))
+        if name != base and base in runs and set(runs[name]) & set(runs[base]):
+            row[f"{measure}_ratio"] = ratio(mine, measured(runs[base], measure))
+    return row
+
+
+def device_rows(lines: dict[str, dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """{field and light: a row a role}; ratios to the best focus, of the trained lens to the best designer's too."""
+    runs, found = by_cell(lines), {}
+    for device in DEVICE:
+        roles = {role: cell for role, cell in compared(lines, device).items() if cell in runs}
+        if "focus" not in roles:
+            continue
+        rows = [{"role": role} | row_of(runs, cell, roles["focus"]) for role, cell in roles.items()]
+        if {"trained", "designer"} <= set(roles):
+            mine, other = (measured(runs[roles[r]], "axial_mm") for r in ("trained", "designer"))
+            rows[-1]["to_designer"] = ratio(mine, other)
+        found[device] = rows
+    return found
+
+
+def network_rows() -> list[dict[str, Any]]:
+    """What the elastic network reads at the base, of committed results: one PSF a depth, in place of the true image."""
+    found = []
+    for name, frames in NETWORKS.items():
+        for row in json.loads((RESULT.parent / f"{name}.json").read_text("utf-8")):
+            mean = interval(row["axial_by_seed_mm"])
+            found.append({"reader": f"elastic network, {frames}", "lens": row["lens"], "mmacs": row["mmacs"],
+                          "axial_mm": mean, "lateral_mm": row["lateral_mm"]})  # fmt: skip
+    return found
+
+
+HEAD = """# What brings how much
+
+Errors of the slippage and of the depth of windows (a quarter of the frame wide) by the reference reader of
+`metalens evaluate optics --reader`, trained anew behind every lens on its true image: whole field, depth, spectrum. In
+every row one knob differs from the base: hyperbolic lens in focus at 40 mm, 1 mm wide, 2 mm before the sensor; ±14°
+about the axis; one wavelength; pixels of 18 µm; 2000 e from white in 9 µm; {frames} frames to learn from. Scenes, noise
+and weights come from the seed. Brackets are 95 % intervals over the seeds (Student's), of ratios those of the
+logarithms paired by seed: they hold what differs from seed to seed and nothing else. `trusted`: the half of the windows
+of which the reader is surest. Images hold to 0.05 of a texture's contrast; where the spectrum's own share is below that
+one wavelength stands for it (10 nm: 0.006, 30 nm: up to 0.017 of the contrast). Gaze is not measured here.
+
+Made by `python -m benchmarks.design_guide run --work DIR`, and `report`; `--only CELL/SEED` reruns one. All numbers,
+and the coefficients of the trained lenses, are in `benchmarks/results/design_guide.json`.
+"""
+FIELD = """
+## Field and light of the device
+
+`oblique`: a camera that looks from one side, {oblique} along x and ±14° along y. `ring`: {ring} about the axis, both
+ways. Frames are those of a camera that faces the eye; their images are those of that part of the field. Every lens of a
+family was chosen by axial error with a seed of its own, for that field and light. `focus`: hyperbolic, in focus at
+{foci} mm. `designer`: r² alone (blur of all angles alike) or, in the oblique field, free of aberrations at its
+middle, in focus at {designers} mm. `trained`: 63 free-form terms moved from the best focus along the exact gradient of
+the likelihood of the windows' depths ({turns} steps of the lens, {hold} of the reader's branch to each, 32 frames a
+step), trained once, on an image to {coarse:g} of the contrast, and read by every seed.
+"""
+
+
+def page(lines: dict[str, dict[str, Any]]) -> str:
+    """Markdown of all tables, and what of the plan was not measured."""
+    runs, devices = by_cell(lines), device_rows(lines)
+    parts = [HEAD.format(frames=cell_of("base").frames), "", *knob_table(knob_rows(runs))]
+    foci, designers = (
+        ", ".join(dict.fromkeys(n.lstrip("abcdefghijklmnopqrstuvwxyz") for n in names)) for names in (FOCI, DESIGNERS)
+    )
+    told = {"coarse": TRAINED, "turns": TRAINING.turns, "hold": TRAINING.hold, "foci": foci, "designers": designers}
+    parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
+    for device, rows in devices.items():
+        parts += device_table(device, rows, lines)
+    parts += ["## Another reader", "", *network_table(network_rows()), ""]
+    absent = missing(lines)
+    if absent:
+        parts += [
+            "## Planned and not measured",
+            "",
+            "Cells without a run: " + ", ".join(f"`{c}`" for c in absent) + ".",
+            "",
+        ]
+    return "\n".join(parts)
+
+
+def reach(field: str) -> str:
+    """Angles that a field spans along x."""
+    place = FIELDS[field]
+    ends = (math.tan(math.radians(place.angle_deg)) + s * place.width_um / 2 / 2000.0 for s in (-1, 1))
+    low, high = (math.degrees(math.atan(e)) for e in ends)
+    return f"±{high:.0f}°" if place.angle_deg == 0 else f"{low:.0f} to {high:.0f}°"
+
+
+def knob_table(rows: list[dict[str, Any]]) -> list[str]:
+    """A row a cell; the ratio of axial errors is to the base."""
+    out = [
+        "| cell | seeds | axial / mm | to the base | lateral / mm | windows / mm (guess) | trusted / mm |",
+        "|---" * 7 + "|",
+    ]
+    for row in rows:
+        told = f"{row['window_mm']} ({row['guess_mm']:.2f})"
+        axial = f"{row['axial_mm'].seeds} | {row['axial_mm']} | {row.get('axial_mm_ratio', '1')}"
+        out.append(f"| `{row['cell']}` | {axial} | {row['lateral_mm']} | {told} | {row['trusted_mm']} |")
+    return out
+
+
+def device_table(device: str, rows: list[dict[str, Any]], lines: dict[str, dict[str, Any]]) -> list[str]:
+    """A row a role, and the runs that chose below."""
+    cell = cell_of(device)
+    out = [f"### {cell.field}, {cell.fwhm:g} nm", "",
+           "| lens | seeds | axial / mm | to best focus | windows / mm | to best focus | trusted / mm | lateral / mm |",
+           "|---" * 8 + "|"]  # fmt: skip
+    for row in rows:
+        ratios = [str(row.get(f"{m}_ratio", 1)) for m in ("axial_mm", "window_mm")]
+        name = f"{row['role']}: `{cell_of(row['cell']).lens}`"
+        both = f"{row['axial_mm']} | {ratios[0]} | {row['window_mm']} | {ratios[1]}"
+        out.append(f"| {name} | {row['axial_mm'].seeds} | {both} | {row['trusted_mm']} | {row['lateral_mm']} |")
+    for row in rows:
+        if "to_designer" in row:
+            out += ["", f"Trained to the best designer's lens, axial: {row['to_designer']}."]
+    scan = {
+        n: v for n, v in lines.items() if n.endswith(f"/{CHOICE}") and replace(cell_of(n[:-2]), lens="focus40") == cell
+    }
+    told = (f"`{cell_of(n[:-2]).lens}` {v['axial_mm']:.2f} ({v['window_mm']:.2f})" for n, v in scan.items())
+    return [*out, "", "Axial error and that of the windows in the runs that chose, mm: " + ", ".join(told) + ".", ""]
+
+
+def network_table(rows: list[dict[str, Any]]) -> list[str]:
+    """The elastic network's rows."""
+    out = ["The elastic network behind a lens that does not move, at 18 µm, on axis, one wavelength, one PSF a depth, "
+           "on frames of equal pupil places (from the committed study; other frames than above, so no ratio):", "",
+           "| reader | lens | MMACs | axial / mm | lateral / mm |", "|---" * 5 + "|"]  # fmt: skip
+    return out + [
+        f"| {r['reader']} | `{r['lens']}` | {r['mmacs']:.2f} | {r['axial_mm']} | {r['lateral_mm']:.2f} |" for r in rows
+    ]
+
+
+def missing(lines: dict[str, dict[str, Any]]) -> list[str]:
+    """Cells of the plan that no run of a table is of."""
+    have = {name.rpartition("/")[0] for name in lines}
+    return list(dict.fromkeys(cell for name in plan(lines) if (cell := name.rpartition("/")[0]) not in have))
+
+
+def write(work: Path) -> None:
+    """JSON and page of the lines there are."""
+    lines = done(work)
+    kept = {"runs": list(lines.values()), "designs": kept_lines(work / DESIGNS)}
+    store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
+    store.write_text(PAGE, page(lines))

@@ -1,0 +1,151 @@
+"""A lens trained with the branch of the reference reader, on the true image and dense labels of depth.
+
+Lens and branch go down one loss, the likelihood of the depths of the windows, in turns: the branch for ``hold`` steps
+behind a lens that stands, while the light at the nodes of the field gathers the gradient of its loss; then the lens one
+step along the exact gradient of all field points, depths and wavelengths. A few drawn points a step would cost as much
+and leave a gradient of mostly noise: of 81 points four are drawn, and differ from the mean by as much as it is long.
+
+The branch is thrown away: what the lens is worth says a reader that begins anew
+(:func:`codesign.evaluate.reader.read`).
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from codesign.batches import Scenes, depth_um, irradiance, samples
+from codesign.evaluate.reader import ReaderConfig
+from codesign.network import blur, losses
+from codesign.network.blur import BlurBranch
+from codesign.optics import OpticsConfig, formed
+from codesign.train import Schedule, read_out
+from metalens.field import subset
+from metalens.ground.errors import ConfigError, TrainingError
+from metalens.image import Imager
+
+
+@dataclass(frozen=True, slots=True)
+class LensTraining:
+    """How lens and branch move.
+
+    turns: of the lens. hold: steps of the branch to one of the lens, of ``batch`` frames each. phase: rate in rad of
+    root-mean-square phase of a term; the lens stands while it is 0. rate: of the branch. seed: of branch and noise.
+    """
+
+    turns: int = 40
+    hold: int = 20
+    batch: int = 32
+    phase: Schedule = field(default_factory=lambda: Schedule(0.04, 0.25, 1.0))
+    rate: float = 3e-3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.turns, self.hold, self.batch) < 1 or not self.rate > 0:
+            raise ConfigError(
+                f"turns {self.turns}, hold {self.hold}, batch {self.batch}, rate {self.rate}: need counts of 1 or more "
+                "and a rate above 0"
+            )
+
+
+def trained(
+    optics: OpticsConfig, start_rad: Tensor, scenes: Scenes, config: ReaderConfig, training: LensTraining
+) -> tuple[Tensor, list[float]]:
+    """Coefficients of the lens at the end, (polynomials,) in rad, and the mean loss of every turn; the same every time.
+
+    Args:
+        optics: whose ``sample_um`` is the reader's pitch. start_rad: (polynomials,) coefficients to start from.
+        scenes: to learn from, with the reader's margin.
+
+    Raises:
+        ConfigError: another pitch, an image that is not the true one, or no coefficients to train.
+        TrainingError: the loss is not finite.
+    """
+    if optics.sample_um != config.pitch_um or not optics.polynomials or optics.image != "true":
+        raise ConfigError(
+            f"optics: sample_um = {optics.sample_um}, polynomials = {optics.polynomials}, image = {optics.image!r}; "
+            f"reader: pitch_um = {config.pitch_um}: need samples of the pitch, 1 polynomial or more, and 'true'"
+        )
+    state = torch.get_rng_state()
+    torch.manual_seed(training.seed)
+    try:
+        return _descended(optics, start_rad, scenes, config, training)
+    finally:
+        torch.set_rng_state(state)
+
+
+def _descended(
+    optics: OpticsConfig, start_rad: Tensor, scenes: Scenes, config: ReaderConfig, training: LensTraining
+) -> tuple[Tensor, list[float]]:
+    branch = BlurBranch(nn.BatchNorm2d(blur.FEATURES)).train()
+    place = nn.Parameter(start_rad.detach().double().clone())
+    reads = torch.optim.AdamW(branch.parameters(), lr=training.rate, weight_decay=0.01)
+    moves = torch.optim.Adam([place])
+    frame, told = samples(scenes.batch(0, 1).frames), []
+    for turn in range(training.turns):
+        rate = training.phase.at(turn / training.turns)
+        whole = formed.imager(optics, place.detach(), frame, margin=scenes.margin)
+        if not isinstance(whole, Imager):
+            raise TypeError("the true image needs a field of PSFs")
+        mean, gathered = 0.0, torch.zeros_like(whole.stack)
+        for step in range(turn * training.hold, (turn + 1) * training.hold):
+            reads.param_groups[0]["lr"] = Schedule(training.rate).at(step / (training.turns * training.hold))
+            reads.zero_grad(set_to_none=True)
+            value, slope = gone_backward(branch, optics, whole, scenes, config, training, step=step, live=rate > 0)
+            reads.step()
+            mean += value / training.hold
+            gathered += slope / training.hold
+        if rate > 0:
+            place.grad = lens_gradient(optics, whole, place, gathered)
+            moves.param_groups[0]["lr"] = rate
+            moves.step()
+        told.append(mean)
+    return place.detach(), told
+
+
+def gone_backward(
+    branch: BlurBranch,
+    optics: OpticsConfig,
+    whole: Imager,
+    scenes: Scenes,
+    config: ReaderConfig,
+    training: LensTraining,
+    *,
+    step: int,
+    live: bool,
+) -> tuple[float, Tensor]:
+    """Loss of one step, whose gradient is added to the branch's, and its gradient to the light of the nodes.
+
+    Returns:
+        The loss, and (rows, columns, depths, h, w); zeros without ``live``.
+    """
+    batch = scenes.batch(step, training.batch)
+    moved = formed.live(optics, whole) if live else None
+    with torch.set_grad_enabled(live):
+        light = irradiance(batch.frames, moved.ready if moved else whole, margin=scenes.margin)
+        noise = torch.Generator().manual_seed(6_000_101 * (training.seed + 1) + step)
+        pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
+        seen = read_out(light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False)
+    found, _ = branch(seen)
+    loss = losses.depth(found, blur.window_vergence(depth_um(batch.frames, margin=scenes.margin)))
+    if not bool(torch.isfinite(loss.detach())):
+        raise TrainingError(f"the loss of step {step} is not finite: lower the rate of the phase")
+    loss.backward()  # type: ignore[no-untyped-call]
+    slope = torch.zeros_like(whole.stack) if moved is None or moved.light.grad is None else moved.light.grad
+    return float(loss.detach()), slope
+
+
+def lens_gradient(optics: OpticsConfig, whole: Imager, place: Tensor, gathered: Tensor) -> Tensor:
+    """(polynomials,) gradient to the coefficients of the lens, from that to the light of all nodes.
+
+    One field point and wavelength after the other: their graphs are not held together.
+    """
+    plan, leaf = whole.plan, place.detach().clone().requires_grad_()
+    share = torch.as_tensor(plan.waves.weights)
+    points = gathered.shape[0] * gathered.shape[1]
+    for wave, weight in enumerate(share / share.sum()):
+        for point in range(points):
+            plane = formed.optics_of(optics, leaf)
+            each = subset.term(plane, plan, gathered, point, wave) * (float(weight) / points)
+            each.backward()  # type: ignore[no-untyped-call]
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
