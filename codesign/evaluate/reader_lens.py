@@ -20,7 +20,7 @@ from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.optics import OpticsConfig, formed
 from codesign.train import Schedule, read_out
-from metalens.field import subset
+from metalens.field import term
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Imager
 
@@ -146,6 +146,6 @@ def lens_gradient(optics: OpticsConfig, whole: Imager, place: Tensor, gathered: 
     for wave, weight in enumerate(share / share.sum()):
         for point in range(points):
             plane = formed.optics_of(optics, leaf)
-            each = subset.term(plane, plan, gathered, point, wave) * (float(weight) / points)
+            each = term(plane, plan, gathered, point, wave) * (float(weight) / points)
             each.backward()  # type: ignore[no-untyped-call]
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from metalens.field.points import psfs as psfs
     from metalens.field.subset import node_light as node_light
     from metalens.field.subset import surrogate as surrogate
+    from metalens.field.subset import term as term
     from metalens.field.waves import PillarWave as PillarWave
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
@@ -45,6 +46,7 @@ __getattr__, __dir__, __all__ = attach(
         "normalised": "engine",
         "psfs": "points",
         "surrogate": "subset",
+        "term": "subset",
         "trial": "engine",
         "with_psfs": "forming",
     },
