@@ -1,21 +1,17 @@
 """The posterior of a fit: every valley, the profile of every named parameter, draws where one is bent, all in words."""
 
-import copy
 import dataclasses
-import functools
-import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from characterize.inference import posterior, walk
+from characterize.inference.ends import Profile, Search, Wanted, valley_of
 from characterize.inference.leastsquares import Solution
-from characterize.inference.posterior import Profile, Valley
+from characterize.inference.posterior import Valley
 from characterize.inference.search import Task, distinct, mirrored, refine
 from characterize.inference.walk import Walk
-from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 REACH = posterior.REACH
@@ -24,7 +20,6 @@ _LOST, _LOWER = 3.0, 0.5  # sigma of bend from which on a parameter is walked; m
 _OF_THE_BENCH = ("log_gain", "background")
 _BESIDE = 8  # profiles side by side, whatever the number of cores; the next ones know the slopes that these met
 _POINTS = 61  # of the curve of a walk
-_MODE = -1  # place of the mode among the stops of a walk
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,9 +58,9 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     if modes[0] is not ends[0]:  # the search has asked for the mirror images of its own best
         modes = mirrored(task, modes)
     for left in reversed(range(_RESTARTS + 1)):
-        valleys = [_valley(task, mode) for mode in modes]
+        valleys = [valley_of(task, mode, modes[0]) for mode in modes]
         walks = _walks(task, modes, valleys[0])
-        profiles, better = _profiles(task, valleys[0], modes[0], walks, followed=bool(left))
+        profiles, better = _profiles(task, valleys[0], modes[0], walks, followed=bool(left), others=valleys[1:])
         if better is None:
             break
         modes = distinct([*modes, better])
@@ -85,100 +80,34 @@ def _walk(task: Task, modes: list[Solution], name: str) -> Walk:
     return walk.walk(task, modes, name, widened=max(1.0, modes[0].chi2_per_dof))
 
 
-def _valley(task: Task, at: Solution, above: tuple[Array, float] | None = None) -> Valley:
-    return Valley(task.problem(), task.data, at.value, task.prior, known=(at.image, at.slopes), above=above)
-
-
 def _profiles(
-    task: Task, valley: Valley, mode: Solution, walks: Mapping[str, Walk], *, followed: bool
+    task: Task,
+    valley: Valley,
+    mode: Solution,
+    walks: Mapping[str, Walk],
+    *,
+    followed: bool,
+    others: Sequence[Valley] = (),
 ) -> tuple[dict[str, Profile], Solution | None]:
     """Of all named parameters; second: a better mode that one led to, where that is ``followed``.
 
-    By the walk where there is one and what is left is straight with the walked parameter held, else by descents.
+    Ends from the mode, from those of ``others`` and from the stops of a walk where a parameter goes farthest; then
+    again from whatever was met on the way and lies beyond an end.
     """
-    found: dict[str, Profile] = {}
-    places = [one.value[np.argmin(one.rise)] for one in walks.values() if one.rise.min() < -_LOWER]
     named = [i for i, name in enumerate(task.names) if not name.startswith(_OF_THE_BENCH)]
-    valleys = {_MODE: valley} | _stops(task, mode, walks, named)
-    for first in range(0, len(named), _BESIDE):
-        some = [(i, {k: copy.copy(one) for k, one in valleys.items()}) for i in named[first : first + _BESIDE]]
-        ends = threads.each(functools.partial(_profile, mode, walks), some)
-        for k, shared in valleys.items():
-            known = len(shared.met)
-            shared.met += tuple(itertools.chain.from_iterable(own[k].met[known:] for _, own in some))
-        for (i, _), (one, better) in zip(some, ends, strict=True):
-            found[task.names[i]] = one
-            places += [] if better is None else [better]
-        if places and followed:
-            other = refine(task, places[0])
-            if other.merit < mode.merit - 0.05:
-                return found, other
-            places, followed = [], False
-    return found, None
-
-
-def _level(mode: Solution) -> float:
-    """Rise of -2 ln L at the end of a 95 % interval."""
-    return posterior.REACH**2 * max(1.0, mode.chi2_per_dof)
-
-
-def _stops(task: Task, mode: Solution, walks: Mapping[str, Walk], named: Sequence[int]) -> dict[int, Valley]:
-    """The misfit about the stops of a walk from which parameters go farthest; none where there is no walk."""
-    for one in walks.values():
-        known = {k for i in named for sign in (-1, 1) for k, _ in one.outermost(i, sign, _level(mode))}
-        return {k: _valley(task, one.stops[k], (mode.value, float(one.rise[k]))) for k in sorted(known)}
-    return {}
-
-
-def _profile(
-    mode: Solution, walks: Mapping[str, Walk], one: tuple[int, dict[int, Valley]]
-) -> tuple[Profile, Array | None]:
-    """Of a parameter, by its place among the others; second: a place below the mode, if one was met."""
-    i, valleys = one
-    valley, level = valleys[_MODE], _level(mode)
-    by = next(iter(walks.values()), None)
-    if by is None:
-        return posterior.profile(valley, i, level=level)
-    if i == by.index or (by.alike(i, level) and valley.bend(i, by.index) < posterior.BENT):
-        return _along(by, i, mode, float(valley.sigma[i]), level), None
-    return _from(by, i, mode, valleys, level)
-
-
-def _from(
-    one: Walk, i: int, mode: Solution, valleys: Mapping[int, Valley], level: float
-) -> tuple[Profile, Array | None]:
-    """Of any parameter by descents to its ends, each from the stop of a walk from where it goes farthest."""
-    goal, better, sides, ends, box = math.sqrt(level), None, [], [], one.interval(level)
-    for sign in (-1, 1):
-        found: list[posterior.End] = []
-        for k, begin in one.outermost(i, sign, level):
-            if not found or sign * begin[i] > sign * found[0].place:
-                found.append(posterior.end(valleys[k], i, sign, goal, begin))
-        better = next((end.lower for end in found if end.lower is not None), better)
-        last = max(found, key=lambda end: sign * end.place)
-        sides.append(np.array(last.seen))
-        ends.append(last.place if last.reached else float(box[0 if sign < 0 else 1][i]))
-    inner = np.column_stack(one.profile_of(i, np.linspace(-1, 1, _POINTS)))
-    near = one.value[one.rise < level, i]  # beyond its stops a walk knows the others' parabola only
-    least, most = max(sides[0][:, 0].max(), near.min()), min(sides[1][:, 0].min(), near.max())
-    inner = inner[(inner[:, 0] >= least) & (inner[:, 0] <= most)]
-    value, rise = np.array(sorted(np.concatenate([*sides, inner]).tolist())).T
-    plain = _plain(ends[0], ends[1], float(mode.value[i]), goal * float(valleys[_MODE].sigma[i]))
-    return Profile(ends[0], ends[1], value, rise, plain), better
-
-
-def _along(one: Walk, i: int, mode: Solution, sigma: float, level: float) -> Profile:
-    """Of any parameter by a walk along another, those left over straight."""
-    low, high = (float(end[i]) for end in one.interval(level))
-    value, rise = one.profile() if i == one.index else one.profile_of(i, np.linspace(-1, 1, _POINTS))
-    plain = _plain(low, high, float(mode.value[i]), math.sqrt(level) * sigma)
-    return Profile(low, high, value, rise, plain)
-
-
-def _plain(low: float, high: float, middle: float, reach: float) -> bool:
-    """Whether an interval is nearly that of the parabola."""
-    ratio = np.array([high - middle, middle - low]) / reach
-    return bool(((ratio > posterior.PARABOLIC[0]) & (ratio < posterior.PARABOLIC[1])).all())
+    places = [one.value[np.argmin(one.rise)] for one in walks.values() if one.rise.min() < -_LOWER]
+    search = Search(task, mode, next(iter(walks.values()), None), [valley, *others])
+    wanted: list[Wanted] = [(i, sign, None) for i in named for sign in (-1, 1)]
+    while wanted:
+        for first in range(0, len(wanted), 2 * _BESIDE):
+            places += search.ends(wanted[first : first + 2 * _BESIDE])
+            if places and followed:
+                other = refine(task, places[0])
+                if other.merit < mode.merit - 0.05:
+                    return {}, other
+                places, followed = [], False
+        wanted = search.beyond()
+    return {task.names[i]: search.profile(i) for i in named}, None
 
 
 def _joined(
@@ -228,14 +157,16 @@ def _intervals(
     for i, name in enumerate(names):
         if name in profiles:
             low[i], high[i], parabolic[i] = profiles[name].low, profiles[name].high, profiles[name].parabolic
+    loose = np.array([name not in profiles for name in names])
     for mode, valley in zip(modes[1:], valleys[1:], strict=True):
         room = np.sqrt(max(level - (mode.merit - best.merit), 0.0))
         if room > 0:
-            low = np.minimum(low, mode.value - room * valley.sigma)
-            high = np.maximum(high, mode.value + room * valley.sigma)
+            low = np.where(loose, np.minimum(low, mode.value - room * valley.sigma), low)
+            high = np.where(loose, np.maximum(high, mode.value + room * valley.sigma), high)
     for one in walks.values():
         ends = one.interval(level)
-        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
+        low = np.where(loose, np.minimum(low, ends[0]), low)
+        high = np.where(loose, np.maximum(high, ends[1]), high)
         apart = np.maximum(high - best.value, best.value - low) / (posterior.REACH * sigma)
         parabolic &= apart < posterior.PARABOLIC[1]
     return low, high, parabolic

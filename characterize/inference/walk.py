@@ -26,7 +26,7 @@ WALKED = ("bias_nm",)
 REACH = 2.5  # prior sigma to either side of what is thought
 SHOWN = 14.0  # rise of -2 ln L up to which a walk is a profile, a probability of 1e-3; beyond it, it looks for valleys
 _WIDEST = 0.35  # of the prior sigma: a step at most
-_VALLEYS, _AGAIN, _BRANCHES, _ALIKE = 3, 3, 2, 1.5
+_VALLEYS, _AGAIN, _BRANCHES = 3, 3, 2
 _NEAR = Settings(iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False)
 _FAR = Settings(iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False)
 _FINE, _ON_IT = 1201, 3.0
@@ -109,11 +109,6 @@ class Walk:
         best = peaks[np.argsort(-far[1:-1][peaks])][:_BRANCHES]
         along = self.spread[:, :, i] / np.maximum(size**2, 1e-300)[:, None]
         return [(int(k), self.value[k] + sign * step[k] * along[k]) for k in best]
-
-    def alike(self, i: int, level: float) -> bool:
-        """Whether another parameter is held as closely all along the walk, up to a rise of ``level``."""
-        size = np.sqrt(self.spread[self.rise < level, i, i])
-        return bool(size.max() < _ALIKE * size.min())
 
     def draws(self, count: int, *, widened: float, rng: np.random.Generator) -> Array:
         """(count, p) of the posterior along the walk; ``widened``: factor of all variances."""

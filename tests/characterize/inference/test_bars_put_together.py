@@ -9,9 +9,9 @@ import pytest
 from characterize.captures import Gain
 from characterize.inference import estimate, knowable, verdict
 from characterize.inference.asbuilt import WithinModel
+from characterize.inference.ends import Profile
 from characterize.inference.leastsquares import Data, Prior
 from characterize.inference.missing import Unstated
-from characterize.inference.posterior import Profile
 from characterize.model import NAMES, PLACE, vector
 
 RNG = np.random.default_rng(57)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from characterize.inference import estimate, explore, missing, posterior, search, verdict
+from characterize.inference.ends import Profile
 from characterize.inference.explore import REACH
 from characterize.inference.leastsquares import Data, Prior, Settings, fit
-from characterize.inference.posterior import Profile, Valley
+from characterize.inference.posterior import Valley
 
 RNG = np.random.default_rng(44)
 SHAPES = RNG.uniform(0.3, 1.6, (2, 3, 6, 5))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from characterize.inference import explore, posterior, search, verdict
+from characterize.inference.ends import profile
 from characterize.inference.leastsquares import Data, Prior, Settings, fit
-from characterize.inference.posterior import REACH, Valley, profile
+from characterize.inference.posterior import REACH, Valley
 from characterize.model import PARAMETERS, PLACE, Known
 
 RNG = np.random.default_rng(21)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterize.inference import explore
-from characterize.inference.posterior import Profile
+from characterize.inference.ends import Profile
 
 NAMES = ("bias_nm", "height_nm", "coma_x_rad", "index")
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.inference import explore, leastsquares, residual
+from characterize.inference import explore, leastsquares, residual, search
 from characterize.inference.leastsquares import Data, Prior
 from characterize.model import NAMES, PLACE
 from characterize.model.setting import Setting
@@ -48,12 +48,8 @@ def rise(b, g, seen):
     return parts / NOISE**2 + ((b - PRIOR.mean[0]) / PRIOR.sigma[0]) ** 2
 
 
-@pytest.mark.parametrize("seen", [(0.55, 0.2), (0.62, -0.2)])
-def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
-    """The gradient's ends lie far from where any walk of the bias stops; the least over a fine grid is the profile.
-
-    A search ends within 0.08 of the root of the rise and goes on by its slope; the noise is held, and alike.
-    """
+def fitted(seen, begin):
+    """The task of frames that show ``seen`` on the first two pictures, and a fit from one side of the ring."""
     model = Ring()
     frames = BRIGHT + seen[0] * PICTURES[0] + seen[1] * PICTURES[1] + 1.3 * PICTURES[2]
     everywhere = np.ones(frames.shape, bool)
@@ -63,8 +59,17 @@ def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
         return residual.problem(model if index is None else model.only(index), NAMED, START)
 
     about = SimpleNamespace(model=model, data=data, names=NAMED, prior=PRIOR, start=START, problem=problem)
-    begin = np.array([4.0, 5.0, 0.0])
-    found = explore.explore(about, [leastsquares.fit(about.problem(), data, begin, prior=PRIOR)])
+    return about, leastsquares.fit(about.problem(), data, np.array(begin), prior=PRIOR)
+
+
+@pytest.mark.parametrize("seen", [(0.55, 0.2), (0.62, -0.2)])
+def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
+    """The gradient's ends lie far from where any walk of the bias stops; the least over a fine grid is the profile.
+
+    A search ends within a quarter of a sigma and goes on by its slopes; the noise is held, and alike.
+    """
+    about, mode = fitted(seen, (4.0, 5.0, 0.0))
+    found = explore.explore(about, [mode])
 
     fine = np.linspace(-25, 25, 2501)
     whole = rise(*np.meshgrid(fine, fine, indexing="ij"), seen)
@@ -77,3 +82,17 @@ def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
     followed = found.profiles["bias_y_nm"]
     assert (followed.low, followed.high) == pytest.approx(tuple(ends), abs=room)
     assert not followed.parabolic
+
+
+@pytest.mark.parametrize("begin", [(4.0, 5.0, 0.0), (-2.0, 6.5, 0.0)])
+@pytest.mark.parametrize("seen", [(0.05, 0.02), (0.55, 0.2), (0.3, -0.7), (-0.9, 0.4), (-0.2, 1.1), (0.1, -1.3)])
+def test_intervals_on_a_ring_are_those_of_the_grid_wherever_the_fit_began(seen, begin):
+    """Neither end reaches farther nor less far, whether valleys are one ring, a bent one or two: 5 % of the width, of
+    which steps between points of the grid are 0.2 %."""
+    about, mode = fitted(seen, begin)
+    found = explore.explore(about, search.mirrored(about, [mode]))
+    fine = np.linspace(-30, 30, 3001)
+    whole = rise(*np.meshgrid(fine, fine, indexing="ij"), seen)
+    for name, low, high, axis in zip(NAMED, found.low, found.high, (1, 0), strict=False):
+        ends = fine[whole.min(axis) - whole.min() < 3.8415][[0, -1]]
+        assert (low, high) == pytest.approx(tuple(ends), abs=0.05 * np.ptp(ends)), name

@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference import leastsquares, posterior, search, walk
+from characterize.inference import ends, leastsquares, posterior, search, walk
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Settings
 from characterize.model import NAMES, PLACE, Known, vector
@@ -45,10 +45,10 @@ def test_ends_with_slopes_of_other_ends_are_those_with_slopes_of_their_own(about
     task, _ = about
     quick, i = valley(about), task.names.index(name)
     for other in ("height_nm", "bias_nm"):  # ends that it may take slopes over from
-        posterior.profile(quick, task.names.index(other))
-    shared, _ = posterior.profile(quick, i)
+        ends.profile(quick, task.names.index(other))
+    shared, _ = ends.profile(quick, i)
     monkeypatch.setattr(posterior, "_HOLDS", 0.0)
-    alone, _ = posterior.profile(valley(about), i)
+    alone, _ = ends.profile(valley(about), i)
     assert alone.high - alone.low > 3 * float(quick.sigma[i])
     assert (shared.low, shared.high) == pytest.approx((alone.low, alone.high), abs=0.04 * float(quick.sigma[i]))
 

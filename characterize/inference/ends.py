@@ -1,0 +1,260 @@
+"""Ends of intervals: the farthest that a parameter may go while the least misfit over all others has risen by no more.
+
+The profile of a parameter is the least misfit over all others as it is moved; where it rises by 3.84 lie the ends of
+its 95 % interval (Wilks 1938), however the valley bends. An end is the solution of "as far as possible with -2 ln L
+below a level" (Venzon and Moolgavkar 1988): each step moves all parameters to where the straight model about the last
+place has it, for one image. So it does not depend on the way there, but for which of several valleys it is in; whoever
+asks begins from all that are known, and again from any place that turns out to lie beyond an end.
+"""
+
+import copy
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from characterize.inference.leastsquares import Prior, Solution
+from characterize.inference.posterior import PARABOLIC, REACH, Spot, Valley
+from characterize.inference.search import Task
+from characterize.inference.walk import Walk
+from metalens.ground import threads
+from metalens.ground.arrays import Array
+
+_CLOSE = 0.25  # sigma of a last step, which is not tried: slopes that hold are right to a tenth of it
+_NEAR = 0.6  # sigma of a step from which on slopes must hold
+_STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell, in all, while these are said to hold
+_FAR = 1.25  # times the goal: a step at most
+_TURNS = 14
+_HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
+_BELOW = 0.5  # of -2 ln L, by which a place is a better mode
+_BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
+_POINTS = 61  # of the curve of a walk
+_MODE = -1  # the first mode among stops of a walk; then -2 ...
+Begin = tuple[int, Array | None, float]
+"""A valley, a place in it or its own lowest, and how far the parabola reaches from there."""
+Wanted = tuple[int, int, Begin | None]
+"""A parameter, the side (-1, 1), and from where."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Profile:
+    """One parameter: 95 % interval, and the rise of -2 ln L at ``value`` (points,) with the rest fitted."""
+
+    low: float
+    high: float
+    value: Array
+    rise: Array
+    parabolic: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class End:
+    """Of a profile.
+
+    place: of the parameter. seen: (value, rise) of the profile on the way. met: (places (p,), rise) on the way, no more
+    than that of the end. lower: a place below the mode, if one was met. steps: images that were asked for.
+    reached: whether the rise there is that asked for.
+    """
+
+    place: float
+    seen: list[tuple[float, float]]
+    met: list[tuple[Array, float]]
+    lower: Array | None = None
+    steps: int = 0
+    reached: bool = True
+
+
+def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile, Array | None]:
+    """The profile of one parameter out to a rise of ``level``; second: a place below the mode, if one was met."""
+    goal, mode = math.sqrt(level), float(valley.mode[i])
+    sides = [end(valley, i, sign, goal) for sign in (-1, 1)]
+    better = next((one.lower for one in sides if one.lower is not None), None)
+    return joined(sides, mode, float(valley.sigma[i]), goal), better
+
+
+def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
+    """Of its two ends; ``sigma``: of the parabola at the mode."""
+    low, high = (one.place for one in sides)
+    points = [(mode, 0.0), *sides[0].seen, *sides[1].seen]
+    if max(one.steps for one in sides) < 2:  # straight
+        points = [(mode + s * sigma, s * s) for s in (-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5)]
+    value, rise = np.array(sorted(points)).T
+    return Profile(low, high, value, rise, plain(low, high, mode, goal * sigma))
+
+
+def plain(low: float, high: float, middle: float, reach: float) -> bool:
+    """Whether an interval is nearly that of the parabola."""
+    ratio = np.array([high - middle, middle - low]) / reach
+    return bool(((ratio > PARABOLIC[0]) & (ratio < PARABOLIC[1])).all())
+
+
+def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None = None, most: float = math.inf) -> End:
+    """The farthest to one side where the misfit has risen by no more than ``goal`` squared.
+
+    begin: (p,) a place with less, instead of the valley's. most: by how much the parameter goes in a step.
+    """
+    here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
+    lowest = valley.least - valley.above[1]
+    far, missed, back, steps = _FAR * goal, 0.0, False, 0
+    seen: dict[float, float] = {}
+    met: list[tuple[Array, float]] = []
+    for _ in range(_TURNS):
+        step, least, size = _outwards(here, i, sign, lowest + goal**2, valley.prior, (far, most))
+        if steps:
+            seen[float(here.x[i])] = max(least - lowest, 0.0)
+        held = missed < _STRAIGHT
+        if held and steps and size < _CLOSE:
+            break
+        if not held and (size < _NEAR or back):  # again, with slopes that hold here
+            here, missed = Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)), 0.0
+            continue
+        there, off = _moved(valley, here, step)
+        steps, rise = steps + 1, there.misfit - lowest
+        if rise < -_BELOW:
+            return End(float(there.x[i]), [(float(there.x[i]), 0.0)], met, there.x, steps)
+        met += [(there.x, rise)] if rise < goal**2 else []
+        back = rise > (goal + _HIGH) ** 2 and (off > size / 2 or there.misfit > here.misfit > lowest + goal**2)
+        if back:
+            far = min(size, far) / 2
+        else:
+            here, missed, far = there, missed + off, min(_FAR * goal, 2 * far)
+    place = float(np.clip(here.x[i] + step[i], valley.prior.low[i], valley.prior.high[i]))
+    return End(place, list(seen.items())[-3:], met, None, steps, held and size < _CLOSE)
+
+
+def _moved(valley: Valley, here: Spot, step: Array) -> tuple[Spot, float]:
+    """After a step, slopes changed by the least that explains it (Broyden 1965), and by how many sigma it missed."""
+    after = valley.residual(here.x + step)
+    missed = after - here.rest - here.slopes @ step
+    measure = here.slopes.T @ (here.slopes @ step)
+    along = max(float(step @ measure), 1e-300)
+    slopes = here.slopes + np.multiply.outer(missed, measure / along)
+    return Spot(here.x + step, after, slopes), float(np.linalg.norm(missed))
+
+
+def _there(valley: Valley, x: Array) -> Spot:
+    rest = valley.residual(x)
+    return Spot(x, rest, valley.slopes_at(x, rest))
+
+
+def _outwards(
+    here: Spot, i: int, sign: int, allowed: float, prior: Prior, limits: tuple[float, float]
+) -> tuple[Array, float, float]:
+    """By the straight model about a spot: ((p,) step to the farthest place whose misfit is ``allowed``, the least
+    misfit with the parameter where it is, size of the step in sigma of the images).
+
+    Where it is allowed nowhere: to the least. limits: size of the step, and by how much the parameter goes, at most.
+    What would leave its bounds stays on them.
+    """
+    curvature, gradient = here.slopes.T @ here.slopes, here.slopes.T @ here.rest
+    free = np.arange(len(here.x)) != i
+    step, least = np.zeros(len(here.x)), here.misfit
+    for _ in range(3):
+        fixed = ~free & (np.arange(len(here.x)) != i)
+        pull = gradient + curvature[:, fixed] @ step[fixed]
+        base = here.misfit + float(step[fixed] @ (gradient[fixed] + pull[fixed]))
+        inner = curvature[np.ix_(free, free)]
+        answers = np.linalg.lstsq(inner, np.stack([curvature[free, i], pull[free]], 1), rcond=1e-14)[0]
+        bend = float(curvature[i, i] - curvature[free, i] @ answers[:, 0])
+        slope = float(pull[i] - curvature[free, i] @ answers[:, 1])
+        least = base - float(pull[free] @ answers[:, 1])
+        root = math.sqrt(max(slope**2 - bend * (least - allowed), 0.0))
+        way = float(np.clip((sign * root - slope) / max(bend, 1e-300), -limits[1], limits[1]))
+        step[i] = np.clip(here.x[i] + way, prior.low[i], prior.high[i]) - here.x[i]
+        step[free] = -answers[:, 1] - answers[:, 0] * step[i]
+        inside = np.clip(here.x + step, prior.low, prior.high) - here.x
+        out = free & (inside != step)
+        if not out.any():
+            break
+        step, free = inside, free & ~out
+    size = math.sqrt(max(float(step @ curvature @ step), 0.0))
+    return (step * (limits[0] / size) if size > limits[0] else step), least, size
+
+
+def valley_of(task: Task, at: Solution, best: Solution, rise: float | None = None) -> Valley:
+    """The misfit about a fit that is ``rise`` above the best one: by its merit, without it."""
+    above = best.value, at.merit - best.merit if rise is None else rise
+    return Valley(task.problem(), task.data, at.value, task.prior, known=(at.image, at.slopes), above=above)
+
+
+class Search:
+    """Ends of all parameters over all valleys that are known; ``valleys``: of the modes, the best first."""
+
+    def __init__(self, task: Task, mode: Solution, by: Walk | None, valleys: Sequence[Valley]) -> None:
+        self._task, self._mode, self._by = task, mode, by
+        self._valleys = {_MODE - k: one for k, one in enumerate(valleys)}
+        self._level = REACH**2 * max(1.0, mode.chi2_per_dof)
+        self._found: dict[tuple[int, int], End] = {}
+        self._tried: dict[tuple[int, int], float] = {}
+        stops = enumerate(zip(by.value, by.rise, strict=True)) if by else ()
+        self._met: list[tuple[int, Array | None, Array]] = [(k, None, x) for k, (x, r) in stops if r < self._level]
+
+    def ends(self, wanted: Sequence[Wanted]) -> list[Array]:
+        """Look for some side by side, and keep them and the slopes that they met; gives places below the mode."""
+        asked = [(i, sign, [begin] if begin else self._begins(i, sign)) for i, sign, begin in wanted]
+        for k in sorted({k for *_, begins in asked for k, *_ in begins} - self._valleys.keys()):
+            rise = float(self._by.rise[k]) if self._by else 0.0
+            self._valleys[k] = valley_of(self._task, self._by.stops[k], self._mode, rise)  # type: ignore[union-attr]
+        own = [{k: copy.copy(self._valleys[k]) for k, *_ in begins} for *_, begins in asked]
+        ends = threads.each(self._farthest, list(zip(asked, own, strict=True)))
+        for k, shared in self._valleys.items():
+            known = len(shared.met)
+            shared.met += tuple(itertools.chain.from_iterable(one[k].met[known:] for one in own if k in one))
+        for (i, sign, _), some in zip(asked, ends, strict=True):
+            before = [self._found[i, sign]] if (i, sign) in self._found else []
+            self._found[i, sign] = max([*before, *(one for _, one in some)], key=lambda one: sign * one.place)
+            self._met += [(k, x, x) for k, one in some for x, _ in one.met]
+        return [one.lower for some in ends for _, one in some if one.lower is not None]
+
+    def beyond(self) -> list[Wanted]:
+        """Ends that a place with less misfit lies beyond, with the farthest of these; each place is tried once."""
+        out: list[Wanted] = []
+        for (i, sign), one in self._found.items():
+            if not self._met:
+                break
+            k, begin, x = max(self._met, key=lambda place: sign * place[2][i])
+            room = _BEYOND * abs(self._found[i, 1].place - self._found[i, -1].place)
+            tried = self._tried.get((i, sign), -math.inf)
+            if sign * x[i] > max(sign * one.place + room, tried):
+                self._tried[i, sign] = sign * float(x[i])
+                out.append((i, sign, (k, begin, sign * float(x[i]))))
+        return out
+
+    def profile(self, i: int) -> Profile:
+        """Of a parameter; of the walk between its ends, where there is one."""
+        sides, sigma = [self._found[i, sign] for sign in (-1, 1)], float(self._valleys[_MODE].sigma[i])
+        middle = float(self._mode.value[i])
+        if self._by is None:
+            return joined(sides, middle, sigma, math.sqrt(self._level))
+        low, high = (one.place for one in sides)
+        inner = np.column_stack(self._by.profile_of(i, np.linspace(-1, 1, _POINTS)))
+        near = self._by.value[self._by.rise < self._level, i]  # beyond its stops a walk knows the others' parabola only
+        seen = [np.array(one.seen) for one in sides]
+        least, most = max(seen[0][:, 0].max(), near.min()), min(seen[1][:, 0].min(), near.max())
+        inner = inner[(inner[:, 0] >= least) & (inner[:, 0] <= most)]
+        value, rise = np.array(sorted(np.concatenate([*seen, inner]).tolist())).T
+        return Profile(low, high, value, rise, plain(low, high, middle, math.sqrt(self._level) * sigma))
+
+    def _begins(self, i: int, sign: int) -> list[Begin]:
+        """Stops of the walk from where a parameter goes farthest, and modes, the farthest first."""
+        out: list[Begin] = []
+        for k, one in self._valleys.items():
+            room = self._level - one.above[1]
+            if k <= _MODE and room > 0:
+                out.append((k, None, sign * float(one.mode[i]) + math.sqrt(room) * float(one.sigma[i])))
+        if self._by is not None:
+            out += [(k, None, sign * float(x[i])) for k, x in self._by.outermost(i, sign, self._level)]
+        return sorted(out, key=lambda begin: -begin[2])
+
+    def _farthest(self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]) -> list[tuple[int, End]]:
+        """Ends from all begins that reach beyond those found."""
+        (i, sign, begins), valleys = asked
+        goal, far, out = math.sqrt(self._level), -math.inf, []
+        most = 2 * goal * float(self._valleys[_MODE].sigma[i])
+        for k, begin, reach in begins:
+            if reach > far:
+                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most)))
+                far = max(far, sign * out[-1][1].place)
+        return out
