@@ -62,15 +62,15 @@ class Focus:
         if self.layers.plain:
             sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / near)
             return np.asarray(sensor), np.asarray(source_path(x_um, y_um, (tangent, 0.0), 1 / far))
-        sine2 = tangent**2 / (1 + tangent**2)
+        sine = tangent / math.hypot(1.0, tangent)
         found = []
         for gap, side in ((self.layers.after(near, self.wavelength_um), 1), (None, -1)):
             if gap is None and not math.isfinite(far):
-                found.append(np.asarray(x_um * math.sqrt(sine2)))
+                found.append(np.asarray(x_um * sine))
                 continue
             pairs = (gap or self.layers.before(far, self.wavelength_um)).layers
-            reach = side * math.sqrt(sine2) * media.bend(pairs, sine2)
-            found.append(np.asarray(media.longer(pairs, sine2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um)[1]))
+            reach = side * sine * media.bend(pairs, sine**2)
+            found.append(np.asarray(media.longer(pairs, sine**2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um)[1]))
         return found[0], found[1]
 
 

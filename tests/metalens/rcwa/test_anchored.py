@@ -67,3 +67,12 @@ def test_nodes_lie_between_foot_and_top():
 def test_walls_that_close_are_refused():
     with pytest.raises(CellError, match="closes the pillar"):
         modal.solve(replace(UPRIGHT, sidewall_rad=0.3), 0.1, WAVELENGTH)
+
+
+def test_a_bar_that_knows_nothing_is_two():
+    """|t| is 1 at most, so no two answers are farther apart; an anchor whose own error is 5 leaves that."""
+    upright = modal.solve(UPRIGHT, DIAMETER, WAVELENGTH, tolerance=1e-2)
+    unsure = replace(upright, t_error=5.0)
+    got = solve_anchored(UPRIGHT, DIAMETER, LIGHT, [unsure], tolerance=1e-2, reaches=(3, 4, 5, 6))
+    assert got.t_error == 2.0
+    assert not got.converged

@@ -1,0 +1,38 @@
+"""Films of air are no films, and a focus check passes up to a quarter of what it may miss."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from metalens.cell import Film, Index
+from metalens.design.focus_check import FocusCheck
+from metalens.design.profiles import Focus
+from metalens.lens import Layers
+
+
+@pytest.mark.parametrize("source_um", [17e3, np.inf])
+@pytest.mark.parametrize("tangent", [0.0, 0.21, -0.34])
+def test_paths_through_films_of_air_are_paths_through_air(tangent, source_um):
+    """Rays by Snell's law through a stack against distances in closed form, to either side of the axis."""
+    random = np.random.default_rng(2)
+    x, y = random.uniform(-400, 400, (2, 40))
+    plain = Focus(0.85, 2100.0, source_um)
+    filled = dataclasses.replace(
+        plain, layers=Layers(front=(Film(Index(1.0), 310.0),), behind=(Film(Index(1.0), 770.0),))
+    )
+    assert not filled.layers.plain
+    for one, other in zip(filled.paths_from(x, y, tangent), plain.paths_from(x, y, tangent), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-9)  # um: Newton's steps of the ray end at 1e-12 of 2 mm
+
+
+@pytest.mark.parametrize(
+    ("x_um", "y_um", "z_um", "strehl", "passed"),
+    [
+        (0.24, -0.24, -1.9, 0.81, True), (0.26, 0.0, 0.0, 0.95, False), (0.0, -0.26, 0.0, 0.95, False),
+        (0.0, 0.0, 2.1, 0.95, False), (0.0, 0.0, -2.1, 0.95, False), (0.0, 0.0, 0.0, 0.79, False),
+        (0.1, 0.1, float("nan"), 0.9, True),
+    ],
+)  # fmt: skip
+def test_a_focus_passes_within_a_quarter_of_resolution_and_depth(x_um, y_um, z_um, strehl, passed):
+    assert FocusCheck(x_um, y_um, z_um, strehl, resolution_um=1.0, depth_um=8.0).passed is passed
