@@ -92,7 +92,7 @@ function plot(parent, title, xName, yName, log) {
         shade.push({ series: [n, n + 1], fill: colours[i % 4] + "33" });
       }
     });
-    if (log) for (let i = 1; i < data.length; i++) data[i] = data[i].map((v) => (v > 0 ? v : null));
+    for (let i = 1; i < data.length; i++) data[i] = data[i].map((v) => (Number.isFinite(v) && (!log || v > 0) ? v : null));  // what is no number is a gap
     const drawn = { hooks: { drawAxes: (u) => { u.ctx.save(); u.ctx.fillStyle = css("--b") + "40"; bands.forEach(([a, b]) => { const l = u.valToPos(a, "x", true), r = u.valToPos(b, "x", true); u.ctx.fillRect(l, u.bbox.top, Math.max(1, r - l), u.bbox.height); }); u.ctx.restore(); } } };
     chart?.destroy();
     chart = new uPlot({ width, height: 260, title, series, bands: shade, plugins: [drawn], scales: { x: { time: false }, y: log ? { distr: 3 } : {} }, legend: { show: Object.keys(lines).length > 1 },

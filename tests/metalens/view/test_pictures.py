@@ -118,6 +118,20 @@ def test_ticks_tell_neighbours_apart(tmp_path):
     assert _told(tmp_path, _everything(), script) == wanted
 
 
+@pytest.mark.parametrize("gap", [np.nan, np.inf])
+def test_a_curve_with_gaps_is_drawn_but_for_these(tmp_path, gap):
+    """Of 100 pieces the first is left out with its end, and two beside a value in the middle: 3 % of the columns."""
+    x = np.linspace(0.0, 1.0, 101)
+    values = np.where((np.arange(101) == 0) | (np.arange(101) == 50), gap, 2.0 + x)
+    wide = []
+    for y in (2.0 + x, values):
+        drawn = _canvas(tmp_path, [Curves("line", x, "x", {"y": y}, "y")], ".uplot canvas")
+        wide.append(int((np.ptp(drawn, axis=-1) > 40).any(0).sum()))  # columns with colour: axes and grid are grey
+        (tmp_path / "page.html").unlink()
+    assert wide[0] > 0.8 * drawn.shape[1]
+    assert 1 - wide[1] / wide[0] == pytest.approx(0.03, abs=0.005)  # ends of lines: 2 px of 1000 each
+
+
 def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):
     values = np.random.default_rng(9).uniform(0, 3.25, (7, 11))
     values[2, 3] = 3.25
