@@ -55,7 +55,6 @@ class End:
 
     place: of the parameter. seen: (value, rise) of the profile on the way. met: (places (p,), rise) on the way, no more
     than that of the end. lower: a place below the mode, if one was met. steps: images that were asked for.
-    reached: whether the rise there is that asked for.
     """
 
     place: float
@@ -63,7 +62,6 @@ class End:
     met: list[tuple[Array, float]]
     lower: Array | None = None
     steps: int = 0
-    reached: bool = True
 
 
 def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile, Array | None]:
@@ -121,7 +119,7 @@ def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None =
         else:
             here, missed, far = there, missed + off, min(_FAR * goal, 2 * far)
     place = float(np.clip(here.x[i] + step[i], valley.prior.low[i], valley.prior.high[i]))
-    return End(place, list(seen.items())[-3:], met, None, steps, held and size < _CLOSE)
+    return End(place, list(seen.items())[-3:], met, None, steps)
 
 
 def _moved(valley: Valley, here: Spot, step: Array) -> tuple[Spot, float]:

@@ -94,10 +94,6 @@ class Valley:
         spread = flat.T @ flat + floor.T @ floor - counted.T @ counted
         return np.asarray(self.covariance @ spread @ self.covariance)
 
-    def rise(self, spot: Spot) -> float:
-        """Of -2 ln L from the mode to a spot."""
-        return spot.misfit - self.least + self.above[1]
-
     def along(self, i: int) -> Array:
         """(p,) how all parameters go when one is moved by one sigma and the rest are fitted, by the parabola."""
         return np.asarray(self.covariance[:, i] / self.sigma[i])
@@ -120,45 +116,17 @@ class Valley:
         return float(np.linalg.norm((up + down) / 2 - self.bottom))
 
     def descend(
-        self,
-        x: Array,
-        *,
-        held: int | None = None,
-        shift: Array | float = 0.0,
-        rounds: int = _SOLVES,
-        least: float = 0.02,
-        slopes: Array | None = None,
+        self, begin: Array, *, shift: Array | float = 0.0, rounds: int = _SOLVES, least: float = 0.02
     ) -> tuple[Array, float]:
-        """The least misfit from ``x`` on, one parameter ``held``: (place, misfit). ``shift``: added to the residual.
-
-        slopes: those to begin with, of :meth:`slopes_at`, where those of the mode do not hold.
-        """
-        begin = Spot(x, self.residual(x) + shift, self.slopes if slopes is None else slopes)
-        found = self.lowered(begin, held=held, shift=shift, rounds=rounds, least=least)
-        return found.x, found.misfit
-
-    def lowered(
-        self,
-        begin: Spot,
-        *,
-        held: int | None = None,
-        shift: Array | float = 0.0,
-        rounds: int = _SOLVES,
-        least: float = 0.02,
-    ) -> Spot:
-        """The least misfit from a spot on, its slopes brought up to date; see :meth:`descend`."""
-        x, rest, slopes, value, damping = begin.x, begin.rest, begin.slopes, begin.misfit, 1e-6
-        free = np.array([j for j in range(len(x)) if j != held])
+        """The least misfit from a place on: (place, misfit), slopes brought up to date. ``shift``: of the residual."""
+        x, rest, slopes, damping = begin, self.residual(begin) + shift, self.slopes, 1e-6
+        value = float(rest @ rest)
         for _ in range(rounds):
-            part = slopes[:, free]
-            curvature, gradient = part.T @ part, part.T @ rest
+            curvature, gradient = slopes.T @ slopes, slopes.T @ rest
             size = np.diag(np.diag(curvature)) * damping
-            step = np.zeros(len(x))
-            step[free] = -np.linalg.lstsq(curvature + size, gradient, rcond=1e-14)[0]
-            there = self.inside(x + step)
+            there = self.inside(x - np.linalg.lstsq(curvature + size, gradient, rcond=1e-14)[0])
             step = there - x
-            expected = -float(step[free] @ (2 * gradient + curvature @ step[free]))
-            if expected < least:
+            if -float(step @ (2 * gradient + curvature @ step)) < least:
                 break
             after = self.residual(there) + shift
             lower = float(after @ after)
@@ -170,7 +138,7 @@ class Valley:
                 x, rest, value = there, after, lower
             else:
                 damping = max(damping * 30, 1e-2)
-        return Spot(x, rest, slopes)
+        return x, value
 
     def slopes_at(self, x: Array, rest: Array | None = None) -> Array:
         """(pixels + p, p) derivatives of :meth:`residual`: by how they change towards places met before, or computed.
