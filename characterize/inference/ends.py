@@ -30,7 +30,7 @@ _TURNS = 14
 _HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
 _BELOW = 0.5  # of -2 ln L, by which a place is a better mode
 _BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
-_POINTS = 61  # of the curve of a walk
+POINTS = 61  # of the curve of a walk
 _MODE = -1  # the first mode among stops of a walk; then -2 ...
 Begin = tuple[int, Array | None, float]
 """A valley, a place in it or its own lowest, and how far the parabola reaches from there."""
@@ -94,7 +94,7 @@ def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None =
     begin: (p,) a place with less, instead of the valley's. most: by how much the parameter goes in a step.
     """
     here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
-    lowest = valley.least - valley.above[1]
+    lowest = valley.least - valley.above
     far, missed, back, steps = _FAR * goal, 0.0, False, 0
     seen: dict[float, float] = {}
     met: list[tuple[Array, float]] = []
@@ -171,10 +171,9 @@ def _outwards(
     return (step * (limits[0] / size) if size > limits[0] else step), least, size
 
 
-def valley_of(task: Task, at: Solution, best: Solution, rise: float | None = None) -> Valley:
-    """The misfit about a fit that is ``rise`` above the best one: by its merit, without it."""
-    above = best.value, at.merit - best.merit if rise is None else rise
-    return Valley(task.problem(), task.data, at.value, task.prior, known=(at.image, at.slopes), above=above)
+def valley_of(task: Task, at: Solution, rise: float) -> Valley:
+    """The misfit about a fit that is ``rise`` of -2 ln L above the best one."""
+    return Valley(task.problem(), task.data, at.value, task.prior, known=(at.image, at.slopes), above=rise)
 
 
 class Search:
@@ -193,8 +192,8 @@ class Search:
         """Look for some side by side, and keep them and the slopes that they met; gives places below the mode."""
         asked = [(i, sign, [begin] if begin else self._begins(i, sign)) for i, sign, begin in wanted]
         for k in sorted({k for *_, begins in asked for k, *_ in begins} - self._valleys.keys()):
-            rise = float(self._by.rise[k]) if self._by else 0.0
-            self._valleys[k] = valley_of(self._task, self._by.stops[k], self._mode, rise)  # type: ignore[union-attr]
+            if self._by is not None:  # the others are modes, known from the beginning
+                self._valleys[k] = valley_of(self._task, self._by.stops[k], float(self._by.rise[k]))
         own = [{k: copy.copy(self._valleys[k]) for k, *_ in begins} for *_, begins in asked]
         ends = threads.each(self._farthest, list(zip(asked, own, strict=True)))
         for k, shared in self._valleys.items():
@@ -227,7 +226,7 @@ class Search:
         if self._by is None:
             return joined(sides, middle, sigma, math.sqrt(self._level))
         low, high = (one.place for one in sides)
-        inner = np.column_stack(self._by.profile_of(i, np.linspace(-1, 1, _POINTS)))
+        inner = np.column_stack(self._by.profile_of(i, np.linspace(-1, 1, POINTS)))
         near = self._by.value[self._by.rise < self._level, i]  # beyond its stops a walk knows the others' parabola only
         seen = [np.array(one.seen) for one in sides]
         least, most = max(seen[0][:, 0].max(), near.min()), min(seen[1][:, 0].min(), near.max())
@@ -239,7 +238,7 @@ class Search:
         """Stops of the walk from where a parameter goes farthest, and modes, the farthest first."""
         out: list[Begin] = []
         for k, one in self._valleys.items():
-            room = self._level - one.above[1]
+            room = self._level - one.above
             if k <= _MODE and room > 0:
                 out.append((k, None, sign * float(one.mode[i]) + math.sqrt(room) * float(one.sigma[i])))
         if self._by is not None:

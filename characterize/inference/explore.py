@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference import posterior, walk
-from characterize.inference.ends import Profile, Search, Wanted, valley_of
+from characterize.inference.ends import POINTS, Profile, Search, Wanted, valley_of
 from characterize.inference.leastsquares import Solution
 from characterize.inference.posterior import Valley
 from characterize.inference.search import Task, distinct, mirrored, refine
@@ -19,7 +19,6 @@ _RESTARTS = 2
 _LOST, _LOWER = 3.0, 0.5  # sigma of bend from which on a parameter is walked; misfit below the mode that is followed
 _OF_THE_BENCH = ("log_gain", "background")
 _BESIDE = 8  # profiles side by side, whatever the number of cores; the next ones know the slopes that these met
-_POINTS = 61  # of the curve of a walk
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,7 +57,7 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     if modes[0] is not ends[0]:  # the search has asked for the mirror images of its own best
         modes = mirrored(task, modes)
     for left in reversed(range(_RESTARTS + 1)):
-        valleys = [valley_of(task, mode, modes[0]) for mode in modes]
+        valleys = [valley_of(task, mode, mode.merit - modes[0].merit) for mode in modes]
         walks = _walks(task, modes, valleys[0])
         profiles, better = _profiles(task, valleys[0], modes[0], walks, followed=bool(left), others=valleys[1:])
         if better is None:
@@ -175,7 +174,7 @@ def _intervals(
 def _whole(one: Walk, best: Solution, low: Array, high: Array) -> Profile:
     """The profile that a walk is."""
     value, rise = one.profile()
-    some = np.unique(np.linspace(0, len(value) - 1, _POINTS).round().astype(int))
+    some = np.unique(np.linspace(0, len(value) - 1, POINTS).round().astype(int))
     return Profile(float(low[one.index]), float(high[one.index]), value[some], rise[some], parabolic=False)
 
 

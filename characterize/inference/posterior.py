@@ -43,7 +43,7 @@ class Valley:
     """The misfit about a mode: -2 ln posterior less a constant, with the noise held.
 
     known: image and Jacobian at the mode, where they have been computed.
-    above: of a place that is no mode, the mode (p,) and the rise of -2 ln L from there.
+    above: rise of -2 ln L from the best mode to this one, or to a place that is no mode.
     met: ways from the mode to where slopes were computed, and how they change on them; a copy goes on with its own.
     """
 
@@ -55,12 +55,11 @@ class Valley:
         prior: Prior,
         *,
         known: tuple[Array, Array] | None = None,
-        above: tuple[Array, float] | None = None,
+        above: float = 0.0,
     ) -> None:
         image, jacobian = model(mode, True) if known is None else known
         noise = np.sqrt(data.variance(image))
-        self._model, self._data, self.prior, self.mode = model, data, prior, np.array(mode, float)
-        self.above: tuple[Array, float] = above or (self.mode, 0.0)
+        self._model, self._data, self.prior, self.mode, self.above = model, data, prior, np.array(mode, float), above
         self._root = np.where(data.usable, 1 / noise, 0.0).ravel()
         first = np.abs(self._pixels(image))
         self._root *= np.sqrt(np.minimum(1, _HUBER / np.maximum(first, _HUBER)))

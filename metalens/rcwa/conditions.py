@@ -35,12 +35,6 @@ class Case:
     between: complex
     media: Media
 
-    @property
-    def lossless(self) -> bool:
-        """Whether no medium absorbs."""
-        films = (index for index, _ in (*self.media.under, *self.media.over))
-        return not any(n.imag for n in (self.pillar, self.between, self.media.substrate, self.media.cover, *films))
-
 
 def case(cell: Cell, light: Light) -> Case:
     """The case of a cell and a plane wave.

@@ -77,6 +77,24 @@ def test_turned_pictures_are_turned_back(orientation):
         assert arrange._orientation(wide, wide, np.zeros(3)) == (0, False)
 
 
+@pytest.mark.parametrize("way", [(True, False), (False, True), (True, True)])
+def test_of_order_and_turn_the_least_is_said_that_explains_the_frames(way):
+    """Four frames that differ, in another order, turned, or both: nothing less brings them back."""
+    expected, order, turned = np.zeros((4, 14, 14)), np.array([2, 0, 3, 1]), 5
+    expected[:, 4:10, 4:10] = RNG.uniform(0, 1, (4, 6, 6)) ** 4
+    back = next(k for k in range(8) if np.array_equal(arrange.turn(arrange.turn(expected, turned), k), expected))
+    light = arrange.turn(expected, turned) if way[1] else expected
+    light = light[np.argsort(order)] if way[0] else light
+    assert arrange._plainest(light, expected, np.zeros(4), order, back) == way
+
+
+def test_of_ways_that_explain_frames_alike_the_order_is_said():
+    """Frames that all are one round spot: order and turn change nothing."""
+    y, x = np.mgrid[-6:7, -6:7]
+    expected = np.repeat(np.exp(-(x**2 + y**2) / 8.0)[None], 4, 0)
+    assert arrange._plainest(expected, expected, np.zeros(4), np.array([2, 0, 3, 1]), 5) == (True, False)
+
+
 def test_turns_by_hand():
     frame = np.array([[[1, 2, 3], [4, 5, 6]]])
     assert arrange.turn(frame, 1)[0].tolist() == [[3, 6], [2, 5], [1, 4]]

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from layout.oasis import cells
+from layout.oasis import Cursor, cells
+from layout.oasis import bytes as oasis
 
 
 class Bytes:
@@ -46,3 +47,15 @@ def test_copies_are_moved_from_their_start():
 def test_a_copy_beyond_32_bits_is_refused_on_every_side(x, y, at):
     with pytest.raises(ValueError, match="beyond"):
         places(x, y, at)
+
+
+def test_cells_placed_by_name_are_told_apart():
+    """Two names and one of them again, each with its place, beside a cell by number (SEMI P39: CNXYRAAF, x, y)."""
+    rods, dots = (bytes([0xB0, 4]) + name for name in (b"rods", b"dots"))
+    raw = rods + bytes([6, 10]) + dots + bytes([14, 3]) + bytes([0xF0, 6, 4, 18]) + rods + bytes([22, 26])
+    cursor, reader = Cursor("FILE", np.frombuffer(raw, np.uint8)), cells.CellReader(cells.OpenCell(0), cells.Budget(9))
+    for _ in range(4):
+        assert reader.record(cursor, oasis.PLACEMENT)
+    placed = reader.cell.close("TOP", {6: "rings"}).placed
+    told = [(placed.children[i], int(x), int(y)) for i, x, y in zip(placed.child, placed.x, placed.y, strict=True)]
+    assert sorted(told) == [("dots", 7, -1), ("rings", 2, 9), ("rods", 3, 5), ("rods", 11, 13)]
