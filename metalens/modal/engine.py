@@ -58,7 +58,7 @@ def geometry(rho: float, plan: MeshPlan) -> Geometry:
     return assemble(rho, plan)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=6)  # both classes of three diameters: the probes of a curve, for either polarisation
 def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False) -> Basis:
     """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change.
 

@@ -1,7 +1,8 @@
 """Which solver takes a pillar cell, and one whose error changes smoothly with the diameter."""
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -36,7 +37,14 @@ def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Calla
 def smooth(
     cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str
 ) -> Callable[[float], Response]:
-    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so far as it goes.
+    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so far as it goes."""
+    return smooth_all(cell, [light], span_um, tolerance=tolerance, engine=engine)[0]
+
+
+def smooth_all(
+    cell: Cell, lights: Sequence[Light], span_um: tuple[float, float], *, tolerance: float, engine: str
+) -> list[Callable[[float], Response]]:
+    """:func:`smooth` for several lights, on the discretisation that all of them need.
 
     It is the least that meets the tolerance at three probes, which a curve over the span solves anyhow: answers are
     remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is reported), but it has no jumps that
@@ -44,17 +52,24 @@ def smooth(
     resonance, where the error is many times that elsewhere, the next mesh takes over. The jump there is the true error
     of the coarser mesh, some tenth of its bar.
     """
-    as_built = engine == "modal" and (cell.under or cell.over or cell.sidewall_rad)
-    if cell.height_um == 0 or as_built:
-        return functools.cache(precise(cell, light, tolerance=tolerance, engine=engine))
+    if cell.height_um == 0 or (engine == "modal" and not upright(cell, engine)):
+        return [functools.cache(precise(cell, light, tolerance=tolerance, engine=engine)) for light in lights]
     make = _modal_levels if engine == "modal" else _rcwa_levels
-    levels = [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
+    of_lights = [[functools.cache(level) for level in make(cell, light, span_um[1], tolerance)] for light in lights]
+    levels = list(zip(*of_lights, strict=True))
     probes = np.array(starts(*span_um))[PROBES].tolist()
     allowed = 1 if engine == "modal" else 0
-    for place, at in enumerate(levels[:-1]):
-        if _failing(at, probes, allowed) <= allowed:
-            return functools.partial(_met, at, levels[place + 1]) if engine == "modal" else at
-    return levels[-1]
+    for coarse, fine in itertools.pairwise(levels):
+        if all(_failing(at, probes, allowed) <= allowed for at in coarse):
+            if engine != "modal":
+                return list(coarse)
+            return [functools.partial(_met, *both) for both in zip(coarse, fine, strict=True)]
+    return list(levels[-1])
+
+
+def upright(cell: Cell, engine: str) -> bool:
+    """Whether the modal engine solves the pillar by itself: its lights of one direction then share modes and a mesh."""
+    return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
 
 
 def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:

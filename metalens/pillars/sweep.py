@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from metalens.cell import Cell, Light
-from metalens.ground import config, executor
+from metalens.ground import config
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.store import Provenance
@@ -22,7 +22,6 @@ AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # half-widths from a resonance where
 FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
 MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
-TASKS_A_CORE = 4  # at least, where both polarisations are solved in one
 WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
 
 
@@ -64,7 +63,7 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
     normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
 
     def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
-        groups = _together(lights)
+        groups = _together(lights, engines.upright(cell, engine))
         tasks = [workers.curves_task(cell, some, span, tolerance=sweep.tolerance, engine=engine) for some in groups]
         results = journal.run(tasks, console, label)
         made = [curve for one in results for curve in workers.curves(one, tolerance=sweep.tolerance)]
@@ -90,12 +89,15 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
     return made
 
 
-def _together(lights: list[Light]) -> list[list[Light]]:
-    """Those of one wavelength and direction in one task, where that leaves every core some tasks."""
-    groups: dict[tuple[float, float], list[Light]] = {}
-    for one in lights:
-        groups.setdefault((one.wavelength_um, one.angle_rad), []).append(one)
-    return list(groups.values()) if len(groups) >= TASKS_A_CORE * executor.cores() else [[one] for one in lights]
+def _together(lights: list[Light], share: bool) -> list[list[Light]]:
+    """Where lights of one wavelength and direction share their work, these in one task, else each in its own.
+
+    Oblique light comes first: it takes several times as long as normal incidence, which then fills the end.
+    """
+    groups: dict[object, list[Light]] = {}
+    for one in sorted(lights, key=lambda light: -light.angle_rad):
+        groups.setdefault((one.wavelength_um, one.angle_rad) if share else one, []).append(one)
+    return list(groups.values())
 
 
 def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:

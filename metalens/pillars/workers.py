@@ -14,7 +14,7 @@ from metalens.ground import config, executor, manifest, reading, store
 from metalens.ground.console import Console
 from metalens.pillars import curve as reduced
 from metalens.pillars.curve import Curve, Nodes
-from metalens.pillars.engines import precise, smooth
+from metalens.pillars.engines import precise, smooth_all
 
 SOLVE_SHARE, FIT_SHARE = 0.5, 0.4  # of an entry's tolerance: for the solver, and for the rational fit
 Task = dict[str, Any]
@@ -26,7 +26,8 @@ def curves_task(
 ) -> Task:
     """Exact solves of one curve t(D) a light, chosen adaptively (:func:`metalens.pillars.curve.explore`).
 
-    Lights of one wavelength and direction share the homogeneous modes at the diameters that every curve begins with.
+    Lights of one wavelength and direction share the mesh, and the homogeneous modes at the diameters that every curve
+    begins with.
     """
     return _task("curves", cell, lights, tolerance, engine) | {"span_um": list(span_um)}
 
@@ -54,7 +55,7 @@ def work(task: Task) -> Result:
         return _listed(task["diameters_um"], [solve(d) for d in task["diameters_um"]])
     low, high = task["span_um"]
     about["tolerance"] *= SOLVE_SHARE
-    solves = [smooth(cell, light, (low, high), **about) for light in lights]
+    solves = smooth_all(cell, lights, (low, high), **about)
     for diameter in reduced.starts(low, high):  # every curve begins with them: one after the other they share modes
         for solve in solves:
             solve(diameter)

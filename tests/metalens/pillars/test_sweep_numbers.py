@@ -43,6 +43,12 @@ def test_entries_above_the_tolerance_are_solved_eight_at_a_time():
     assert all(task["lights"] == [[0.85, 0.0, "x", 0.0]] for task in tasks)
 
 
+def test_lights_share_a_task_where_they_share_modes_and_oblique_ones_come_first():
+    normal, s, p, other = Light(0.85, 0.0, "x"), Light(0.85, 0.1, "s"), Light(0.85, 0.1, "p"), Light(0.84, 0.2, "s")
+    assert sweep._together([normal, s, other, p], True) == [[other], [s, p], [normal]]
+    assert sweep._together([normal, s, other, p], False) == [[other], [s], [p], [normal]]
+
+
 def test_single_solves_stand_where_they_are_better():
     d = np.array([0.1, 0.12, 0.15])
     row = np.array([[1, 2j, 3], [0.1, 0.2, 0.3], [0.05, 0.02, 0.04]], complex)

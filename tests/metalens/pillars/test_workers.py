@@ -131,8 +131,33 @@ def test_beside_a_resonance_alone_the_next_mesh_takes_over(monkeypatch, finer_er
     assert at(0.22).reason == ("fine" if finer_error < bar else "coarse")
 
 
+def test_lights_of_one_direction_take_the_mesh_that_both_need(monkeypatch):
+    """Light p needs the third mesh: s is never asked on it for less than its own curve, and has it too."""
+    asked, needs = [], {"s": 1, "p": 2}
+
+    def levels(cell, light, largest_um, tolerance):
+        def level(number):
+            def at(diameter_um):
+                asked.append((light.polarization, number))
+                met = number >= needs[light.polarization]
+                return Response(0.9 + 0.2j * diameter_um, 0.1 + 0j, 1e-5, 9, 1.0, "modal", met, str(number))
+
+            return at
+
+        return [level(number) for number in range(4)]
+
+    monkeypatch.setattr(engines, "_modal_levels", levels)
+    lights = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
+    s, p = engines.smooth_all(CELL, lights, (0.07, 0.23), tolerance=5e-4, engine="modal")
+    assert [asked.count(("s", number)) for number in range(4)] == [2, 3, 3, 0]
+    assert [asked.count(("p", number)) for number in range(4)] == [0, 2, 3, 0]  # where s fails p is not tried
+    assert s(0.12).reason == p(0.12).reason == "2"
+    assert engines.smooth(CELL, lights[0], (0.07, 0.23), tolerance=5e-4, engine="modal")(0.12).reason == "1"
+
+
 def test_curves_of_one_task_are_those_of_tasks_of_their_own():
-    """Both polarisations share modes and are told one after the other: the same bits as each by itself."""
+    """Both polarisations share modes and are told one after the other: the same bits as each by itself, as both need
+    the same mesh here."""
     span, about = (0.1, 0.14), {"tolerance": 2e-2, "engine": "modal"}
     both = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
     joined = workers.work(workers.curves_task(CELL, both, span, **about))
