@@ -8,7 +8,7 @@ import pytest
 
 from layout.dose import assign
 from layout.dose.assign import Fields, Ladder
-from layout.dose.exposure import CLEARS, point_exposure
+from layout.dose.exposure import CLEARS, PointExposure, point_exposure
 from layout.process.process import Exposure
 
 
@@ -94,3 +94,11 @@ def test_energies_of_three_gaussians_have_the_stated_ratios():
     assert found.density(np.array([r])) == pytest.approx([want], rel=1e-12)
     inside = sum(e / 1.75 * (1 - math.exp(-((r / w) ** 2))) for e, w in ((1, 0.02), (0.6, 9.0), (0.15, 0.4)))
     assert found.within(np.array([r])) == pytest.approx([inside], rel=1e-12)
+
+
+def test_an_edge_is_as_steep_as_the_error_functions_of_all_its_ranges():
+    """0.7 nm of width is 0.35 nm at each edge, where half a plane gives erf / 2: relative to the half that clears."""
+    alphas, weights = np.array([0.03, 0.5]), np.array([0.8, 0.2])
+    rise = sum(w * math.erf(0.35e-3 / a) / 2 for a, w in zip(alphas, weights, strict=True))
+    # an error function is straight to (x / range)^2 / 3, 5e-5 here
+    assert assign.straight_edge_error(PointExposure(alphas, weights)) == pytest.approx(rise / CLEARS, rel=1e-4)

@@ -66,3 +66,13 @@ def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
     assert found[3] == [(1.65, 0.5)]
     core = PointExposure(np.array([0.05]), np.array([0.6]))
     assert rects.own(cut, core)[0][1] == pytest.approx(0.6 * (0.5 * erf(0.13 / 0.05) / 2 + 0.25), abs=1e-4)
+
+
+def test_samples_of_rectangles_stand_in_the_middle_of_cells_no_longer_than_a_step():
+    """The first in 4 by 2 cells of a quarter, the second, 0.3 by 0.2, in 2 by 1."""
+    boxes = np.array([[0.0, 1.0, 1.0, 1.5], [5.0, 5.0, 5.3, 5.2]])
+    points, area, of = rects.samples(Rects(boxes, np.zeros(2, int), np.ones(2)), 0.25)
+    first = [(0.125 + 0.25 * i, 1.125 + 0.25 * j) for j in range(2) for i in range(4)]
+    assert points == pytest.approx(np.array([*first, (5.075, 5.1), (5.225, 5.1)]), abs=1e-12)
+    assert area == pytest.approx([0.0625] * 8 + [0.03] * 2, abs=1e-12)
+    assert of.tolist() == [0] * 8 + [1] * 2

@@ -95,3 +95,14 @@ def test_diameters_that_a_narrow_resonance_passes_must_be_solved():
     vanishing = {w: found[: 1 if w.wavelength_um < 0.845 else 0] for w, found in poles.items()}
     full = few_nodes.complete(sweep, {w: still for w in nodes}, vanishing, d)
     assert (full[few_nodes.light(0.846, 0.0, "x")][2].real[np.abs(d - 0.152) < 0.015] == 1).all()
+
+
+def test_a_narrow_resonance_passes_from_one_node_to_the_other_and_four_half_widths_beyond():
+    d = np.linspace(0.1, 0.2, 1001)
+    there, here = np.array([[0.15, 1e-3]]), np.array([[0.16, 2e-3]])
+    for pair in ((here, there), (there, here)):
+        mask = few_nodes._passed(*pair, d)
+        assert (d[mask].min(), d[mask].max()) == pytest.approx((0.142, 0.168), abs=1.01e-4)
+        assert mask.sum() == np.ptp(np.flatnonzero(mask)) + 1  # one run
+    lost = few_nodes._passed(there, np.empty((0, 2)), d)  # at no place of the other: 20 nm to either side
+    assert (d[lost].min(), d[lost].max()) == pytest.approx((0.126, 0.174), abs=1.01e-4)
