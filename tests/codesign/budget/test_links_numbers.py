@@ -1,6 +1,7 @@
 """Single links of the error budget with everything but their own arithmetic typed in."""
 
 import math
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from codesign.budget import floor, links, person, reading
 from codesign.budget.entry import NONE, Entry
 from codesign.evaluate import AXIAL, ExperimentConfig
+from metalens.ground.errors import CellError
 
 RNG = np.random.default_rng(12)
 
@@ -127,3 +129,81 @@ def test_fixation_is_what_is_left_of_the_whole_error(monkeypatch):
 def test_what_is_left_of_a_goal_above_its_floor_is_the_rest_of_the_squares():
     parts = (Entry("a", NONE, NONE, 0.03, ""), Entry("b", NONE, NONE, 0.04, ""), Entry("c", NONE, NONE, 9.0, "", False))
     assert floor.allowance_rad(0.13, parts) == pytest.approx(0.12)
+
+
+def test_the_virtual_experiment_is_told_in_radians_and_outside_the_sum():
+    about = SimpleNamespace(reading=None, given=SimpleNamespace(frames=SimpleNamespace(frames=7)))
+    assert not list(links._measured(about))
+    about.reading = SimpleNamespace(measured_deg={AXIAL: 1.3, "lateral": 2.9})
+    (found,) = links._measured(about)
+    assert found.gaze_rad == pytest.approx(1.3 * math.pi / 180, rel=1e-12)
+    assert (found.link, found.counted) == (links.MEASURED, False)
+    assert "7 frames" in found.method
+    assert math.isnan(found.psf)
+
+
+@dataclass(frozen=True)
+class Layers:
+    front: tuple[str, ...]
+    behind: tuple[str, ...]
+
+    @property
+    def films(self) -> tuple[str, ...]:
+        return self.front + self.behind
+
+
+def optics_links(layers, reading):
+    about = SimpleNamespace(
+        lens=SimpleNamespace(layers=layers),
+        reading=reading,
+        device=SimpleNamespace(image=lambda **given: given, whole="whole", both_polarisations=lambda: "both"),
+        entry=lambda link, optics, method: Entry(link, NONE, 0.1, 0.2, repr(optics)),
+    )
+    return {one.link: one for one in links._optics(about)}
+
+
+def test_films_are_taken_away_on_both_faces_and_a_lens_without_them_errs_by_none():
+    found = optics_links(Layers(("silica",), ("nitride", "silica")), None)
+    assert found["glass"].method == "{'layers': Layers(front=(), behind=())}"
+    assert found["polarisation"].method == "'both'"
+    assert "pillars on a lattice" not in found  # no run: nothing smooth to compare with
+    bare = optics_links(Layers((), ()), None)["glass"]
+    assert (bare.psf, bare.gaze_rad) == (0.0, 0.0)
+
+
+def test_pillars_stand_in_place_of_the_smooth_phase_of_the_run():
+    """Its wave and its layers, both of the run's own device."""
+    true = SimpleNamespace(wave="smooth wave", layers="no films")
+
+    def changed(link, one, other, said):
+        return Entry(link, NONE, 0.3, 0.4, f"{one} against {other}")
+
+    found = optics_links(Layers((), ()), SimpleNamespace(true=true, changed=changed))
+    said = "whole against {'wave': 'smooth wave', 'layers': 'no films'}"
+    assert found["pillars on a lattice"].method == said
+
+
+def test_rows_of_neighbours_are_told_by_their_length_in_pillars(monkeypatch):
+    """Rows of 20 and 10 pillars of 0.42 um turn light of 0.85 um by 1 / 20 and 1 / 10 of a wave a pillar."""
+    rows = SimpleNamespace(sine=0.85 / 0.42 / np.array([20.0, 10.0, 14.2]), diagonal=np.array([False, False, True]))
+    monkeypatch.setattr(links, "_among", lambda about, rows, said: Entry("neighbours", 0.1, 0.2, 0.3, said))
+    monkeypatch.setattr(links.supercell, "neighbours", lambda lens: rows)
+    cell = SimpleNamespace(pitch_um=0.42)
+    about = SimpleNamespace(lens=SimpleNamespace(neighbours=None, wavelength_um=0.85, cell=cell))
+    (found,) = links._neighbours(about)
+    assert found.method.startswith("rows of 20, 10 unlike pillars")
+
+    def refused(lens):
+        raise CellError("tilted walls")
+
+    monkeypatch.setattr(links.supercell, "neighbours", refused)
+    assert not list(links._neighbours(about))
+
+
+def test_what_is_open_of_neighbours_that_the_lens_holds_adds_in_quadrature(monkeypatch):
+    doubts = iter([Entry("neighbours", 0.3, 0.5, 0.02, ""), Entry("neighbours", 0.4, 1.2, 0.015, "")])
+    monkeypatch.setattr(links, "_among", lambda about, rows, said: next(doubts))
+    held = SimpleNamespace(doubted=lambda sine: (sine, sine))
+    about = SimpleNamespace(lens=SimpleNamespace(neighbours=held), aperture=SimpleNamespace(turn_sine=lambda: 0.1))
+    (found,) = links._neighbours(about)
+    assert (found.phase_rad, found.psf, found.gaze_rad) == pytest.approx((0.5, 1.3, 0.025), rel=1e-12)
