@@ -35,3 +35,35 @@ def test_a_second_lens_is_told_by_the_three_parameters_that_differ_most_in_sigma
     assert bent.startswith("height_nm is bent: 95 % within -9.25 to 1.5 about -7, ")
     assert second.startswith("a second lens explains the frames nearly as well (misfit +2.5, probability 22%): ")
     assert ": height_nm -4 for -7, index 0.08 for 0.02, bias_nm -6 for 2; frames" in second
+
+
+@pytest.mark.parametrize(("gain", "followed", "left"), [(0.06, True, True), (0.04, True, False), (5.0, False, False)])
+def test_a_better_lens_met_on_the_way_out_ends_the_search_of_ends(monkeypatch, gain, followed, left):
+    """By more than 0.05 of the misfit, and where it is to be followed; it is fitted to its end once."""
+    refined = []
+
+    class Found:
+        def __init__(self, *given):
+            self.rounds = 0
+
+        def ends(self, wanted):
+            return ["place", "another"]
+
+        def beyond(self):
+            self.rounds += 1
+            return [(0, 1, None)] if self.rounds < 3 else []
+
+        def profile(self, i):
+            return f"profile {i}"
+
+    def refine(task, place):
+        refined.append(place)
+        return SimpleNamespace(merit=812.0 - gain)
+
+    monkeypatch.setattr(explore, "Search", Found)
+    monkeypatch.setattr(explore, "refine", refine)
+    task, mode = SimpleNamespace(names=("bias_nm", "height_nm")), SimpleNamespace(merit=812.0)
+    profiles, other = explore._profiles(task, None, mode, {}, followed=followed)
+    assert refined == (["place"] if followed else [])
+    assert (other is not None) == left
+    assert profiles == ({} if left else {"bias_nm": "profile 0", "height_nm": "profile 1"})
