@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from characterize.inference import search
+from metalens.ground.errors import FitError
 
 COVARIANCE = np.array([[0.04, 0.03], [0.03, 0.25]])
 
@@ -25,3 +26,23 @@ def test_ends_are_kept_best_first_where_they_lie_a_sigma_apart_and_explain_as_mu
     best, twin, other = end([1.0, 5.0], 10.0), end([1.05, 5.1], 10.5), end([2.0, 5.0], 11.0)
     far = end([-2.0, 5.0], 10.0 + search.MODES_WITHIN + 0.1)
     assert search.distinct([far, other, twin, best]) == [best, other]
+
+
+def test_a_wider_search_that_leaves_the_model_s_range_is_none(monkeypatch):
+    """From the one begin that it is given; faults that are no refusal of a fit are not hidden."""
+    asked = []
+
+    def searched(task, begins):
+        asked.append((task, [one.tolist() for one in begins]))
+        if task == "refused":
+            raise FitError("beyond the library")
+        if task == "broken":
+            raise ZeroDivisionError
+        return ["an end"]
+
+    monkeypatch.setattr(search, "search", searched)
+    assert search.wider("more parameters", np.array([1.0, 2.0])) == ["an end"]
+    assert asked == [("more parameters", [[1.0, 2.0]])]
+    assert search.wider("refused", np.array([1.0, 2.0])) is None
+    with pytest.raises(ZeroDivisionError):
+        search.wider("broken", np.array([1.0, 2.0]))
