@@ -8,7 +8,7 @@ from codesign.train.moving import Schedule
 
 
 def test_weights_alone_move_at_the_rate_asked_from_the_first_step_to_the_last():
-    run = InnerConfig(steps=900, seed=5, weights=Schedule(3e-3, 0.25, 0.75, clip=0.4))
+    run = InnerConfig(steps=900, seed=5, weights=Schedule(3e-3, 0.25, 0.75, clip=0.4), pitch=Schedule(0.01))
     made = train.fine_tuning(run, RetrainConfig(steps=30, rate=7e-4))
     assert made.weights == Schedule(7e-4, 0.0, 1.0, clip=0.4)
     assert made.optics.rate == made.pitch.rate == 0.0
