@@ -30,6 +30,7 @@ _TURNS = 14
 _HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
 _BELOW = 0.5  # of -2 ln L, by which a place is a better mode
 _BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
+_WORTH = 0.1  # sigma by which a begin must reach beyond what is found
 POINTS = 61  # of the curve of a walk
 _MODE = -1  # the first mode among stops of a walk; then -2 ...
 Begin = tuple[int, Array | None, float]
@@ -102,7 +103,8 @@ def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None =
         step, least, size = _outwards(here, i, sign, lowest + goal**2, valley.prior, (far, most))
         if steps:
             seen[float(here.x[i])] = max(least - lowest, 0.0)
-        held = missed < _STRAIGHT
+        off_level = size < _CLOSE and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2
+        held = missed < _STRAIGHT and not off_level
         if held and steps and size < _CLOSE:
             break
         if not held and (size < _NEAR or back):  # again, with slopes that hold here
@@ -242,16 +244,20 @@ class Search:
             if k <= _MODE and room > 0:
                 out.append((k, None, sign * float(one.mode[i]) + math.sqrt(room) * float(one.sigma[i])))
         if self._by is not None:
-            out += [(k, None, sign * float(x[i])) for k, x in self._by.outermost(i, sign, self._level)]
+            modes = [one.mode for k, one in self._valleys.items() if k <= _MODE]
+            stops = self._by.outermost(i, sign, self._level)
+            own = [any(np.array_equal(self._by.value[k], mode) for mode in modes) for k, _ in stops]
+            out += [(k, None, sign * float(x[i])) for (k, x), twice in zip(stops, own, strict=True) if not twice]
         return sorted(out, key=lambda begin: -begin[2])
 
     def _farthest(self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]) -> list[tuple[int, End]]:
         """Ends from all begins that reach beyond those found."""
         (i, sign, begins), valleys = asked
         goal, far, out = math.sqrt(self._level), -math.inf, []
-        most = 2 * goal * float(self._valleys[_MODE].sigma[i])
+        sigma = float(self._valleys[_MODE].sigma[i])
+        most = 2 * goal * sigma
         for k, begin, reach in begins:
-            if reach > far:
+            if reach > far + _WORTH * sigma:
                 out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most)))
                 far = max(far, sign * out[-1][1].place)
         return out

@@ -10,7 +10,7 @@ from characterize.inference import posterior, walk
 from characterize.inference.ends import POINTS, Profile, Search, Wanted, valley_of
 from characterize.inference.leastsquares import Solution
 from characterize.inference.posterior import Valley
-from characterize.inference.search import Task, distinct, mirrored, refine
+from characterize.inference.search import Task, anchored, distinct, mirrored, refine
 from characterize.inference.walk import Walk
 from metalens.ground.arrays import Array
 
@@ -51,7 +51,7 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
 
     Intervals, curves, draws and covariance hold the errors of dark and flat too, which all frames have in common.
     """
-    modes = list(ends)
+    task, modes = anchored(task, ends[0]), list(ends)
     for name in walk.WALKED:
         modes = walk.valleys(task, modes, name) if name in task.names else modes
     if modes[0] is not ends[0]:  # the search has asked for the mirror images of its own best

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from characterize.model import detector as detector
     from characterize.model import made as made
     from characterize.model import thinplate as thinplate
+    from characterize.model.detector import oversampling as oversampling
     from characterize.model.forward import ForwardModel as ForwardModel
-    from characterize.model.forward import oversampling as oversampling
     from characterize.model.glass import extra_path as extra_path
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
@@ -47,7 +47,7 @@ __getattr__, __dir__, __all__ = attach(
         "incidence_rad": "pillars",
         "light_maps": "setting",
         "made": "",
-        "oversampling": "forward",
+        "oversampling": "detector",
         "prior_rad": "thinplate",
         "slopes": "pillar_slopes",
         "spectrum": "setting",

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import fft, special
 
 from metalens.ground.arrays import Array
+from metalens.lens import Lens
 
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 
@@ -126,6 +127,12 @@ def _half_step(grid: Grid) -> Array:
 def fine_enough(pixel_um: float, highest: float) -> int:
     """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled at twice that or above."""
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
+
+
+def oversampling(lens: Lens, pixel_um: float) -> int:
+    """Samples along a pixel's side that are fine enough for the light of a lens."""
+    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
+    return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
 
 
 def pixel(fy: Array, fx: Array, pixel_um: float) -> Array:

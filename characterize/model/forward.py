@@ -44,6 +44,7 @@ WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
+_FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,12 +67,6 @@ class _Group:
         return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
 
 
-def oversampling(lens: Lens, pixel_um: float) -> int:
-    """Samples along a pixel's side that are fine enough for the light of a lens."""
-    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
-    return detector.fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
-
-
 class ForwardModel:
     """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
 
@@ -87,10 +82,10 @@ class ForwardModel:
             )
         self.lens, self.setting = lens, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
-        over = oversampling(lens, setting.pixel_um)
+        over = detector.oversampling(lens, setting.pixel_um)
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
-        self.modes = np.empty(0)
+        self.modes, self._missed = np.empty(0), moments.MISSED
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
@@ -131,6 +126,13 @@ class ForwardModel:
         part.cut = tolerance
         return part
 
+    def quick(self) -> "ForwardModel":
+        """The same model by few terms of every field and on fewer samples: for differences to images of this one."""
+        part, over = self.rough(_FEW), detector.oversampling(self.lens, _FEWER * self.grid.pixel_um)
+        part._missed, part.grid = _SMOOTHER * moments.MISSED, dataclasses.replace(self.grid, oversample=over)
+        part.groups = [dataclasses.replace(group, reduced=group.reduced.quick()) for group in self.groups]
+        return part
+
     def with_walls(self, angle_rad: float) -> "ForwardModel":
         """The same lens with side walls that lean by an angle about half height; its derivatives are those without."""
         part = copy.copy(self)
@@ -165,12 +167,8 @@ class ForwardModel:
         if wanted is None:
             return image, None
         out = np.zeros((len(wanted), n, s.rows, s.columns))
-        plain: dict[str, Any] = {
-            "background_e": 1.0,
-            "background_x_e": self._edge_x,
-            "background_y_e": self._edge_y,
-            "log_gain": sampled,
-        }
+        plain: dict[str, Any] = {"background_e": 1.0, "log_gain": sampled}
+        plain |= {"background_x_e": self._edge_x, "background_y_e": self._edge_y}
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
         if "stage_zero_um" in wanted or "stage_scale" in wanted:
@@ -225,16 +223,16 @@ class ForwardModel:
         by = {"bias": lens[1], **dict(zip(ANSWERING, lens[2], strict=False)), "wave": lens[3]}
         factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
         out = self._quick((operators, coarse), group, transfer, bases, factors)
-        conjugate, power = field.conj(), np.vdot(lit, lit).real
+        conjugate, power, rough = field.conj(), np.vdot(lit, lit).real, max(self.cut, _SLOPE_TOLERANCE)
         for name in factors.keys() - out.keys():
             # the part of a change that is the light itself needs no sum, nor loses digits
             changed = bases.changed(factors[name])
             same = np.vdot(lit, changed) / power
             changed = changed - same * lit
-            rate = operators.envelope(operators.coarse(changed, _SLOPE_TOLERANCE))
+            rate = operators.envelope(operators.coarse(changed, rough))
             if moves := factors[name].moves:
                 beside = float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
-                rate = rate + factors[name].um * operators.rates(lit, moves, _SLOPE_TOLERANCE, beside=beside)
+                rate = rate + factors[name].um * operators.rates(lit, moves, rough, beside=beside)
             out[name] = self.grid.sample(2 * (conjugate * rate).real, transfer) + 2 * same.real * light
         growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
         for name in growth.keys() & out.keys():  # the source's image grows or shrinks too
@@ -259,9 +257,9 @@ class ForwardModel:
             return {}
 
         def field(base: str, light: Array) -> Array:
-            return coarse if base == LIT else operators.coarse(light, _SLOPE_TOLERANCE)
+            return coarse if base == LIT else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
 
-        return moments.rates(turned, self.grid, blur, group.reduced.seen(), bases, field, factors)
+        return moments.rates(turned, self.grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
 
     def _factors(self, x: Array, group: _Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
         """(name, what one unit does to the light on the nodes) of all parameters that change it."""

@@ -27,7 +27,7 @@ _DEGREE = 5
 _PLACES = 4  # of the window along each axis where coefficients are computed
 _ACROSS = 15  # places of the lens along each axis that they are fitted to
 _BLOCK = 40  # rows of fine samples whose derivatives are formed at once
-_MISSED = 5e-3  # of a factor, where no polynomial is close enough: its parameter is computed by itself
+MISSED = 5e-3  # of a factor, where no polynomial is close enough: its parameter is computed by itself
 _COARSE_PIXEL = 7e-3  # of the lens's radius: pixels across which coefficients change too much
 
 
@@ -91,14 +91,15 @@ def rates(
     bases: Bases,
     field: Callable[[str, Array], Array],
     factors: Mapping[str, Factor],
+    missed: float = MISSED,
 ) -> dict[str, Array]:
     """(frames, rows, columns) derivatives of the light by name; those that no polynomial is close to are left out.
 
     Args:
         lens: (q, p) direction cosines p and q of the nodes, and which of them meet the lens.
-        field: (name, (frames, q, p) light) to (frames, Y, X) coarse field.
+        field: (name, (frames, q, p) light) to (frames, Y, X) coarse field. missed: share of a factor that is close.
     """
-    tables = _tables(turned, grid, lens, factors)
+    tables = _tables(turned, grid, lens, factors, missed)
     needed = {LIT: 0}
     for name, (degree, _) in tables.items():
         for base, most in ((factors[name].base, degree), (factors[name].added, 0)):
@@ -184,7 +185,7 @@ def _through(blur: Sums, conjugate: Array, field: Array, ways: tuple[Array, Arra
 
 
 def _tables(
-    turned: Turned, grid: Grid, lens: tuple[Array, Array, Array], factors: Mapping[str, Factor]
+    turned: Turned, grid: Grid, lens: tuple[Array, Array, Array], factors: Mapping[str, Factor], missed: float
 ) -> dict[str, tuple[int, Array]]:
     """{name: (degree, (frames or 1, powers, rows, columns) coefficients)} of those factors that are polynomials."""
     some = np.unique(np.linspace(0, len(lens[0]) - 1, _ACROSS).round().astype(int))
@@ -200,7 +201,7 @@ def _tables(
     out = {}
     for name, factor in factors.items():
         values = factor.values(cut)[:, keep].astype(complex)
-        found = _fitted(shapes, values, _moves(turned, factor, p, q, places))
+        found = _fitted(shapes, values, _moves(turned, factor, p, q, places), missed)
         if found is not None:
             degree, table = found
             square = table.reshape(_PLACES, _PLACES, *table.shape[1:])
@@ -230,7 +231,7 @@ def _logarithm(kernel: Kernel, p: Array, q: Array, place: tuple[float, float]) -
     return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.distance_um / r**2))
 
 
-def _fitted(shapes: tuple[Array, Array], values: Array, moved: list[Array]) -> tuple[int, Array] | None:
+def _fitted(shapes: tuple[Array, Array], values: Array, moved: list[Array], missed: float) -> tuple[int, Array] | None:
     """(degree, (places, powers, frames) coefficients) of the least degree that is close; None where none is.
 
     shapes: orthonormal ones (places, nodes, powers), and the triangles that make them of the powers.
@@ -242,6 +243,6 @@ def _fitted(shapes: tuple[Array, Array], values: Array, moved: list[Array]) -> t
     left = float(np.linalg.norm(wanted) ** 2) - np.cumsum((np.abs(amounts) ** 2).sum((0, 2)))
     for degree in range(_DEGREE + 1):
         count = len(powers(degree))
-        if left[count - 1] <= _MISSED**2 * size:
+        if left[count - 1] <= missed**2 * size:
             return degree, np.linalg.solve(triangle[:, :count, :count], amounts[:, :count])
     return None

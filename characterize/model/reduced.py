@@ -7,6 +7,7 @@ low rank (:mod:`kernel`). The adjoint of interpolation between nodes gathers the
 full sum for every smooth f.
 """
 
+import copy
 import dataclasses
 import functools
 import itertools
@@ -66,6 +67,7 @@ class Reduced:
         self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
+        self._near, self._usual = False, dict[tuple[float, ...], Terms]()
         self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
         self._directions(depths_um)
@@ -73,6 +75,13 @@ class Reduced:
         self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
         self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
         self.known = self.k * self.path(self.x_um, self.y_um, bench.distance_um, bench)
+
+    def quick(self) -> "Reduced":
+        """The same nodes, with terms that belong to the nominal wavelength and distance: what is left of the kernel
+        when its factors are put on hardly changes with either."""
+        part = copy.copy(self)
+        part._operators, part._near, part._usual = {}, True, {}
+        return part
 
     def _directions(self, depths_um: Array) -> None:
         d, (cx, cy) = self.bench.distance_um, self.center_um
@@ -214,14 +223,27 @@ class Reduced:
             return down.astype(real_of(kind)), across.astype(real_of(kind))
 
         few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
-        terms = self._terms(kernel, [kernel], (1.0,), (y, x), inner)
+        rest = (
+            self._nominal(kernel, (y, x), inner) if self._near else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
+        )
         return Operators(
             parts[0],
             parts[1],
-            terms,
+            rest,
             moved,
             Turned(kernel, (bands[0], bands[1]), functools.cache(bent)) if few else None,
         )
+
+    def _nominal(self, kernel: Kernel, axes_um: tuple[Array, Array], inner_um: tuple[float, float]) -> Terms:
+        """As :meth:`_terms` of the kernel alone, from those of the nominal one: turned and as bright as its own are."""
+        usual = dataclasses.replace(kernel, k=self.k, distance_um=self.bench.distance_um)
+        key, (y, x) = (*inner_um, *(float(part) for axis in axes_um for part in (len(axis), axis[0]))), axes_um
+        if key not in self._usual:
+            self._usual[key] = self._terms(usual, [usual], (1.0,), axes_um, inner_um)
+        brighter = kernel.k / usual.k * usual.distance_um / kernel.distance_um
+        turn = brighter * kernel.window(x, y[:, None]) / usual.window(x, y[:, None])
+        found = self._usual[key]
+        return dataclasses.replace(found, window=found.window * turn[:, None].astype(self.kind))
 
     def _terms(
         self,

@@ -9,8 +9,9 @@ import numpy as np
 from characterize.bench import bench
 from characterize.bench.bench import Camera, Truth
 from characterize.captures.capture import Capture
-from characterize.inference.leastsquares import Data
-from characterize.model import ForwardModel
+from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.search import Task
+from characterize.model import NAMES, ForwardModel
 from characterize.model.parameters import Known
 from characterize.model.setting import Setting
 from metalens import design, profiles
@@ -110,6 +111,21 @@ def near_focus(depths_um: tuple[float, ...], **values: float) -> tuple[Data, For
     everywhere, n = np.ones(electrons.shape, bool), len(depths_um)
     data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
     return data, ForwardModel(lens(), Setting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16), RESPONSE)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Given(Task):
+    """A task whose parameters and what is known of them are given, not those of a lens."""
+
+    names: tuple[str, ...] = ()
+    prior: Prior | None = None
+
+
+def given(model: object, frames: np.ndarray, noise: float, names: tuple[str, ...], prior: Prior) -> Given:
+    """Frames with the same noise in every pixel, and a stand-in for the model."""
+    everywhere = np.ones(frames.shape, bool)
+    data = Data(frames, everywhere, ~everywhere, np.full(frames.shape, noise**2), np.full(frames.shape, 1e15))
+    return Given(model, data, np.zeros(len(NAMES)), {}, None, names=names, prior=prior)
 
 
 def with_a_moved_frame(shots: Capture) -> Capture:

@@ -7,7 +7,7 @@ import pytest
 
 from characterize.inference import leastsquares
 from characterize.inference.leastsquares import Data, Prior
-from characterize.model.forward import oversampling
+from characterize.model.detector import oversampling
 from characterize.pupil.record import _components
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.inference import explore, posterior, search, verdict
+from characterize.inference import ends, explore, posterior, search, verdict
 from characterize.inference.ends import profile
 from characterize.inference.leastsquares import Data, Prior, Settings, fit
 from characterize.inference.posterior import REACH, Valley
@@ -186,3 +186,48 @@ def test_chance_of_a_misfit_is_that_of_the_pixels_that_count():
     left = np.array([0.3, 0.0, -1.2, 0.0, 0.7, 2.0, -0.1])
     assert verdict.chance_of(SimpleNamespace(residual_sigma=left)) == pytest.approx(math.sqrt(2 / 5))
     assert verdict.chance_of(SimpleNamespace(residual_sigma=np.zeros(4))) == pytest.approx(math.sqrt(2))
+
+
+def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
+    """r = (x, 2 (y - x), 0), x at least 1.19: at (1.2, 0.1) all is too high, and what is first believed of y leads
+    nowhere. Slopes are asked for once more, and the end is that of the ball: x = y = 1.96."""
+    asked = []
+
+    class Believed:
+        mode, bottom, least, above = np.zeros(2), np.zeros(3), 0.0, 0.0
+        slopes = np.array([[1.0, 0.0], [-2.0, 2.0], [0.0, 0.0]])
+        prior = Prior(np.zeros(2), np.full(2, np.inf), np.array([1.19, -9.0]), np.full(2, 9.0))
+
+        def residual(self, x):
+            return self.slopes @ x
+
+        def slopes_at(self, x, rest):
+            asked.append(x)
+            return self.slopes if len(asked) > 1 else np.array([[2.2, 0.0], [1.22, 0.0], [0.0, 1.0]])
+
+    found = ends.end(Believed(), 0, 1, 1.96, begin=np.array([1.2, 0.1]))
+    assert len(asked) == 2
+    assert found.place == pytest.approx(1.96, rel=1e-6)
+
+
+def test_modes_that_are_stops_of_the_walk_too_begin_once_and_begins_count_by_a_tenth_of_a_sigma(monkeypatch):
+    """Of three stops one is the mode; a begin that reaches 0.09 sigma beyond the first one's end is not worth it."""
+    valley = SimpleNamespace(mode=np.array([1.0, 2.0]), sigma=np.array([0.5, 1.0]), above=0.0)
+    found = object.__new__(ends.Search)
+    found._valleys, found._level = {-1: valley}, 4.0
+    places = np.array([[0.0, 2.0], [1.0, 2.0], [2.0, 2.5]])
+    found._by = SimpleNamespace(
+        value=places, outermost=lambda i, sign, level: [(k, np.array([9.0, 2.0 + k])) for k in range(3)]
+    )
+    assert found._begins(1, 1) == [(-1, None, 4.0), (2, None, 4.0), (0, None, 2.0)]
+    assert found._begins(1, -1) == [(-1, None, 0.0), (0, None, -2.0), (2, None, -4.0)]
+
+    def reached(valley, i, sign, goal, **others):
+        tried.append(valley)
+        return SimpleNamespace(place=3.95)
+
+    monkeypatch.setattr(ends, "end", reached)
+    for reach, count in ((4.04, 1), (4.06, 2)):
+        tried = []
+        begins = [(-1, None, 4.2), (2, None, reach)]
+        assert len(found._farthest(((1, 1, begins), {-1: valley, 2: valley}))) == count == len(tried)

@@ -1,20 +1,24 @@
 """A valley that only the walk finds may have a mirror image: both are in the intervals."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from characterize.inference import explore, leastsquares, residual
-from characterize.inference.leastsquares import Data, Prior
-from characterize.model import NAMES, PLACE
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.inference import explore, leastsquares
+from characterize.inference.leastsquares import Prior
+from characterize.model import PLACE
 from characterize.model.setting import Setting
 
 NAMED = ("bias_nm", "bias_x_nm", "background_e")
 RNG = np.random.default_rng(7)
 BRIGHT, PICTURES = RNG.uniform(3, 9, (5, 6, 5)), RNG.standard_normal((3, 5, 6, 5))
 LOW, HIGH, PER_NM, LEAN, NOISE = -7.0, 11.0, 0.013, 3.0, 0.05
-START = np.zeros(len(NAMES))
 
 
 class Forked:
@@ -37,29 +41,26 @@ class Forked:
     def rough(self, tolerance):
         return self
 
+    def quick(self):
+        return self
+
     def images(self, x, names=None):
-        b, lean, level = (x[PLACE[name]] for name in NAMED)
+        bias, lean, level = (x[PLACE[name]] for name in NAMED)
         one, two, three = PICTURES[:, self.index]
-        q, fork = PER_NM * (b - LOW) * (b - HIGH), lean**2 + LEAN * lean - 25 * (HIGH - b) / (HIGH - LOW)
-        worse = 0.012 * (b - LOW) / (HIGH - LOW)
+        q, fork = PER_NM * (bias - LOW) * (bias - HIGH), lean**2 + LEAN * lean - 25 * (HIGH - bias) / (HIGH - LOW)
+        worse = 0.012 * (bias - LOW) / (HIGH - LOW)
         image = BRIGHT[self.index] + q * one + 0.05 * fork * two + (level + worse) * three
         if names is None:
             return image, None
-        by_bias = PER_NM * (2 * b - LOW - HIGH) * one + 0.05 * 25 / (HIGH - LOW) * two + 0.012 / (HIGH - LOW) * three
+        by_bias = PER_NM * (2 * bias - LOW - HIGH) * one + 0.05 * 25 / (HIGH - LOW) * two + 0.012 / (HIGH - LOW) * three
         return image, np.stack([by_bias, 0.05 * (2 * lean + LEAN) * two, three])
 
 
 def test_both_signs_of_a_gradient_that_the_walk_met_lie_in_its_interval():
     model, wide = Forked(), np.array([30.0, 40.0, 9.0])
-    everywhere = np.ones(BRIGHT.shape, bool)
-    data = Data(BRIGHT.copy(), everywhere, ~everywhere, np.full(BRIGHT.shape, NOISE**2), np.full(BRIGHT.shape, 1e15))
     known = Prior(np.zeros(3), np.array([15.0, 20.0, 0.02]), -wide, wide)
-
-    def problem(index=None):
-        return residual.problem(model if index is None else model.only(index), NAMED, START)
-
-    task = SimpleNamespace(model=model, data=data, names=NAMED, prior=known, start=START, problem=problem)
-    end = leastsquares.fit(problem(), data, np.array([HIGH, 0.0, 0.0]), prior=known)
+    task = b.given(model, BRIGHT.copy(), NOISE, NAMED, known)
+    end = leastsquares.fit(task.problem(), task.data, np.array([HIGH, 0.0, 0.0]), prior=known)
     assert end.value[0] == pytest.approx(HIGH, abs=1.0)
     found = explore.explore(task, [end])
     roots = np.roots([1, LEAN, -25])

@@ -12,7 +12,7 @@ from scipy import integrate, optimize, special
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference import explore, leastsquares, residual, search, walk
+from characterize.inference import explore, leastsquares, search, walk
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Data, Prior
 from characterize.model import NAMES, PLACE, Known, vector
@@ -23,7 +23,6 @@ DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
 RNG = np.random.default_rng(5)
 BRIGHT, PICTURES = RNG.uniform(3, 9, (5, 4, 3)), RNG.standard_normal((3, 5, 4, 3))
 ROOTS, PER_NM, NOISE, HEIGHT = (-9.0, 14.0), 0.011, 0.4, 1.7
-START = np.zeros(len(NAMES))
 
 
 class Double:
@@ -43,6 +42,9 @@ class Double:
     def rough(self, tolerance):
         return self
 
+    def quick(self):
+        return self
+
     def images(self, x, names=None):
         bias, height, level = (x[PLACE[name]] for name in NAMED)
         one, two, three = PICTURES[:, self.index]
@@ -58,15 +60,7 @@ def prior(mean, sigma):
 
 
 def task(known):
-    model = Double()
-    frames = BRIGHT + HEIGHT * (PICTURES[1] + 0.3 * PICTURES[0])
-    everywhere = np.ones(frames.shape, bool)
-    data = Data(frames, everywhere, ~everywhere, np.full(frames.shape, NOISE**2), np.full(frames.shape, 1e15))
-
-    def problem(index=None):
-        return residual.problem(model if index is None else model.only(index), NAMED, START)
-
-    return SimpleNamespace(model=model, data=data, names=NAMED, prior=known, start=START, problem=problem)
+    return b.given(Double(), BRIGHT + HEIGHT * (PICTURES[1] + 0.3 * PICTURES[0]), NOISE, NAMED, known)
 
 
 def at(about, bias):

@@ -1,0 +1,83 @@
+"""A quick model put right at one lens: images of all lenses that explain the same frames differ from the whole model's
+by less than the noise can tell."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.inference import leastsquares, search
+from characterize.inference.arrange import Arrangement
+from characterize.model import Known, vector
+
+DEPTHS = (560.0, 600.0, 640.0)
+FREE = {"bias_nm", "bias_x_nm", "stage_zero_um", "distance_um", "coma_x_rad", "log_gain", "background_e"}
+
+
+def fitted():
+    """The task of three frames near focus, and its fit."""
+    data, model = b.near_focus(DEPTHS, bias_nm=6.0, stage_zero_um=4.0, coma_x_rad=0.2)
+    start = vector({"crosstalk_px": 0.2})
+    held = {p.name: Known(p.name, p.start) for p in search.PARAMETERS if p.name not in FREE}
+    found = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
+    about = search.Task(model, data, start, held, found)
+    begin = search.starts(about, biases_nm=(0.0,))[0]
+    return about, search.refine(about, begin[[search.PLACE[name] for name in about.names]])
+
+
+ABOUT, MODE = fitted()
+QUICK = search.anchored(ABOUT, MODE)
+
+
+def test_it_is_the_whole_model_at_its_place_and_its_part_for_some_frames():
+    want, slopes = ABOUT.problem()(MODE.value, True)
+    got, rates = QUICK.problem()(MODE.value, True)
+    assert got == pytest.approx(want, abs=1e-3)  # electrons: single precision of 6000
+    assert np.abs(rates - MODE.slopes).max() < 1e-3 * np.abs(slopes).max()
+    some = np.array([0, 2])
+    part, few = QUICK.problem(some)(MODE.value, True)
+    assert part == pytest.approx(want[some], abs=1e-3)
+    assert np.abs(few - MODE.slopes[:, some]).max() < 1e-3 * np.abs(slopes).max()
+
+
+def test_it_leaves_out_a_percent_and_yet_differs_by_no_tenth_of_a_sigma_within_the_posterior():
+    """What few terms leave out is seen in the image itself; of the change by 2.5 sigma of the parameters they leave out
+    a few percent: less than 0.1 sigma, whose square is 0.01."""
+    noise = np.sqrt(ABOUT.data.variance(MODE.image))
+    plain = ABOUT.model.quick().images(ABOUT.all_of(MODE.value))[0]
+    assert np.linalg.norm((plain - MODE.image) / noise) > 0.3
+    size, turn = np.linalg.eigh(MODE.covariance)
+    apart = []
+    for way in np.random.default_rng(3).standard_normal((6, len(size))):
+        value = MODE.value + turn @ (np.sqrt(size) * 2.5 * way / np.linalg.norm(way))
+        got, want = (one.problem()(value, False)[0] for one in (QUICK, ABOUT))
+        apart.append(float((((got - want) / noise) ** 2).sum()))
+    assert 1e-7 < max(apart) < 0.01
+
+
+def test_a_fit_by_it_from_afar_ends_where_that_of_the_whole_model_does():
+    """To a tenth of a sigma, of which the end of either fit is 0.02."""
+    begin = MODE.value + 6 * np.sqrt(np.diag(MODE.covariance)) * np.where(np.arange(len(MODE.value)) % 2, 1, -1)
+    found = leastsquares.fit(QUICK.problem(), ABOUT.data, begin, prior=ABOUT.prior)
+    assert (np.abs(found.value - MODE.value) / np.sqrt(np.diag(MODE.covariance))).max() < 0.1
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(np.sqrt(np.diag(MODE.covariance)), rel=0.03)
+
+
+def test_terms_of_the_usual_distance_are_turned_and_as_bright_as_own_ones():
+    """Of a lens on its axis and one seen at an angle, 2 % farther and 1 % in wavelength off: field of one term, whose
+    own terms it differs from by less than that one leaves out."""
+    model = b.near_focus(DEPTHS)[1]
+    for group in model.groups:
+        own, near = group.reduced, group.reduced.quick()
+        light = own.gathered[0]
+        about = {"wavelength_um": 0.8585, "distance_um": 112.2, "axes_um": model.grid.axes_um()}
+        whole = own.operators(**about).coarse(light)
+        one, got = (part.operators(**about).coarse(light, np.inf) for part in (own, near))
+        missed = np.linalg.norm(one - whole) / np.linalg.norm(whole)
+        assert np.linalg.norm(got - one) / np.linalg.norm(one) < 0.5 * missed
+        assert np.vdot(got, got).real == pytest.approx(np.vdot(one, one).real, rel=5e-3)
+        assert missed < 0.1
