@@ -191,6 +191,43 @@ def test_draws_of_a_fit_count_from_its_best_estimate(monkeypatch):
     assert seeds == [3]  # the same draws for every lens
 
 
+def test_the_process_is_drawn_as_often_as_asked_and_without_a_mask_not_at_all(monkeypatch):
+    asked, made = [], []
+
+    def draws(spread, count, *, seed):
+        asked.append((spread, count, seed))
+        return [SimpleNamespace(state=lambda k=k: f"state {k}") for k in range(count)]
+
+    monkeypatch.setattr(links, "draws", draws)
+    monkeypatch.setattr(links, "_drawn", lambda about, link, lenses, method: made.extend(lenses) or (link, method))
+    got = list(links._spread(about(given=SimpleNamespace(mask=SimpleNamespace(spread="its spread"), draws=3))))
+    assert asked == [("its spread", 3, 5)]
+    assert [(one.state, one.shift_um) for one in made] == [(f"state {k}", 0.0) for k in range(3)]
+    assert got == [("process spread", "3 draws of the process, lens not measured")]
+    assert not list(links._spread(about(given=SimpleNamespace(mask=None, draws=3))))
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(("off_um", "shape", "refused"), [(8e-7, 3, False), (1.2e-5, 3, True), (0.0, 4, True)])
+def test_a_fit_of_another_lens_is_refused(monkeypatch, off_um, shape, refused):
+    """Diameters are told apart by a picometre and 1e-5 of themselves."""
+    own, other = np.full((3, 3), 0.2), np.full((shape, 3), 0.2)
+    other[1, 2] += off_um
+    fitted = SimpleNamespace(
+        design=SimpleNamespace(diameters=SimpleNamespace(diameter_um=other)),
+        parameters=lambda row=None: np.zeros(len(links.PLACE)),
+        lens_samples=lambda count, seed: [None] * count,
+    )
+    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=own))
+    monkeypatch.setattr(links, "_drawn", lambda about, link, lenses, method: len(lenses))
+    told = links._calibration(about(lens=lens, given=SimpleNamespace(asbuilt=fitted, draws=2)))
+    if refused:
+        with pytest.raises(LensError, match="another lens"):
+            list(told)
+    else:
+        assert list(told) == [2]
+
+
 def test_numerics_change_one_setting_of_the_finest_each(monkeypatch):
     finest = Numerics(40, 8, 1e-6, 2e-5)
     given = SimpleNamespace(numerics=Numerics(11, 3, 4e-4, 6e-3), fwhm_nm=30.0)
