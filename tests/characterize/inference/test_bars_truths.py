@@ -118,6 +118,7 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance():
     )
     setting = SimpleNamespace(depth_um=np.array([2e4]))
     model = SimpleNamespace(setting=setting, groups=[], images=lambda x, names=None: (light + x[-1] * picture, None))
+    model.quick = lambda: model
     prior = SimpleNamespace(low=np.array([-50.0]), high=np.array([50.0]))
     task = SimpleNamespace(model=model, names=("bias_nm",), prior=prior, start=np.zeros(1))
     problem = lambda *_: lambda x, jacobian: (light + x[0] * picture, None)  # noqa: E731

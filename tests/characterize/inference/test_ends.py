@@ -109,6 +109,7 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
     bright[0, 0], picture[0, 1] = 2.0, 1.7
 
     def problem(model, names, start):
+        assert model == "quick"
         return lambda x, jacobian: (bright + x[0] * picture + x[1] * 100, None)
 
     monkeypatch.setattr(verdict.residual, "problem", problem)
@@ -117,7 +118,8 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
     wide = np.full(2, np.inf)
     covariance = np.diag([0.09, 4.0])
     prior = Prior(np.zeros(2), wide, -wide, wide)
-    about = SimpleNamespace(model=None, names=("bias_nm", "background_e"), prior=prior, start=None)
+    model = SimpleNamespace(quick=lambda: "quick")
+    about = SimpleNamespace(model=model, names=("bias_nm", "background_e"), prior=prior, start=None)
     best = SimpleNamespace(value=np.array([0.7, 5.0]))
     found = SimpleNamespace(draws=np.empty((0, 2)), covariance=covariance, best=best)
     angle = np.arctan2(RNG.normal(0.7, 0.3, 10**6) * 1.7, 2.0) - math.atan2(0.7 * 1.7, 2.0)

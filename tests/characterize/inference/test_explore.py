@@ -27,6 +27,9 @@ class Straight:
         self.setting = Setting(depth, np.zeros((len(depth), 2)), np.ones(len(depth)), 1.7, *bright.shape[1:])
         self.groups = [SimpleNamespace(index=np.arange(len(depth)))]
 
+    def quick(self):
+        return self
+
     def only(self, index):
         return Straight(self.bright[index], self.pictures[:, index], self.setting.depth_um[index])
 
