@@ -245,9 +245,9 @@ class Search:
                 out.append((k, None, sign * float(one.mode[i]) + math.sqrt(room) * float(one.sigma[i])))
         if self._by is not None:
             modes = [one.mode for k, one in self._valleys.items() if k <= _MODE]
-            stops = self._by.outermost(i, sign, self._level)
-            own = [any(np.array_equal(self._by.value[k], mode) for mode in modes) for k, _ in stops]
-            out += [(k, None, sign * float(x[i])) for (k, x), twice in zip(stops, own, strict=True) if not twice]
+            for k, x in self._by.outermost(i, sign, self._level):
+                if not any(np.array_equal(self._by.value[k], mode) for mode in modes):
+                    out.append((k, None, sign * float(x[i])))
         return sorted(out, key=lambda begin: -begin[2])
 
     def _farthest(self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]) -> list[tuple[int, End]]:

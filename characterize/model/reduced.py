@@ -185,7 +185,7 @@ class Reduced:
         edge_um: width of a rim of the window where a tenfold error is allowed, since only its blur is seen.
         The last few are kept: an image is often followed by its derivatives.
         """
-        key = wavelength_um, distance_um, *(float(part) for axis in axes_um for part in (len(axis), axis[0]))
+        key = wavelength_um, distance_um, *_named(axes_um)
         found = self._operators.get(key)
         if found is None:
             found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
@@ -224,7 +224,9 @@ class Reduced:
 
         few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
         rest = (
-            self._nominal(kernel, (y, x), inner) if self._near else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
+            self._from(nominal, kernel, (y, x), inner)
+            if self._near
+            else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
         )
         return Operators(
             parts[0],
@@ -234,10 +236,11 @@ class Reduced:
             Turned(kernel, (bands[0], bands[1]), functools.cache(bent)) if few else None,
         )
 
-    def _nominal(self, kernel: Kernel, axes_um: tuple[Array, Array], inner_um: tuple[float, float]) -> Terms:
-        """As :meth:`_terms` of the kernel alone, from those of the nominal one: turned and as bright as its own are."""
-        usual = dataclasses.replace(kernel, k=self.k, distance_um=self.bench.distance_um)
-        key, (y, x) = (*inner_um, *(float(part) for axis in axes_um for part in (len(axis), axis[0]))), axes_um
+    def _from(
+        self, usual: Kernel, kernel: Kernel, axes_um: tuple[Array, Array], inner_um: tuple[float, float]
+    ) -> Terms:
+        """As :meth:`_terms` of the kernel alone, from those of the usual one: turned and as bright as its own are."""
+        key, (y, x) = (*inner_um, *_named(axes_um)), axes_um
         if key not in self._usual:
             self._usual[key] = self._terms(usual, [usual], (1.0,), axes_um, inner_um)
         brighter = kernel.k / usual.k * usual.distance_um / kernel.distance_um
@@ -295,6 +298,11 @@ class Reduced:
 def _on_even(count: int, first: float, last: float, samples: int) -> Array:
     """(samples, count) from Legendre nodes on [-1, 1] to even places; treat as read-only."""
     return legendre.interpolation(count, np.linspace(first, last, samples))
+
+
+def _named(axes_um: tuple[Array, Array]) -> tuple[float, ...]:
+    """What tells even axes apart, as they are kept by: counts and first places."""
+    return tuple(float(part) for axis in axes_um for part in (len(axis), axis[0]))
 
 
 def _as(way: Ways, kind: Any) -> Ways:
