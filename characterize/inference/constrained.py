@@ -1,4 +1,4 @@
-"""One step of a fit inside its limits: the least of a quadratic between bounds and inside a ball, by SLSQP (NLopt)."""
+"""The least of a quadratic inside limits: between bounds by BVLS (SciPy), inside a ball too by SLSQP (NLopt)."""
 
 import contextlib
 from collections.abc import Callable
@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 import nlopt
 import numpy as np
+from scipy import optimize
 
 from metalens.ground.arrays import Array
+
+_KNOWN = 1e-14  # of the largest eigenvalue
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -22,6 +25,30 @@ class Ball:
         return float(np.linalg.norm(x[self.index])) <= self.radius * (1 + 1e-9)
 
 
+def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those that stop it (Stark, Parker 1995).
+
+    Clipping the free minimum to the bounds is not it where parameters go together: what one may not do, others do. Nor
+    is what stays when all that the free minimum violates are held at once: some of them leave for others alone.
+
+    Args:
+        curvature: (p, p) positive; combinations that it knows to less than 1e-14 of the rest do not move.
+        gradient, low, high: (p,); bounds may be infinite, and touch.
+    """
+    own = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    values, vectors = np.linalg.eigh(curvature / np.outer(own, own))
+    some = values > _KNOWN * values[-1]
+    root = np.sqrt(values[some])
+    matrix, wanted = (vectors[:, some] * root).T, -(vectors[:, some].T @ (gradient / own)) / root
+    out, loose = np.clip(np.zeros(len(own)), low, high), high > low
+    limits = low[loose] * own[loose], high[loose] * own[loose]
+    rest = wanted - matrix[:, ~loose] @ (out[~loose] * own[~loose])
+    found = optimize.lsq_linear(matrix[:, loose], rest, limits, method="bvls", tol=1e-12, max_iter=20 * len(own))
+    held = np.where(found.active_mask < 0, low[loose], high[loose])
+    out[loose] = np.where(found.active_mask == 0, np.clip(found.x / own[loose], low[loose], high[loose]), held)
+    return out
+
+
 def step(
     curvature: Array,
     gradient: Array,
@@ -33,8 +60,6 @@ def step(
     tolerance: float = 1e-3,
 ) -> Array:
     """The s with least sᵀCs / 2 + gᵀs for which x + s lies between ``low`` and ``high`` and inside the ball.
-
-    Clipping the free minimum to the bounds is not it where parameters go together: what one may not do, others do.
 
     Args:
         curvature: (p, p) positive definite. gradient, x, low, high: (p,); x inside all limits, bounds may be infinite.

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.inference import constrained
 from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.posterior import PARABOLIC, REACH, Spot, Valley
 from characterize.inference.search import Task
@@ -148,29 +149,68 @@ def _outwards(
     Where it is allowed nowhere: to the least. limits: size of the step, and by how much the parameter goes, at most.
     What would leave its bounds stays on them.
     """
-    curvature, gradient = here.slopes.T @ here.slopes, here.slopes.T @ here.rest
-    free = np.arange(len(here.x)) != i
-    step, least = np.zeros(len(here.x)), here.misfit
-    for _ in range(3):
-        fixed = ~free & (np.arange(len(here.x)) != i)
-        pull = gradient + curvature[:, fixed] @ step[fixed]
-        base = here.misfit + float(step[fixed] @ (gradient[fixed] + pull[fixed]))
-        inner = curvature[np.ix_(free, free)]
-        answers = np.linalg.lstsq(inner, np.stack([curvature[free, i], pull[free]], 1), rcond=1e-14)[0]
-        bend = float(curvature[i, i] - curvature[free, i] @ answers[:, 0])
-        slope = float(pull[i] - curvature[free, i] @ answers[:, 1])
-        least = base - float(pull[free] @ answers[:, 1])
-        root = math.sqrt(max(slope**2 - bend * (least - allowed), 0.0))
-        way = float(np.clip((sign * root - slope) / max(bend, 1e-300), -limits[1], limits[1]))
-        step[i] = np.clip(here.x[i] + way, prior.low[i], prior.high[i]) - here.x[i]
-        step[free] = -answers[:, 1] - answers[:, 0] * step[i]
-        inside = np.clip(here.x + step, prior.low, prior.high) - here.x
-        out = free & (inside != step)
-        if not out.any():
-            break
-        step, free = inside, free & ~out
-    size = math.sqrt(max(float(step @ curvature @ step), 0.0))
+    about = _Straight(here, i, prior)
+    rest = about.others(0.0)
+    least, tried, step = here.misfit + about.change(rest), set[bytes](), rest
+    held = np.zeros(len(rest), bool)
+    while held.tobytes() not in tried:  # from piece to piece of the profile, each with others held on their bounds
+        tried.add(held.tobytes())
+        way = about.way(sign, allowed - here.misfit, step, held)
+        step = about.others(float(np.clip(way, -limits[1], limits[1])))
+        held = about.held(step)
+    size = math.sqrt(max(float(step @ about.curvature @ step), 0.0))
     return (step * (limits[0] / size) if size > limits[0] else step), least, size
+
+
+class _Straight:
+    """The misfit by the straight model about a spot, one parameter led, the others fitted inside their bounds."""
+
+    def __init__(self, here: Spot, i: int, prior: Prior) -> None:
+        self.curvature, self._gradient, self._i = here.slopes.T @ here.slopes, here.slopes.T @ here.rest, i
+        self._low, self._high = prior.low - here.x, prior.high - here.x
+        self._rest = np.flatnonzero(np.arange(len(here.x)) != i)
+        self._free = self._solved(self._rest, self._gradient)
+
+    def _solved(self, free: Array, pull: Array) -> Array:
+        """(free, 2) how these go with what is led, and against their pull."""
+        inner = self.curvature[np.ix_(free, free)]
+        both = np.stack([self.curvature[free, self._i], pull[free]], 1)
+        return np.asarray(np.linalg.lstsq(inner, both, rcond=1e-14)[0])
+
+    def change(self, step: Array) -> float:
+        """Of the misfit by a step."""
+        return float(step @ (2 * self._gradient + self.curvature @ step))
+
+    def held(self, step: Array) -> Array:
+        """(p,) whether a step of the others ends on a bound."""
+        on = (step == self._low) | (step == self._high)
+        on[self._i] = False
+        return np.asarray(on)
+
+    def others(self, way: float) -> Array:
+        """(p,) step of all with one led to ``way``, or as far as its bounds let it."""
+        i, rest = self._i, self._rest
+        step = np.zeros(len(self._low))
+        step[i] = np.clip(way, self._low[i], self._high[i])
+        step[rest] = -self._free[:, 1] - self._free[:, 0] * step[i]
+        if ((step < self._low) | (step > self._high))[rest].any():
+            pull = self._gradient + self.curvature[:, i] * step[i]
+            inner = self.curvature[np.ix_(rest, rest)]
+            step[rest] = constrained.between(inner, pull[rest], self._low[rest], self._high[rest])
+        return step
+
+    def way(self, sign: int, room: float, step: Array, held: Array) -> float:
+        """How far the one led goes until the misfit has changed by ``room``, the ``held`` of a step kept there; where
+        it is more everywhere, to the least."""
+        i, still = self._i, np.where(held, step, 0.0)
+        free = self._rest[~held[self._rest]]
+        pull = self._gradient + self.curvature @ still
+        answers = self._solved(free, pull)
+        bend = float(self.curvature[i, i] - self.curvature[free, i] @ answers[:, 0])
+        slope = float(pull[i] - self.curvature[free, i] @ answers[:, 1])
+        least = self.change(still) - float(pull[free] @ answers[:, 1])
+        root = math.sqrt(max(slope**2 - bend * (least - room), 0.0))
+        return (sign * root - slope) / max(bend, 1e-300)
 
 
 def valley_of(task: Task, at: Solution, rise: float) -> Valley:

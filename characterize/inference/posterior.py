@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.inference import constrained
 from characterize.inference.leastsquares import Data, Model, Prior, Settings
 from metalens.ground import threads
 from metalens.ground.arrays import Array
@@ -122,8 +123,10 @@ class Valley:
         value = float(rest @ rest)
         for _ in range(rounds):
             curvature, gradient = slopes.T @ slopes, slopes.T @ rest
-            size = np.diag(np.diag(curvature)) * damping
-            there = self.inside(x - np.linalg.lstsq(curvature + size, gradient, rcond=1e-14)[0])
+            curved = curvature + np.diag(np.diag(curvature)) * damping
+            there = x - np.linalg.lstsq(curved, gradient, rcond=1e-14)[0]
+            if (self.inside(there) != there).any():
+                there = self.inside(x + constrained.between(curved, gradient, self.prior.low - x, self.prior.high - x))
             step = there - x
             if -float(step @ (2 * gradient + curvature @ step)) < least:
                 break
