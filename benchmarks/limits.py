@@ -44,7 +44,7 @@ def rows() -> list[Row]:
 def measured(folder: Path, verbs: tuple[str, ...]) -> list[Row]:
     """A row a command; only these verbs where some are named."""
     files = chain.shipped()
-    chain.lay_out(folder, files, None, aperture_mm=None)
+    chain.laid(files, None, aperture_mm=None).write(folder)
     every = [*chain.stages(files), *OTHERS]
     return [_row(folder, stage) for stage in every if not verbs or stage.words[0] in verbs]
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-import metalens
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal.case import case_of
@@ -22,7 +21,7 @@ from metalens.modal.engine import evaluate
 from metalens.modal.mesh import MeshPlan, build
 from metalens.modal.spaces import select
 
-FILE = Path(metalens.__file__).parent / "data" / "reference_pillars.json"
+FILE = Path(__file__).parent / "results" / "reference_pillars.json"
 FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
 FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
 BOTH = MeshPlan(5, 6, 5, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0))

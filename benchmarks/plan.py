@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from codesign.budget import plan
+from codesign.budget import plan, task
 from codesign.budget.plan import Chain, Choice, PlanConfig, TrueChoice
 from codesign.budget.task import TaskSetting
 
@@ -27,9 +27,9 @@ def rows() -> list[Row]:
     for each in plans:
         choice = each.choice
         if choice.diameter_step_nm not in truths:
-            truths[choice.diameter_step_nm] = plan.reality(chain, choice.diameter_step_nm)
+            truths[choice.diameter_step_nm] = _reality(chain, choice.diameter_step_nm)
         if choice not in found:
-            error = plan.achieved(chain, choice, truths[choice.diameter_step_nm])
+            error = _achieved(chain, choice, truths[choice.diameter_step_nm])
             found[choice] = error, _seconds(chain, choice)
     finest = _seconds(chain, chain.finest)
     ratios = np.array([p.predicted_rad / found[p.choice][0] for p in plans])
@@ -49,6 +49,18 @@ def rows() -> list[Row]:
             goal=f">= 3x cheaper: least {costs.min():.1f}x, median {np.median(costs):.1f}x"),
         Row("pilot", "metalens plan", measured.spent_seconds, math.nan, "no error"),
     ]  # fmt: skip
+
+
+def _achieved(chain: Chain, choice: Choice | TrueChoice, truth: torch.Tensor) -> float:
+    """Gaze error, rad, of the estimator that believes in the optics of ``choice``, on images of :func:`_reality`."""
+    optics = chain.optics(chain.table(choice.library_tolerance), choice.imaging)
+    return task.gaze_rms(chain.read(truth, optics))
+
+
+def _reality(chain: Chain, diameter_step_nm: float) -> torch.Tensor:
+    """(scenes, pixels) of the eyes through the finest optics, pillars as the mask has them."""
+    exact = chain.table(chain.finest.library_tolerance)
+    return chain.electrons(chain.optics(chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.imaging))
 
 
 def _seconds(chain: Chain, choice: Choice | TrueChoice) -> float:

@@ -104,11 +104,6 @@ def measure(image: Array, about: Micrograph) -> Diameters:
     return Diameters(row, column, diameter, 2 * sigma * about.pixel_nm, missing, collapsed, site, lattice)
 
 
-def level(image: Array, about: Micrograph) -> Array:
-    """Image without charging: row medians and a shade slower than two pitches taken off, contrast scaled to 1."""
-    return _flattened(image, about.pitch_nm / about.pixel_nm)
-
-
 def _flattened(image: Array, pitch: float) -> Array:
     rows = ndimage.gaussian_filter1d(np.median(image, axis=1), 2 * pitch)
     steady = image - rows[:, None]

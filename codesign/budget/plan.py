@@ -19,7 +19,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
 from codesign.budget import task
 from codesign.budget.chain import (
@@ -260,24 +259,7 @@ def _place(measured: Pilot, knob: str) -> int:
     return measured.levels[knob].index(getattr(PILOT, knob))
 
 
-def achieved(chain: Chain, choice: Choice | TrueChoice, truth: torch.Tensor) -> float:
-    """Gaze error, rad, of the estimator that believes in the optics of ``choice``.
-
-    Args:
-        truth: images (scenes, pixels) of the eyes through the finest optics with the mask of ``choice``; see
-            :func:`reality`.
-    """
-    optics = chain.optics(chain.table(choice.library_tolerance), choice.imaging)
-    return task.gaze_rms(chain.read(truth, optics))
-
-
-def reality(chain: Chain, diameter_step_nm: float) -> torch.Tensor:
-    """Images of the eyes through the finest optics, pillars as the mask has them."""
-    exact = chain.table(chain.finest.library_tolerance)
-    return chain.electrons(chain.optics(chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.imaging))
-
-
 __all__ = [
     "LEVELS", "PILOT", "TRUE_LEVELS", "Chain", "Choice", "Imaging", "Pilot", "Plan", "PlanConfig", "TrueChoice",
-    "achieved", "choose", "nodes_of", "pilot", "reality",
+    "choose", "nodes_of", "pilot",
 ]  # fmt: skip

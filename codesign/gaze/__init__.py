@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from codesign.gaze import personal as personal
     from codesign.gaze.axis import EyeGeometry as EyeGeometry
     from codesign.gaze.axis import optical_axis as optical_axis
-    from codesign.gaze.axis import pupil_of as pupil_of
     from codesign.gaze.bench import GazeErrors as GazeErrors
     from codesign.gaze.personal import PersonalGaze as PersonalGaze
     from codesign.gaze.personal import angle_deg as angle_deg
@@ -26,6 +25,5 @@ __getattr__, __dir__, __all__ = attach(
         "mean_geometry": "personal",
         "optical_axis": "axis",
         "personal": "",
-        "pupil_of": "axis",
     },
 )

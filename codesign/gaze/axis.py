@@ -1,4 +1,4 @@
-"""From pupil centre and slippage to gaze: the spherical-eye solver, and a learned turn from optical to visual axis.
+"""From pupil centre and slippage to the optical axis of the eye: the spherical-eye solver.
 
 Camera frame: origin at the lens, z towards the eye, x right and y down as on the (upright) sensor image.
 """
@@ -68,31 +68,9 @@ def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Op
     return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-9), hit)
 
 
-def pupil_of(direction: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Tensor:
-    """(batch, 2) place on the sensor, mm, of the pupil of an eye that looks along ``direction``: the inverse.
-
-    Raises:
-        SceneError: the pupil lies behind the lens.
-    """
-    centre = torch.tensor(geometry.centre_mm, dtype=direction.dtype, device=direction.device) - slip_mm
-    point = centre + geometry.radius_mm * direction
-    if bool((point[..., 2] <= 0).any()):
-        raise SceneError("a pupil lies behind the lens: the slippage is larger than the distance to the eye")
-    return point[..., :2] / point[..., 2:] * geometry.sensor_distance_mm
-
-
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:
     """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|)."""
     a, b = one / one.norm(dim=-1, keepdim=True), other / other.norm(dim=-1, keepdim=True)
     gap = ((a - b) ** 2).sum(-1)
     near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
     return 2 * torch.atan2(near, (a + b).norm(dim=-1))
-
-
-def turn(axis: Tensor, yaw_rad: Tensor, pitch_rad: Tensor) -> Tensor:
-    """Directions turned about the vertical (yaw) and then about the horizontal axis (pitch)."""
-    x, y, z = axis.unbind(-1)
-    c, s = torch.cos(yaw_rad), torch.sin(yaw_rad)
-    x, z = c * x + s * z, c * z - s * x
-    c, s = torch.cos(pitch_rad), torch.sin(pitch_rad)
-    return torch.stack([x, c * y - s * z, c * z + s * y], -1)

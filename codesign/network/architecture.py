@@ -4,7 +4,7 @@ An :class:`Architecture` names depth, kernel, expansion, width and resolution; :
 inverted residuals that the network builds and the cost model counts.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -203,12 +203,6 @@ def active(space: Space, architecture: Architecture) -> Architecture:
         kernels=tuple(k if u else min(space.kernels) for k, u in zip(architecture.kernels, used, strict=True)),
         expansions=tuple(e if u else min(space.expansions) for e, u in zip(architecture.expansions, used, strict=True)),
     )
-
-
-def walk(rows: list[list[Block]]) -> Iterator[Block]:
-    """All blocks in order."""
-    for row in rows:
-        yield from row
 
 
 def _uniform(space: Space, pick: Callable[[Any], Any]) -> Architecture:

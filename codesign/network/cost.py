@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from codesign.network import blur
-from codesign.network.architecture import Architecture, Block, Space, blocks, divisible, stem_channels
+from codesign.network.architecture import Architecture, Block, Space, blocks, stem_channels
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 
@@ -159,59 +159,3 @@ def macs(
     """
     input_size(window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution)
     return macs_of_size(space or Space(), architecture, window_um / pitch_um * architecture.resolution)
-
-
-def mobilenet_v3(variant: str, *, size: int = 224, classes: int = 1000) -> int:
-    """Multiply-accumulates of MobileNetV3 small or large as published (Howard et al. 2019, Tables 1 and 2)."""
-    rows, last, hidden = _MOBILENETS[variant]
-    inputs, chain = 16, []
-    for kernel, wide, outputs, squeeze, stride in rows:
-        chain.append(Block(kernel, inputs, wide, outputs, stride, divisible(wide / 4) if squeeze else 0, "relu"))
-        inputs = outputs
-    body = backbone(16, chain, inputs=3)
-    end = max(body.per_pixel)
-    per_pixel = dict(body.per_pixel) | {end: body.per_pixel[end] + inputs * last}
-    return int(Cost(per_pixel, body.constant + last * hidden + hidden * classes).at(size))
-
-
-# kernel, expanded channels, output channels, squeeze-and-excitation, stride
-_MOBILENETS: dict[str, tuple[list[tuple[int, int, int, bool, int]], int, int]] = {
-    "large": (
-        [
-            (3, 16, 16, False, 1),
-            (3, 64, 24, False, 2),
-            (3, 72, 24, False, 1),
-            (5, 72, 40, True, 2),
-            (5, 120, 40, True, 1),
-            (5, 120, 40, True, 1),
-            (3, 240, 80, False, 2),
-            (3, 200, 80, False, 1),
-            (3, 184, 80, False, 1),
-            (3, 184, 80, False, 1),
-            (3, 480, 112, True, 1),
-            (3, 672, 112, True, 1),
-            (5, 672, 160, True, 2),
-            (5, 960, 160, True, 1),
-            (5, 960, 160, True, 1),
-        ],
-        960,
-        1280,
-    ),
-    "small": (
-        [
-            (3, 16, 16, True, 2),
-            (3, 72, 24, False, 2),
-            (3, 88, 24, False, 1),
-            (5, 96, 40, True, 2),
-            (5, 240, 40, True, 1),
-            (5, 240, 40, True, 1),
-            (5, 120, 48, True, 1),
-            (5, 144, 48, True, 1),
-            (5, 288, 96, True, 2),
-            (5, 576, 96, True, 1),
-            (5, 576, 96, True, 1),
-        ],
-        576,
-        1024,
-    ),
-}

@@ -2,15 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from layout.dose import Solution
 from layout.mask import cells, die, dosed, shaped, tone
-from layout.mask.plan import Lattice, MaskPlan, PillarClass, pillar_classes
+from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
 from layout.process import LayerNumber, Process, names
 from metalens.cell.shapes import Circle
 from metalens.ground.arrays import Array
@@ -174,50 +171,6 @@ def _refuse_beyond_plain(process: Process, with_doses: bool) -> None:
             "exposure: doses are corrected for round pillars on a square lattice alone; leave the correction to the "
             "writer (--no-dose) or set exposure.correct = false"
         )
-
-
-def stream(
-    rows: Callable[[int, int], Array],
-    process: Process,
-    *,
-    shape: tuple[int, int],
-    pitch_um: float,
-    range_um: tuple[float, float],
-    name: str = "METALENS",
-) -> MaskPlan:
-    """The mask of a lens too large for memory: diameters come in blocks of rows, whenever they are needed.
-
-    Args:
-        rows: (first row, end row) -> (rows, columns) diameters in um, 0 for no pillar; the same at each call.
-        shape: (rows, columns) of the lens. range_um: thinnest and widest diameter that may come.
-
-    Raises:
-        ProcessError: as :func:`plan`, and a diameter outside the range (when the block is made).
-    """
-    pitch, rules = pitch_units(pitch_um, process), process.rules
-    low, high = (float(process.written_diameter_nm(d / nm)) / rules.diameter_step_nm for d in range_um)
-    reach = math.ceil(3 * process.bias.range_um / pitch_um) if process.bias.isolated_nm else 0
-    thinnest = max(1, math.floor(low) - math.ceil(max(0.0, process.bias.isolated_nm) / rules.diameter_step_nm))
-    widest = math.ceil(high) + math.ceil(max(0.0, -process.bias.isolated_nm) / rules.diameter_step_nm)
-    steps = np.arange(thinnest, widest + 1)
-    classes = _plain_classes(steps * rules.diameter_step_nm, process)
-    kind = np.uint8 if len(classes) <= 255 else np.uint16
-
-    def sites(top: int, bottom: int) -> Array:
-        first, end = shape[0] - bottom, shape[0] - top  # rows of the map, which run upwards on the mask
-        begin, stop = max(0, first - reach), min(shape[0], end + reach)
-        block = np.asarray(rows(begin, stop))
-        if not block.any():
-            return np.zeros((end - first, shape[1]), kind)
-        drawn = cells.drawn_steps(DiameterMap(block, pitch_um), process)[first - begin : end - begin]
-        if (drawn[drawn > 0] < steps[0]).any() or (drawn > steps[-1]).any():
-            raise ProcessError(f"rows {first} to {end - 1}: a diameter outside {range_um} um; widen range_um")
-        return np.where(drawn > 0, drawn - (thinnest - 1), 0).astype(kind)[::-1]
-
-    x0, y0, axis = _origin(shape, (pitch, pitch), rules.grid_nm)
-    lattice = Lattice("LENS", shape[0], shape[1], pitch, x0, y0, sites)
-    made = MaskPlan(name, classes, (lattice,), grid=rules.grid_nm, axis=axis)
-    return tone.inverted(made, process) if process.tone == "negative" else made
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:

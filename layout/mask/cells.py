@@ -67,11 +67,6 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
     return Cells(hold(drawn.shape, lookup.dtype, blocks), used * step, counts[used], step / 2)
 
 
-def drawn_steps(diameters: DiameterMap, process: Process) -> Array:
-    """(y, x) uint16 drawn diameters in steps of ``diameter_step_nm``, 0 where there is no pillar."""
-    return np.concatenate([block for _, block in drawn_blocks(diameters, process)])
-
-
 def drawn_blocks(diameters: DiameterMap, process: Process) -> Iterator[tuple[int, Array]]:
     """(first row, drawn diameters in steps) of blocks of rows.
 

@@ -84,7 +84,7 @@ class Laid:
 
 
 def shipped() -> ChainFiles:
-    """The demo's own settings, as names of files that :func:`lay_out` writes."""
+    """The demo's own settings, as names of files that :func:`laid` gives."""
     return _named(SHIPPED, budget=False)  # a minute more: asked for with a CHAIN.toml, or metalens budget
 
 
@@ -99,13 +99,6 @@ def load(path: Path) -> ChainFiles:
         if not (path.parent / value).is_file():
             raise ConfigError(f"{path}: {name} = {str(value)!r}: no such file beside it")
     return found
-
-
-def lay_out(folder: Path, files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> ChainFiles:
-    """Write what :func:`laid` gives into the chain's folder; the files under their plain names."""
-    here = laid(files, source, aperture_mm=aperture_mm)
-    here.write(folder)
-    return here.files
 
 
 def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> Laid:

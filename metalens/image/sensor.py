@@ -190,14 +190,6 @@ def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
     return rounded
 
 
-def capture(
-    irradiance: Tensor, sample_um: float, *, sensor: Sensor, generator: torch.Generator | None = None
-) -> Tensor:
-    """Frames in digital numbers from irradiance (..., y, x): integrate, expose, digitise."""
-    mean = mean_electrons(irradiance, sample_um, sensor=sensor)
-    return digitise(expose(mean, sensor=sensor, generator=generator), sensor=sensor)
-
-
 def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
     """Noise variance of a pixel that expects ``mean`` electrons: photon, read and rounding noise, electrons²."""
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))

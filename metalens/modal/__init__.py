@@ -1,7 +1,6 @@
 """A modal method for round pillars: exact along z, elements that follow the disc across.
 
-``solve`` gives one response with its error estimate, ``solve_many`` a table over diameters, wavelengths, angles and
-polarisations, ``gradient`` the exact derivatives of t.
+``solve`` gives one response with its error estimate, ``gradient`` the exact derivatives of t.
 """
 
 from typing import TYPE_CHECKING
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from metalens.modal.ladder import RUNGS as RUNGS
     from metalens.modal.ladder import Rung as Rung
     from metalens.modal.ladder import first_rung as first_rung
-    from metalens.modal.table import Table as Table
-    from metalens.modal.table import solve_many as solve_many
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -26,12 +23,10 @@ __getattr__, __dir__, __all__ = attach(
         "Gradient": "derivatives",
         "RUNGS": "ladder",
         "Rung": "ladder",
-        "Table": "table",
         "case_of": "case",
         "evaluate": "engine",
         "first_rung": "ladder",
         "gradient": "derivatives",
         "solve": "engine",
-        "solve_many": "table",
     },
 )

@@ -60,14 +60,6 @@ def centroid(stack: PsfStack) -> tuple[Array, Array]:
     return (psf.sum(-2) * stack.x_um).sum(-1), (psf.sum(-1) * stack.y_um).sum(-1)
 
 
-def width_um(stack: PsfStack) -> Array:
-    """D4σ-like width: four times the root mean square distance from the centroid along one axis, (…, depth)."""
-    psf = stack.numpy().intensity
-    cx, cy = centroid(stack)
-    square = (stack.x_um - cx[..., None, None]) ** 2 + (stack.y_um[:, None] - cy[..., None, None]) ** 2
-    return np.asarray(4 * np.sqrt((psf * square).sum((-1, -2)) / 2))
-
-
 def axial_information(stack: PsfStack, *, normalisation: Normalisation) -> tuple[Array, Array]:
     """I(z) of Eq. 11, per mm², between neighbouring depths: (middle depths in um, (…, depth - 1)).
 

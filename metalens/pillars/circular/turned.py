@@ -76,13 +76,6 @@ class Turned:
         return cls(size, wavelength, *(arrays[name] for name in ("angle_rad", "t", "t_error", "earlier")))
 
 
-def isolated(t_x: Array, t_y: Array, angle_rad: Array) -> Array:
-    """(..., 2, 2) R(θ) diag(t_x, t_y) R(-θ): the Jones matrix of a pillar that is turned alone."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    off = (t_x - t_y) * c * s
-    return np.stack([np.stack([t_x * c**2 + t_y * s**2, off], -1), np.stack([off, t_x * s**2 + t_y * c**2], -1)], -2)
-
-
 def circular(t: Array, hand: float) -> tuple[Array, Array]:
     """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1) through Jones matrices."""
     come = np.array([1.0, 1j * hand]) / math.sqrt(2)

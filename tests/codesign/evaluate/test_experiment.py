@@ -20,9 +20,9 @@ from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.gaze import personal, regressor
-from codesign.gaze.axis import pupil_of
 from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
+from tests.referees.seen_pupil import pupil_of
 
 SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0)
 

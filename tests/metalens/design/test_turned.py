@@ -13,7 +13,8 @@ from metalens.design import Focus, Limits
 from metalens.ground.errors import LensError
 from metalens.library import PillarLibrary, Sweep
 from metalens.pillars import Proxy
-from metalens.pillars.circular import Turned, isolated
+from metalens.pillars.circular import Turned
+from tests.referees.turned_pillar import isolated
 
 CELL = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))
 T_X, T_Y, SIZE, WAVELENGTH = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j), 0.23, 0.94

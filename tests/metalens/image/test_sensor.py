@@ -94,7 +94,10 @@ def test_dark_pixels_give_zero_counts_and_finite_gradient():
 
 def test_saturated_frame_sticks_at_full_scale_without_gradient():
     light = torch.full((6, 6), 50.0, requires_grad=True)
-    frame = sensors.capture(light, 3.0, sensor=Sensor(bits=8, read_noise_e=0.0))
+    sensor = Sensor(bits=8, read_noise_e=0.0)
+    frame = sensors.digitise(
+        sensors.expose(sensors.mean_electrons(light, 3.0, sensor=sensor), sensor=sensor), sensor=sensor
+    )
     frame.sum().backward()
     assert torch.equal(frame, torch.full((6, 6), 255.0))
     assert torch.equal(light.grad, torch.zeros(6, 6))

@@ -289,27 +289,6 @@ def test_hard_float32_numbers_are_taken_in_double_precision():
     assert single == double
 
 
-def test_table_is_made_of_single_solves():
-    calls = []
-    table = modal.solve_many(
-        cell(),
-        [0.1, 0.2],
-        [0.84, 0.85],
-        angles_rad=[0.0, 0.2],
-        polarizations=("s", "p"),
-        tolerance=1e-2,
-        progress=calls.append,
-    )
-    assert table.t.shape == (2, 2, 2, 2)
-    assert sum(calls) == table.t.size
-    one = modal.solve(cell(), 0.2, 0.84, angle_rad=0.2, polarization="p", tolerance=1e-2)
-    assert table.t[1, 1, 0, 1] == one.t
-    assert table.t_error[1, 1, 0, 1] == one.t_error
-    assert (table.t[0, 0] == table.t[1, 0]).all()
-    assert (table.t_error <= 1e-2).all()
-    assert table.converged.all()
-
-
 # --- refusals ------------------------------------------------------------
 
 

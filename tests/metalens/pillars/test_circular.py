@@ -11,8 +11,9 @@ from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Square
 from metalens.ground.errors import CellError, ConfigError, DomainError
 from metalens.pillars import Sweep, Wanted, converted
-from metalens.pillars.circular import Turned, check, isolated, solve
+from metalens.pillars.circular import Turned, check, solve
 from metalens.pillars.circular.turned import circular, mirrored
+from tests.referees.turned_pillar import isolated
 
 # low contrast, so that few harmonics suffice; far enough apart that the neighbours hardly see the turn
 WEAK = Cell(0.3, 0.4, Index(1.6), Index(1.33), Index(1.1), Index(1.1), shape=Rectangle(0.45))
