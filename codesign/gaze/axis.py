@@ -65,7 +65,7 @@ def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Op
     hit = inside > 0
     depth = torch.sqrt(torch.where(hit, inside, torch.ones_like(inside))) * hit
     offset = -beside - depth[..., None] * ray
-    return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-9), hit)
+    return OpticalAxis(offset / offset.norm(dim=-1, keepdim=True), hit)
 
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:

@@ -120,8 +120,8 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
     )
     middle = paths.reference_depth(seen)
     x, y = lens.diameters.x_um, lens.diameters.y_um
-    count_x = _count(seen, x, float(abs(window.x_um).max()), middle) + margin
-    count_y = _count(seen, y, float(abs(window.y_um).max()), middle) + margin
+    count_x = _count(seen, float(x[-1]), float(abs(window.x_um).max()), middle) + margin
+    count_y = _count(seen, float(y[-1]), float(abs(window.y_um).max()), middle) + margin
     (nodes_x, onto_x), (nodes_y, onto_y) = _basis(x, count_x), _basis(y, count_y)
     return Focus(window, seen, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
 
@@ -165,22 +165,22 @@ def peak(psf: Array) -> Array:
     return np.array(found).reshape(psf.shape[:-2])
 
 
-def _count(seen: Case, span_um: Array, reach_um: float, middle: float) -> int:
+def _count(seen: Case, edge_um: float, reach_um: float, middle: float) -> int:
     """Half the turns of phase across the lens that are left, plus what Chebyshev series need beyond (Bessel decay)."""
-    x = np.linspace(span_um[0], span_um[-1], 1001)
+    x = np.linspace(-edge_um, edge_um, 1001)
     away = paths.beyond(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(seen, x, 0.0, _ON_AXIS, middle)
     differences = [away + paths.from_source(seen, x, 0.0, _ON_AXIS, c) for c in seen.inverse_depths_per_um]
     slope = max(float(abs(np.gradient(path, x)).max()) for path in differences)
-    turns = seen.wavenumber * slope * float(span_um[-1] - span_um[0]) / 2
+    turns = seen.wavenumber * slope * edge_um
     return int(np.ceil(turns + 4 * turns ** (1 / 3)))
 
 
-def _basis(span_um: Array, count: int) -> tuple[Array, Array]:
+def _basis(sites_um: Array, count: int) -> tuple[Array, Array]:
     """(nodes, (nodes, sites) Lagrange basis on Chebyshev points, by their discrete orthogonality)."""
-    half, centre = (span_um[-1] - span_um[0]) / 2, (span_um[-1] + span_um[0]) / 2
+    edge = sites_um[-1]
     angle = np.pi * (np.arange(count) + 0.5) / count
     order = np.arange(count)
     at_nodes = np.cos(np.outer(order, angle))
     at_nodes[0] /= 2
-    at_sites = np.cos(np.outer(order, np.arccos(np.clip((span_um - centre) / half, -1, 1))))
-    return np.asarray(centre + half * np.cos(angle)), (2 / count * at_nodes.T @ at_sites).astype(np.float32)
+    at_sites = np.cos(np.outer(order, np.arccos(sites_um / edge)))
+    return np.asarray(edge * np.cos(angle)), (2 / count * at_nodes.T @ at_sites).astype(np.float32)

@@ -9,7 +9,8 @@ import torch
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import TURN, WAVELENGTH_UM, LensError, LensErrors
-from metalens.pillars import DEFAULT_CELL
+from metalens.cell import Light
+from metalens.pillars import DEFAULT_CELL, engines
 
 SETTINGS = optics.OpticsConfig()
 
@@ -101,3 +102,12 @@ def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have():
     state = LensError({"height_nm": 8.0}).state()
     want = (2 * math.pi / math.sqrt(12) * 8e-3 / DEFAULT_CELL.height_um) ** 2
     assert lens_errors.variance_rad2(state) == pytest.approx(want, rel=0.01)
+
+
+def test_the_phases_that_training_takes_are_those_of_the_solver():
+    """The fit's 1e-3 rad and the solver's 1e-4 over the diameters that training looks at, both ends among them."""
+    low, high = TURN.domain_um
+    solve = engines.smooth(DEFAULT_CELL, Light(WAVELENGTH_UM), (low, high), tolerance=1e-3, engine="modal")
+    diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
+    told = np.exp(1j * np.asarray(TURN.phase_rad(diameter, WAVELENGTH_UM)))
+    assert np.abs(np.angle([solve(float(d)).t for d in diameter] / told)).max() < 1.1e-3
