@@ -142,7 +142,7 @@ def _library_knob(chain: Chain, truth: Optics, finest_seconds: float) -> tuple[A
     coarse = chain.levels["library_tolerance"][:-1]
     errors = [_misread(chain, truth, chain.optics(chain.table(tolerance), chain.around)) for tolerance in coarse]
     seconds = [*(chain.library(tolerance)[1] for tolerance in coarse), finest_seconds]
-    return np.stack([*errors, np.zeros_like(errors[0])]), np.maximum.accumulate(np.array(seconds))
+    return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
 def _mask_knob(chain: Chain, believed: Optics, exact: Array) -> tuple[Array, Array]:

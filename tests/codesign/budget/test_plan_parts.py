@@ -32,7 +32,10 @@ def chain_of(levels, **more):
     made = SimpleNamespace(levels=levels, config=config, aperture=Aperture, around="around", said=[], eyes="eyes")
     made.optics = lambda table, numerics: (table, numerics)
     made.table = lambda tolerance: f"table {tolerance}"
-    made.library = lambda tolerance: (SimpleNamespace(solves=40), {0.03: 2.5, 0.02: 1.5, 0.01: 4.5}[tolerance])
+    made.library = lambda tolerance: (
+        SimpleNamespace(solves=round(1.2 / tolerance)),
+        {0.03: 2.5, 0.02: 1.5, 0.01: 4.5}[tolerance],
+    )
     made.electrons = lambda optics: ("image of", optics)
     made.say = made.said.append
     vars(made).update(more)
@@ -97,13 +100,16 @@ def test_kernels_are_timed_by_the_image_of_a_scene_at_many_depths(misread, monke
 
 
 def test_a_true_image_costs_its_stacks_and_its_frames(misread, monkeypatch):
-    scripted(monkeypatch, 0.5, 0.9, 0.25, 0.6)
-    monkeypatch.setattr(plan, "nodes_of", lambda optics: (3, 5, 7, 2) if optics[1] == 0.3 else (9, 11, 13, 4))
-    errors, seconds, nodes = plan._image_knob(chain_of({"image_tolerance": (0.3, 0.2)}), "table")
-    assert misread == [(("table", 0.2), ("table", 0.3))]
-    assert errors[:, 1, 1].tolist() == pytest.approx([0.2, 0])
-    assert seconds.tolist() == pytest.approx([7 * 0.5 + 110 * 0.3] * 2)  # the finer took less: noise of the clock
-    assert nodes.tolist() == [[3, 5, 7, 2], [9, 11, 13, 4]]
+    scripted(monkeypatch, 0.5, 0.9, 0.25, 0.6, 4.0, 1.2)
+    monkeypatch.setattr(
+        plan, "nodes_of", lambda optics: {0.3: (3, 5, 7, 2), 0.2: (9, 11, 13, 4)}.get(optics[1], (8,) * 4)
+    )
+    errors, seconds, nodes = plan._image_knob(chain_of({"image_tolerance": (0.3, 0.2, 0.1)}), "table")
+    assert misread == [(("table", 0.1), ("table", 0.3)), (("table", 0.1), ("table", 0.2))]
+    assert errors[:, 1, 1].tolist() == pytest.approx([0.2, 0.4, 0])
+    # the second took less than the first: noise of the clock
+    assert seconds.tolist() == pytest.approx([7 * 0.5 + 110 * 0.3] * 2 + [7 * 4.0 + 110 * 0.4])
+    assert nodes.tolist() == [[3, 5, 7, 2], [9, 11, 13, 4], [8, 8, 8, 8]]
 
 
 def test_the_finest_library_is_the_coarse_one_put_right_by_twelve_solves(monkeypatch):
@@ -126,11 +132,13 @@ def test_the_finest_library_is_the_coarse_one_put_right_by_twelve_solves(monkeyp
     monkeypatch.setattr(plan, "time", SimpleNamespace(perf_counter=itertools.count(3.0, 6.0).__next__))
     lens = SimpleNamespace(proxy=SimpleNamespace(domain_um=(0.1, 0.21)), wavelength_um=0.85, cell="cell")
     tables = {0.03: coarse}
-    chain = chain_of({"library_tolerance": (0.03, 0.01)}, lens=lens, table=tables.__getitem__)
+    chain = chain_of({"library_tolerance": (0.03, 0.02, 0.01)}, lens=lens, table=tables.__getitem__)
     table, seconds = plan._exact(chain)
     assert len(solved) == 12
     assert table == pytest.approx(coarse * factor, rel=1e-9)
     assert seconds == pytest.approx(1.5 * 0.5 * 40)
+    listed = plan._listed(chain)
+    assert np.array(listed[0]) + 1j * np.array(listed[1]) == pytest.approx(table, rel=1e-15)
 
 
 def test_a_pilot_keeps_what_each_knob_gave_and_one_frame_s_noise(monkeypatch):

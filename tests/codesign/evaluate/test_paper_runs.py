@@ -4,6 +4,7 @@ import functools
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -54,6 +55,12 @@ def test_compute_of_a_frozen_part_is_that_at_its_own_best_error():
     assert "0.90 mm" in found["fig8b/optics"].conditions
     assert "fig8b/pitch" not in found  # ours never gets there: no number is made up
     assert {claim.key for claim in paper.claims()} >= {"fig8b/optics", "fig8b/pitch"}
+
+
+def test_lenses_are_compared_at_the_largest_tolerance_of_their_runs(monkeypatch):
+    told = {Path("a/run.toml"): 0.04, Path("b/run.toml"): 0.11, Path("c/run.toml"): 0.07}
+    monkeypatch.setattr(runs, "load", lambda path: SimpleNamespace(optics=SimpleNamespace(image_tolerance=told[path])))
+    assert paper_runs.image_tolerance([Path("a"), Path("b"), Path("c")]) == 0.11
 
 
 def test_runs_are_told_apart_by_what_they_wrote(tmp_path):
