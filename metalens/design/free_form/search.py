@@ -165,7 +165,7 @@ class _Best:
         seen = self.objective.judge(phase.detach(), self.focus_um)
         spare = float(seen.encircled.min()) - self.settings.encircled
         rank = (spare >= -5e-4, float(seen.information.mean()))
-        if self.controls is None or rank > self.rank or (not self.rank[0] and rank[0]):
+        if self.controls is None or rank > self.rank:
             self.rank, self.controls, self.score = rank, controls.detach().clone(), seen
         return spare
 
@@ -173,8 +173,7 @@ class _Best:
 def _climb(
     pupil: Pupil, settings: Asked, objective: Objective, focus_um: float, zones: int, generator: torch.Generator
 ) -> FisherPhase:
-    spread = settings.spread_rad * (0.1 if zones else 1.0)
-    controls = spread * torch.randn(settings.grids[0], settings.grids[0], generator=generator, dtype=torch.float64)
+    controls = _begun(settings, zones, generator)
     total, done, margin = settings.iterations, 0, 0.01
     best = _Best(objective, settings, focus_um)
     for grid, count in zip(settings.grids, _shares(settings), strict=True):
@@ -187,17 +186,16 @@ def _climb(
         build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
         for _ in range(count):
             for group in step.param_groups:
-                group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
+                group["lr"] = _rate(rate, done, total)
             loss, energy = objective.loss(build(controls), focus_um, generator)
-            missing = torch.relu(settings.encircled + margin - energy)
-            loss = loss + 10 * (1 + 4 * done / total) * (missing.mean() + 8 * (missing**2).mean())
+            loss = loss + _penalty(torch.relu(settings.encircled + margin - energy), done / total)
             step.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             step.step()
             done += 1
             if grid == settings.grids[-1] and (done % CHECKS == 0 or done == total):
                 spare = best.look(controls, build(controls))
-                margin = min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
+                margin = _margin(margin, spare)
         controls = controls.detach()
     if settings.refine:
         from metalens.design.free_form.refine import refine
@@ -208,6 +206,28 @@ def _climb(
         raise ConfigError("no iterate was judged")
     reason = "encircled energy kept at every depth" if best.rank[0] else "encircled energy missed: raise iterations"
     return FisherPhase(best.controls, focus_um, zones, settings.grids[-1] == 0, best.score, (), best.rank[0], reason)
+
+
+def _begun(settings: Asked, zones: int, generator: torch.Generator) -> Tensor:
+    """Controls of the coarsest grid at random; on a double helix a tenth of the spread, which leaves its vortices."""
+    spread = settings.spread_rad * (0.1 if zones else 1.0)
+    size = settings.grids[0]
+    return spread * torch.randn(size, size, generator=generator, dtype=torch.float64)
+
+
+def _rate(first: float, done: int, total: int) -> float:
+    """Step of Adam, rad, after so many of all iterations: half a cosine down to 2 mrad."""
+    return first * (0.5 + 0.5 * math.cos(math.pi * done / total)) + 0.002
+
+
+def _penalty(missing: Tensor, share: float) -> Tensor:
+    """Of encircled energy that is missing: five times as strong at the end as at the beginning."""
+    return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
+
+
+def _margin(margin: float, spare: float) -> float:
+    """What is asked for beyond the bound: more where an honest look has less than 0.0015 to spare, within limits."""
+    return min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
 
 
 def _shares(settings: Fisher) -> list[int]:
