@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from codesign.budget import plan, task
 from codesign.budget.entry import Entry
@@ -174,16 +173,3 @@ def test_a_pilot_keeps_what_each_knob_gave_and_one_frame_s_noise(monkeypatch):
     assert plan.pilot(chain).floor == ()
     known = (person, Entry("sensor noise", plan.NONE, plan.NONE, 3e-3, "told"))
     assert plan.pilot(chain, floor=known).floor == known
-
-
-def test_what_was_achieved_is_the_rms_over_both_angles_of_what_the_choice_reads(monkeypatch):
-    """Eyes through the finest optics with the mask's pillars, read by who believes in the choice."""
-    shifts = torch.tensor([[3e-3, -4e-3, 9.0], [1e-3, 2e-3, 9.0]])
-    asked = []
-    chain = chain_of({}, finest=plan.TrueChoice(0.01, 0.2, 1))
-    chain.read = lambda image, believed: asked.append((image, believed)) or shifts
-    truth = plan.reality(chain, 8)
-    assert truth == ("image of", (("rounded", "table 0.01", 0.008), 0.2))
-    choice = plan.TrueChoice(0.03, 0.3, 8)
-    assert plan.achieved(chain, choice, truth) == pytest.approx(math.sqrt((9e-6 + 16e-6 + 1e-6 + 4e-6) / 2))
-    assert asked == [(truth, ("table 0.03", 0.3))]
