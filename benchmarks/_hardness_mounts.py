@@ -8,7 +8,6 @@ from pathlib import Path
 
 _LIBC = ctypes.PyDLL(None, use_errno=True)  # keeps the lock of the interpreter, so that a fork has it too
 _NEW_NAMESPACE, _BIND, _PRIVATE, _DETACH = 0x20000, 0x1000, (1 << 18) | 0x4000, 2
-_AGAIN, _READ_ONLY = 32, 1
 _MAKING = os.O_CREAT | os.O_EXCL | os.O_TRUNC
 
 
@@ -23,13 +22,6 @@ def own() -> bool:
 def memory(folder: Path, size: int) -> bool:
     """Mount a file system of memory with so many bytes; False where that is not allowed."""
     return bool(_LIBC.mount(b"none", os.fsencode(folder), b"tmpfs", 0, f"size={size}".encode()) == 0)
-
-
-def read_only(folder: Path) -> bool:
-    """Let nobody write into a folder, root included; False where that is not allowed."""
-    name = os.fsencode(folder)
-    bound = _LIBC.mount(name, name, None, _BIND, None) == 0
-    return bound and _LIBC.mount(None, name, None, _AGAIN | _BIND | _READ_ONLY, None) == 0
 
 
 def gone(folder: Path) -> None:

@@ -22,7 +22,6 @@ CELLS = {
     0.94: Cell(0.40, 0.7, pillar=Index(3.6), substrate=Index(1.4513)),
 }
 REFERENCE_TOLERANCE = 1e-4
-NO_ERROR = float("nan")
 
 
 def rows() -> list[Row]:

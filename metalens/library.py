@@ -7,7 +7,6 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from metalens.pillars.fit import proxy_of as proxy_of
     from metalens.pillars.record import DEFAULT_CELL as DEFAULT_CELL
-    from metalens.pillars.record import PLAIN as PLAIN
     from metalens.pillars.record import PillarLibrary as PillarLibrary
     from metalens.pillars.record import Sweep as Sweep
     from metalens.pillars.record import check as check
@@ -19,7 +18,6 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "DEFAULT_CELL": "metalens.pillars.record",
-        "PLAIN": "metalens.pillars.record",
         "PillarLibrary": "metalens.pillars.record",
         "Sweep": "metalens.pillars.record",
         "check": "metalens.pillars.record",

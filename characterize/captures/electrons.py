@@ -85,8 +85,8 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
     return Gain(gain, gain**2 * sigma, read)
 
 
-def clean(capture: Capture, *, gain: Gain | None = None) -> Frames:
-    """Frames in electrons with masks; the gain from the flats unless given, else one electron a count, and so said.
+def clean(capture: Capture) -> Frames:
+    """Frames in electrons with masks; the gain from the flats, else one electron a count, and so said.
 
     Brackets (frames of one position and angle with different exposure) are merged by :func:`merge_brackets`
     beforehand by whoever wants one frame a position; without that every exposure is fitted as its own frame.
@@ -96,7 +96,7 @@ def clean(capture: Capture, *, gain: Gain | None = None) -> Frames:
     """
     notes = list(capture.corrections)
     raw = np.asarray(capture.frames, float)
-    gain = gain or _gain(capture, notes)
+    gain = _gain(capture, notes)
     dark = _dark_level(capture, notes)
     flat, flat_error = _flat_field(capture, dark, notes)
     bad = bad_pixels(capture)

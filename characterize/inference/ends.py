@@ -66,14 +66,6 @@ class End:
     steps: int = 0
 
 
-def profile(valley: Valley, i: int, *, level: float = REACH**2) -> tuple[Profile, Array | None]:
-    """The profile of one parameter out to a rise of ``level``; second: a place below the mode, if one was met."""
-    goal, mode = math.sqrt(level), float(valley.mode[i])
-    sides = [end(valley, i, sign, goal) for sign in (-1, 1)]
-    better = next((one.lower for one in sides if one.lower is not None), None)
-    return joined(sides, mode, float(valley.sigma[i]), goal), better
-
-
 def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
     """Of its two ends; ``sigma``: of the parabola at the mode."""
     low, high = (one.place for one in sides)

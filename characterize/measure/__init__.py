@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from characterize.measure import frames as frames
     from characterize.measure import metrics as metrics
     from characterize.measure import overlay as overlay
+    from characterize.measure import register as register
     from characterize.measure import sem as sem
 
 __getattr__, __dir__, __all__ = attach(
@@ -16,6 +17,7 @@ __getattr__, __dir__, __all__ = attach(
         "frames": "",
         "metrics": "",
         "overlay": "",
+        "register": "",
         "sem": "",
     },
 )

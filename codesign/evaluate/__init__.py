@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from codesign.evaluate.reader import ReaderConfig as ReaderConfig
     from codesign.evaluate.reader import judged as judged
     from codesign.evaluate.shown import ExperimentConfig as ExperimentConfig
-    from codesign.evaluate.shown import Points as Points
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -36,7 +35,6 @@ __getattr__, __dir__, __all__ = attach(
         "LATERAL": "gaze_experiment",
         "Line": "paper",
         "Measured": "paper",
-        "Points": "shown",
         "ROLES": "paper",
         "ReaderConfig": "reader",
         "Result": "gaze_experiment",

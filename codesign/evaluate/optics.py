@@ -210,16 +210,11 @@ class SceneEnergy:
         return torch.arccos(along.clamp(-1, 1))
 
 
-def scene_energies(
-    lenses: Sequence[Lens], states: States, settings: Scenes | None = None, *, views: Triplets | None = None
-) -> list[SceneEnergy]:
+def scene_energies(lenses: Sequence[Lens], states: States, settings: Scenes | None = None) -> list[SceneEnergy]:
     """Table 1: how much the images of the same scenes change with gaze and with axial slip.
 
     Images of all lenses are scaled to the same mean (the paper normalises the PSFs' sums). The steps are the paper's
     kind of perturbation, not infinitesimal ones.
-
-    Args:
-        views: rendered triplets of the states, where they are at hand.
 
     Raises:
         SceneError: no lens is given, or they differ in their sensor distance.
@@ -234,7 +229,7 @@ def scene_energies(
                 f"lens {number + 1} is made for a sensor at {lens.reduced_um:g} um (through films: reduced), the first "
                 f"for {distance:g} um: their images differ in size; compare lenses of one sensor distance"
             )
-    views = views or scene_views(states, settings, sensor_distance_um=distance)
+    views = scene_views(states, settings, sensor_distance_um=distance)
     out = []
     for lens in lenses:
         rendered = (views.anchor, views.gaze, views.slip)

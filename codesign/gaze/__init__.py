@@ -7,23 +7,17 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.gaze import bench as bench
     from codesign.gaze import personal as personal
-    from codesign.gaze.axis import EyeGeometry as EyeGeometry
-    from codesign.gaze.axis import optical_axis as optical_axis
     from codesign.gaze.bench import GazeErrors as GazeErrors
     from codesign.gaze.personal import PersonalGaze as PersonalGaze
     from codesign.gaze.personal import angle_deg as angle_deg
-    from codesign.gaze.personal import mean_geometry as mean_geometry
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "EyeGeometry": "axis",
         "GazeErrors": "bench",
         "PersonalGaze": "personal",
         "angle_deg": "personal",
         "bench": "",
-        "mean_geometry": "personal",
-        "optical_axis": "axis",
         "personal": "",
     },
 )

@@ -128,16 +128,11 @@ def kernels(
     window: Window,
     *,
     fwhm_nm: float = 0.0,
-    shift_um: float = 0.0,
-    offset_um: tuple[float, float] = (0.0, 0.0),
 ) -> PsfBasis:
     """PSFs on the pixel grid, of sum 1, as a few kernels.
 
     Pillars answer at every wavelength as at the design wavelength: over a diode's line their dispersion changes a
     PSF far less than that of diffraction does.
-
-    Args:
-        shift_um: added to the distance between lens and sensor. offset_um: of the window from the chief ray.
 
     Raises:
         PropagationError: as :func:`metalens.psf.psf_stack`.
@@ -152,12 +147,11 @@ def kernels(
         pitch_um=lens.diameters.pitch_um,
         wavelength_um=nodes.wavelengths_um.tolist(),
         weights=nodes.weights.tolist(),
-        sensor_distance_um=lens.sensor_distance_um + shift_um,
+        sensor_distance_um=lens.sensor_distance_um,
         depths_um=depths,
         window_um=size * window.pitch_um,
         samples=size * fine,
         tolerance=numerics.psf_tolerance,
-        offset_um=offset_um,
     )
     light = torch.as_tensor(stack.intensity).reshape(len(depths), size * fine, size * fine)
     pixels = integrate(light, window.pitch_um / fine, pitch_um=window.pitch_um, shape=(size + 1, size + 1))

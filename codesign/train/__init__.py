@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from codesign.train.formation import read_out as read_out
     from codesign.train.inner import Batch as Batch
     from codesign.train.inner import InnerConfig as InnerConfig
-    from codesign.train.inner import Model as Model
     from codesign.train.inner import Record as Record
     from codesign.train.inner import Scenes as Scenes
     from codesign.train.inner import Schedule as Schedule
@@ -42,7 +41,6 @@ __getattr__, __dir__, __all__ = attach(
         "End": "finish",
         "InnerConfig": "inner",
         "Journal": "journal",
-        "Model": "inner",
         "Part": "words",
         "Place": "words",
         "Record": "inner",

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from codesign.batches import Batch, Flat
 from codesign.network import Architecture, Baseline, Supernet
-from codesign.optics import Stack
 from codesign.train import assess
 from codesign.train.inner import Scenes, Trainer
 from metalens.image import Frames
@@ -66,15 +65,14 @@ def depth_response(
     *,
     batches: int,
     shift_um: float = 1000.0,
-    stack: Stack | None = None,
 ) -> DepthResponse:
     """Shift the depth of the PSFs alone and see how far the prediction follows; the noise is the same in both.
 
     A network that guesses depth from the size of what it sees answers 0, however well it scores on natural frames.
     The batch statistics must be measured (:func:`codesign.network.supernet.recalibrate`).
     """
-    here = _axial(trainer, scenes, net, architecture, batches, stack)
-    there = _axial(trainer, Displaced(scenes, shift_um), net, architecture, batches, stack)
+    here = _axial(trainer, scenes, net, architecture, batches)
+    there = _axial(trainer, Displaced(scenes, shift_um), net, architecture, batches)
     change = (there - here) / (shift_um * 1e-3)
     return DepthResponse(float(change.mean()), float(change.std() / len(change) ** 0.5), len(change))
 
@@ -85,7 +83,6 @@ def _axial(
     net: Supernet | Baseline,
     architecture: Architecture,
     batches: int,
-    stack: Stack | None,
 ) -> Tensor:
-    seen = assess.frames(trainer, scenes, batches, stack=stack)
+    seen = assess.frames(trainer, scenes, batches)
     return assess.predict(net, architecture, seen, trainer.inner).slip_mm[:, 2]

@@ -5,21 +5,15 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
-    from layout.certify.certificate import Certificate as Certificate
-    from layout.certify.certificate import certify as certify
     from layout.certify.certificate import survey as survey
     from layout.certify.made_lens import MadeRows as MadeRows
-    from layout.certify.verdict import Edges as Edges
     from layout.certify.verdict import Survey as Survey
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "Certificate": "certificate",
-        "Edges": "verdict",
         "MadeRows": "made_lens",
         "Survey": "verdict",
-        "certify": "certificate",
         "survey": "certificate",
     },
 )

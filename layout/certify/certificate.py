@@ -4,13 +4,12 @@ See :mod:`layout.certify.exposed` for the model. Of marks, labels and any other 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from layout.certify import outlines
 from layout.certify.exposed import THRESHOLD, WIDE_UM, Band, Simulation, Terms
-from layout.certify.gathered import Exposed, Polygons, gathered, on_lattices
+from layout.certify.gathered import Exposed, Polygons, on_lattices
 from layout.certify.verdict import Edges, Survey, Tally
 from layout.files import MaskContent
 from layout.mask import MaskPlan
@@ -18,91 +17,6 @@ from layout.process import LayerNumber, Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Certificate:
-    """What comes out, for every round pillar that is written and along the edges of everything else.
-
-    x_um, y_um: (n,) places. drawn_nm, resist_nm, made_nm: (n,) diameters: equal-area of the polygon, in the resist,
-    at half height after the etch (bias for the density around it). exposure: (n,) of the drawn edge, relative to
-    dose-to-size.
-    layer: (n,) layer numbers. judged: (n,) false for the dose test, which is wrong on purpose.
-    survey: the verdict over all of them.
-    """
-
-    x_um: Array
-    y_um: Array
-    drawn_nm: Array
-    resist_nm: Array
-    made_nm: Array
-    exposure: Array
-    layer: Array
-    judged: Array
-    survey: Survey
-
-    @property
-    def edges(self) -> Edges:
-        """Of the other shapes."""
-        return self.survey.edges
-
-    @property
-    def undosed(self) -> tuple[LayerNumber, ...]:
-        """Layers with shapes and no dose."""
-        return self.survey.undosed
-
-    @property
-    def lean_nm(self) -> float:
-        """Foot less half-height diameter."""
-        return self.survey.lean_nm
-
-    @property
-    def worst_exposure(self) -> float:
-        """Largest |exposure - 1| of the judged pillars and of all edges."""
-        return self.survey.worst_exposure
-
-    @property
-    def worst_nm(self) -> float:
-        """Largest |width in the resist - drawn|: diameters, and twice the shift of an edge."""
-        return self.survey.worst_nm
-
-    @property
-    def ok(self) -> bool:
-        """As :attr:`layout.certify.Survey.ok`."""
-        return self.survey.ok
-
-
-def certify(
-    content: MaskContent, doses: Mapping[LayerNumber, float], process: Process, *, height_um: float = 0.0
-) -> Certificate:
-    """Simulate the exposure of a mask that was read back, with its dose table; pillars in order of strips of height.
-
-    Args:
-        height_um: of the pillars, for their feet.
-
-    Accuracy: backscatter to 1e-3 of itself (pixels of a quarter of its range), edges to 0.01 nm. Edges are sampled
-    away from corners, which round off.
-
-    Raises:
-        ProcessError: no double or triple Gaussian is given, or no round pillar is in the file.
-    """
-    terms = _terms(process)
-    scene = gathered(content, doses, _fixed(process))
-    kinds, count = scene.kinds, scene.places.count
-    x, y = np.empty(count), np.empty(count)
-    resist, made, exposure = (np.empty(count, np.float32) for _ in range(3))
-    kind, end = np.empty(count, np.int32), 0
-
-    def keep(band: Band) -> None:
-        nonlocal end
-        some = slice(end, end := end + len(band.kind))
-        x[some], y[some], kind[some] = band.x_um, band.y_um, band.kind
-        resist[some], made[some], exposure[some] = band.resist_nm, band.made_nm, band.exposure
-
-    survey = _surveyed(scene, process, terms, height_um, keep)
-    drawn = (kinds.size_um / nm).astype(np.float32)[kind]
-    judged = _judged(scene, process)[kind]
-    return Certificate(x, y, drawn, resist, made, exposure, kinds.layer.astype(np.uint16)[kind], judged, survey)
 
 
 def survey(
@@ -114,11 +28,15 @@ def survey(
     height_um: float = 0.0,
     keep: Callable[[Band, Array], None] | None = None,
 ) -> Survey:
-    """As :func:`certify`, of a file whose pillars stand exactly where ``plan`` has them, in bounded memory.
+    """Simulate the exposure of a mask that was read back, whose pillars stand exactly where ``plan`` has them.
 
     Args:
         content: read back; sums over its placements, that agree with the plan, are enough.
-        keep: is given each band of pillars with the (n,) layer numbers of its pillars.
+        doses: its dose table. height_um: of the pillars, for their feet.
+        keep: is given each band of pillars with the (n,) layer numbers of its pillars; memory is bounded.
+
+    Accuracy: backscatter to 1e-3 of itself (pixels of a quarter of its range), edges to 0.01 nm. Edges are sampled
+    away from corners, which round off.
 
     Raises:
         ProcessError: no double or triple Gaussian is given, no round pillar has a dose, or a class is not round.

@@ -14,7 +14,7 @@ import numpy as np
 from layout.certify import neighbours, outlines
 from layout.certify.background import Raster
 from layout.certify.gathered import Exposed
-from layout.certify.places import Places, strip_of
+from layout.certify.places import OnLattices, strip_of
 from layout.process import Process, compiled
 from metalens.ground.arrays import Array
 
@@ -42,7 +42,7 @@ class Wide:
     spots: tuple[Array, Array, Array]
     whole: Array | None = None
 
-    def between(self, places: Places, first: int, end: int) -> tuple[Raster, Array]:
+    def between(self, places: OnLattices, first: int, end: int) -> tuple[Raster, Array]:
         """Pixels with the exposure in some strips."""
         if self.whole is not None:
             return self.raster, self.whole

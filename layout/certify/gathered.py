@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.certify.places import Listed, OnLattices, Places
+from layout.certify.places import OnLattices
 from layout.files import NOTHING, MaskContent, flat
 from layout.mask import MaskPlan
 from layout.process import LayerNumber
@@ -43,31 +43,16 @@ class Exposed:
     """Everything that is exposed: kinds of round pillars and their places, other shapes, layers without a dose."""
 
     kinds: Kinds
-    places: Places
+    places: OnLattices
     others: Polygons
     undosed: tuple[LayerNumber, ...]
-
-
-def gathered(content: MaskContent, doses: Mapping[LayerNumber, float], fixed: Sequence[int]) -> Exposed:
-    """Everything below the top cells but the layer numbers ``fixed``.
-
-    Raises:
-        ProcessError: no round pillar has a dose.
-    """
-    found = _Found(content.unit_nm * nm, doses, fixed)
-    for stack in (s for top in content.tops for s in flat.stacks(content, top)):
-        found.take(stack)
-    if not found.x:
-        raise ProcessError("the mask holds no round pillar with a dose; nothing can be certified")
-    kind = np.repeat(np.arange(len(found.x), dtype=np.int32), [len(x) for x in found.x])
-    places = Listed.of(np.concatenate(found.x), np.concatenate(found.y), kind)
-    return Exposed(found.kinds, places, found.others, tuple(sorted(found.missing)))
 
 
 def on_lattices(
     content: MaskContent, plan: MaskPlan, doses: Mapping[LayerNumber, float], fixed: Sequence[int]
 ) -> Exposed:
-    """As :func:`gathered`, of a file whose lattices hold exactly the places of ``plan`` (their sums agree).
+    """Everything below the top cell but the layer numbers ``fixed``, of a file whose lattices hold exactly the places
+    of ``plan`` (their sums agree).
 
     Shapes, layers and figures come from the file, doses from the table; of the plan only the places are taken.
 

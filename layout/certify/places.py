@@ -1,9 +1,8 @@
-"""Where the round pillars stand, strip by strip from bottom to top: lists of places, or lattices in bands of rows."""
+"""Where the round pillars stand, strip by strip from bottom to top: lattices in bands of rows."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -13,87 +12,19 @@ from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top
-_STRIP = 1 << 17  # pillars of a strip of a list
 _SITES = 1 << 17  # of a strip of lattices
 _LEAST_ROWS = 8
-_MOST_STRIPS = 65_535
 
 
-class Places(Protocol):
-    """Pillars in strips of equal height: numbers 0 to ``strips`` - 1, each pillar in one of them."""
-
-    @property
-    def box_um(self) -> Box:
-        """Around all of them."""
-        ...
-
-    @property
-    def strips(self) -> int:
-        """Number of strips."""
-        ...
-
-    @property
-    def height_um(self) -> float:
-        """Height of a strip."""
-        ...
-
-    @property
-    def count(self) -> int:
-        """Number of pillars."""
-        ...
-
-    def part(self, first: int, end: int) -> tuple[Array, Array, Array]:
-        """(n,) x, y and kind of the pillars of some strips."""
-        ...
-
-
-def strip_of(places: Places, y_um: Array) -> Array:
+def strip_of(places: "OnLattices", y_um: Array) -> Array:
     """(n,) strips that hold some heights; those beyond the ends belong to the outer ones."""
     found = np.floor((np.asarray(y_um) - places.box_um[1]) / places.height_um).astype(np.int64)
     return np.asarray(np.clip(found, 0, places.strips - 1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Listed:
-    """Places in memory, sorted by strip: x_um, y_um, kind (n,); starts: (strips + 1,)."""
-
-    x_um: Array
-    y_um: Array
-    kind: Array
-    starts: Array
-    box_um: Box
-    height_um: float
-
-    @classmethod
-    def of(cls, x_um: Array, y_um: Array, kind: Array) -> "Listed":
-        """Places in any order."""
-        box = float(x_um.min()), float(y_um.min()), float(x_um.max()), float(y_um.max())
-        strips = min(_MOST_STRIPS, max(1, len(x_um) // _STRIP))
-        height = (box[3] - box[1]) / strips * (1 + 1e-12) or 1.0
-        strip = np.minimum((y_um - box[1]) / height, strips - 1).astype(np.uint16)
-        order = np.argsort(strip, kind="stable")
-        starts = np.searchsorted(strip[order], np.arange(strips + 1))
-        return cls(x_um[order], y_um[order], kind[order], starts, box, height)
-
-    @property
-    def strips(self) -> int:
-        """Number of strips."""
-        return len(self.starts) - 1
-
-    @property
-    def count(self) -> int:
-        """Number of pillars."""
-        return len(self.x_um)
-
-    def part(self, first: int, end: int) -> tuple[Array, Array, Array]:
-        """(n,) x, y and kind of the pillars of some strips."""
-        some = slice(int(self.starts[max(first, 0)]), int(self.starts[min(end, self.strips)]))
-        return self.x_um[some], self.y_um[some], self.kind[some]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class OnLattices:
-    """Places on lattices of a plan, never all in memory.
+    """Places on lattices of a plan, never all in memory; each pillar in one of the strips 0 to ``strips`` - 1.
 
     kinds: (classes + 1,) kind of each class number, -1 for those that are passed over. centre_um: (kinds, 2) of the
     shape, from its site. height: of a strip, in database units.

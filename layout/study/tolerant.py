@@ -25,7 +25,7 @@ class TolerantChoice:
 
     lens: with the chosen diameters. moved: share of the pillars that changed.
     before, after: rms over the pillars of |d ln t / dD - common|, per nm.
-    phase_error_before_rad, phase_error_rad: rms distance from the wanted phase.
+    phase_error_rad: rms distance from the phase of the former pillars.
     transmission_before, transmission: mean |T|.
     """
 
@@ -33,7 +33,6 @@ class TolerantChoice:
     moved: float
     before: float
     after: float
-    phase_error_before_rad: float
     phase_error_rad: float
     transmission_before: float
     transmission: float
@@ -43,14 +42,12 @@ def choose(
     lens: Lens,
     process: Process,
     *,
-    wanted_rad: Array | None = None,
     tolerance_rad: float = 0.1,
     loss: float = 0.05,
 ) -> TolerantChoice:
     """Choose each pillar anew among the printable diameters within ``tolerance_rad`` of its phase.
 
     Args:
-        wanted_rad: (y, x) phase that is wanted; left out: the phase of the present pillars.
         loss: how much |T| may fall below that of the present pillars of the phase.
 
     Raises:
@@ -59,7 +56,7 @@ def choose(
     if not 0 < tolerance_rad < np.pi:
         raise ProcessError(f"tolerance_rad = {tolerance_rad}: need a phase between 0 and pi")
     present = lens.diameters.diameter_um > 0
-    wanted = lens.phase_rad() if wanted_rad is None else wanted_rad
+    wanted = lens.phase_rad()
     bins = (np.remainder(wanted, 2 * np.pi) * (_BINS / (2 * np.pi))).astype(np.int32) % _BINS
     weight = np.bincount(bins[present], minlength=_BINS)
     stock = _stock(lens, process)
@@ -69,7 +66,7 @@ def choose(
     made = replace(lens, diameters=DiameterMap(chosen, lens.diameters.pitch_um))
     old, new = _statistics(lens, wanted, present), _statistics(made, wanted, present)
     moved = float((abs(chosen - lens.diameters.diameter_um) > 1e-6)[present].mean())
-    return TolerantChoice(made, moved, old[0], new[0], old[1], new[1], old[2], new[2])
+    return TolerantChoice(made, moved, old[0], new[0], new[1], old[2], new[2])
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,10 +13,8 @@ if TYPE_CHECKING:
     from metalens.design.focusing import meeting_um as meeting_um
     from metalens.design.of_phase import Limits as Limits
     from metalens.design.of_phase import Quality as Quality
-    from metalens.design.of_phase import field_angle as field_angle
     from metalens.design.of_phase import make as make
     from metalens.design.of_phase import phase_of as phase_of
-    from metalens.design.of_phase import printable as printable
     from metalens.design.own_cell import Unlike as Unlike
     from metalens.design.own_cell import left_out as left_out
     from metalens.design.own_cell import rough_unlike as rough_unlike
@@ -48,7 +46,6 @@ __getattr__, __dir__, __all__ = attach(
         "Split": "paired",
         "Unlike": "own_cell",
         "check_focus": "focus_check",
-        "field_angle": "of_phase",
         "focuses": "focusing",
         "meeting_um": "focusing",
         "hyperbolic": "profiles",
@@ -58,7 +55,6 @@ __getattr__, __dir__, __all__ = attach(
         "make_turned": "turned",
         "neighbours": "",
         "phase_of": "of_phase",
-        "printable": "of_phase",
         "profiles": "",
         "rough_unlike": "own_cell",
         "rows": "own_cell",

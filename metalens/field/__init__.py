@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
     from metalens.lens import Layers as Layers
-    from metalens.lens import Media as Media
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -32,7 +31,6 @@ __getattr__, __dir__, __all__ = attach(
         "Grid": "plan",
         "Imager": "forming",
         "Layers": "metalens.lens",
-        "Media": "metalens.lens",
         "Optics": "points",
         "PillarWave": "waves",
         "Plan": "plan",

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
-    from metalens.pillars.axes.between import Surface as Surface
     from metalens.pillars.axes.between import surface as surface
     from metalens.pillars.axes.plots import figure as figure
     from metalens.pillars.axes.record import KIND as KIND
@@ -21,7 +20,6 @@ __getattr__, __dir__, __all__ = attach(
     {
         "AxesLibrary": "record",
         "KIND": "record",
-        "Surface": "between",
         "check": "record",
         "figure": "plots",
         "load": "record",

@@ -13,16 +13,16 @@ from metalens.pillars.axes.record import AxesLibrary
 NM = 1e3
 
 
-def figure(path: Path, library: AxesLibrary, place: int = 0) -> None:
-    """PNG of one wavelength; pairs of sizes above the tolerance are blank."""
+def figure(path: Path, library: AxesLibrary) -> None:
+    """PNG of the first wavelength; pairs of sizes above the tolerance are blank."""
     canvas, panels = report.canvas(2, 3, size=(11, 6.6))
-    t, usable = library.t[place], library.usable[place]
+    t, usable = library.t[0], library.usable[0]
     for row, name in enumerate("xy"):
         own = np.where(usable, t[..., row, row], np.nan)
-        title = f"{name}-polarised, {NM * library.wavelength_um[place]:g} nm"
+        title = f"{name}-polarised, {NM * library.wavelength_um[0]:g} nm"
         _map(canvas, panels[row][0], library, np.angle(own) / (2 * np.pi) % 1, (title, "phase / turns"), "twilight")
         _map(canvas, panels[row][1], library, np.abs(own), (title, "|t|"), "viridis")
-    bar = np.log10(np.maximum(library.t_error[place], 1e-6))
+    bar = np.log10(np.maximum(library.t_error[0], 1e-6))
     _map(canvas, panels[0][2], library, bar, ("error bar", "log10 |t - exact|"), "magma")
     _held_out(panels[1][2], library)
     write_bytes(path, report.png(canvas))

@@ -14,13 +14,13 @@ import bench_lens as b
 
 from characterize.inference import arrange, causes, estimate, leastsquares, missing, verdict
 from characterize.inference.arrange import Arrangement
-from characterize.inference.ends import profile
 from characterize.inference.leastsquares import Data, Prior
 from characterize.inference.missing import Fitted, Lean
 from characterize.inference.posterior import Valley
 from characterize.inference.search import Task
 from characterize.model import ForwardModel, Setting, vector
 from metalens.ground.errors import FitRefused
+from tests.referees.one_profile import profile
 
 RNG = np.random.default_rng(71)
 SIGMA = 0.37  # of the noise in a pixel

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from characterize.inference import ends, explore, posterior, search, verdict
-from characterize.inference.ends import profile
 from characterize.inference.leastsquares import Data, Prior, Settings, fit
 from characterize.inference.posterior import REACH, Valley
 from characterize.model import PARAMETERS, PLACE, Known
+from tests.referees.one_profile import profile
 
 RNG = np.random.default_rng(21)
 SHAPES = np.array([[[[0.43, -0.17, 0.28]]], [[[0.05, 0.4, -0.17]]]])  # (parameter, frame, y, x)

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from characterize.inference.ends import profile
 from characterize.inference.knowable import density
 from characterize.inference.leastsquares import Data, Prior
 from characterize.inference.posterior import REACH, Valley, draws, shares
+from tests.referees.one_profile import profile
 
 NOISE = 0.7
 SHAPES = np.random.default_rng(0).standard_normal((2, 3, 11, 13))

@@ -10,10 +10,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference import ends, leastsquares, posterior, search, walk
+from characterize.inference import leastsquares, posterior, search, walk
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Settings
 from characterize.model import NAMES, PLACE, Known, vector
+from tests.referees.one_profile import profile
 
 DEPTHS = (560.0, 600.0, 640.0)
 FREE = ("bias_nm", "height_nm", "stage_zero_um", "stage_scale", "spherical_rad", "log_gain", "background_e")
@@ -45,10 +46,10 @@ def test_ends_with_slopes_of_other_ends_are_those_with_slopes_of_their_own(about
     task, _ = about
     quick, i = valley(about), task.names.index(name)
     for other in ("height_nm", "bias_nm"):  # ends that it may take slopes over from
-        ends.profile(quick, task.names.index(other))
-    shared, _ = ends.profile(quick, i)
+        profile(quick, task.names.index(other))
+    shared, _ = profile(quick, i)
     monkeypatch.setattr(posterior, "_HOLDS", 0.0)
-    alone, _ = ends.profile(valley(about), i)
+    alone, _ = profile(valley(about), i)
     assert alone.high - alone.low > 3 * float(quick.sigma[i])
     assert (shared.low, shared.high) == pytest.approx((alone.low, alone.high), abs=0.04 * float(quick.sigma[i]))
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from layout.certify.background import Raster
-from layout.certify.places import Listed, OnLattices, strip_of
+from layout.certify.places import OnLattices, strip_of
 from layout.mask import Lattice
+from tests.referees.listed_certificate import Listed
 
 
 def disc_of_pillars(pitch=0.41, n=90):
@@ -59,7 +60,7 @@ def test_lattices_and_lists_hold_the_same_pillars_each_in_one_strip():
     lattices = OnLattices.of(parts, kinds, centre, unit_nm=1.0, count=0)
     x, y, kind = lattices.part(0, lattices.strips)
     assert len(x) == sum(np.isin(l.array, [1, 3]).sum() for l in parts)
-    listed = Listed.of(x, y, kind)
+    listed = Listed(x, y, kind)
     for places in (lattices, listed):
         strips = [places.part(k, k + 1) for k in range(places.strips)]
         assert sum(len(p[0]) for p in strips) == len(x)

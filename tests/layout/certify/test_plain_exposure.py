@@ -5,12 +5,12 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.certify import certify
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
+from tests.referees.listed_certificate import certify
 
 pytest.importorskip("klayout.db")
 
@@ -76,7 +76,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     doses.write(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     resist = plain_exposure.Resist(drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])])
-    found = certify(layout.read_gdsii(tmp_path / "m.gds"), doses.read(tmp_path / "doses.csv"), process).edges
+    found = certify(layout.read_gdsii(tmp_path / "m.gds"), doses.read(tmp_path / "doses.csv"), process).survey.edges
     assert set(found.layer.tolist()) == {process.layers.marks[0], process.layers.labels[0]}
     assert np.abs(found.exposure - 1).max() < 0.01
     assert 2 * np.abs(found.shift_nm).max() < 1
