@@ -1,6 +1,5 @@
 """Who asks for no tolerance gets 1e-3, as the pages say: the same bits as asked for, and less error than with 1."""
 
-import numpy as np
 import pytest
 
 from metalens import modal, rcwa
@@ -20,8 +19,3 @@ def test_one_pillar(engine):
 def test_many_pillars():
     asked = rcwa.solve_many(CELL, [0.12, 0.19], 0.83, **LIGHT, tolerance=1e-3)
     assert rcwa.solve_many(CELL, [0.12, 0.19], 0.83, **LIGHT) == asked
-    table = modal.solve_many(CELL, [0.12, 0.19], [0.83], angles_rad=[0.11])
-    same = modal.solve_many(CELL, [0.12, 0.19], [0.83], angles_rad=[0.11], tolerance=1e-3)
-    rough = modal.solve_many(CELL, [0.12, 0.19], [0.83], angles_rad=[0.11], tolerance=1.0)
-    assert (table.t == same.t).all()
-    assert np.abs(table.t - rough.t).max() > 0
