@@ -40,7 +40,7 @@ class Rendered:
 def rendered(test: People) -> Rendered:
     """All frames of the people."""
     out = []
-    for step in range(PEOPLE * EACH // BATCH):
+    for step in range(len(test.states) // BATCH):
         batch = test.batch(step, BATCH)
         one = flattened(batch.frames, torch.ones(BATCH))  # type: ignore[arg-type]
         out.append(Batch(one, batch.mask, batch.slip_mm))

@@ -9,27 +9,34 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
+from torch import nn
 
 from benchmarks import kept_lines
 from benchmarks.design_guide import (
+    BOUNDS,
     CHOICE,
     DESIGNERS,
     DESIGNS,
     DEVICE,
-    FIELDS,
     FOCI,
     KNOBS,
+    LADDER,
+    NETWORK_FRAMES,
+    RESULT,
     TRAINED,
     TRAINING,
-    cell_of,
     compared,
     done,
     plan,
+    watched,
 )
+from benchmarks.design_guide_cells import FIELDS, cell_of
+from benchmarks.design_guide_network import EACH, PEOPLE
+from codesign.evaluate.reader import ReferenceReader
+from codesign.network import blur
 from metalens.ground import store
 
-ROOT = Path(__file__).parents[1]
-RESULT, PAGE = ROOT / "benchmarks" / "results" / "design_guide.json", ROOT / "docs" / "codesign" / "guide.md"
+PAGE = Path(__file__).parents[1] / "docs" / "codesign" / "guide.md"
 MEASURES = ("axial_mm", "lateral_mm", "window_mm", "trusted_mm")
 NETWORKS = {"codesign_study_p18blur": "25 600 frames", "codesign_study_p18blurlong": "76 800 frames"}
 
@@ -103,19 +110,29 @@ def row_of(runs: dict[str, dict[int, dict[str, Any]]], name: str, base: str) -> 
     return row
 
 
-def device_rows(lines: dict[str, dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """{field and light: a row a role}; ratios to the best focus, of the trained lens to the best designer's too."""
-    runs, found = by_cell(lines), {}
-    for device in DEVICE:
-        roles = {role: cell for role, cell in compared(lines, device).items() if cell in runs}
-        if "focus" not in roles:
-            continue
-        rows = [{"role": role} | row_of(runs, cell, roles["focus"]) for role, cell in roles.items()]
-        if {"trained", "designer"} <= set(roles):
-            mine, other = (measured(runs[roles[r]], "axial_mm") for r in ("trained", "designer"))
-            rows[-1]["to_designer"] = ratio(mine, other)
-        found[device] = rows
-    return found
+def role_rows(runs: dict[str, dict[int, dict[str, Any]]], roles: dict[str, str]) -> list[dict[str, Any]]:
+    """A row a role that has runs; ratios to the best focus, of the trained lens to the best designer's too."""
+    roles = {role: cell for role, cell in roles.items() if cell in runs}
+    if "focus" not in roles:
+        return []
+    rows = [{"role": role} | row_of(runs, cell, roles["focus"]) for role, cell in roles.items()]
+    if {"trained", "designer"} <= set(roles):
+        mine, other = (measured(runs[roles[r]], "axial_mm") for r in ("trained", "designer"))
+        rows[-1]["to_designer"] = ratio(mine, other)
+    return rows
+
+
+def device_rows(lines: dict[str, dict[str, Any]], devices: tuple[str, ...] = DEVICE) -> dict[str, list[dict[str, Any]]]:
+    """{field and light: rows of its roles}, of those that have runs."""
+    runs = by_cell(lines)
+    found = {device: role_rows(runs, compared(lines, device)) for device in devices}
+    return {device: rows for device, rows in found.items() if rows}
+
+
+def reference_macs(pixels: int) -> int:
+    """Multiply-accumulates of the reference reader for a frame: its branch and the layers to the slippage."""
+    layers = [part.weight.numel() for part in ReferenceReader().slip if isinstance(part, nn.Linear)]
+    return blur.macs(pixels) + sum(layers)
 
 
 def network_rows() -> list[dict[str, Any]]:
@@ -138,7 +155,8 @@ about the axis; one wavelength; pixels of 18 µm; 2000 e from white in 9 µm; {f
 and weights come from the seed. Brackets are 95 % intervals over the seeds (Student's), of ratios those of the
 logarithms paired by seed: they hold what differs from seed to seed and nothing else. `trusted`: the half of the windows
 of which the reader is surest. Images hold to 0.05 of a texture's contrast; where the spectrum's own share is below that
-one wavelength stands for it (10 nm: 0.006, 30 nm: up to 0.017 of the contrast). Gaze is not measured here.
+one wavelength stands for it (10 nm: 0.006, 30 nm: up to 0.017 of the contrast). Gaze is
+that of the elastic network, further down.
 
 Made by `python -m benchmarks.design_guide run --work DIR`, and `report`; `--only CELL/SEED` reruns one. All numbers,
 and the coefficients of the trained lenses, are in `benchmarks/results/design_guide.json`.
@@ -152,12 +170,31 @@ family was chosen by axial error with a seed of its own, for that field and ligh
 {foci} mm. `designer`: r² alone (blur of all angles alike) or, in the oblique field, free of aberrations at its
 middle, in focus at {designers} mm. `trained`: 63 free-form terms moved from the best focus along the exact gradient of
 the likelihood of the windows' depths ({turns} steps of the lens, {hold} of the reader's branch to each, 32 frames a
-step), trained once, on an image to {coarse:g} of the contrast, and read by every seed.
+step), trained once, on an image to {coarse:g} of the contrast, and read by every seed. `asphere`: six radial terms,
+likewise. `bound`: what the blur of one window alone can tell, the least standard deviation of its depth, mean over the
+windows of the field and the depths, for a patch of unknown 1/f texture of contrast 0.2, its contrast and fall unknown
+too, in the photons' noise, where depths spread by 3 mm beforehand. Readers see edges and neighbouring windows as well,
+and may do better.
+"""
+RUNGS = """\
+## Where the gain is lost
+
+Scenes, pixels and light of the oblique field at 30 nm; PSFs held over the field. `angle`: every window through the PSFs
+of the middle, 17°. `line`: PSFs that vary along x as in the oblique field, and along y not at all. `oblique`: the true
+image. Every rung has its own best focus, designer's lens and trained lens, chosen and trained as above.
+"""
+NETWORK = """\
+## Another reader
+
+The elastic network of the co-design study, trained anew behind each of the lenses of the oblique field at 30 nm that
+stand, on the same true image: {frames} frames, each seen once, the same for all lenses of a seed; judged on the
+test frames of the reference reader ({macs:.2f} MMACs), and by gaze: {people} people, a personal calibration on a fifth
+of {each} frames each.
 """
 
 
-def page(lines: dict[str, dict[str, Any]]) -> str:
-    """Markdown of all tables, and what of the plan was not measured."""
+def page(lines: dict[str, dict[str, Any]], bounds: dict[str, float] | None = None) -> str:
+    """Markdown of all tables, and what of the plan was not measured; ``bounds`` by cell."""
     runs, devices = by_cell(lines), device_rows(lines)
     parts = [HEAD.format(frames=cell_of("base").frames), "", *knob_table(knob_rows(runs))]
     foci, designers = (
@@ -166,8 +203,9 @@ def page(lines: dict[str, dict[str, Any]]) -> str:
     told = {"coarse": TRAINED, "turns": TRAINING.turns, "hold": TRAINING.hold, "foci": foci, "designers": designers}
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():
-        parts += device_table(device, rows, lines)
-    parts += ["## Another reader", "", *network_table(network_rows()), ""]
+        parts += device_table(device, rows, lines, bounds or {})
+    parts += [RUNGS, *ladder_table(device_rows(lines, LADDER), bounds or {}), ""]
+    parts += [*watched_table(role_rows(runs, watched(lines)), runs), "", *network_table(network_rows()), ""]
     absent = missing(lines)
     if absent:
         parts += [
@@ -200,17 +238,20 @@ def knob_table(rows: list[dict[str, Any]]) -> list[str]:
     return out
 
 
-def device_table(device: str, rows: list[dict[str, Any]], lines: dict[str, dict[str, Any]]) -> list[str]:
+def device_table(
+    device: str, rows: list[dict[str, Any]], lines: dict[str, dict[str, Any]], bounds: dict[str, float]
+) -> list[str]:
     """A row a role, and the runs that chose below."""
     cell = cell_of(device)
     out = [f"### {cell.field}, {cell.fwhm:g} nm", "",
-           "| lens | seeds | axial / mm | to best focus | windows / mm | to best focus | trusted / mm | lateral / mm |",
-           "|---" * 8 + "|"]  # fmt: skip
+           "| lens | seeds | axial / mm | to best focus | windows / mm | to best focus | trusted / mm | lateral / mm "
+           "| bound / mm |", "|---" * 9 + "|"]  # fmt: skip
     for row in rows:
         ratios = [str(row.get(f"{m}_ratio", 1)) for m in ("axial_mm", "window_mm")]
         name = f"{row['role']}: `{cell_of(row['cell']).lens}`"
         both = f"{row['axial_mm']} | {ratios[0]} | {row['window_mm']} | {ratios[1]}"
-        out.append(f"| {name} | {row['axial_mm'].seeds} | {both} | {row['trusted_mm']} | {row['lateral_mm']} |")
+        out.append(f"| {name} | {row['axial_mm'].seeds} | {both} | {row['trusted_mm']} | {row['lateral_mm']} | "
+                   f"{_told(bounds.get(row['cell']))} |")  # fmt: skip
     for row in rows:
         if "to_designer" in row:
             out += ["", f"Trained to the best designer's lens, axial: {row['to_designer']}."]
@@ -219,6 +260,55 @@ def device_table(device: str, rows: list[dict[str, Any]], lines: dict[str, dict[
     }
     told = (f"`{cell_of(n[:-2]).lens}` {v['axial_mm']:.2f} ({v['window_mm']:.2f})" for n, v in scan.items())
     return [*out, "", "Axial error and that of the windows in the runs that chose, mm: " + ", ".join(told) + ".", ""]
+
+
+def _told(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def ladder_table(rungs: dict[str, list[dict[str, Any]]], bounds: dict[str, float]) -> list[str]:
+    """A row a rung: its lenses, and the trained one against the others."""
+    head = ("field", "best focus", "designer", "best focus, axial / mm", "designer to it", "trained to it",
+            "trained to designer", "windows, trained to focus", "trusted, likewise", "bound, likewise")  # fmt: skip
+    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for device, rows in rungs.items():
+        of = {row["role"]: row for row in rows}
+        if not {"focus", "designer", "trained"} <= set(of):
+            continue
+        focus, designer, trained = (of[role] for role in ("focus", "designer", "trained"))
+        ends = (bounds.get(row["cell"]) for row in (trained, focus))
+        least = [end for end in ends if end is not None]
+        told = [f"`{cell_of(device).field}`", *(f"`{cell_of(row['cell']).lens}`" for row in (focus, designer))]
+        told += [focus["axial_mm"], designer["axial_mm_ratio"], trained["axial_mm_ratio"], trained["to_designer"]]
+        told += [trained["window_mm_ratio"], trained["trusted_mm_ratio"]]
+        told += [_told(least[0] / least[1] if len(least) == 2 else None)]
+        out.append("| " + " | ".join(map(str, told)) + " |")
+    return out
+
+
+def watched_table(rows: list[dict[str, Any]], runs: dict[str, dict[int, dict[str, Any]]]) -> list[str]:
+    """The network's rows in the oblique field, gaze with its interval."""
+    told = {"frames": f"{NETWORK_FRAMES:,}".replace(",", " "), "people": PEOPLE, "each": EACH}
+    out = [NETWORK.format(macs=reference_macs(cell_of("base").config.pixels) / 1e6, **told)]
+    head = ("lens", "MMACs", "seeds", "axial / mm", "to best focus", "windows / mm", "to best focus", "lateral / mm",
+            "pupil IoU", "gaze / °", "to best focus")  # fmt: skip
+    out += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for row in rows:
+        mine, base = (measured(runs[r["cell"]], "gaze_deg") for r in (row, rows[0]))
+        macs, iou = (np.mean(list(measured(runs[row["cell"]], n).values())) for n in ("mmacs", "iou"))
+        parts = [f"{row['role']}: `{cell_of(row['cell']).lens}`", f"{macs:.2f}", row["axial_mm"].seeds]
+        parts += [row["axial_mm"], row.get("axial_mm_ratio", 1), row["window_mm"], row.get("window_mm_ratio", 1)]
+        parts += [
+            row["lateral_mm"],
+            f"{iou:.2f}",
+            interval(list(mine.values())),
+            1 if row is rows[0] else ratio(mine, base),
+        ]
+        out.append("| " + " | ".join(map(str, parts)) + " |")
+    for row in rows:
+        if "to_designer" in row:
+            out += ["", f"Trained to the best designer's lens, axial, by the network: {row['to_designer']}."]
+    return out
 
 
 def network_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -240,6 +330,7 @@ def missing(lines: dict[str, dict[str, Any]]) -> list[str]:
 def write(work: Path) -> None:
     """JSON and page of the lines there are."""
     lines = done(work)
-    kept = {"runs": list(lines.values()), "designs": kept_lines(work / DESIGNS)}
+    bounds = kept_lines(work / BOUNDS)
+    kept = {"runs": list(lines.values()), "designs": kept_lines(work / DESIGNS), "bounds": bounds}
     store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
-    store.write_text(PAGE, page(lines))
+    store.write_text(PAGE, page(lines, {line["cell"]: line["bound_mm"] for line in bounds}))

@@ -10,6 +10,7 @@ The branch is thrown away: what the lens is worth says a reader that begins anew
 """
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +23,7 @@ from codesign.optics import OpticsConfig, formed
 from codesign.train import Schedule, read_out
 from metalens.field import term
 from metalens.ground.errors import ConfigError, TrainingError
-from metalens.image import Imager
+from metalens.image import Imager, UniformImager
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +49,29 @@ class LensTraining:
             )
 
 
+class Forms(Protocol):
+    """What images frames of ``frame`` samples, margin included, through a lens of these coefficients."""
+
+    def __call__(
+        self, settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
+    ) -> UniformImager | Imager: ...
+
+
 def trained(
-    optics: OpticsConfig, start_rad: Tensor, scenes: Scenes, config: ReaderConfig, training: LensTraining
+    optics: OpticsConfig,
+    start_rad: Tensor,
+    scenes: Scenes,
+    config: ReaderConfig,
+    training: LensTraining,
+    *,
+    forms: Forms = formed.imager,
 ) -> tuple[Tensor, list[float]]:
     """Coefficients of the lens at the end, (polynomials,) in rad, and the mean loss of every turn; the same every time.
 
     Args:
         optics: whose ``sample_um`` is the reader's pitch. start_rad: (polynomials,) coefficients to start from.
         scenes: to learn from, with the reader's margin.
+        forms: the image, by default the true one of the settings.
 
     Raises:
         ConfigError: another pitch, an image that is not the true one, or no coefficients to train.
@@ -69,13 +85,18 @@ def trained(
     state = torch.get_rng_state()
     torch.manual_seed(training.seed)
     try:
-        return _descended(optics, start_rad, scenes, config, training)
+        return _descended(optics, start_rad, scenes, config, training, forms)
     finally:
         torch.set_rng_state(state)
 
 
 def _descended(
-    optics: OpticsConfig, start_rad: Tensor, scenes: Scenes, config: ReaderConfig, training: LensTraining
+    optics: OpticsConfig,
+    start_rad: Tensor,
+    scenes: Scenes,
+    config: ReaderConfig,
+    training: LensTraining,
+    forms: Forms,
 ) -> tuple[Tensor, list[float]]:
     branch = BlurBranch(nn.BatchNorm2d(blur.FEATURES)).train()
     place = nn.Parameter(start_rad.detach().double().clone())
@@ -84,7 +105,7 @@ def _descended(
     frame, told = samples(scenes.batch(0, 1).frames), []
     for turn in range(training.turns):
         rate = training.phase.at(turn / training.turns)
-        whole = formed.imager(optics, place.detach(), frame, margin=scenes.margin)
+        whole = forms(optics, place.detach(), frame, margin=scenes.margin)
         if not isinstance(whole, Imager):
             raise TypeError("the true image needs a field of PSFs")
         mean, gathered = 0.0, torch.zeros_like(whole.stack)

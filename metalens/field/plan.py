@@ -68,6 +68,11 @@ class Grid:
         """(y, x) samples on which sources may lie: image, margin and spare."""
         return self.samples[0] + 2 * (self.margin + self.spare), self.samples[1] + 2 * (self.margin + self.spare)
 
+    @property
+    def half_um(self) -> list[float]:
+        """[y, x] from the middle of the frame to its last sample: how far the field reaches."""
+        return [(n - 1) / 2 * self.step_um for n in self.frame]
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
@@ -109,7 +114,7 @@ def planned(
     if not 0 < tolerance < 1:
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
     window = Window(grid.window, grid.step_um)
-    half = [(n - 1) / 2 * grid.step_um for n in grid.frame]
+    half = grid.half_um
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
     coarse = _coarse(source, 2) if isinstance(source, Source) else waves
     ends = depth_nodes(grid, 3)

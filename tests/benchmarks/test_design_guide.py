@@ -1,5 +1,6 @@
 """The design guide: names of cells, lenses of known phase, ratios of hand-made lines, one tiny run that resumes."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -7,8 +8,12 @@ import pytest
 import torch
 
 from benchmarks import design_guide as guide
+from benchmarks import design_guide_bound as bound
+from benchmarks import design_guide_network as network
 from benchmarks import design_guide_report as told
 from benchmarks import keep_line, kept_lines
+from benchmarks.design_guide_cells import FIELDS, Cell, cell_of, run_of
+from benchmarks.design_guide_image import forms
 from codesign.evaluate.reader import ReaderConfig
 from codesign.evaluate.reader_lens import LensTraining
 from codesign.optics.stack import added_phase
@@ -24,10 +29,10 @@ def test_every_name_of_the_plan_is_that_of_its_cell():
     names = guide.plan({})
     assert len(names) == len(set(names)) > 60
     for name in names:
-        cell, seed = guide.run_of(name)
+        cell, seed = run_of(name)
         assert f"{cell.name}/{seed}" == name
-    assert guide.cell_of("fwhm=30,field=ring") == guide.Cell(field="ring", fwhm=30.0)
-    assert guide.cell_of("fwhm=30,field=ring").name == "field=ring,fwhm=30"
+    assert cell_of("fwhm=30,field=ring") == Cell(field="ring", fwhm=30.0)
+    assert cell_of("fwhm=30,field=ring").name == "field=ring,fwhm=30"
 
 
 @pytest.mark.parametrize(
@@ -40,6 +45,8 @@ def test_every_name_of_the_plan_is_that_of_its_cell():
         ("lens=fresnel40/1", "and a lens: focusF"),
         ("lens=free-helix2/1", "and a lens: focusF"),
         ("lens=radial-oblique40/1", "radial- of the first two"),
+        ("reader=oracle/1", "one of reference, network"),
+        ("field=line,reader=network/0", "a field that is not held"),
         ("base", "need CELL/SEED"),
         ("base/-1", "need CELL/SEED"),
     ],
@@ -52,7 +59,7 @@ def test_bad_names_are_refused_before_any_run(tmp_path, name, message):
 
 def test_a_quadratic_lens_has_the_phase_of_a_parabola():
     """Its coefficients and the hyperbolic focus add up to -k r² (1/d + 1/s) / 2, a constant left free."""
-    settings = guide.optics_of(cell := guide.cell_of("lens=quadratic40"))
+    settings = guide.optics_of(cell := cell_of("lens=quadratic40"))
     added = added_phase(settings, guide.start_of(cell))
     x, y = (c.double() for c in coordinates(settings.pupil))
     r2, k = x**2 + y**2, 2 * math.pi / 0.85
@@ -86,9 +93,9 @@ def test_ratios_are_paired_by_seed():
         told.ratio({0: 1.0}, {1: 1.0})
 
 
-def _scanned():
+def _scanned(device=None):
     """Lines that choose: least of the foci is 70 mm, of the designers' lenses the oblique one of 150 mm."""
-    device, lines = guide.DEVICE[0], {}
+    device, lines = device or guide.DEVICE[0], {}
     for family in ("focus", "designer"):
         for k, cell in enumerate(guide.candidates(device, family)):
             best = "focus70" in cell or "oblique150" in cell
@@ -102,6 +109,7 @@ def test_what_is_chosen_is_least_in_the_runs_that_choose_and_then_planned():
     assert roles == {
         "focus": "lens=focus70,field=oblique,fwhm=30",
         "designer": "lens=oblique150,field=oblique,fwhm=30",
+        "asphere": "lens=radial-focus70,field=oblique,fwhm=30",
         "trained": "lens=free-focus70,field=oblique,fwhm=30",
     }
     assert {f"{cell}/4" for cell in roles.values()} <= set(guide.plan(lines))
@@ -130,7 +138,7 @@ def test_the_page_tells_ratios_to_best_focus_and_designer_and_what_is_missing():
 
 def test_a_run_trains_its_lens_once_and_goes_on_where_it_was(tmp_path, monkeypatch):
     tiny = ReaderConfig(frames=64, pool=32, test=32, pixels=32, pitch_um=36.0)
-    monkeypatch.setattr(guide.Cell, "reader", property(lambda cell: tiny))
+    monkeypatch.setattr(Cell, "config", property(lambda cell: tiny))
     monkeypatch.setattr(
         guide, "TRAINING", LensTraining(turns=1, hold=1, batch=4, phase=replace(guide.TRAINING.phase, start=0))
     )
@@ -151,3 +159,102 @@ def test_a_run_trains_its_lens_once_and_goes_on_where_it_was(tmp_path, monkeypat
     guide.run(other, names[1:])
     again, kept = kept_lines(other / guide.LINES)[0], kept_lines(tmp_path / guide.LINES)[1]
     assert {k: v for k, v in again.items() if k != "cpu_s"} == {k: v for k, v in kept.items() if k != "cpu_s"}
+
+
+def test_a_held_axis_of_the_field_has_the_psfs_of_its_middle():
+    """Along y the outermost rows see one PSF; along x they differ, as in the field that is not held."""
+    cell = cell_of("lens=focus30,field=line,pitch=31.5")
+    settings = replace(guide.optics_of(cell), image_tolerance=0.4, window_samples=9)
+    form = forms(FIELDS["line"].share)
+    held, whole = (f(settings, torch.zeros(0), 44, margin=4) for f in (form, forms((1.0, 1.0))))
+    apart = [float((one.stack[0, 0] - one.stack[-1, 0]).norm() / one.stack[0, 0].norm()) for one in (held, whole)]
+    assert apart[0] < 2e-3  # a thousandth of the field
+    assert apart[1] > 0.1
+    across = [float((one.stack[0, 0] - one.stack[0, -1]).norm() / one.stack[0, 0].norm()) for one in (held, whole)]
+    assert across[0] > 0.1
+    middle = 2000 * math.tan(math.radians(17.0))
+    reach = (held.plan.x_um[-1] - held.plan.x_um[0]) / 2
+    assert float(held.plan.x_um.mean()) == pytest.approx(middle, abs=60)  # nodes lie denser on one side
+    assert float(reach) == pytest.approx(31.5 * 43 / 2, rel=0.02)
+    assert held.plan.y_um.abs().max() < 1.0
+
+
+def test_a_bound_is_the_prior_without_information_and_the_blur_with_much():
+    """1 / √(J + 1/9): J = 0 gives 3 mm, 7/144 gives 12/√23 mm, much gives 1/√J."""
+    assert bound.spread_mm(torch.zeros(4)) == pytest.approx(3.0)
+    assert bound.spread_mm(torch.full((2, 3), 7 / 144)) == pytest.approx(12 / math.sqrt(23))
+    assert bound.spread_mm(torch.tensor([1e4, 4e4])) == pytest.approx(0.0075, rel=1e-3)
+
+
+def test_the_bound_is_taken_at_the_middles_of_the_readers_windows():
+    """56 pixels: windows of 14 that overlap by half; their middles lie 7 pixels apart about that of the field."""
+    cell = cell_of("field=oblique")
+    at = bound.centres_um(guide.optics_of(cell), cell.config, (0.5, 1.0)).reshape(7, 7, 2)
+    assert float(at[3, 3, 0]) == pytest.approx(2000 * math.tan(math.radians(17.0)))
+    assert (at[3, 4] - at[3, 3]).tolist() == pytest.approx([126.0, 0.0])
+    assert (at[6, 2] - at[3, 2]).tolist() == pytest.approx([0.0, 189.0])
+
+
+def test_the_bound_tells_a_lens_that_blurs_with_depth_from_one_that_hardly_does():
+    """A wide aperture moves its blur with depth more than a narrow one of a fifth: it tells more."""
+    cell = cell_of("lens=focus30,field=angle,pitch=31.5")
+    config, share = ReaderConfig(pixels=32, pitch_um=31.5), FIELDS["angle"].share
+    found = []
+    for aperture in (0.7, 0.14):
+        settings = replace(guide.optics_of(cell), aperture_mm=aperture, image_tolerance=0.4, window_samples=9)
+        whole = forms(share)(settings, torch.zeros(0), 40, margin=4)
+        found.append(bound.bound_mm(settings, torch.zeros(0), whole, config, share))
+    assert found[0] < 0.9 * found[1]
+    assert 0.99 * bound.PRIOR_MM < found[1] <= bound.PRIOR_MM  # of so narrow a lens no blur is seen
+
+
+@pytest.mark.slow
+def test_the_network_reads_the_frames_that_judge_the_reader(monkeypatch):
+    """The lens stands; errors are below those of answers from anywhere in the range."""
+    tiny = ReaderConfig(frames=32, pool=32, test=32, pixels=32, pitch_um=31.5, seed=3)
+    kept, gaze_deg = [], network.gaze_deg
+    monkeypatch.setattr(network, "PEOPLE", 2)
+    monkeypatch.setattr(network, "EACH", 16)
+    monkeypatch.setattr(network, "gaze_deg", lambda *given: kept.append(given[0]) or gaze_deg(*given))
+    cell = cell_of("lens=oblique30,field=oblique,pitch=31.5,reader=network")
+    settings, place = replace(guide.optics_of(cell), image_tolerance=0.4, window_samples=9), guide.start_of(cell)
+    judge = guide.scenery(tiny).judge
+    found = network.read(settings, place, judge, tiny)
+    truth = judge.batch(0, 32).slip_mm
+    assert 0 < found["axial_mm"] < 3 * float(truth[:, 2].abs().mean())
+    assert found["trusted_mm"] != found["window_mm"]
+    assert 0 < found["gaze_deg"] < 60
+    assert torch.equal(kept[0].model.coefficients_rad.detach(), place)
+
+
+def test_the_page_has_the_rungs_with_bounds_and_the_network():
+    lines = {}
+    for rung, share in zip(guide.LADDER, (0.6, 0.8, 1.1), strict=True):
+        lines |= _scanned(rung)[1]
+        roles = guide.compared(lines, rung)
+        for seed in range(2):
+            for role, part in (("focus", 1.0), ("designer", 0.8), ("trained", share)):
+                lines |= _line(f"{roles[role]}/{seed}", part * (1 + seed), window=part)
+    for seed in range(2):
+        for role, part in (("focus", 1.0), ("designer", 0.5), ("trained", 0.9)):
+            name = f"{guide.watched(lines)[role]}/{seed}"
+            lines |= {name: _line(name, part)[name] | {"gaze_deg": 2 * part, "mmacs": 3.3, "iou": 0.8}}
+    roles = guide.compared(lines, guide.LADDER[0])
+    page = told.page(lines, {roles["trained"]: 0.9, roles["focus"]: 1.2})
+    want = "| `angle` | `focus70` | `oblique150` | 1.50 [-4.85, 7.85] | 0.80 [0.80, 0.80] | 0.60 [0.60, 0.60] | 0.75 ["
+    assert want in page
+    assert page.split(want)[1].splitlines()[0].endswith("| 0.75 |")
+    assert "| trained: `free-focus70` | 3.30 | 2 | 0.90 [0.90, 0.90] | 0.90 [0.90, 0.90] |" in page
+    assert "by the network: 1.80 [1.80, 1.80]" in page
+    assert "| 1.80 [1.80, 1.80] | 0.90 [0.90, 0.90] |\n" in page
+
+
+def test_a_plan_goes_on_from_the_committed_results(tmp_path):
+    """All lines come over as they are; a folder that has lines keeps them."""
+    guide.begin(tmp_path)
+    kept = json.loads(guide.RESULT.read_text("utf-8"))
+    assert kept_lines(tmp_path / guide.LINES) == kept["runs"]
+    assert kept_lines(tmp_path / guide.DESIGNS) == kept["designs"]
+    with pytest.raises(SystemExit, match=r"already holds runs\.jsonl, designs\.jsonl"):
+        guide.begin(tmp_path)
+    assert kept_lines(tmp_path / guide.LINES) == kept["runs"]
