@@ -269,17 +269,21 @@ class Search:
         return Profile(low, high, value, rise, plain(low, high, middle, math.sqrt(self._level) * sigma))
 
     def _begins(self, i: int, sign: int) -> list[Begin]:
-        """Stops of the walk from where a parameter goes farthest, and modes, the farthest first."""
+        """Stops of the walk from where a parameter goes farthest, and modes, the farthest first.
+
+        Each as far as it may reach and still be called a parabola: what ends nearer than it says hides no other.
+        """
         out: list[Begin] = []
         for k, one in self._valleys.items():
             room = self._level - one.above
             if k <= _MODE and room > 0:
-                out.append((k, None, sign * float(one.mode[i]) + math.sqrt(room) * float(one.sigma[i])))
+                out.append((k, None, sign * float(one.mode[i]) + PARABOLIC[1] * math.sqrt(room) * float(one.sigma[i])))
         if self._by is not None:
             modes = [one.mode for k, one in self._valleys.items() if k <= _MODE]
             for k, x in self._by.outermost(i, sign, self._level):
-                if not any(np.array_equal(self._by.value[k], mode) for mode in modes):
-                    out.append((k, None, sign * float(x[i])))
+                here = self._by.value[k]
+                if not any(np.array_equal(here, mode) for mode in modes):
+                    out.append((k, None, sign * float(here[i] + PARABOLIC[1] * (x[i] - here[i]))))
         return sorted(out, key=lambda begin: -begin[2])
 
     def _farthest(self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]) -> list[tuple[int, End]]:

@@ -139,14 +139,21 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
 
 
 def reversals(task: Task, best: Solution) -> list[Array]:
-    """Starts with the sign of some biases turned round, all other parameters going along as the parabola says."""
+    """Starts with the sign of some biases turned round, all other parameters going along as the parabola says.
+
+    The whole field of the bias first, where it stands off 0 by its sigma: near focus images show products of its parts
+    nearly alone, which are the same for a field of the other sign. Then each gradient that does, and these together.
+    """
+    value, covariance = best.value, best.covariance
     places = [task.names.index(name) for name in _REVERSED if name in task.names]
-    sigma = np.sqrt(np.diag(best.covariance))
-    far = [i for i in places if abs(best.value[i]) > sigma[i]]
+    whole = [i for i, name in enumerate(task.names) if name == "bias_nm"] + places
+    off = float(value[whole] @ leastsquares.invert(covariance[np.ix_(whole, whole)]) @ value[whole]) if whole else 0.0
+    far = [i for i in places if abs(value[i]) > math.sqrt(covariance[i, i])]
+    turned = [whole if off > 1 else [], *([i] for i in far), far]
     out = []
-    for some in [*([i] for i in far), *([far] if len(far) > 1 else [])]:
-        block = np.linalg.solve(best.covariance[np.ix_(some, some)], -2 * best.value[some])
-        moved = best.value + best.covariance[:, some] @ block
+    for some in (list(one) for one in dict.fromkeys(map(tuple, turned)) if one):
+        block = np.linalg.solve(covariance[np.ix_(some, some)], -2 * value[some])
+        moved = value + covariance[:, some] @ block
         out.append(np.clip(moved, task.prior.low, task.prior.high))
     return out
 

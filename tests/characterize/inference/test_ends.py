@@ -174,14 +174,16 @@ def test_reversed_starts_turn_biases_beyond_their_sigma_and_take_the_rest_along(
     wide = np.full(4, 1e9)
     about = SimpleNamespace(names=names, prior=Prior(np.zeros(4), wide, -wide, wide))
     got = search.reversals(about, SimpleNamespace(value=value, covariance=covariance))
-    assert len(got) == 3  # each alone, and both
-    for start, some in zip(got, ([0], [2], [0, 2]), strict=True):
+    assert len(got) == 3  # all of the field, and each alone
+    for start, some in zip(got, ([0, 2], [0], [2]), strict=True):
         rest = [i for i in range(4) if i not in some]
         gain = covariance[np.ix_(rest, some)] @ np.linalg.inv(covariance[np.ix_(some, some)])
         assert start[some] == pytest.approx(-value[some])
         assert start[rest] == pytest.approx(value[rest] + gain @ (-2 * value[some]))
     value = np.array([0.9 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
-    assert len(search.reversals(about, SimpleNamespace(value=value, covariance=covariance))) == 1
+    both, one = search.reversals(about, SimpleNamespace(value=value, covariance=covariance))
+    assert both[[0, 2]] == pytest.approx(-value[[0, 2]])
+    assert one[2] == pytest.approx(-value[2])
 
 
 def test_chance_of_a_misfit_is_that_of_the_pixels_that_count():
@@ -213,7 +215,10 @@ def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
 
 
 def test_modes_that_are_stops_of_the_walk_too_begin_once_and_begins_count_by_a_tenth_of_a_sigma(monkeypatch):
-    """Of three stops one is the mode; a begin that reaches 0.09 sigma beyond the first one's end is not worth it."""
+    """Of three stops one is the mode; a begin that reaches 0.09 sigma beyond the first one's end is not worth it.
+
+    Each may go 1.18 times as far as its parabola says, as an interval may that is still called one.
+    """
     valley = SimpleNamespace(mode=np.array([1.0, 2.0]), sigma=np.array([0.5, 1.0]), above=0.0)
     found = object.__new__(ends.Search)
     found._valleys, found._level = {-1: valley}, 4.0
@@ -221,8 +226,10 @@ def test_modes_that_are_stops_of_the_walk_too_begin_once_and_begins_count_by_a_t
     found._by = SimpleNamespace(
         value=places, outermost=lambda i, sign, level: [(k, np.array([9.0, 2.0 + k])) for k in range(3)]
     )
-    assert found._begins(1, 1) == [(-1, None, 4.0), (2, None, 4.0), (0, None, 2.0)]
-    assert found._begins(1, -1) == [(-1, None, 0.0), (0, None, -2.0), (2, None, -4.0)]
+    for sign, reach in ((1, {-1: 2 + 1.18 * 2, 2: 2.5 + 1.18 * 1.5, 0: 2.0}), (-1, {-1: 0.36, 0: -2.0, 2: -4.27})):
+        begins = found._begins(1, sign)
+        assert [k for k, *_ in begins] == list(reach)
+        assert [far for *_, far in begins] == pytest.approx(list(reach.values()))
 
     def reached(valley, i, sign, goal, **others):
         tried.append(valley)
