@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from metalens.propagate.estimate import SAFETY as SAFETY
     from metalens.propagate.estimate import Sample as Sample
     from metalens.propagate.estimate import draw as draw
+    from metalens.propagate.estimate import pupil_error as pupil_error
     from metalens.propagate.estimate import relative_error as relative_error
     from metalens.propagate.estimate import scan as scan
     from metalens.propagate.estimate import square_error as square_error
@@ -73,6 +74,7 @@ __getattr__, __dir__, __all__ = attach(
         "paths": "",
         "plan": "window",
         "plan_wide": "window",
+        "pupil_error": "estimate",
         "relative_error": "estimate",
         "scan": "estimate",
         "square_error": "estimate",

@@ -58,9 +58,10 @@ class Budget:
 
     numerical: of the propagation, measured on the result. sampling: of the integration over the cells of the window.
     spectrum: of the quadrature over wavelengths. source: of a source of finite size, whose points are taken as alike.
-    polarisation: of one scalar in place of both polarisations. neighbours: of pillars taken as if each stood among its
-        like, or of the factor of solved rows where the lens holds them. angle: of pillars that answer as at normal
-        incidence. glass: of light that goes twice between two faces.
+    polarisation: of one scalar in place of both polarisations; of both, of rays whose fields are those on their way to
+        the window's middle. neighbours: of pillars taken as if each stood among its like, or of the factor of solved
+        rows where the lens holds them. angle: of pillars that answer as at normal incidence. glass: of light that goes
+        twice between two faces.
     outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
         show it, so it is in no total.
     """
@@ -138,7 +139,7 @@ def with_model(
     slanted = min(1.0, left_out.angle * math.sin(incidence_rad) ** 2)
     return replace(
         budget,
-        polarisation=scalar_error(aperture, uneven) if polarisation == "scalar" else 0.0,
+        polarisation=scalar_error(aperture, uneven) if polarisation == "scalar" else budget.polarisation,
         neighbours=_neighbours(aperture, left_out.neighbours, polarisation, _Seen(light, slanted, lit)),
         angle=0.0 if has_angles else slanted,
         glass=ghost,

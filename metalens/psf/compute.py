@@ -23,8 +23,10 @@ from metalens.propagate import (
     light_wide,
     light_windowed,
     mixed,
+    paths,
     plan,
     plan_wide,
+    pupil_error,
     relative_error,
 )
 from metalens.psf.vector import Mixing
@@ -52,7 +54,8 @@ class Result:
 
     power: sum of squares of the transmission over the pillars, wavelengths weighted. brightness: mean of the window at
         the darkest depth, against pillars of random phases. sampling: error of an integration over cells. source: of a
-        source of finite size taken as alike.
+        source of finite size taken as alike. rays: of both polarisations as rays to the window's middle have them, nan
+        of a scalar.
     """
 
     intensity: torch.Tensor
@@ -62,6 +65,7 @@ class Result:
     brightness: float = math.inf
     sampling: float = 0.0
     source: float = 0.0
+    rays: float = math.nan
 
     @property
     def whole(self) -> float:
@@ -112,7 +116,7 @@ def intensity(
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
-    return Result(result.intensity.to(phase.dtype), error, result.reason, result.power)
+    return Result(result.intensity.to(phase.dtype), error, result.reason, result.power, rays=result.rays)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -140,7 +144,7 @@ class Lit:
 
 def _exact(lit: Lit, reason: str) -> Result:
     total: Any = 0.0
-    power = 0.0
+    power, samples = 0.0, []
     for (phase, level), case, weight, pupils in lit.each():
         powers = (level.double() ** 2).sum((-1, -2)).tolist()
         power += weight * lit.power(case, powers, level)
@@ -150,7 +154,23 @@ def _exact(lit: Lit, reason: str) -> Result:
         for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-    return Result(torch.as_tensor(total).to(lit.phase.dtype), EXACT[lit.phase.dtype], reason, power)
+        samples.append(_of_pillars((phase, level), case, weight, pupils))
+    found = Result(torch.as_tensor(total).to(lit.phase.dtype), EXACT[lit.phase.dtype], reason, power)
+    return _from_middle(found, lit, [samples], [total])
+
+
+def _of_pillars(maps: tuple[torch.Tensor, torch.Tensor], case: Case, weight: float, pupils: Pupils) -> Sample:
+    """What a sum over all pillars took of a wavelength, to be judged."""
+    y, x = case.pillars_um
+    path = paths.from_source(case, x, y[:, None], case.tangents, paths.reference_depth(case))
+    turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
+    light = torch.polar(maps[1].double(), maps[0].double() + torch.as_tensor(turn)).numpy()
+    return Sample(case, weight, light, 0.0, 1, (y, x), pupils(y, x))
+
+
+def _from_middle(result: Result, lit: Lit, samples: list[list[Sample]], seen: list[Any]) -> Result:
+    """With what rays to the window's middle leave out of both polarisations."""
+    return result if lit.mixing is None else replace(result, rays=pupil_error(samples, seen, lit.mixing.pupils))
 
 
 def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Result:
@@ -183,6 +203,7 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
         given += weight * power
         total = total + torch.cat(rows, -2)
     result = _judged(total, samples, seen, (lit.cases, lit.weights, given), choice)
+    result = _from_middle(result, lit, samples, seen)
     return _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
 
 
@@ -213,8 +234,9 @@ def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Res
         light = light if weight == 1 else light * weight
         total = light if total is None else total + light
         power += weight * lit.power(case, powers, maps[1])
-    result = _judged(total, [samples], [total.detach().cpu().numpy()], (lit.cases, lit.weights, power), choice)
-    result = _few_seen(result, tolerance)
+    seen = [total.detach().cpu().numpy()]
+    result = _judged(total, [samples], seen, (lit.cases, lit.weights, power), choice)
+    result = _few_seen(_from_middle(result, lit, [samples], seen), tolerance)
     return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
 
 

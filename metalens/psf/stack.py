@@ -130,7 +130,7 @@ def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor) -> PsfStack:
     """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
     share = (stack.energy_um2.detach().cpu().double() / whole).min()
     outside = max(0.0, 1 - float(share))
-    budget = Budget(worst.error, sampling=worst.sampling, source=worst.source, outside=outside)
+    budget = Budget(worst.error, sampling=worst.sampling, source=worst.source, polarisation=worst.rays, outside=outside)
     return dataclasses.replace(stack, budget=budget)
 
 

@@ -5,8 +5,9 @@ the one sum over its pillars.
 
 A ray of direction a, polarised along e, leaves a pillar in direction b for the window: its field is turned with it,
 R e = e - (a + b)(b·e)/(1 + a·b), and |E|² cos θ is kept: E = t R e / √b_z (Richards and Wolf 1959, for the two
-polarisations of the source). The direction is that to the window's centre. Intensity is |Ex|² + |Ey|² + |Ez|², the mean
-of both polarisations.
+polarisations of the source). The direction is that to the window's centre; what other points of a wide window see of
+another is measured (:func:`metalens.propagate.pupil_error`). Intensity is |Ex|² + |Ey|² + |Ez|², the mean of both
+polarisations.
 
 What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), whatever the slope of the rays. With
 H = b x E of every ray it is a sum of squares with signs, like that of E:
