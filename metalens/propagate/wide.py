@@ -33,6 +33,7 @@ from metalens.propagate.paths import from_source, over_blocks, reference_depth, 
 from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 
 BAND_BYTES = 8e6  # of the depths that are mixed at once
+EVERY = 3  # point of the grid of the lens whose light says which depth fields are needed
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
 
@@ -40,6 +41,7 @@ CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 class WidePlan:
     """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x) depth fields on the grid of the
     lens, its phases included; coefficients: (depth, b); chirp, transfer: (Y, X) behind the first and second transform.
+    left: of the light of all depths that fewer fields may leave out, root mean square.
     """
 
     case: Case
@@ -49,6 +51,7 @@ class WidePlan:
     coefficients: torch.Tensor
     chirp: torch.Tensor
     transfer: torch.Tensor
+    left: float
 
     @property
     def nodes_um(self) -> tuple[Array, Array]:
@@ -90,7 +93,7 @@ def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.de
     table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind, device=device)
     for one, field in zip(table, fields, strict=True):
         one.copy_(torch.from_numpy(field * lens))
-    return WidePlan(case, found, pillars, table, given[0], given[1], given[2])
+    return WidePlan(case, found, pillars, table, given[0], given[1], given[2], tolerance)
 
 
 def _depth_fields(case: Case, found: tuple[Axis, Axis], tolerance: float) -> tuple[Iterator[Array], Array]:
@@ -182,22 +185,41 @@ def light_wide(
     found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
     gathered, total = torch.stack([g for g, _ in found]), None
     for sign, light in mixed(gathered, pupils, plan.nodes_um):
-        here = _mixed(fields_wide(light, plan), plan.coefficients)
+        mixture, coefficients = (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
+        here = _mixed(fields_wide(light, plan, mixture), coefficients)
         here = here if sign == 1 else sign * here
         total = here if total is None else total + here
     return torch.as_tensor(total), gathered.detach(), [power for _, power in found]
 
 
-def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
-    """(b, y, x) field of every depth field on the window from the light on the grid of the lens, up to a phase of each
-    sample that all share."""
+def _fewer(light: torch.Tensor, plan: WidePlan) -> tuple[torch.Tensor, torch.Tensor]:
+    """(fewer, b) mixtures of the depth fields and (depth, fewer) coefficients for this light on the grid of the lens:
+    a round lens leaves the corners of its square dark, where depths differ most.
+
+        F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L,    U: first eigenvectors of C G Cᴴ,    G_ij = Σ_x |L|² B_i B_j*
+    """
+    some = (plan.fields[:, ::EVERY, ::EVERY] * light[::EVERY, ::EVERY]).flatten(1).to(torch.complex128)
+    c = plan.coefficients.to(torch.complex128)
+    power, axes = torch.linalg.eigh(c @ (some @ some.mH) @ c.mH)
+    lost = torch.cumsum(power.clamp_min(0), 0)  # ascending
+    first = min(int((lost <= plan.left**2 * lost[-1]).sum()), len(lost) - 1)
+    kept = axes[:, first:]
+    return (kept.mH @ c).to(plan.coefficients), kept.to(plan.coefficients)
+
+
+def fields_wide(gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | None = None) -> torch.Tensor:
+    """(b, y, x) field of every depth field, or of every mixture (fewer, b) of them, on the window from the light on the
+    grid of the lens, up to a phase of each sample that all share."""
     y, x = plan.axes
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
     parts = []
-    out = None if gathered.requires_grad else gathered.new_empty((len(plan.fields), my, mx))
-    for start in range(0, len(plan.fields), step):
-        light = torch.fft.fft(plan.fields[start : start + step] * gathered, n=x.first)[..., : x.size]
+    fields = plan.fields if mixture is None else torch.tensordot(mixture, plan.fields, 1)
+    count = len(fields)
+    out = None if gathered.requires_grad else gathered.new_empty((count, my, mx))
+    for start in range(0, count, step):
+        some = slice(start, start + step)
+        light = torch.fft.fft(fields[some] * gathered, n=x.first)[..., : x.size]
         light = torch.fft.fft(light, n=y.first, dim=-2)[..., : y.size, :]
         light *= plan.chirp
         light = torch.fft.fft2(light)
@@ -207,7 +229,7 @@ def fields_wide(gathered: torch.Tensor, plan: WidePlan) -> torch.Tensor:
         if out is None:
             parts.append(seen)
         else:
-            out[start : start + step] = seen
+            out[some] = seen
     return torch.cat(parts) if out is None else out
 
 

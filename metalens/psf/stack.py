@@ -65,7 +65,7 @@ def psf_stack(
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
         polarisation: ``scalar``; or of both polarisations (:mod:`metalens.psf.vector`) the ``flux`` through the
             sensor's plane, which a pixel counts, or ``vector``: |Ex|² + |Ey|² + |Ez|². A 1 mm lens at 21 depths takes
-            1.7 and 3.4 times the processor time of the scalar.
+            2.8 and 4 times the processor time of the scalar.
         neighbours: solved rows of unlike pillars, whose factor goes onto the maps where the phase has that slope
             (:mod:`metalens.psf.among`): onto fields along and across it apart, their mean for the scalar; at every
             wavelength and angle as at those of the rows. Or, for both polarisations, what
