@@ -8,9 +8,21 @@ import torch
 from torch import Tensor
 
 from codesign.batches.batch import Batch
-from codesign.eye import POPULATION, Camera, Motion, Rendered, Rig, States, Trait, drawn, dressed, render
+from codesign.eye import (
+    POPULATION,
+    Camera,
+    Motion,
+    Rendered,
+    Rig,
+    States,
+    Trait,
+    drawn,
+    dressed,
+    pigmented,
+    render,
+    viewed,
+)
 from codesign.eye import population as eye
-from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames
 
@@ -19,8 +31,10 @@ TRAINING, VALIDATION, TEST, EXPERIMENT = 0, 1, 2, 9
 ALBEDOS = ("iris", "sclera", "skin", "pupil", "exposure")
 LOOKS = (
     *ALBEDOS, "iris_contrast", "veins", "pores", "lashes", "brow", "glint", "ambient", "fissure_upper_um",
-    "fissure_lower_um",
+    "fissure_lower_um", "pupil_radius_um",
 )  # fmt: skip
+LEAST = {"iris": 0.05, "pupil_radius_um": 700.0}  # 0 elsewhere: nobody could see the pupil of a black iris
+MOST = {name: 0.95 for name in ALBEDOS} | {"pupil_radius_um": 4300.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +47,9 @@ class SceneConfig:
     slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
     depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image tells it from slippage.
     variety: factor on how far looks spread about the population's mean: albedos and texture of iris, sclera and skin,
-        lashes, brow, pupil, glints, ambient light, exposure, opening of the lids. 1 is the population as published,
-        bare; from there to 2 and more come spectacles with reflections, make-up, uneven light, shadows, movement and
-        other views (:mod:`codesign.eye.worn`): for faces, lamps and cameras that nobody modelled.
+        lashes, brow, pupil and its size, glints, ambient light, exposure, opening of the lids. 1 is the population as
+        published, bare; from there to 2 and more come spectacles with reflections, make-up, uneven light, shadows,
+        movement and other views (:mod:`codesign.eye.worn`): for faces, lamps and cameras that nobody modelled.
     pool: frames that training draws from again and again, at another scale each time; 0 renders every frame anew.
     """
 
@@ -130,33 +144,7 @@ def worn(states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[i
     if variety <= 1:
         return render(states, rig=rig, camera=camera)
     found = drawn(len(states), variety, np.random.default_rng(seed))
-    return dressed(tilted(states, found.size["tilt"], rig, camera), found)
-
-
-def tilted(states: States, tilt_deg: Array, rig: Rig, camera: Camera) -> Rendered:
-    """Frames that are each seen from another elevation: the rig's and ``tilt_deg`` (n,), rounded to 10 degrees."""
-    steps = np.round(np.asarray(tilt_deg) / 10).astype(int)
-    parts, order = [], []
-    for step in np.unique(steps):
-        rows = np.flatnonzero(steps == step)
-        turned = replace(rig, elevation_rad=rig.elevation_rad - math.radians(10.0 * int(step)))
-        parts.append(render(states[torch.from_numpy(rows)], rig=turned, camera=camera))
-        order.append(rows)
-    return joined(parts, torch.from_numpy(np.argsort(np.concatenate(order))))
-
-
-def joined(parts: list[Rendered], rows: Tensor) -> Rendered:
-    """Rendered frames of several calls as one, in the order ``rows`` of all of them one after the other."""
-    frames, labels = (
-        type(getattr(parts[0], part))(
-            *(
-                torch.cat([getattr(getattr(p, part), name) for p in parts])[rows]
-                for name in type(getattr(parts[0], part)).__slots__
-            )
-        )
-        for part in ("frames", "labels")
-    )
-    return Rendered(frames, torch.cat([p.pupil for p in parts])[rows], labels)
+    return dressed(render(pigmented(states, found), rig=rig, camera=camera, view=viewed(found)), found)
 
 
 def varied(variety: float) -> Motion:
@@ -167,13 +155,14 @@ def varied(variety: float) -> Motion:
 
 
 def looks(variety: float) -> dict[str, Trait]:
-    """Traits of :data:`LOOKS`, spread and limits widened about the mean; at least 0, albedos at most 0.95."""
+    """Traits of :data:`LOOKS`, spread and limits widened about the mean, between :data:`LEAST` and :data:`MOST`."""
     found = {}
     for name in LOOKS:
         t = POPULATION[name]
-        high = t.mean + (t.high - t.mean) * variety
-        top = min(high, 0.95) if name in ALBEDOS else high
-        found[name] = replace(t, sd=t.sd * variety, low=max(t.mean - (t.mean - t.low) * variety, 0.0), high=top)
+        top = min(t.mean + (t.high - t.mean) * variety, MOST.get(name, math.inf))
+        found[name] = replace(
+            t, sd=t.sd * variety, low=max(t.mean - (t.mean - t.low) * variety, LEAST.get(name, 0.0)), high=top
+        )
     return found
 
 

@@ -20,16 +20,19 @@ if TYPE_CHECKING:
     from codesign.eye.population import Rig as Rig
     from codesign.eye.population import States as States
     from codesign.eye.population import Trait as Trait
-    from codesign.eye.population import face_axes as face_axes
     from codesign.eye.population import mean_eye_um as mean_eye_um
     from codesign.eye.population import parameters as parameters
     from codesign.eye.renderer import Camera as Camera
     from codesign.eye.renderer import Labels as Labels
     from codesign.eye.renderer import Rendered as Rendered
     from codesign.eye.renderer import render as render
+    from codesign.eye.view import View as View
+    from codesign.eye.view import face_axes as face_axes
     from codesign.eye.worn import CAUSES as CAUSES
     from codesign.eye.worn import drawn as drawn
     from codesign.eye.worn import dressed as dressed
+    from codesign.eye.worn import pigmented as pigmented
+    from codesign.eye.worn import viewed as viewed
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -50,7 +53,7 @@ __getattr__, __dir__, __all__ = attach(
         "model": "",
         "dressed": "worn",
         "drawn": "worn",
-        "face_axes": "population",
+        "face_axes": "view",
         "mean_eye_um": "population",
         "parameters": "population",
         "population": "",
@@ -59,5 +62,8 @@ __getattr__, __dir__, __all__ = attach(
         "states_at": "dataset",
         "textures": "",
         "triplets": "dataset",
+        "View": "view",
+        "pigmented": "worn",
+        "viewed": "worn",
     },
 )

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from codesign.eye import model
 from codesign.eye.textures import KINDS, VARIANTS
+from codesign.eye.view import View, face_axes, seen_axes
 from metalens.ground.errors import SceneError
 
 
@@ -190,21 +191,24 @@ def draw(count: int, seed: int | tuple[int, ...], *, motion: Motion | None = Non
     return States(*(torch.from_numpy(np.asarray(value, float)) for value in values))
 
 
-def parameters(states: States, rig: Rig, *, pixel_rad: float, exposed: States | None = None) -> Tensor:
+def parameters(
+    states: States, rig: Rig, *, pixel_rad: float, exposed: States | None = None, view: View | None = None
+) -> Tensor:
     """(n, COUNT) parameters of :mod:`codesign.eye.model` in float64, differentiable in gaze, torsion, slip, mount.
 
     Args:
         pixel_rad: angle of a pixel, which sets the softness of edges.
         exposed: states that the automatic exposure was set at; by default these, without following their derivatives.
+        view: other cameras than the rig's.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
     cornea, limbus, sclera = (t[k] * size for k in ("cornea_radius_um", "limbus_radius_um", "sclera_radius_um"))
     ring, offset = _spheres(sclera, cornea, limbus)
     behind = offset + cornea - t["pupil_behind_um"] * size
-    face = _face(rig, states)
+    face = _face(rig, states, view)
     axis, across, down = _turned(face, states)
-    centre = _turn(_nominal_centre(rig, t["depth_um"], behind), states.mount_rad) + states.slip_um
+    centre = _turn(_nominal_centre(rig, t["depth_um"], behind, view), states.mount_rad) + states.slip_um
     plane = centre + face[2] * (offset + cornea - t["plane_um"])[:, None]
     lamps = torch.tensor(rig.lamps_um, dtype=torch.float64).flatten().expand(len(states), -1)
     follow = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
@@ -212,9 +216,9 @@ def parameters(states: States, rig: Rig, *, pixel_rad: float, exposed: States | 
     upper = states.aperture * (t["fissure_upper_um"] * size - follow) - (1 - states.aperture) * lower
     half = t["fissure_half_um"] * size
     held = states if exposed is None else exposed
-    depth = _exposure_depth(rig, t["depth_um"], behind, held)
+    depth = _exposure_depth(rig, t["depth_um"], behind, held, view)
     gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
-    edge = 0.6 * pixel_rad * depth.clamp_min(2000.0) + 25.0
+    edge = 0.6 * (pixel_rad if view is None else pixel_rad * view.wide) * depth.clamp_min(2000.0) + 25.0
     places = {
         model.CENTRE: centre, model.FACE_X: face[0], model.FACE_Y: face[1], model.FACE_Z: face[2], model.AXIS: axis,
         model.IRIS_X: across, model.IRIS_Y: down, model.PLANE: plane, model.LED: lamps,
@@ -285,37 +289,35 @@ def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Te
     return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
 
 
-def directions(states: States, rig: Rig) -> tuple[Tensor, Tensor]:
+def directions(states: States, rig: Rig, view: View | None = None) -> tuple[Tensor, Tensor]:
     """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors."""
-    axis, across, down = _turned(_face(rig, states), states)
+    axis, across, down = _turned(_face(rig, states, view), states)
     side, rise = torch.tan(states.trait("kappa_x_rad")), torch.tan(states.trait("kappa_y_rad"))
     visual = axis - side[:, None] * across - rise[:, None] * down  # nose to -x, up to -y
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
-def face_axes(elevation_rad: float) -> Tensor:
-    """(3, 3) rows right, down and out of the face in the frame of a camera that sees it from this far below."""
-    s, c = math.sin(elevation_rad), math.cos(elevation_rad)
-    return torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64)
+def _axes(rig: Rig, view: View | None) -> Tensor:
+    """(3, 1 or n, 3) axes of the face before the camera, or before each of the cameras of a view."""
+    return face_axes(rig.elevation_rad)[:, None] if view is None else seen_axes(rig.elevation_rad, view).transpose(0, 1)
 
 
-def _face(rig: Rig, states: States) -> tuple[Tensor, Tensor, Tensor]:
+def _face(rig: Rig, states: States, view: View | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Axes of the face in the camera's frame: right, down, and out towards the viewer."""
-    axes = face_axes(rig.elevation_rad)
-    right, down, out = (_turn(row.expand(len(states), 3), states.mount_rad) for row in axes)
+    right, down, out = (_turn(row.expand(len(states), 3), states.mount_rad) for row in _axes(rig, view))
     return right, down, out
 
 
-def _nominal_centre(rig: Rig, depth_um: Tensor, behind_um: Tensor) -> Tensor:
-    out = face_axes(rig.elevation_rad)[2]
+def _nominal_centre(rig: Rig, depth_um: Tensor, behind_um: Tensor, view: View | None = None) -> Tensor:
+    out = _axes(rig, view)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out
 
 
-def _exposure_depth(rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States) -> Tensor:
+def _exposure_depth(rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States, view: View | None) -> Tensor:
     """(n,) distance of the face for which exposure and edges are set, without derivatives."""
-    centre = _turn(_nominal_centre(rig, depth_um, behind_um), states.mount_rad) + states.slip_um
+    centre = _turn(_nominal_centre(rig, depth_um, behind_um, view), states.mount_rad) + states.slip_um
     return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from codesign.eye import model, textures
 from codesign.eye.landmarks import NAMES, iris_to_camera, landmark_points
 from codesign.eye.population import Rig, States, directions, parameters
+from codesign.eye.view import View
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
 from metalens.image import Frames
@@ -83,40 +84,49 @@ def render(
     camera: Camera | None = None,
     texture_seed: int = 0,
     exposed: States | None = None,
+    view: View | None = None,
 ) -> Rendered:
     """Render states with labels, masks and depth (float32); compiled, on all threads of numba.
 
     Args:
         exposed: states that the automatic exposure was set at, where it shall not follow; by default these.
+        view: other cameras than the rig's. A picture that is ``wide`` times as wide is that of an eye so much smaller
+            across at the same depth, as this rig's camera would see it: places of its labels shrink with it.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
     """
     rig, camera = rig or Rig(), camera or Camera()
-    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed)
-    frames, mask = _compiled(p, states.scale, rig, camera, texture_seed)
-    return Rendered(frames, mask, _labels(states, p, mask, rig=rig, camera=camera))
+    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed, view=view)
+    wide = np.ones(len(states)) if view is None else view.wide.numpy()
+    frames, mask = _compiled(p, states.scale, rig, camera, texture_seed, wide)
+    return Rendered(frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view))
 
 
-def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int) -> tuple[Frames, Tensor]:
+def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int, wide: Array) -> tuple[Frames, Tensor]:
     from codesign.eye import kernel as render_kernel
 
     n, size = len(p), camera.pixels
-    t = camera.tangents(rig).astype(np.float32)
     light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
     pupil = np.empty((n, 1, size, size), np.float32)
     values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
-    render_kernel.render(values, factor, textures.pairs(seed), t, t, light, cover, depth, pupil)
+    ends = [*np.flatnonzero(np.diff(wide)) + 1, n]  # of runs of frames that are as wide
+    for first, end in zip([0, *ends], ends, strict=False):
+        t, run = (camera.tangents(rig) * wide[first]).astype(np.float32), slice(first, end)
+        out = (light[run], cover[run], depth[run], pupil[run])
+        render_kernel.render(values[run], factor[run], textures.pairs(seed), t, t, *out)
     return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(pupil[:, 0])
 
 
-def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera) -> Labels:
+def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera, view: View | None) -> Labels:
     p, scale = p.detach(), states.scale[:, None]
+    wide = torch.ones_like(states.scale) if view is None else view.wide
+    across = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
     centre = p[:, model.CENTRE : model.CENTRE + 3]
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
-    optic, visual = directions(states, rig)
+    optic, visual = directions(states, rig, view)
     here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
-    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)), rig)
+    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig)
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
@@ -126,15 +136,15 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
     sums = [(line * grid).sum(1) / weight.clamp_min(1e-9) for line in (columns, rows)]
     centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return Labels(
-        slip_um=scale * (here + states.slip_um) - here,
+        slip_um=scale * across * (here + states.slip_um) - here,
         optic_axis=optic.detach(),
         visual_axis=visual.detach(),
-        centre_um=scale * centre,
-        pupil_um=scale * pupil,
+        centre_um=scale * across * centre,
+        pupil_um=scale * across * pupil,
         pupil_px=middle,
         centroid_px=centroid,
         visible=(weight / area.clamp_min(1e-6)).clamp(0, 1),
-        landmarks_px=camera.position_px(landmark_points(p), rig),
+        landmarks_px=camera.position_px(landmark_points(p) / wide[:, None, None], rig),
     )
 
 

@@ -12,7 +12,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from codesign.eye.hair import lashes, patches
+from codesign.eye.population import POPULATION, States
 from codesign.eye.renderer import Labels, Rendered
+from codesign.eye.view import View
 from metalens.ground.arrays import Array
 from metalens.image import Frames
 
@@ -32,7 +35,7 @@ class Cause:
 
 
 CAUSES: Mapping[str, Cause] = {
-    "tilt": Cause(0.6, -30.0, 30.0, "deg", "the camera sees the face from above or below its usual place"),
+    "tilt": Cause(0.7, -30.0, 50.0, "deg", "the camera sees the face from below or above its usual place"),
     "liner": Cause(0.25, 0.3, 0.9, "opacity", "dark line along the lids' margins: liner, mascara, dense lashes"),
     "lid_shadow": Cause(0.25, 0.15, 0.6, "opacity", "darkened upper lid: eye shadow, a deep socket"),
     "rim": Cause(0.2, 0.03, 0.10, "frame widths", "band of a spectacle frame before the face"),
@@ -44,7 +47,20 @@ CAUSES: Mapping[str, Cause] = {
     "vignette": Cause(0.4, 0.1, 0.8, "of the light", "another camera's corners are darker than its middle"),
     "saturation": Cause(0.25, 0.01, 0.15, "of the pixels", "the brightest part of the frame is at the camera's white"),
     "tone": Cause(0.5, -0.6, 0.6, "logarithm of gamma", "another camera's curve: dark parts lifted or crushed"),
+    "side": Cause(0.6, -40.0, 40.0, "deg", "the camera sees the face from its left or right"),
+    "roll": Cause(0.5, -25.0, 25.0, "deg", "the camera is turned about its axis"),
+    "wide": Cause(0.7, 1.1, 2.2, "times the field", "a wider field: the whole opening of the lids, lashes and brow"),
+    "iris": Cause(0.35, 0.08, 0.5, "of the albedo", "irises little brighter than the pupil, as some are beyond 900 nm"),
+    "overhang": Cause(0.5, 0.5, 1.0, "opacity", "dark lashes from the lids' margins, across the eye and its lids"),
+    "socket": Cause(
+        0.3, 0.2, 0.75, "of the light", "the eye lies darker than the skin: deep sockets, lamps from the side"
+    ),
+    "patch": Cause(0.4, 0.4, 0.95, "opacity", "dark places of the skin: brow, hair, nostril, socket"),
+    "retina": Cause(0.2, 0.02, 0.25, "radiance", "light from the retina, of lamps near the camera's axis"),
+    "veil": Cause(0.4, 0.02, 0.2, "radiance", "stray light and black level: dark parts lifted by as much everywhere"),
 }
+VIEWS = ("tilt", "side", "roll", "wide")  # of the view that frames are rendered from
+BEFORE = (*VIEWS, "iris")  # what frames are rendered with; all else is put on them
 RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
 WHITE, BLACK = 0.99, 1e-3  # of a tone curve: share of the pixels below its white, and the least level of it
 TAPS = 15  # of the kernel of a movement, at most its length
@@ -67,17 +83,30 @@ def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
     return Worn(size, generator.random((count, 12)))
 
 
+def viewed(worn: Worn) -> View:
+    """The cameras that the frames are rendered from."""
+    tilt, side, roll, wide = (torch.from_numpy(worn.size[name]) for name in VIEWS)
+    return View(torch.deg2rad(tilt), torch.deg2rad(side), torch.deg2rad(roll), torch.where(wide > 0, wide, 1.0))
+
+
+def pigmented(states: States, worn: Worn) -> States:
+    """The states with the irises that some frames have."""
+    traits, size = states.traits.clone(), torch.from_numpy(worn.size["iris"])
+    traits[:, list(POPULATION).index("iris")] *= torch.where(size > 0, size, 1.0)
+    return replace(states, traits=traits)
+
+
 def dressed(made: Rendered, worn: Worn) -> Rendered:
-    """Rendered frames with what is worn but the tilt, which belongs to the view that they are rendered from.
+    """Rendered frames with what is worn but the causes of :func:`viewed` and :func:`pigmented`: those came before.
 
     Light, coverage and depth of both sheets change, and the pupil's mask where something hides or moves it; of the
     labels the centroid and the visible share of the pupil follow.
     """
-    if not any(worn.size[name].any() for name in CAUSES if name != "tilt"):
+    if not any(worn.size[name].any() for name in CAUSES if name not in BEFORE):
         return made
     light, cover, depth = (getattr(made.frames, name).clone() for name in Frames.__slots__)
     pupil, grid = made.pupil.clone(), _grid(int(light.shape[-1]))
-    for steps in ((_made_up, _glints), (_lit,), (_spectacles,), (_moved,), (_recorded,)):
+    for steps in ((_made_up, _grown, _glints), (_lit,), (_spectacles,), (_moved,), (_recorded,)):
         for step in steps:
             step(light, cover, depth, pupil, grid, worn, made.labels)
     return Rendered(Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil))
@@ -107,6 +136,18 @@ def _made_up(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: o
         light[i, 0] *= 1 - opacity * _soft(_spread(cover[i, 1], up=high, down=0), high / 2)
 
 
+def _grown(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
+    """A darker eye, light of the retina, dark places of the skin, lashes over both sheets; masks stay outlines."""
+    for i, taken, _ in _on(worn, "socket"):
+        light[i, 1] *= 1 - taken
+    for i, radiance, _ in _on(worn, "retina"):
+        light[i, 1] += radiance * pupil[i]
+    for i, opacity, draws in _on(worn, "patch"):
+        light[i, 0] *= 1 - opacity * patches(int(light.shape[-1]), draws)
+    for i, opacity, draws in _on(worn, "overhang"):
+        light[i] *= 1 - opacity * lashes(cover[i, 1], draws)
+
+
 def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
     """(y, x) largest coverage within ``up`` rows below each pixel and ``down`` rows above it."""
     padded = F.pad(cover[None, None], (0, 0, down, up))
@@ -122,14 +163,14 @@ def _soft(picture: Tensor, width: float) -> Tensor:
 
 def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
             of: Labels) -> None:  # fmt: skip
-    """One to four spots about the pupil, 0.5 to 2 % of the frame across, on what is seen of the eye."""
+    """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is seen of the eye."""
     pixels, (x, y) = int(light.shape[-1]), grid
     for i, radiance, draws in _on(worn, "glints"):
         px, py = ((of.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
         turn, apart = 6.283 * draws[3], 0.02 + 0.07 * draws[4]
         for k in range(1 + int(4 * draws[5])):
             at = turn + 1.7 * k
-            size = 0.005 + 0.015 * ((draws[6] + 0.37 * k) % 1)
+            size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
             dx, dy = x - px - apart * np.cos(at), y - py - apart * np.sin(at)
             light[i, 1] += radiance * cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
 
@@ -195,12 +236,14 @@ def _moved(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: obj
 
 def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
               of: Labels) -> None:  # fmt: skip
-    """As another camera gives it: darker corners, white from some level on, a curve between black and its white.
+    """As another camera gives it: stray light, darker corners, white from some level on, a curve from black to white.
 
     A factor on both sheets alike. Curves are of the light before the lens, where frames are dressed: blur and curve
     change places only at edges.
     """
     x, y = grid
+    for i, radiance, _ in _on(worn, "veil"):
+        light[i] += radiance * cover[i]
     for i, dark, _ in _on(worn, "vignette"):
         light[i] *= 1 - dark * 2 * (x**2 + y**2)
     for i, share, _ in _on(worn, "saturation"):

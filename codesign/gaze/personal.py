@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from codesign.eye import Rig
+from codesign.eye import Rig, face_axes
 from codesign.eye import population as eye
 from codesign.gaze import regressor
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
@@ -120,7 +120,7 @@ def _penalty(features: Array, missed: Array, gaze_deg: Array, *, hidden: int, se
 
 def face_angles(direction: Array, elevation_rad: float) -> Array:
     """(n, 2) angles across and down, deg, in the frame of the face, of directions (n, 3) in the camera's."""
-    right, down, out = eye.face_axes(elevation_rad).numpy() @ np.asarray(direction).T
+    right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
     return np.asarray(np.degrees(np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)))
 
 

@@ -9,7 +9,7 @@ import torch
 
 from codesign.batches import scenes
 from codesign.batches.scenes import EyeScenes, SceneConfig
-from codesign.eye import POPULATION, Motion, Rig
+from codesign.eye import POPULATION, Motion
 
 OWN = SceneConfig(
     pixels=50, margin=7, slip_mm=(1.9, 1.1, 3.2), gaze_deg=(17.0, 11.0), depth_sd_mm=0.6, variety=1.7, scale=0.15
@@ -31,6 +31,10 @@ def test_depths_are_those_of_the_rig_and_its_slippage_and_frames_have_their_marg
     assert (made.camera.pixels, made.camera.pitch_um, made.rig.sensor_distance_um) == (64, 11.0, 1800.0)
 
 
+LIMITS = {name: (0.0, 0.95) for name in ("sclera", "skin", "pupil", "exposure")}
+LIMITS |= {"iris": (0.05, 0.95), "pupil_radius_um": (700.0, 4300.0)}
+
+
 @pytest.mark.parametrize("variety", [0.5, 1.0, 2.5])
 def test_looks_spread_about_their_mean_and_stay_above_nothing(variety):
     made = scenes.looks(variety)
@@ -38,10 +42,10 @@ def test_looks_spread_about_their_mean_and_stay_above_nothing(variety):
         usual = POPULATION[name]
         assert trait.mean == usual.mean
         assert trait.sd == pytest.approx(usual.sd * variety)
-        assert trait.low == pytest.approx(max(usual.mean - (usual.mean - usual.low) * variety, 0.0))
-        high = usual.mean + (usual.high - usual.mean) * variety
-        bright = name in ("iris", "sclera", "skin", "pupil", "exposure")
-        assert trait.high == pytest.approx(min(high, 0.95) if bright else high)
+        low = usual.mean - (usual.mean - usual.low) * variety
+        least, most = LIMITS.get(name, (0.0, math.inf))
+        assert trait.low == pytest.approx(max(low, least))
+        assert trait.high == pytest.approx(min(usual.mean + (usual.high - usual.mean) * variety, most))
     low, high = Motion().aperture
     assert scenes.varied(variety).aperture == pytest.approx((max(1 - (1 - low) * variety, 0.1), high))
 
@@ -52,24 +56,6 @@ def test_scales_bring_every_depth_to_one_that_knows_nothing_of_it():
     got = scenes.decoupled(depth, (18e3, 27e3), 0.15, np.random.default_rng(9))
     wanted = np.random.default_rng(9).uniform(18e3, 27e3, 4)
     assert got.numpy() == pytest.approx(np.clip(wanted / depth.numpy(), 0.85, 1.15))
-
-
-def test_views_from_another_elevation_are_rounded_to_ten_degrees_and_keep_their_order(monkeypatch):
-    asked = []
-
-    def render(states, *, rig, camera):
-        asked.append((states.tolist(), rig.elevation_rad))
-        return states
-
-    monkeypatch.setattr(scenes, "render", render)
-    monkeypatch.setattr(scenes, "joined", lambda parts, rows: torch.cat(parts)[rows])
-    states, rig = torch.arange(5), Rig()
-    found = scenes.tilted(states, np.array([-14.0, 3.0, 12.0, -6.0, 4.9]), rig, None)
-    assert found.tolist() == [0, 1, 2, 3, 4]
-    want = [([0, 3], 10.0), ([1, 4], 0.0), ([2], -10.0)]  # -14 and -6 are one step down: seen from higher up
-    assert [rows for rows, _ in asked] == [rows for rows, _ in want]
-    for (_, elevation), (_, more) in zip(asked, want, strict=True):
-        assert elevation == pytest.approx(rig.elevation_rad + math.radians(more))
 
 
 def test_a_batch_has_the_mask_without_its_margin_and_slippage_in_millimetres():

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.batches.flat import flattened
-from codesign.batches.scenes import EyeScenes, SceneConfig, tilted
+from codesign.batches.scenes import EyeScenes, SceneConfig
 from codesign.eye import renderer
 from codesign.eye import worn as wear
 from codesign.eye.renderer import Labels, Rendered
@@ -179,14 +179,3 @@ def test_scenes_wear_by_their_variety_and_from_their_seed():
     assert float((one.frames.coverage.sum(1) - 1).abs().max()) < 1e-4
     undressed = renderer.render(SCENES.states(2, 6), rig=SCENES.rig, camera=SCENES.camera)
     assert not torch.equal(one.pinhole(), undressed.pinhole())
-
-
-def test_frames_of_several_views_keep_their_order():
-    states = SCENES.states(1, 5)
-    tilt = np.array([0.0, 20.0, 0.0, -10.0, 20.0])
-    out = tilted(states, tilt, SCENES.rig, SCENES.camera)
-    for i in (1, 3):
-        rig = replace(SCENES.rig, elevation_rad=SCENES.rig.elevation_rad - math.radians(tilt[i]))
-        alone = renderer.render(states[i : i + 1], rig=rig, camera=SCENES.camera)
-        torch.testing.assert_close(out.pinhole()[i], alone.pinhole()[0], rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(out.labels.optic_axis[i], alone.labels.optic_axis[0])

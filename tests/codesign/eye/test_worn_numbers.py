@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from codesign.eye import worn as wear
+from codesign.eye.population import draw
 from codesign.eye.renderer import Labels, Rendered
 from metalens.image import Frames
 
@@ -51,7 +52,7 @@ def test_amounts_of_what_may_be_worn():
     """Shares at variety 2 and ranges: what presets and docs were measured with."""
     table = {name: (c.share, c.low, c.high) for name, c in wear.CAUSES.items()}
     assert table == {
-        "tilt": (0.6, -30.0, 30.0),
+        "tilt": (0.7, -30.0, 50.0),
         "liner": (0.25, 0.3, 0.9),
         "lid_shadow": (0.25, 0.15, 0.6),
         "rim": (0.2, 0.03, 0.10),
@@ -63,6 +64,15 @@ def test_amounts_of_what_may_be_worn():
         "vignette": (0.4, 0.1, 0.8),
         "saturation": (0.25, 0.01, 0.15),
         "tone": (0.5, -0.6, 0.6),
+        "side": (0.6, -40.0, 40.0),
+        "roll": (0.5, -25.0, 25.0),
+        "wide": (0.7, 1.1, 2.2),
+        "iris": (0.35, 0.08, 0.5),
+        "overhang": (0.5, 0.5, 1.0),
+        "socket": (0.3, 0.2, 0.75),
+        "patch": (0.4, 0.4, 0.95),
+        "retina": (0.2, 0.02, 0.25),
+        "veil": (0.4, 0.02, 0.2),
     }
 
 
@@ -111,7 +121,7 @@ def test_glints_are_lorentzian_spots_about_the_pupil():
     added = np.zeros((N, N))
     for k in range(4):  # 1 + int(4 x 0.76)
         turn = 6.283 * 0.41 + 1.7 * k
-        apart, size = 0.02 + 0.07 * 0.58, 0.005 + 0.015 * ((0.36 + 0.37 * k) % 1)
+        apart, size = 0.02 + 0.07 * 0.58, 0.005 + 0.035 * ((0.36 + 0.37 * k) % 1) ** 2
         away = (X - px - apart * math.cos(turn)) ** 2 + (Y - py - apart * math.sin(turn)) ** 2
         added += 0.9 * OPENING / (1 + (away / size**2) ** 2)
     assert light[1] == pytest.approx(LIGHT[1] + added, abs=5 * ROUND)  # (away / size²)² amplifies float32 near a spot
@@ -252,3 +262,50 @@ def test_a_tone_curve_is_a_power_between_black_and_white(log_gamma):
     inside = level > 1e-3 * white
     assert inside.any()
     assert seen.sum(0)[inside] == pytest.approx(white * (level[inside] / white) ** gamma, rel=1e-4)
+
+
+def test_light_of_the_retina_fills_the_pupil_and_stray_light_everything():
+    before, was = put_on(), scene().frames
+    lit, seen = put_on(retina=0.21), put_on(veil=0.13)
+    assert lit[0][1] == pytest.approx(LIGHT[1] + 0.21 * OPENING, abs=ROUND)  # the scene's pupil is its opening
+    assert seen[0] == pytest.approx(LIGHT + 0.13 * was.coverage[FRAME].double().numpy(), abs=ROUND)
+    assert np.array_equal(lit[0][0], LIGHT[0].astype(float))
+    for now in (lit, seen):
+        assert all(np.array_equal(now[k], before[k]) for k in (1, 2, 3))
+
+
+def test_dark_places_of_the_skin_are_ellipses_of_which_every_other_is_striped():
+    light, *rest = put_on(patch=0.8)
+    dark = np.zeros((N, N))
+    for k in range(3):  # 1 + int(3 x 0.76)
+        at_x, at_y = 1.1 * ((0.36 + 0.38 * k) % 1 - 0.5), 1.1 * ((0.19 + 0.71 * k) % 1 - 0.5)
+        half_x, half_y = 0.05 + 0.2 * ((0.68 + 0.57 * k) % 1), 0.05 + 0.2 * ((0.47 + 0.23 * k) % 1)
+        turn = 3.1416 * ((0.23 + 0.47 * k) % 1)
+        u = (X - at_x) * math.cos(turn) + (Y - at_y) * math.sin(turn)
+        v = (Y - at_y) * math.cos(turn) - (X - at_x) * math.sin(turn)
+        hair = 0.75 + 0.25 * np.sin(80 * v + 12 * u) if k != 1 else 1.0
+        dark = np.maximum(dark, hair / (1 + ((u / half_x) ** 2 + (v / half_y) ** 2) ** 2))
+    assert light[0] == pytest.approx(LIGHT[0] * (1 - 0.8 * dark), abs=1e-5)  # 80 v of float32 places: 80 x 6e-8
+    assert np.array_equal(light[1], LIGHT[1].astype(float))
+    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+
+
+def test_lashes_darken_both_sheets_by_one_factor_and_leave_the_outline():
+    light, *rest = put_on(overhang=0.7)
+    factor = light / LIGHT
+    assert factor[0] == pytest.approx(factor[1], rel=1e-5)
+    assert factor.min() == pytest.approx(0.3, abs=0.03)  # where lashes of full darkness (110 to 255 of 255) lie
+    assert factor.max() == 1.0
+    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+
+
+def test_a_deep_socket_darkens_the_eye_and_a_dark_iris_is_a_share_of_its_albedo():
+    light, *rest = put_on(socket=0.35)
+    assert light == pytest.approx(LIGHT * np.array([1.0, 0.65])[:, None, None], abs=ROUND)
+    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+    states = draw(3, 4)
+    sizes = {name: np.zeros(3) for name in wear.CAUSES} | {"iris": np.array([0.0, 0.23, 0.41])}
+    found = wear.pigmented(states, wear.Worn(sizes, np.zeros((3, 12))))
+    want = states.trait("iris") * torch.tensor([1.0, 0.23, 0.41], dtype=torch.float64)
+    assert torch.equal(found.trait("iris"), want)
+    assert torch.equal(found.trait("pupil"), states.trait("pupil"))
