@@ -52,14 +52,12 @@ def case(
             an area of p² sqrt(3) / 2, and 0 transmission at every other site.
 
     Raises:
-        PropagationError: a length that is not positive, an angle of 90° or more, no depth.
+        PropagationError: a length that is not positive, an angle of 90° or more, no depth, an offset that is no pair.
     """
     step_um, cells = window_of(window_um, samples)
     ax, ay = angles(angle_rad)
     tangents = float(np.tan(ax)), float(np.tan(ay))
-    depths = np.atleast_1d(np.asarray(depths_um, float))
-    if not (depths > 0).all():
-        depths = np.array([np.nan])
+    depths = _depths(depths_um, offset_um)
     d = sensor_distance_um
     films: dict[str, Any] = {}
     if layers is not None and not layers.plain and d > 0:
@@ -81,16 +79,27 @@ def case(
     )
 
 
+def _depths(depths_um: Any, offset_um: Any) -> Array:
+    """(depth,) of the sources; nan, which a case refuses, for one that is not above 0."""
+    depths = np.atleast_1d(np.asarray(depths_um, float))
+    if depths.ndim != 1 or np.shape(offset_um) != (2,):
+        words = f"depths_um of shape {depths.shape}, offset_um of {np.shape(offset_um)}"
+        raise PropagationError(f"{words}: need (depth,) and a pair (x, y)")
+    return depths if (depths > 0).all() else np.array([np.nan])
+
+
 def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
     """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs (x, y).
 
     Raises:
-        PropagationError: no number and no pair, or cells that are not square to 1e-6.
+        PropagationError: no number and no pair, parts of samples, or cells that are not square to 1e-6.
     """
-    wide, many = np.ravel(np.asarray(window_um, float)), np.ravel(np.asarray(samples, int))
-    if wide.size not in (1, 2) or many.size not in (1, 2):
-        raise PropagationError(f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each")
-    (width, height), (across, down) = np.resize(wide, 2).tolist(), np.resize(many, 2).tolist()
+    wide, many = np.ravel(np.asarray(window_um, float)), np.ravel(np.asarray(samples, float))
+    if wide.size not in (1, 2) or many.size not in (1, 2) or (many % 1 != 0).any():
+        raise PropagationError(
+            f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each, samples whole"
+        )
+    (width, height), (across, down) = np.resize(wide, 2).tolist(), np.resize(many.astype(int), 2).tolist()
     step = width / max(across, 1)
     if abs(height / max(down, 1) - step) > 1e-6 * abs(step):
         raise PropagationError(
@@ -188,8 +197,8 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
         (depth, y, x) complex, of the kind that came in.
 
     Raises:
-        PropagationError: the window is too large for the method, a tolerance that is not above 0; otherwise as
-            :func:`exact`.
+        PropagationError: the window is too large for the method, a tolerance that is not above 0 and below 1;
+            otherwise as :func:`exact`.
 
     Sums are in float64 whatever comes in, so that a tighter tolerance is not lost in rounding.
     """
@@ -197,8 +206,8 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
 
     from metalens.propagate.window import field_windowed, plan
 
-    if not tolerance > 0:
-        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0")
+    if not 0 < tolerance < 1:
+        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0 and below 1")
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
     made = plan(case(phase.shape, **geometry), tolerance, torch.float64, phase.device)

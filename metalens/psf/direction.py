@@ -30,7 +30,7 @@ class Wanted:
     """What is asked of a direction, as in :func:`metalens.psf.psf_stack`.
 
     Raises:
-        PropagationError: a tolerance that is not above 0, a polarisation that is none.
+        PropagationError: a tolerance that is not above 0 and below 1, a polarisation that is none.
     """
 
     tolerance: float
@@ -40,8 +40,8 @@ class Wanted:
     fields: Jones | None = None
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise PropagationError(f"tolerance is {self.tolerance}, need a relative error above 0")
+        if not 0 < self.tolerance < 1:
+            raise PropagationError(f"tolerance is {self.tolerance}, need a relative error above 0 and below 1")
         if self.polarisation not in COUNTED:
             raise PropagationError(f"polarisation = {self.polarisation!r}: need one of {', '.join(COUNTED)}")
 

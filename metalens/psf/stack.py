@@ -91,9 +91,9 @@ def psf_stack(
     about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
     about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers}
     about |= {"depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)), "offset_um": _value(offset_um)}
-    several = np.ndim(_value(angle_rad)) == 2
+    several, angles = _directions(angle_rad)
     cases, found = [], []
-    for angle in angle_rad if several else [angle_rad]:
+    for angle in angles:
         seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
@@ -104,6 +104,14 @@ def psf_stack(
     given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
     stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
+
+
+def _directions(angle_rad: Any) -> tuple[bool, Any]:
+    """Whether several field angles are given, and each of them."""
+    shape = np.shape(_value(angle_rad))
+    if len(shape) == 2 and 0 in shape:
+        raise PropagationError(f"angle_rad of shape {shape}: need one direction or more")
+    return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
 
 
 def _centred(cases: list[Case], like: Case) -> list[Case]:
@@ -198,14 +206,20 @@ def _maps(
     phase: Any, level: Any, wavelength_um: float | Sequence[float], weights: Sequence[float] | None
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], list[float], Array]:
     """Maps (…, wavelength, y, x) as tensors of one dtype, the wavelengths, and their weights of sum 1."""
-    waves = np.atleast_1d(np.asarray(wavelength_um, float)).tolist()
+    waves = np.atleast_1d(np.asarray(wavelength_um, float)).ravel().tolist()
+    if not waves:
+        raise PropagationError("wavelength_um is empty, need one wavelength or more")
     share = np.full(len(waves), 1 / len(waves)) if weights is None else np.asarray(weights, float)
     if share.shape != (len(waves),) or not (share >= 0).all() or not share.sum() > 0:
         raise PropagationError(f"{len(waves)} wavelengths with weights {share}, need one weight >= 0 for each")
     phase = torch.as_tensor(phase)
-    if not phase.is_floating_point():
+    if phase.dtype not in KEPT:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
-    level = torch.as_tensor(level).to(phase).expand(phase.shape)
+    level = torch.as_tensor(level).to(phase)
+    if phase.ndim < 2 or 0 in phase.shape[:-2] or not _serves(level, phase):
+        shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {tuple(level.shape)}"
+        raise PropagationError(f"{shapes}: need (…, y, x) of both, alike")
+    level = level.expand(phase.shape)
     if np.ndim(wavelength_um) == 0:
         phase, level = phase.unsqueeze(-3), level.unsqueeze(-3)
     elif phase.ndim < 3 or phase.shape[-3] != len(waves):
@@ -213,3 +227,9 @@ def _maps(
             f"{len(waves)} wavelengths, but maps of shape {tuple(phase.shape)}; need (…, wavelength, y, x)"
         )
     return (phase, level), waves, share / share.sum()
+
+
+def _serves(level: torch.Tensor, phase: torch.Tensor) -> bool:
+    """Whether a transmission is one of these maps, or of all of them."""
+    alike = zip(level.shape[::-1], phase.shape[::-1], strict=False)
+    return level.ndim <= phase.ndim and all(n in (1, m) for n, m in alike)
