@@ -37,9 +37,9 @@ def test_discs_within_five_sites_to_either_side_are_exact(monkeypatch, site):
     monkeypatch.setattr(sampled, "_distant", lambda *_: np.array([0.013]))
     fields = SimpleNamespace(
         bodies=[lens], table=SimpleNamespace(diameter_um=DIAMETER, goal=GOAL, own=OWN),
-        at=lambda far, number, first, count, near: np.full((count, SHAPE[1]), 0.071),
+        at=lambda *asked: {("far", 0, row, 1, "near"): np.full((1, SHAPE[1]), 0.071)}[asked],
     )  # fmt: skip
-    found = SimpleNamespace(far=None, near=None)
+    found = SimpleNamespace(far="far", near="near")
     got = sampled.sampled_error(fields, Ladder(DOSES), found, point=POINT, samples=1)
     turn, exact = 2 * np.pi * (np.arange(24) + 0.5) / 24, 0.013
     for width, weight in zip(POINT.widths_um, POINT.weights, strict=True):
