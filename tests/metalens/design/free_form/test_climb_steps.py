@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from metalens.design.free_form import search
+from metalens.design.free_form.refine import refine
 from metalens.design.free_form.settings import Fisher
 
 
@@ -79,3 +80,24 @@ def test_starts_lie_evenly_in_the_range_of_foci_with_zones_in_turn(monkeypatch):
     assert asked == [(pytest.approx(22e3), 0, 7000), (pytest.approx(26e3), 5, 7001), (pytest.approx(30e3), 0, 7002)]
     assert found.focus_um == pytest.approx(30e3)  # the most information of those that converged
     assert found.starts == ((9.0, pytest.approx(0.7)), (4.0, pytest.approx(0.82)), (5.0, pytest.approx(0.81)))
+
+
+def test_refining_goes_to_the_least_within_half_a_radian_where_the_energy_allows():
+    """A parabola about (1, 2, -0.2, 0.3). Energy 0.9 - x₀ / 2 is asked to be 0.7: x₀ up to 0.4, less 0.002 of a margin
+    of 1e-3; x₁ from 0.1 on stops at its reach; the others arrive. A start that keeps no energy is not kept either."""
+    least = torch.tensor([[1.0, 2.0], [-0.2, 0.3]], dtype=torch.float64)
+
+    def loss(phase, focus_um, generator):
+        assert (focus_um, generator) == (2e4, None)
+        return 3 * ((phase - least) ** 2).sum(), torch.stack([0.9 - phase[0, 0] / 2, 0.95 + 0 * phase[0, 0]])
+
+    settings = SimpleNamespace(encircled=0.7, refine=60)
+    start = torch.tensor([[0.0, 0.1], [0.05, -0.1]], dtype=torch.float64)
+    found = refine(start, lambda controls: controls, SimpleNamespace(loss=loss), settings, 2e4)
+    assert found.shape == (2, 2)
+    assert 0.396 < float(found[0, 0]) < 0.4 + 1e-9
+    assert float(found[0, 1]) == pytest.approx(0.6, abs=1e-9)
+    assert found[1].tolist() == pytest.approx([-0.2, 0.3], abs=2e-3)  # 60 evaluations
+    lost = start + torch.tensor([[0.45, 0.0], [0.0, 0.0]], dtype=torch.float64)
+    again = refine(lost, lambda controls: controls, SimpleNamespace(loss=loss), settings, 2e4)
+    assert float(again[0, 0]) < 0.4 + 1e-9
