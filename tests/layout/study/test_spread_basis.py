@@ -1,11 +1,13 @@
 """The basis of a spread is the smallest that keeps what it says, found anew from the eigenvalues of all overlaps."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from layout.study import focus
-from layout.study.spread_model import reduce
-from metalens.made import Spread, draws, transmission
+from layout.study.spread_model import _summed, missed, reduce
+from metalens.made import Draw, Spread, draws, transmission
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 
 KEPT = 3e-4  # of the variation of t, in amplitude: lenses drawn anew then miss 2e-3 of theirs
@@ -37,3 +39,64 @@ def test_no_fewer_functions_would_keep_the_variation_and_no_more_are_taken(scale
     power = np.linalg.eigvalsh(overlaps(lens, spread, seed))[::-1]
     left = np.sqrt(np.maximum(np.r_[power.sum(), power.sum() - np.cumsum(power)], 0) / power.sum())
     assert left[rank] <= KEPT < left[rank - 1]
+
+
+AMOUNTS = {"bias_nm": 3.1, "gradient_nm": 6.3, "bow_nm": -2.7, "height_nm": 5.9, "index": 0.004, "sidewall_deg": 0.3}
+
+
+@pytest.fixture(scope="module")
+def reduced():
+    lens = hyperbolic()
+    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 4), 150.0, 0.85, np.array([1500.0]))
+    return lens, reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=5)
+
+
+def test_functions_of_the_basis_are_orthonormal_over_the_pillars(reduced):
+    _, model = reduced
+    assert len(np.unique(model.count)) > 3
+    gram = (model.basis * model.count) @ model.basis.conj().T
+    assert np.abs(gram - np.eye(len(gram))).max() < 1e-9
+
+
+def test_light_of_a_drawn_lens_is_the_sum_over_its_pillars_one_by_one(reduced):
+    """Each with the bias of its own place, 0.4 rad off the axes."""
+    lens, model = reduced
+    d, radius = lens.diameters.diameter_um, lens.diameters.radius_um
+    u, v = lens.diameters.x_um / radius, lens.diameters.y_um[:, None] / radius
+    state = Draw(AMOUNTS, 0.4).state()
+    along = u * np.cos(0.4) + v * np.sin(0.4)
+    bias_nm = AMOUNTS["bias_nm"] + AMOUNTS["gradient_nm"] / 2 * along + AMOUNTS["bow_nm"] * (u**2 + v**2 - 0.5)
+    t = np.where(d > 0, transmission(PROXY, SENS, d + bias_nm * 1e-3, 0.85, state.answers()), 0)
+    exact = model.focus.light(model.focus.project(t[None]))
+    fast = model.focus.light(model.drawn([Draw({}).state(), state]))[1:]
+    assert (
+        np.abs(fast - exact).max() < 2e-3 * np.abs(exact).max()
+    )  # the basis: 3e-4 of what draws change, far ones more
+
+
+def test_what_a_basis_misses_is_what_least_squares_leave_at_the_worst_of_three_places(reduced):
+    """On the axis and at both ends of the gradient, each draw by itself; a third of the functions are taken away."""
+    _, model = reduced
+    fewer = dataclasses.replace(model, basis=model.basis[: 2 * len(model.basis) // 3])
+    lenses = [Draw(AMOUNTS, 0.4), Draw({**AMOUNTS, "bow_nm": 4.0, "height_nm": -3.0}, 2.9)]
+    worst, root = [], np.sqrt(model.count)
+    for draw in lenses:
+        a = draw.amounts
+        for along in (0.0, 1.0, -1.0):
+            bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (along**2 - 0.5)
+            size = model.diameter_um + bias_nm * 1e-3
+            t = transmission(PROXY, SENS, size, 0.85, draw.state().answers()) * root
+            left = t - (fewer.basis * root).T @ np.linalg.lstsq((fewer.basis * root).T, t, rcond=None)[0]
+            worst.append(np.linalg.norm(left) / np.linalg.norm(t))
+    assert missed(fewer, lenses) == pytest.approx(max(worst), rel=1e-6)
+    assert missed(fewer, lenses[1:]) == pytest.approx(max(worst[3:]), rel=1e-6)
+
+
+def test_rows_of_a_part_are_summed_from_its_first_on(reduced):
+    """40 rows from row 70 on, more than are taken at once."""
+    lens, model = reduced
+    columns = np.random.default_rng(2).normal(size=(2, 5, 2)).view(complex)[..., 0].astype(np.complex64)
+    index = np.random.default_rng(3).integers(0, 5, (40, lens.diameters.diameter_um.shape[1]))
+    got = _summed((model.focus, columns), (70, index))
+    want = model.focus.project(columns[:, index], slice(70, 110))
+    assert np.abs(got - want).max() < 1e-5 * np.abs(want).max()  # float32 sums
