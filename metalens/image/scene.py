@@ -160,7 +160,7 @@ def _table(psf: PsfBasis) -> Tensor:
 
 def _span(pixels: int, points: int) -> tuple[Tensor, Tensor]:
     position = torch.linspace(0, points - 1, pixels, dtype=torch.float64)
-    first = position.floor().clamp(max=max(points - 2, 0)).long()
+    first = position.floor().long()
     return first, position - first
 
 

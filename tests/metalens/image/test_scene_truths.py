@@ -64,6 +64,31 @@ def test_weights_over_the_field_are_bilinear_and_over_depth_straight_in_inverse_
             assert got[i, j] == pytest.approx(want, abs=3e-4)  # depths are coded in 4096 steps of their range
 
 
+@pytest.mark.parametrize("field", [(3, 1), (1, 4), (4, 3)])
+def test_weights_of_one_depth_go_straight_from_field_point_to_field_point(field):
+    """Two kernels, a frame of 5 x 8 pixels from corner to corner: along one axis, then along the other."""
+    weights = torch.from_numpy(RNG.uniform(0.2, 1.0, (*field, 1, 2)))
+    psf = PsfBasis(torch.ones(2, 3, 3), weights, torch.tensor([21e3], dtype=torch.float64), 0.0, 0.0)
+    got = scene.weight_maps(psf, torch.full((1, 5, 8), 33e3, dtype=torch.float64))
+    assert got.shape == (2, 1, 5, 8)
+    down, across = (np.linspace(0, n - 1, pixels) for n, pixels in zip(field, (5, 8), strict=True))
+    for k in range(2):
+        rows = np.array([np.interp(across, np.arange(field[1]), row) for row in weights[:, :, 0, k].numpy()])
+        want = np.array([np.interp(down, np.arange(field[0]), column) for column in rows.T]).T
+        assert got[k, 0].numpy() == pytest.approx(want, rel=1e-12)
+
+
+def test_weights_of_one_field_point_go_straight_in_inverse_depth_and_stay_beyond_the_nodes():
+    weights = torch.from_numpy(RNG.uniform(0.2, 1.0, (1, 1, 3, 2)))
+    nodes = torch.tensor([10e3, 17e3, 40e3], dtype=torch.float64)
+    psf = PsfBasis(torch.ones(2, 3, 3), weights, nodes, 0.0, 0.0)
+    depth = torch.tensor([[[8e3, 10e3, 12e3, 16e3], [19e3, 33e3, 40e3, 70e3]]], dtype=torch.float64)
+    got = scene.weight_maps(psf, depth)
+    for k in range(2):
+        want = np.interp(-1 / depth.numpy(), -1 / nodes.numpy(), weights[0, 0, :, k].numpy())
+        assert got[k].numpy() == pytest.approx(want, abs=3e-4)  # depths are coded in 4096 steps of their range
+
+
 def test_border_pixels_go_on_half_to_either_side():
     row = torch.arange(4.0).reshape(1, 1, 4)
     got = scene._padded(row, (1, 9))[0, 0].tolist()
