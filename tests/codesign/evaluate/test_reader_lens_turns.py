@@ -46,12 +46,16 @@ def told(monkeypatch):
     monkeypatch.setattr(torch.optim, "AdamW", Reads)
     monkeypatch.setattr(reader_lens, "Imager", Whole)
     monkeypatch.setattr(reader_lens, "samples", lambda frames: 8)
-    monkeypatch.setattr(reader_lens.formed, "imager", lambda *_, **__: Whole())
+
+    def forms(optics, place, frame, *, margin):
+        assert (frame, margin) == (8, 2)
+        return Whole()
+
     monkeypatch.setattr(reader_lens, "gone_backward", gone)
     monkeypatch.setattr(reader_lens, "lens_gradient", gradient)
     scenes = SimpleNamespace(batch=lambda step, size: SimpleNamespace(frames=None), margin=2)
     start = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
-    said.end, said.losses = reader_lens._descended(None, start, scenes, None, TRAINING)
+    said.end, said.losses = reader_lens._descended(None, start, scenes, None, TRAINING, forms)
     said.moved = said.end - start
     return said
 
