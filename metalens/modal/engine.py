@@ -15,7 +15,7 @@ from metalens.modal.assembly import Geometry, assemble
 from metalens.modal.case import Case, case_of, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
-from metalens.modal.ladder import RUNGS, Rung, first_rung
+from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
@@ -26,7 +26,6 @@ from metalens.rcwa import anchored
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
-COMPARED, STEP = 2, 2.0  # rungs before, and times the change from them: for cells unlike those of lenses
 MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimate follows: the next move it by 1e-4
 
 
@@ -34,15 +33,16 @@ MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimat
 class Solution:
     """One rung's answer.
 
-    matrix: (2, 2) zero-order scattering matrix, mean of both forms. spread: how far the forms are apart, half the
-    difference. drift: change of the matrix per relative error of the transverse wavenumbers squared of the layer
-    modes, which both forms share. grazing: change of the matrix for what the mesh misplaces cutoffs. bloch: half
-    the Bloch phase. size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``. energy: mean of
-    both forms. unknowns: of both forms.
+    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of how far the forms are apart,
+    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per relative error of the transverse
+    wavenumbers squared of the layer modes, which both forms share. grazing: change of the matrix for what the mesh
+    misplaces cutoffs. bloch: half the Bloch phase. size: wavelengths in a pitch, in the densest medium. strange: as in
+    ``Case``; where it is, damping of round trips in the layer. energy: mean of both forms. unknowns: of both forms.
     """
 
     matrix: np.ndarray
-    spread: float
+    waves: float
+    rim: float
     drift: float
     energy: float
     unknowns: int
@@ -50,6 +50,12 @@ class Solution:
     bloch: float = 0.0
     size: float = 0.0
     strange: float = 0.0
+    damping: float = 1.0
+
+    @property
+    def spread(self) -> float:
+        """Half of how far the forms are apart, waves and rim together."""
+        return self.waves + self.rim
 
 
 @lru_cache(maxsize=4)
@@ -96,7 +102,8 @@ def determinant(matrix: np.ndarray) -> complex:
 class Form:
     """What one form gives: zero-order matrix (2, 2), power out per unit power in, size; and of the layer modes that
     travel, by falling axial wavenumber, q (m,) and, for the electric form, the derivative of the matrix in each
-    (m, 2, 2). grazing: change of the matrix when orders near their cutoff take the wavenumbers of the mesh."""
+    (m, 2, 2). grazing: change of the matrix when orders near their cutoff take the wavenumbers of the mesh.
+    damping: see ``Match``; 1 in cells of lenses, which are not judged by it."""
 
     matrix: np.ndarray
     energy: float
@@ -104,6 +111,7 @@ class Form:
     q: np.ndarray
     by_q: np.ndarray
     grazing: float
+    damping: float
 
 
 def layer_between(
@@ -161,6 +169,7 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
         q=q[travelling],
         by_q=match.rate(moved)[:, pair][:, :, pair] * sign,
         grazing=grazing,
+        damping=match.damping if case.strange else 1.0,
     )
 
 
@@ -186,12 +195,12 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
     pairs = nearest_pairs(first.q, second.q)
     explained = first.by_q[pairs[:, 0]] * (first.q[pairs[:, 0]] - second.q[pairs[:, 1]])[:, None, None]
     rest = first.matrix - second.matrix - explained.sum(0)
-    spread = np.abs(explained).sum(0).max() + np.abs(rest).max()
     dense = case.k0**2 * max(case.disc, case.around, key=lambda e: e.real)
     slack = np.abs(dense - first.q**2) / (2 * np.abs(first.q))
     return Solution(
         matrix=geometric_mean(first.matrix, second.matrix),
-        spread=float(spread) / 2,
+        waves=float(np.abs(explained).sum(0).max()) / 2,
+        rim=float(np.abs(rest).max()) / 2,
         drift=float((np.abs(first.by_q) * slack[:, None, None]).sum(0).max(initial=0.0)),
         energy=(first.energy + second.energy) / 2,
         unknowns=first.unknowns + second.unknowns,
@@ -199,6 +208,7 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
         strange=case.strange,
+        damping=min(first.damping, second.damping),
     )
 
 
@@ -230,22 +240,22 @@ def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
 
     At sharp resonances both forms may lie together by accident, far from the truth: guided modes of a thin layer of low
-    contrast, pillars that carry many waves, discs of the rarer medium. So for cells unlike those of lenses the two
-    rungs before are solved too, of which the coarsest mesh is none, and ``STEP`` times the farther change from them
-    counts.
+    contrast, pillars that carry many waves, discs of the rarer medium. So cells unlike those of lenses begin two rungs
+    lower, and how the answer settles from mesh to mesh counts (see ``ladder``); two meshes alone tell nothing of them.
     """
     best: Climb | None = None
-    before: list[np.ndarray] = []
-    compared = COMPARED if case.strange > 0 else 0
-    first = first_rung(tolerance)
-    for rung in RUNGS[max(first - compared, 1) if compared else first :]:
-        solution = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
-        error = rung.error(solution, case.rho)
-        if compared:
-            changes = [float(np.abs(solution.matrix - one).max()) for one in before[-compared:]]
-            error = max(error, STEP * max(changes) if len(changes) == compared else 1.0)
-            before.append(solution.matrix)
-        if error <= tolerance:
+    solved: list[Solution] = []
+    begin = max(first_rung(tolerance, case.rho) - (COMPARED if case.strange else 0), 0)
+    last: MeshPlan | None = None
+    for rung in RUNGS[begin:]:
+        plan = rung.choice(case.rho).plan
+        if plan == last:  # of wide discs, for which two rungs have one mesh
+            continue
+        solution, last = evaluate(case, plan, weak=rung.weak), plan
+        known = not case.strange or len(solved) >= COMPARED
+        error = rung.error(solution, case.rho, solved) if known else 1.0
+        solved.append(solution)
+        if error <= tolerance and known:
             reason = f"the {rung.name} mesh meets the tolerance"
             return Climb(solution, rung, error, True, reason)
         if best is None or error < best.error:

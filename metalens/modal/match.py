@@ -185,6 +185,11 @@ class Match:
     round_trip: np.ndarray
     amplitude: np.ndarray
 
+    @property
+    def damping(self) -> float:
+        """Least singular value of the round trip: what the waves least damped lose, or come back out of step by."""
+        return float(np.linalg.svd(self.round_trip, compute_uv=False).min(initial=1.0))
+
     def rate(self, moved: np.ndarray) -> np.ndarray:
         """Derivatives (..., ports, ports) of the scattering matrix, given those (..., carry) of the factors exp(i q h)
         of the carrying modes."""

@@ -98,8 +98,7 @@ def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float)
         def at(diameter_um: float) -> Response:
             case = case_of(cell, diameter_um, light)
             made = evaluate(case, mesh.plan, weak=rung.weak)
-            shared = max(rung.choice(case.rho).thin, mesh.thin) - mesh.thin + mesh.shared(case.rho, case.bloch)
-            error = rung.bound(shared, made, case.rho)
+            error = rung.error(made, case.rho, mesh=mesh)
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
             return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
 

@@ -1,79 +1,88 @@
-"""The error estimate of a mesh as its parts say, for discs of every width and at a cutoff."""
+"""The error estimate of a mesh as its parts say, for discs of every width, at a cutoff and after other meshes."""
 
+import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from metalens.modal import ladder
-from metalens.modal.ladder import Choice, Rung
+from metalens.modal.ladder import Choice, Factors, Rung
 
-NARROW_PLAN, WIDE_PLAN = object(), object()
-RUNG = Rung(
-    "typed",
-    (
-        Choice(NARROW_PLAN, 0.6, 2e-4, 7e-3, oblique=3e-4, middle=5e-4),
-        Choice(WIDE_PLAN, 1.0, 1e-4, 4e-3),
-    ),
-    safety=1.4, usual=1e-2, at_cutoff=3.1, thin=0.45,
-)  # fmt: skip
+THIN_PLAN, WIDE_PLAN = object(), object()
+THIN = Factors(0.3, 1.4, flat=2e-4, steep=7e-4, oblique=3e-4)
+WIDE = Factors(0.7, 0.9, flat=1e-4, at_cutoff=3.1, grazing=0.15)
+ALONE, AFTER = Factors(2.2, 5.1, flat=6e-4), Factors(0.4, 0.6, moved=0.8)
+RUNG = Rung("typed", (Choice(THIN_PLAN, 0.6, THIN, AFTER), Choice(WIDE_PLAN, 1.0, WIDE, THIN)), 1e-2, alone=ALONE)
+UNSEEN = 0.02 * 1e-2
 
 
-def found(spread=0.02, drift=1.7, grazing=0.0, bloch=0.0, size=1.3, strange=0.0):
-    return SimpleNamespace(spread=spread, drift=drift, grazing=grazing, bloch=bloch, size=size, strange=strange)
+def found(t=0.6 + 0.1j, **other):
+    usual = {"rim": 0.02, "waves": 0.05, "drift": 1.7, "grazing": 0.0, "bloch": 0.0, "size": 1.3, "strange": 0.0}
+    all_ = {"matrix": np.array([[0.1, t], [t, 0.2j]]), "damping": 1.0} | usual | other
+    return SimpleNamespace(**all_, spread=all_["rim"] + all_["waves"])
 
 
 @pytest.mark.parametrize(
-    ("rho", "bloch", "want"),
+    ("rho", "bloch", "size", "want"),
     [
-        (0.2, 0.0, 0.45 * 0.02 + 0.2 * (2e-4 + 7e-3 * 0.2**4) * 1.7),  # thin: the forms err apart
-        (0.28, 0.3, 1.4 * 0.02 + (2e-4 + 7e-3 * 0.28**4 + 3e-4) * 1.7),
-        (0.5, 0.0, 1.4 * 0.02 + (2e-4 + 7e-3 * 0.5**4 + 5e-4) * 1.7),
-        (0.8, 0.3, 1.4 * 0.02 + (1e-4 + 4e-3 * 0.8**4) * 1.7),
-        (0.95, 0.0, 3 * 1.4 * 0.02 + 1.5 * (1e-4 + 4e-3 * 0.95**4) * 1.7),  # a narrow gap
+        (0.2, 0.0, 1.3, 0.3 * 0.02 + 1.4 * 0.05 + (2e-4 + 7e-4 * 0.65**6) * 1.7),
+        (0.5, 0.3, 1.3, 0.3 * 0.02 + 1.4 * 0.05 + (5e-4 + 7e-4 * 0.65**6) * 1.7),
+        (0.5, 0.0, 2.5, 0.3 * 0.02 + 1.4 * 0.05 + (2e-4 + 7e-4 * 1.25**6) * 1.7),
+        (0.8, 0.3, 1.3, 0.7 * 0.02 + 0.9 * 0.05 + 1e-4 * 1.7),
     ],
 )
-def test_the_estimate_adds_half_difference_and_drift_by_the_width_of_the_disc(rho, bloch, want):
-    assert RUNG.choice(rho).plan is (NARROW_PLAN if rho <= 0.6 else WIDE_PLAN)
-    assert RUNG.error(found(bloch=bloch), rho) == pytest.approx(want + 0.02 * 1e-2, rel=1e-9)
+def test_the_estimate_adds_rim_waves_and_drift_by_the_width_of_the_disc_and_the_waves_in_a_pitch(
+    rho, bloch, size, want
+):
+    """What elements of degree three get wrong of a wave rises as the sixth power of its number."""
+    assert RUNG.choice(rho).plan is (THIN_PLAN if rho <= 0.6 else WIDE_PLAN)
+    unseen = UNSEEN if bloch else 0.0  # at normal incidence a plane wave is uniform, which elements follow
+    assert RUNG.error(found(bloch=bloch, size=size), rho) == pytest.approx(want + unseen, rel=1e-9)
 
 
-def test_near_a_cutoff_the_difference_counts_more_and_exact_cutoffs_in_part():
-    shared = 2e-4 + 7e-3 * 0.5**4 + 5e-4
-    want = 3.1 * 0.02 + shared * 1.7 + 0.15 * 0.04 + 2e-4
-    assert RUNG.error(found(grazing=0.04), 0.5) == pytest.approx(want, rel=1e-9)
-    thin = 3.1 * 0.02 + (2e-4 + 7e-3 * 0.2**4) * 1.7 + 0.15 * 0.04 + 2e-4  # no longer as of thin discs
-    assert RUNG.error(found(grazing=0.04), 0.2) == pytest.approx(thin, rel=1e-9)
-    gap = 4.2 * 0.02 + 1.5 * (1e-4 + 4e-3 * 0.95**4) * 1.7 + 0.15 * 0.04 + 2e-4  # 3 x 1.4 is above 3.1
-    assert RUNG.error(found(grazing=0.04), 0.95) == pytest.approx(gap, rel=1e-9)
+def test_near_a_cutoff_the_difference_counts_more_and_exact_cutoffs_in_part_where_a_mesh_says_so():
+    at = found(grazing=0.04)
+    assert RUNG.error(at, 0.8) == pytest.approx(3.1 * 0.07 + 1e-4 * 1.7 + 0.15 * 0.04, rel=1e-9)
+    assert RUNG.error(at, 0.5) == RUNG.error(found(), 0.5)
 
 
-def test_in_a_pitch_of_many_waves_the_shared_error_rises_as_their_sixth_power():
-    shared = 2e-4 + 7e-3 * 0.5**4 + 5e-4
-    for size, more in ((2.0, 1.0), (2.5, 1.25**6)):
-        want = 1.4 * 0.02 + more * shared * 1.7 + 2e-4
-        assert RUNG.error(found(size=size), 0.5) == pytest.approx(want, rel=1e-9)
+def test_a_mesh_meant_for_wider_discs_is_judged_as_the_own_and_the_wider_one():
+    """The larger of both: neither was chosen on thin discs on the mesh of wide ones."""
+    wide, thin = RUNG.choices[1], RUNG.error(found(), 0.5)
+    of_wide = 0.7 * 0.02 + 0.9 * 0.05 + 1e-4 * 1.7
+    assert RUNG.error(found(), 0.5, mesh=wide) == pytest.approx(max(thin, of_wide), rel=1e-9)
+    much_rim = found(rim=1.1)
+    assert RUNG.error(much_rim, 0.5, mesh=wide) == pytest.approx(0.7 * 1.1 + 0.9 * 0.05 + 1.7e-4, rel=1e-9)
 
 
-def test_discs_too_thin_to_be_told_are_given_the_whole_difference():
-    for rho, safety, share in ((0.031, 0.45, 0.2), (0.029, 1.4, 1.0)):
-        want = safety * 0.02 + share * (2e-4 + 7e-3 * rho**4) * 1.7 + 2e-4
-        assert RUNG.error(found(), rho) == pytest.approx(want, rel=1e-9)
+@pytest.mark.parametrize("strange", [1.0, 3.0])
+def test_cells_unlike_those_of_lenses_are_judged_by_one_mesh_more_widely(strange):
+    want = strange * (2.2 * 0.02 + 5.1 * 0.05 + 6e-4 * 1.7)
+    assert RUNG.error(found(strange=strange), 0.5) == pytest.approx(want, rel=1e-9)
 
 
-@pytest.mark.parametrize(("strange", "safety"), [(0.5, 1.4), (1.0, 2.5), (2.5, 6.25)])
-def test_cells_unlike_those_of_lenses_have_wider_bars_and_no_discount_for_thin_discs(strange, safety):
-    """Never less than the rung's own factor; the shared error five times."""
-    for rho in (0.2, 0.28):
-        shared = 2e-4 + 7e-3 * rho**4
-        want = safety * 0.02 + 5 * shared * 1.7 + 2e-4
-        assert RUNG.error(found(strange=strange), rho) == pytest.approx(want, rel=1e-9)
+def test_after_other_meshes_the_farthest_change_counts_as_far_as_the_forms_have_drawn_together():
+    """Changes of 0.5 and 0.3; the forms are at a quarter of what they were on the first mesh, further apart than on
+    the second: 0.5 / 2 and 0.3. The last two meshes count."""
+    now = found(strange=1.0)
+    first, second = found(rim=0.08, waves=0.2, t=0.1 + 0.1j), found(rim=0.001, waves=0.02, t=0.6 + 0.4j)
+    assert ladder.settled(now, first) == pytest.approx(0.5 * math.sqrt(0.07 / 0.28), rel=1e-9)
+    assert ladder.settled(now, second) == pytest.approx(0.3, rel=1e-9)
+    both = RUNG.error(now, 0.5, (first, second))
+    assert both == pytest.approx(0.4 * 0.02 + 0.6 * 0.05 + 0.8 * 0.3, rel=1e-9)
+    assert RUNG.error(now, 0.5, (first, first)) == pytest.approx(both - 0.8 * 0.05, rel=1e-9)
+    assert RUNG.error(now, 0.5, (second, first, first)) == RUNG.error(now, 0.5, (first, first))
+    assert ladder.settled(now, found(rim=0.0, waves=0.0, t=0.1 + 0.1j)) == pytest.approx(0.5, rel=1e-9)
+    assert RUNG.error(found(), 0.5, (first,)) == RUNG.error(found(), 0.5)  # cells of lenses need none
 
 
-def test_a_mesh_may_have_factors_of_its_own_in_place_of_those_of_the_rung():
-    own = Rung("own", (Choice(NARROW_PLAN, 0.6, 2e-4, safety=0.7, at_cutoff=1.1), *RUNG.choices[1:]), 1.4, 1e-2, 3.1)
-    assert own.error(found(), 0.5) == pytest.approx(0.7 * 0.02 + 2e-4 * 1.7 + 2e-4, rel=1e-9)
-    assert own.error(found(grazing=0.04), 0.5) == pytest.approx(1.1 * 0.02 + 2e-4 * 1.7 + 0.15 * 0.04 + 2e-4, rel=1e-9)
-    assert own.error(found(grazing=0.04), 0.8) == RUNG.error(found(grazing=0.04), 0.8)
+def test_near_a_resonance_a_change_counts_by_as_much_as_waves_in_the_layer_go_undamped():
+    """The answer moves as one over what a round trip loses, up to six times as far; losing all is no less than 1."""
+    before = found(t=0.6 + 0.4j)
+    for damping, factor in ((0.25, 4.0), (1.0, 1.0), (1.3, 1.0), (0.01, 6.0)):
+        now = found(strange=1.0, damping=damping)
+        assert ladder.settled(now, before) == pytest.approx(0.3 * factor, rel=1e-9)
 
 
 def test_modes_far_below_the_error_are_left_out():
@@ -87,3 +96,17 @@ def test_the_first_mesh_is_the_coarsest_that_usually_meets_the_tolerance():
     for i, value in enumerate(usual):
         assert ladder.first_rung(value) == i
         assert ladder.first_rung(0.999 * value) == min(i + 1, len(usual) - 1)
+
+
+def test_a_mesh_may_usually_meet_less_for_some_discs(monkeypatch):
+    quick = Rung("quick", (Choice(THIN_PLAN, 0.3, THIN, AFTER, usual=3e-3), *RUNG.choices), 2e-2, alone=ALONE)
+    monkeypatch.setattr(ladder, "RUNGS", (quick, RUNG))
+    assert [ladder.first_rung(5e-3, rho) for rho in (0.25, 0.35)] == [0, 1]
+    assert ladder.first_rung(5e-3) == 1
+    assert [ladder.first_rung(2e-2, rho) for rho in (0.25, 0.35)] == [0, 0]
+
+
+def test_off_normal_incidence_waves_may_count_more():
+    slanted = Rung("slanted", (Choice(THIN_PLAN, 1.0, Factors(0.3, 1.4, slanted=2.1), AFTER),), 1e-9, alone=ALONE)
+    for bloch, factor in ((0.0, 1.4), (0.2, 2.1)):
+        assert slanted.error(found(bloch=bloch), 0.5) == pytest.approx(0.3 * 0.02 + factor * 0.05, rel=1e-8)

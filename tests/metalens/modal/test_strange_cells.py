@@ -77,8 +77,8 @@ def test_bars_of_coarse_meshes_cover_cells_unlike_those_of_lenses(name, drawn, t
     assert error > 5 * doubt  # the mesh is what is wrong
 
 
-# Drawn with seeds on which no factor was chosen: the cells whose bars are nearest to their errors, so that half of a
-# factor would not cover them. Values of the mesh "fine", of the last one of "reference".
+# Cells whose bars are nearest to their errors, so that two fifths of
+# their factors would not cover them. Values of the mesh "fine", of the last one of "reference".
 TALL = (
     cell(0.4018070723, 1.869884332, 3.376210251, 1.66570934, 1.09029881, 1.21034073),
     0.1843747312,
@@ -88,11 +88,6 @@ WIDE = (
     cell(0.3431547314, 0.8111891931, 2.642703311, 1.69219485, 1.11870482, 1.27228516),
     0.2363329621,
     Light(0.6823754945),
-)
-VERY_TALL = (
-    cell(0.8958655415, 6.753076545, 2.857055773, 1.38727462, 1.58630213, 2.19359255),
-    0.2488732583,
-    Light(1.151715765),
 )
 TALLER = (
     cell(0.7948552376, 11.0175124, 1.89818664, 2.04340399, 1.32803376, 1.42092133),
@@ -104,32 +99,50 @@ SHARP_HOLE = (
     0.1776699277,
     Light(0.9744799279),
 )
+AT_CUTOFF = (  # within 0.2 % of the cutoff of an order of the substrate, where bars were a fifteenth of the error
+    cell(0.520574852, 0.381721476, 2.747248786, 1.60065034, 1.0, 1.0),
+    0.351280652,
+    Light(0.834092407),
+)
+DARK = cell(0.4, 0.7, 3.6, 1.4525, 1.0, 1.0), 0.272, Light(0.85, math.radians(5), "p")  # a sharp oblique resonance
+FORMS_ALIKE = cell(0.4364, 1.8514, 2.9316, 1.302, 1.0744, 1.1737), 0.2165, Light(0.8488)
 TIGHT = [
-    ("tall", TALL, 0.69795654 + 0.65842580j, -0.06944216 + 0.27296506j, COARSE),
+    ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, COARSE),
+    ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, EVEN),
     ("tall", TALL, 0.69795654 + 0.65842580j, -0.06944216 + 0.27296506j, FAIR),
     ("wide", WIDE, -0.72565884 + 0.36378853j, -0.15416812 - 0.56330218j, COARSE),
     ("wide", WIDE, -0.72565884 + 0.36378853j, -0.15416812 - 0.56330218j, EVEN),
-    ("very tall", VERY_TALL, -0.34356066 + 0.85666383j, -0.34878953 - 0.10497982j, COARSE),
+    ("at a cutoff", AT_CUTOFF, 0.59499749 + 0.08338888j, 0.68131847 + 0.41812609j, EVEN),
+    ("dark", DARK, 0.19752507 - 0.08091882j, -0.43306048 - 0.87572519j, COARSE),
+    ("dark", DARK, 0.19752507 - 0.08091882j, -0.43306048 - 0.87572519j, EVEN),
+    ("forms alike", FORMS_ALIKE, 0.21386131 - 0.91826247j, -0.31857679 - 0.09780695j, FAIR),
+    ("many orders", MANY_ORDERS, -0.38280652 + 0.40235310j, -0.06895376 + 0.10798189j, EVEN),
     ("taller", TALLER, 0.21283293 + 0.65345647j, 0.17572653 + 0.16581570j, FAIR),
     ("sharp hole", SHARP_HOLE, 0.72350856 + 0.56291204j, -0.17304880 + 0.36016596j, FAIR),
 ]
 
 
 @pytest.mark.parametrize(("name", "drawn", "t", "r", "rung"), TIGHT, ids=[f"{one[0]}, {one[4].name}" for one in TIGHT])
-def test_bars_that_are_tight_hold_and_would_not_with_half_a_factor(name, drawn, t, r, rung):
+def test_bars_that_are_tight_hold_and_would_not_with_two_fifths_of_their_factors(name, drawn, t, r, rung):
     case = case_of(*drawn)
     found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
-    assert 1.1 * error < rung.error(found, case.rho) < 1.9 * error
+    assert 1.1 * error < rung.error(found, case.rho) < 2.5 * error
 
 
-def test_a_sharp_resonance_of_a_hole_is_told_by_the_mesh_before():
-    """Both forms of the mesh "good" lie six times as near to each other as to the finest mesh."""
+def test_a_sharp_resonance_of_a_hole_is_told_by_the_meshes_before():
+    """Both forms of the mesh "good" lie six times as near to each other as to the finest mesh. How the answer settles
+    over the damping of the layer's waves tells it, on the mesh before too, and so does the climb."""
     t, r = TIGHT[-1][2:4]
-    drawn, good = case_of(*SHARP_HOLE), RUNGS[3]
-    alone = evaluate(drawn, good.choice(drawn.rho).plan, weak=good.weak)
-    assert abs(alone.matrix[1, 0] - t) > 3 * good.error(alone, drawn.rho)
-    found = modal.solve(SHARP_HOLE[0], SHARP_HOLE[1], SHARP_HOLE[2].wavelength_um, tolerance=5e-2)
+    drawn, made = case_of(*SHARP_HOLE), []
+    for rung in RUNGS[:4]:
+        made.append(evaluate(drawn, rung.choice(drawn.rho).plan, weak=rung.weak))
+    assert made[3].damping < 0.1 < made[1].damping
+    for i in (2, 3):
+        error = max(abs(made[i].matrix[1, 0] - t), abs(made[i].matrix[0, 0] - r))
+        assert 1.1 * error < RUNGS[i].error(made[i], drawn.rho, made[:i]) < 2.6 * error
+        assert i == 2 or abs(made[i].matrix[1, 0] - t) > 3 * RUNGS[i].error(made[i], drawn.rho)
+    found = modal.solve(SHARP_HOLE[0], SHARP_HOLE[1], SHARP_HOLE[2].wavelength_um, tolerance=0.1)
     assert found.converged
     assert 1.1 * max(abs(found.t - t), abs(found.r - r)) < found.t_error
 
