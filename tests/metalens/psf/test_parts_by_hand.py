@@ -121,3 +121,30 @@ def test_blocks_are_looked_at_across_the_whole_lens():
         shape = (64, 160) if axis == 0 else (160, 64)
         wide, narrow = (needed(s, lambda y, x: np.exp(1j * x * y / 9), axis) for s in (shape, (64, 64)))
         assert wide > narrow
+
+
+def test_wavelengths_are_as_few_as_tell_every_path_of_two_lines():
+    """Lines of 0.3 at 0.84 um and 0.7 at 0.86 um: their mean alone errs most over the longest of 65 paths that it is
+    asked for, two tell all."""
+    lines, share, reach = np.array([0.84, 0.86]), np.array([0.3, 0.7]), 7.0
+    mean = float(lines @ share)
+    p = reach * np.arange(65) / 64
+    miss = max(abs(np.exp(2j * np.pi * a / mean) - share @ np.exp(2j * np.pi * a / lines)) for a in p)
+    assert miss > 0.05
+    source = spectrum.Measured(lines, share)
+    one = spectrum.nodes(source, path_um=reach, tolerance=1.001 * miss)
+    assert one.wavelengths_um == pytest.approx([mean])
+    assert one.error == pytest.approx(miss, rel=1e-9)
+    two = spectrum.nodes(source, path_um=reach, tolerance=0.999 * miss)
+    assert np.sort(two.wavelengths_um) == pytest.approx(lines, rel=1e-12)
+    assert two.weights.sum() == pytest.approx(1, rel=1e-12)
+    assert two.error < 1e-9
+
+
+def test_a_line_has_half_its_light_half_a_width_away():
+    """Behind thick silicon every photon counts, so light of equal power counts by its wavelength."""
+    um, share = spectrum.weight(spectrum.Source(850.0, 30.0, silicon_um=1e6))
+    level = np.interp([0.850, 0.835, 0.865, 0.880], um, share)
+    assert level[1:] / level[0] == pytest.approx(np.array([835, 865, 880]) / 850 * [0.5, 0.5, 1 / 16], rel=1e-9)
+    assert (um[0], um[-1]) == pytest.approx((0.775, 0.925), rel=1e-12)
+    assert share.sum() == pytest.approx(1, rel=1e-12)
