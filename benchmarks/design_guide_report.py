@@ -173,8 +173,8 @@ the likelihood of the windows' depths ({turns} steps of the lens, {hold} of the 
 step), trained once, on an image to {coarse:g} of the contrast, and read by every seed. `asphere`: six radial terms,
 likewise. `bound`: what the blur of one window alone can tell, the least standard deviation of its depth, mean over the
 windows of the field and the depths, for a patch of unknown 1/f texture of contrast 0.2, its contrast and fall unknown
-too, in the photons' noise, where depths spread by 3 mm beforehand. Readers see edges and neighbouring windows as well,
-and may do better.
+too, in the photons' noise, where depths spread by 3 mm beforehand; that less light falls towards the rim is left out.
+Readers see edges and neighbouring windows as well, and may do better.
 """
 RUNGS = """\
 ## Where the gain is lost
