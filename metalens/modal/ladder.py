@@ -208,15 +208,21 @@ ON_GOOD = (  # discs that leave a wide or a narrow gap
 )
 
 
-def _finer(name: str, plan: MeshPlan, usual: float, safety: float, flat: float, oblique: float = 0.0) -> Rung:
+def _finer(plan: MeshPlan, safety: float, flat: float, oblique: float = 0.0) -> tuple[Choice, ...]:
     """One mesh for all discs, with factors of the worst cells: too few were solved on finer ones to tell them apart."""
     usually = Factors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
     wide = Factors(2 * safety, 2 * safety, flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
     narrow = Factors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
     after = Factors(3.0, 3.0, moved=0.33)
-    alone = Factors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique, grazing=0.15)
     ends = (0.7, usually), (NARROW, wide), (1.0, narrow)
-    return Rung(name, tuple(Choice(plan, end, factors, after) for end, factors in ends), usual, alone)
+    return tuple(Choice(plan, end, factors, after) for end, factors in ends)
+
+
+def _alone(safety: float, flat: float, oblique: float = 0.0) -> Factors:
+    return Factors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique, grazing=0.15)
+
+
+ON_FINER = _finer(FINER, 0.5, 4e-8, 1e-7)
 
 
 RUNGS = (
@@ -271,10 +277,11 @@ RUNGS = (
         1e-4,
         alone=Factors(3.0, 3.0, 1e-6, 1e-6, oblique=1.5e-6),
     ),
-    _finer("fine", FINE, 2.5e-5, 1.0, 3e-7, 3e-7),
-    _finer("finer", FINER, 8e-6, 0.5, 4e-8, 1e-7),
-    _finer("finest", FINEST, 3e-6, 0.35, 2e-8, 5e-8),
-    _finer("reference", REFERENCE, 1e-6, 0.3, 1e-8),
+    # what "fine" adds to "good" is lost on wide discs, whose gap it does not divide: they go on to "finer"
+    Rung("fine", (*_finer(FINE, 1.0, 3e-7, 3e-7)[:1], *ON_FINER[1:]), 2.5e-5, _alone(1.0, 3e-7, 3e-7)),
+    Rung("finer", ON_FINER, 8e-6, _alone(0.5, 4e-8, 1e-7)),
+    Rung("finest", _finer(FINEST, 0.35, 2e-8, 5e-8), 3e-6, _alone(0.35, 2e-8, 5e-8)),
+    Rung("reference", _finer(REFERENCE, 0.3, 1e-8), 1e-6, _alone(0.3, 1e-8)),
 )
 
 
