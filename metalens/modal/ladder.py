@@ -31,7 +31,7 @@ gaps), and two of many waves in a pitch. With these factors all do, the nearest 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -46,7 +46,7 @@ class Factors:
     rim, waves: of both halves of the forms' difference. flat, steep, oblique: relative error of transverse wavenumbers
     squared that both forms share, ``flat + steep (waves in a pitch / SIZE)⁶``, ``oblique`` more off normal incidence.
     moved: of the change from meshes before. slanted: least value of waves off normal incidence; at_cutoff: of rim and
-    waves where an order is near its cutoff. grazing: of the change that exact cutoffs make.
+    waves where an order is near its cutoff, where the forms err alike. grazing: of the change that exact cutoffs make.
     """
 
     rim: float
@@ -56,8 +56,8 @@ class Factors:
     oblique: float = 0.0
     moved: float = 0.0
     slanted: float = 0.0
-    at_cutoff: float = 0.0
-    grazing: float = 0.0
+    at_cutoff: float = 2.6
+    grazing: float = 0.15
 
     def bound(self, found: "Measured", before: "Sequence[Measured]" = ()) -> float:
         """Error estimate of a solution, after the meshes ``before``."""
@@ -203,32 +203,37 @@ EVEN = MeshPlan(4, 4, 4, BOTH)
 SETTLED, WIDE = Factors(0.6, 2.0, moved=0.31), Factors(2.5, 1.8, moved=0.33)
 UNSETTLED = Factors(9.0, 9.0, moved=0.33)  # of elements of degree three and four
 ON_GOOD = (  # discs that leave a wide or a narrow gap
-    Choice(GOOD, NARROW, Factors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7), WIDE),
-    Choice(GOOD, 1.0, Factors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7), WIDE),
+    Choice(GOOD, NARROW, Factors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0), WIDE),
+    Choice(GOOD, 1.0, Factors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0), WIDE),
 )
 
 
 def _finer(plan: MeshPlan, safety: float, flat: float, oblique: float = 0.0) -> tuple[Choice, ...]:
     """One mesh for all discs, with factors of the worst cells: too few were solved on finer ones to tell them apart."""
-    usually = Factors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
-    wide = Factors(2 * safety, 2 * safety, flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
-    narrow = Factors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique, at_cutoff=2.6, grazing=0.15)
+    usually = Factors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique)
+    wide = Factors(2 * safety, 2 * safety, flat, flat, oblique=oblique)
+    narrow = Factors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique)
     after = Factors(3.0, 3.0, moved=0.33)
     ends = (0.7, usually), (NARROW, wide), (1.0, narrow)
     return tuple(Choice(plan, end, factors, after) for end, factors in ends)
 
 
 def _alone(safety: float, flat: float, oblique: float = 0.0) -> Factors:
-    return Factors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique, grazing=0.15)
+    return Factors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique)
 
 
 ON_FINER = _finer(FINER, 0.5, 4e-8, 1e-7)
 
 
+def _rough(*choices: Choice) -> tuple[Choice, ...]:
+    """Near a cutoff both forms err alike, and the more the fewer elements there are."""
+    return tuple(replace(one, factors=replace(one.factors, at_cutoff=4.6)) for one in choices)
+
+
 RUNGS = (
     Rung(
         "coarse",
-        (
+        _rough(
             Choice(COARSE, TINY, Factors(1.2, 1.2, 1e-5, 1e-5, oblique=2e-4), UNSETTLED),
             Choice(
                 COARSE, THIN, Factors(0.5, 0.62, 6.3e-6, 2.5e-5, oblique=3.8e-5, slanted=1.7), UNSETTLED, usual=1e-3
@@ -243,7 +248,7 @@ RUNGS = (
     ),
     Rung(
         "fair",
-        (
+        _rough(
             Choice(FAIR, TINY, Factors(1.2, 1.2, 3e-6, 8e-6, oblique=1e-5), UNSETTLED),
             Choice(FAIR, THIN, Factors(0.81, 0.62, 1e-6, 1e-5, slanted=1.7), UNSETTLED, usual=2e-4),
             Choice(FAIR, 0.6, Factors(0.44, 1.0, 1.2e-6, 1.3e-4), UNSETTLED),
@@ -269,9 +274,15 @@ RUNGS = (
     Rung(
         "good",
         (
-            Choice(GOOD, TINY, Factors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7), SETTLED),
-            Choice(GOOD, THIN, Factors(0.69, 0.62, 3.7e-8, 3.8e-7, oblique=1.2e-7, slanted=1.7), SETTLED, usual=2.5e-5),
-            Choice(GOOD, 0.7, Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7), SETTLED),
+            Choice(GOOD, TINY, Factors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7, at_cutoff=1.0), SETTLED),
+            Choice(
+                GOOD,
+                THIN,
+                Factors(0.69, 0.62, 3.7e-8, 3.8e-7, oblique=1.2e-7, slanted=1.7, at_cutoff=1.0),
+                SETTLED,
+                usual=2.5e-5,
+            ),
+            Choice(GOOD, 0.7, Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0), SETTLED),
             *ON_GOOD,
         ),
         1e-4,
