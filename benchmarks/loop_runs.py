@@ -6,10 +6,12 @@ The settings of every study are made here, from one text over the preset ``smoke
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from codesign.network.architecture import largest
+from codesign.optics import formed
 from codesign.optics import stack as trained
 from codesign.train import run as runs
 from codesign.train.evolution import Candidate, Search
@@ -34,10 +36,12 @@ kernels = [5]
 resolution = [1.0, 1.0]
 [run]
 pitch_um = {pitch_um}
+frozen = ["pitch"]
 budgets_mmacs = [{budget}]
 [inner]
 steps = {steps}
-batch = 32
+batch = {batch}
+seed = {seed}
 slip_scale_mm = {slip_scale_mm}
 optics_weight = {optics_weight}
 [inner.optics]
@@ -45,7 +49,8 @@ rate = {rate}
 start = 0.12
 end = 0.8
 [optics]
-image = "uniform"
+image = "{image}"
+fwhm_nm = {fwhm_nm}
 sample_um = {pitch_um}
 window_samples = {window}
 depth_count = 16
@@ -62,7 +67,9 @@ class Recipe:
 
     focus_mm: of the hyperbolic lens that training starts from. moves: whether training moves the lens as well.
     pitch_um: of pixels and samples. edge_um: of the image. width: of the network. slip_mm, gaze_deg: reach of slippage
-    and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss.
+    and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss. steps: of ``batch``
+    frames.
+    seed: of weights, frames and noise. image, fwhm_nm: see :class:`codesign.optics.stack.OpticsConfig`.
     """
 
     focus_mm: float
@@ -76,6 +83,10 @@ class Recipe:
     gaze_deg: tuple[float, float] = (18.0, 13.0)
     rate: float = 0.02
     optics_weight: float = 0.05
+    batch: int = 32
+    seed: int = 0
+    image: Literal["true", "uniform"] = "uniform"
+    fwhm_nm: float = 0.0
 
     @property
     def toml(self) -> str:
@@ -85,7 +96,7 @@ class Recipe:
             pixels=pixels, margin=pixels // 8, pool=self.pool, slip_mm=list(self.slip_mm), gaze_deg=list(self.gaze_deg),
             width=self.width, pitch_um=self.pitch_um, budget=BUDGET, steps=self.steps,
             slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=self.rate if self.moves else 0.0,
-            optics_weight=self.optics_weight,
+            optics_weight=self.optics_weight, batch=self.batch, seed=self.seed, image=self.image, fwhm_nm=self.fwhm_nm,
             window=2 * int(WINDOW_UM / self.pitch_um / 2) + 1, focus_mm=self.focus_mm,
             polynomials=35 if self.moves else 0,
         )  # fmt: skip
@@ -107,7 +118,10 @@ def finished(folder: Path, recipe: Recipe) -> None:
     runs.save(path, going)
     if not (folder / "lens.h5").exists():
         _design(folder / "lens.h5", settings, runs.coefficients(going).numpy())
-    store.write_text(folder / "result.json", json.dumps({"rows": finish(going)}))
+    scenes, coefficients = settings.scenes, runs.coefficients(going)
+    side = scenes.pixels + 2 * scenes.margin
+    said = formed.described(settings.optics, coefficients, side, margin=scenes.margin)
+    store.write_text(folder / "result.json", json.dumps({"rows": finish(going), "image": said}))
 
 
 def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> None:

@@ -25,8 +25,9 @@ as the forms have drawn together since (the root of it: errors decay no slower),
 
 On three other seeds (70217, 81173, 92311) 1157 of 1163 bars of four meshes held at first; the factors were widened for
 the four cells of the others: a thin disc in steep light (``slanted``), a disc of 0.9 pitches (now with those of narrow
-gaps), and two of many waves in a pitch. With these factors all do, the nearest at 0.82 of its bar. Meshes finer than
-"good" have the factors of the worst of 60 cells.
+gaps), and two of many waves in a pitch. With these factors all do, the nearest at 0.82 of its bar. Cutoffs were rare
+among those cells: their factors are calibrated on cells drawn at cutoffs (``benchmarks.hard_cells``). Meshes finer
+than "good" have the factors of the worst of 60 cells.
 """
 
 import math
