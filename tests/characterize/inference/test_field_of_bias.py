@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,14 +9,13 @@ from scipy import optimize
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
+from pictured import Pictured
 
 from characterize.inference import explore, leastsquares, search
 from characterize.inference.leastsquares import Prior
 from characterize.model import PLACE
-from characterize.model.setting import Setting
 
 NAMED = ("bias_nm", "bias_x_nm", "bias_y_nm", "bias_r_nm", "background_e")
-DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
 RNG = np.random.default_rng(8)
 BRIGHT = RNG.uniform(3, 9, (5, 4, 3))
 PICTURES = np.linalg.qr(RNG.standard_normal((60, 8)))[0].T.reshape(8, 5, 4, 3)  # of unit length, at right angles
@@ -37,23 +35,8 @@ def products(field):
     return value, slopes
 
 
-class Field:
-    """Seven pictures of the products, and a background; a quick one sees a hundredth less of all."""
-
-    def __init__(self, index=None, seen=1.0):
-        self.seen = seen
-        self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3)
-        self.groups = [SimpleNamespace(index=np.arange(len(index)))]
-
-    def only(self, index):
-        return Field(self.index[index], self.seen)
-
-    def rough(self, tolerance):
-        return self
-
-    def quick(self):
-        return Field(self.index, 0.99)
+class Field(Pictured):
+    """Seven pictures of the products, and a background."""
 
     def images(self, x, names=None):
         *field, level = (x[PLACE[name]] for name in NAMED)

@@ -2,21 +2,19 @@
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
+from pictured import Pictured
 
 from characterize.inference import explore, leastsquares, search
 from characterize.inference.leastsquares import Prior
 from characterize.model import PLACE
-from characterize.model.setting import Setting
 
 NAMED = ("bias_nm", "bias_y_nm", "background_e")
-DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
 RNG = np.random.default_rng(8)
 BRIGHT = RNG.uniform(3, 9, (5, 4, 3))
 PICTURES = np.linalg.qr(RNG.standard_normal((60, 3)))[0].T.reshape(3, 5, 4, 3)  # of unit length, at right angles
@@ -24,26 +22,8 @@ PRODUCT, SQUARES, NOISE = 0.043, 0.013, 0.4
 PRIOR = Prior(np.array([1.7, 0.0, 0.0]), np.array([15.0, np.inf, np.inf]), np.full(3, -40.0), np.full(3, 40.0))
 
 
-class Ring:
-    """(b + ig)², its parts on two pictures: two lenses alike, (b, g) and (-b, -g), with a ring between them.
-
-    A quick one sees a hundredth less of all, as one term of a field would.
-    """
-
-    def __init__(self, index=None, seen=1.0):
-        self.seen = seen
-        self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3)
-        self.groups = [SimpleNamespace(index=np.arange(len(index)))]
-
-    def only(self, index):
-        return Ring(self.index[index], self.seen)
-
-    def rough(self, tolerance):
-        return self
-
-    def quick(self):
-        return Ring(self.index, 0.99)
+class Ring(Pictured):
+    """(b + ig)², its parts on two pictures: two lenses alike, (b, g) and (-b, -g), with a ring between them."""
 
     def images(self, x, names=None):
         bias, g, level = (x[PLACE[name]] for name in NAMED)
