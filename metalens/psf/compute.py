@@ -154,7 +154,8 @@ def _exact(lit: Lit, reason: str) -> Result:
         for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-        samples.append(_of_pillars((phase, level), case, weight, pupils))
+        if lit.mixing is not None:  # a scalar has no rays to be judged
+            samples.append(_of_pillars((phase, level), case, weight, pupils))
     found = Result(torch.as_tensor(total).to(lit.phase.dtype), EXACT[lit.phase.dtype], reason, power)
     return _from_middle(found, lit, [samples], [total])
 
