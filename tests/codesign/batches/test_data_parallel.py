@@ -67,10 +67,12 @@ parallel.leave()
 def _run(script, target, count, text=WORKER):
     script.write_text(text)
     plain = [sys.executable, str(script), str(target)]
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", *plain[1:]]
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
+    # a process that the transport ends (SIGABRT, once in 100s of runs) begins again; other numbers fail all the same
+    command = [*launcher, "--max-restarts=2", *plain[1:]]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command if count > 1 else plain, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.returncode == 0, done.stderr
     return torch.load(target, weights_only=False)
 
 
