@@ -3,6 +3,7 @@
 import argparse
 import ast
 import contextlib
+import functools
 import json
 import multiprocessing
 import os
@@ -20,7 +21,7 @@ from benchmarks.mutation.server import Server
 
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "benchmarks" / "results" / "mutants.json"
-REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # {"path: was -> became": why no test can tell}
+REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # path -> line's words -> change -> why none can tell
 LONGEST_S = 120.0  # of test files whose usual time is not known
 SEEN = ROOT / "build" / "mutants" / "reach.json"  # which tests run which lines, as seen before the first mutant
 
@@ -184,8 +185,7 @@ def _files(chosen: list[rules.Mutant], tests: str, near: int) -> tuple[str, ...]
 def _survivors(result: Path) -> list[rules.Mutant]:
     """Those of the kept result that have no reason, found again in the source as it is now."""
     kept = json.loads(result.read_text(encoding="utf-8"))["mutants"]
-    reasons = json.loads(REASONS.read_text(encoding="utf-8"))
-    open_ = (r for r in kept if r["outcome"] == "survived" and _reasoned(r) not in reasons)
+    open_ = (r for r in kept if r["outcome"] == "survived" and not _reason(r))
     left = {(row["path"], row["text"], row["was"], row["became"]) for row in open_}
     found = []
     for path in sorted({row[0] for row in left}):
@@ -227,7 +227,6 @@ def _say(done: int, total: int, row: dict[str, object]) -> None:
 
 def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) -> int:
     """The result as JSON and as a table; with --again the judged ones replace their old lines."""
-    reasons = json.loads(REASONS.read_text(encoding="utf-8"))
     if asked.again:
         kept = json.loads(asked.result.read_text(encoding="utf-8"))
         judged = {_identity(row): row for row in rows}
@@ -236,7 +235,7 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
         words = f"python -m benchmarks.mutation {words}".strip()
     for row in rows:
         row.pop("reason", None)
-        reason = reasons.get(_reasoned(row))
+        reason = _reason(row)
         if reason and row["outcome"] != "killed":
             row["reason"] = reason
     asked.result.write_text(json.dumps({"command": words, "mutants": rows}, indent=1) + "\n", encoding="utf-8")
@@ -245,9 +244,16 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
     return int(any(row["outcome"] in ("survived", "no test") and "reason" not in row for row in rows))
 
 
-def _reasoned(row: dict[str, object]) -> str:
-    """What a mutant is called in the file of reasons."""
-    return f"{row['path']}: {row['was']} -> {row['became']}"
+def _reason(row: dict[str, object]) -> str:
+    """Why no test can tell a mutant, by its file, the words of its line and the change; "" where nobody said."""
+    reason: str = _reasons().get(row["path"], {}).get(row["text"], {}).get(f"{row['was']} -> {row['became']}", "")
+    return reason
+
+
+@functools.cache
+def _reasons() -> dict[object, dict[object, dict[str, str]]]:
+    reasons: dict[object, dict[object, dict[str, str]]] = json.loads(REASONS.read_text(encoding="utf-8"))
+    return reasons
 
 
 def _identity(row: dict[str, object]) -> tuple[object, ...]:

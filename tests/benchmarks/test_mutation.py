@@ -4,6 +4,7 @@ import importlib.util
 
 import pytest
 
+from benchmarks.mutation import __main__ as main
 from benchmarks.mutation import reach, rules, server
 from benchmarks.mutation.graph import Graph
 from benchmarks.mutation.reach import Reach
@@ -130,3 +131,32 @@ def test_a_watched_test_tells_its_lines(tree):
     other = MODULE.replace("abs(x)", "(x)")
     assert answer.outcome(path, other, ["test_it.py::test_a"], 60.0)[0] == "passed"
     answer.close()
+
+
+def test_a_reason_is_for_one_line(tmp_path, monkeypatch):
+    """The same change of another line of the file has no reason; lines that move keep theirs."""
+    file = tmp_path / "reasons.json"
+    file.write_text('{"a.py": {"x = 2.0": {"2.0 -> (4.0)": "a scale"}}}')
+    monkeypatch.setattr(main, "REASONS", file)
+    main._reasons.cache_clear()
+    row = {"path": "a.py", "line": 3, "text": "x = 2.0", "was": "2.0", "became": "(4.0)"}
+    assert main._reason(row) == main._reason(row | {"line": 9}) == "a scale"
+    assert not any(main._reason(row | other) for other in ({"text": "y = 2.0"}, {"became": "(1.0)"}, {"path": "b.py"}))
+    main._reasons.cache_clear()
+
+
+def test_test_files_of_closed_forms_are_asked_first(tree):
+    """Before the longer one of the module's own name, before one that only imports it, whatever their words."""
+    folder = tree / "tests" / "metalens"
+    folder.mkdir(parents=True)
+    said = "from metalens import numbers_of\n"
+    files = {"numbers_of": said * 9, "numbers_of_truths": said, "sums_parts": said, "other": said * 20}
+    for name, words in files.items():
+        (folder / f"test_{name}.py").write_text(words)
+    asked = Graph(tree).related("metalens.numbers_of", {}, 40.0)
+    assert [name.split("test_")[1] for name in asked] == [
+        "numbers_of_truths.py",
+        "sums_parts.py",
+        "numbers_of.py",
+        "other.py",
+    ]

@@ -82,15 +82,18 @@ def test_values_go_to_their_places_and_the_rest_to_the_modes():
     [(6000.0, 5750.0, False), (6000.0, 5650.0, True), (30000.0, 29405.0, False), (30000.0, 29300.0, True)],
 )
 def test_a_phase_is_kept_where_unseen_frames_gain_four_sigma_and_a_fiftieth(monkeypatch, before, after, kept):
-    """4 frames of 750 good pixels: 6000 has to fall by 4 sqrt(2 · 3000) = 310, 30000 by its fiftieth, 600."""
+    """4 frames of 750 good pixels: 6000 has to fall by 4 sqrt(2 · 3000) = 310, 30000 by its fiftieth, 600.
+
+    By depth they are frames 1, 2, 0 and 3: the first and the third say what the others are judged by, and back.
+    """
     pixels = np.ones((4, 30, 26), bool)
     usable, full = pixels.copy(), ~pixels
     usable[:, 0, :], full[:, 1, 0:4] = False, True
     data = Data(1.0 * pixels, usable, full, 1.0 * pixels, 1.0 * pixels)
     assert (usable & ~full).sum() == 3000
     model = SimpleNamespace(setting=SimpleNamespace(depth_um=np.array([3.0, 1.0, 2.0, 4.0])))
-    model.only = lambda index: model
-    p, asked = len(NAMES), []
+    p, asked, split = len(NAMES), [], []
+    model.only = lambda index: split.append(index.tolist()) or model
     value = RNG.normal(size=p + MODES)
     slopes = RNG.normal(size=(60 + MODES, p + MODES))
     made = _solution(value, slopes.T @ slopes)
@@ -106,6 +109,7 @@ def test_a_phase_is_kept_where_unseen_frames_gain_four_sigma_and_a_fiftieth(monk
     start = np.array([2.0, -1.0])
     got = residual.attempt(model, data, NAMES, start, base=start, prior=Prior.none(start))
     assert asked == [(p, False), (p + MODES, False)] * 2 + [(p + MODES, True)] * kept
+    assert split == [[0, 1], [2, 3], [2, 3], [0, 1]]
     if not kept:
         assert got is None
         return

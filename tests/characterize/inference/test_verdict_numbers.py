@@ -11,6 +11,7 @@ from characterize.inference import verdict
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.missing import Unstated
 from characterize.model import PARAMETERS, PLACE
+from tests.characterize.inference.test_explore import Straight, task
 
 RNG = np.random.default_rng(41)
 NOTHING = Unstated.none(4)
@@ -104,3 +105,102 @@ def test_a_wave_front_that_leaves_less_than_half_the_peak_is_no_tolerance(waves,
     found = verdict.problems(("coma_x_rad", "bias_nm", "spherical_rad"), one, Gain(1.3, 0.01, 2.0))
     assert [words.startswith("aberrations of") for words in found] == [True] * refused
     assert (np.exp(-(waves**2)) < 0.5) == refused
+
+
+def finished(residual_sigma, **more):
+    told = {"converged": True, "image": 900 * (residual_sigma != 9), "residual_sigma": residual_sigma}
+    return SimpleNamespace(**(told | {"chi2_per_dof": 1.0, "value": np.zeros(2)} | more))
+
+
+@pytest.mark.parametrize(("size", "count", "told"), [(6.4, 21, True), (6.4, 19, False), (5.6, 40, False)])
+def test_a_ghost_is_two_hundredths_of_the_pixels_beyond_six_sigma(size, count, told):
+    """Of 1000, on either side; a normal residual is there once in five hundred million."""
+    assert stats.norm.sf(6) * 2 < 1 / 5e8
+    residual_sigma = np.zeros((2, 20, 25))
+    residual_sigma.flat[: 3 * count : 3] = size * (-1.0) ** np.arange(count)
+    one = finished(residual_sigma, image=900 * np.eye(25)[None])
+    found = verdict.problems(("bias_nm", "coma_x_rad"), one, Gain(1.3, 0.01, 2.0))
+    assert any("beyond 6 sigma: a ghost" in words for words in found) is told
+
+
+def test_the_frame_that_is_explained_worst_has_the_most_squares_in_all():
+    """Frame 1 with 7 times 4 has 112; frame 0 one of 10, whose cube is more; frame 2 more pixels, which are less."""
+    residual_sigma = np.full((3, 6, 8), 0.1)
+    residual_sigma[0, 2, 3], residual_sigma[1, 4, :7], residual_sigma[2] = 10.0, -4.0, 1.3
+    one = finished(residual_sigma, chi2_per_dof=2.71, image=900 * np.eye(8)[None])
+    found = verdict.problems(("bias_nm", "coma_x_rad"), one, Gain(1.3, 0.01, 2.0))
+    assert "chi-square per degree of freedom is 2.71, not 1" in found[0]
+    assert "(worst: frame 1)" in found[0]
+
+
+def by_pixels(residual, dark, flat):
+    """Sigma by which frames go together, one pixel after the other with its whole covariance matrix."""
+    total = expected = variance = 0.0
+    for y, x in np.ndindex(residual.shape[1:]):
+        own, some = residual[:, y, x], residual[:, y, x] != 0
+        root = np.sqrt(1 + (flat[:, y, x] * some) ** 2)
+        r, d, f = own / root, dark[:, y, x] * some / root, flat[:, y, x] * some / root
+        k = np.outer(d, d) + np.outer(f, f)
+        k[np.diag_indices(len(k))] = some
+        a = (np.eye(len(k), k=1) + np.eye(len(k), k=-1)) / 2
+        total, expected = total + r @ a @ r, expected + np.trace(a @ k)
+        variance += 2 * np.trace(a @ k @ a @ k)
+    return (total - expected) / np.sqrt(variance)
+
+
+def test_sigma_of_frames_that_go_together_counts_shares_of_seen_pixels_only():
+    """A third of the pixels are masked; shares of dark and flat differ from pixel to pixel and are taken off."""
+    shape = (4, 11, 9)
+    dark, flat = RNG.uniform(0.4, 0.8, shape), RNG.uniform(0.5, 1.3, shape)
+    residual = RNG.standard_normal(shape) + 1.6 * RNG.standard_normal(shape[1:])
+    residual[RNG.uniform(size=shape) < 0.35] = 0.0
+    want = by_pixels(np.clip(residual, -6, 6), dark, flat)
+    assert want > 5
+    found = [words for words in verdict.structure(residual, np.stack([dark, flat])) if "frame to frame" in words]
+    assert f"({want:.1f} sigma)" in found[0]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_no_pixel_counts_for_more_than_six_sigma_beside_its_neighbour(sign):
+    """One pair of 30 and 6.5 is 36 over the root of 16 x 24 pairs, 1.8 sigma, not 9.9; a square of nine has six."""
+    residual = np.where(np.indices((17, 24)).sum(0) % 2, 1e-3, -1e-3)[None]
+    residual[0, 4, 5], residual[0, 5, 5] = 30.0 * sign, 6.5 * sign
+    assert not any("pixel to pixel" in words for words in verdict.structure(residual))
+    residual[0, 4:7, 9:12] = 30.0 * sign
+    found = next(words for words in verdict.structure(residual) if "pixel to pixel" in words)
+    assert f"({7 * 36 / np.sqrt(16 * 24):.1f} sigma)" in found  # pairs with a thousandth in them: 0.036 at most
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_darker_frame_is_told_as_a_brighter_one(sign):
+    residual = np.tile(np.array([[1.0, -1.0], [-1.0, 1.0]]), (3, 5, 6))
+    residual[2] += 0.47 * sign  # of 120 pixels: 5.15
+    assert any("frame 2 is brighter or darker than the model by 5.1 sigma" in w for w in verdict.structure(residual))
+
+
+def test_what_moves_a_parameter_most_in_its_own_errors_is_named_first_and_three_are():
+    """0.9, 6, 1.5, 3 and 0.2 errors at most, of which the second and the fourth are the smallest numbers."""
+    names, sigma = ("bias_nm", "coma_x_rad"), np.array([0.8, 0.01])
+    errors = np.array([[0.9, 0.3], [0.0, 6.0], [1.5, 0.0], [0.0, 3.0], [0.2, 0.1]])
+    causes = ("a plate of glass", "an oblique saddle", "uneven light", "a ghost", "an echo")
+    by_cause = errors * sigma
+    unstated = Unstated(causes, by_cause, np.diag((by_cause**2).sum(0)) * [[9.0], [4.0]], np.zeros((2, 2)))
+    said = verdict.process_verdict(names, -1.96 * sigma, 1.96 * sigma, np.full(2, 0.1), unstated)
+    assert "that is without oblique saddle, ghost, uneven light: bias_nm" in said
+
+
+def test_expected_error_without_draws_is_that_of_the_covariance(monkeypatch):
+    """To first order in C: root of tr C G over the image's length, G the products of pictures at right angles to it."""
+    bright, pictures = RNG.uniform(2, 9, (5, 6, 7)), RNG.normal(size=(3, 5, 6, 7))
+    pictures[1] += 0.7 * pictures[0]
+    pictures[2] = 0.8
+    value = np.array([0.31, -0.12, 5.0])
+    root = np.array([[0.02, 0.0, 0.0], [-0.03, 0.012, 0.0], [0.0, 0.0, 1.7]])
+    found = SimpleNamespace(draws=np.empty((0, 3)), covariance=root @ root.T, best=SimpleNamespace(value=value))
+    image = (bright + np.tensordot(value[:2], pictures[:2], 1)).ravel()
+    flat = pictures[:2].reshape(2, -1)
+    across = flat - np.outer(flat @ image, image) / (image @ image)
+    want = np.sqrt(np.trace(found.covariance[:2, :2] @ (across @ across.T)) / (image @ image))
+    monkeypatch.setattr(verdict, "_SHOWN", 2000)
+    got = verdict.predicted_error(task(Straight(bright, pictures)), found)
+    assert got == pytest.approx((want, want), rel=0.06)  # of a mean of 2000 squares: three times 1.6 %, and C's square
