@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from metalens.lens.record import parts as parts
     from metalens.lens.record import save as save
     from metalens.lens.record import streamed as streamed
+    from metalens.lens.waves import saddle as saddle
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -47,6 +48,7 @@ __getattr__, __dir__, __all__ = attach(
         "parts": "record",
         "picture": "",
         "reach": "",
+        "saddle": "waves",
         "save": "record",
         "streamed": "record",
     },

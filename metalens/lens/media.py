@@ -94,12 +94,18 @@ def passed(order: Sequence[float], p: Any) -> Any:
 
 def passed_at(order: Sequence[float], w: Any) -> Any:
     """As :func:`passed`, of w = p²."""
+    s_power, p_power = passed_apart(order, w)
+    return (s_power + p_power) / 2
+
+
+def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
+    """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel)."""
     s_power, p_power = w * 0 + 1, w * 0 + 1
     for a, b in itertools.pairwise(order):
         ca, cb = (1 - w / a**2) ** 0.5, (1 - w / b**2) ** 0.5
         s_power = s_power * (1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2)
         p_power = p_power * (1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2)
-    return (s_power + p_power) / 2
+    return s_power, p_power
 
 
 def _with_normals(layers: Pairs, w: Any) -> list[tuple[float, Any, Any]]:

@@ -32,7 +32,8 @@ def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
     Raises:
         PropagationError: maps that do not fit, are empty or hold NaN or infinity.
 
-    Accuracy: rounding only, 1e-12 of the sum of the pillars' magnitudes for paths up to 1 m.
+    Accuracy: rounding only, 1e-12 of the sum of the pillars' magnitudes for paths up to 1 m; through films that and
+    :func:`metalens.propagate.paths.films_error`, below rounding but for steep rays through some um.
     """
     y, x = case.window_um
     points = np.stack(np.meshgrid(x + case.centre_um[0], y + case.centre_um[1]), -1).reshape(-1, 2)
@@ -64,7 +65,9 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
     numbers: Any = (case.wavenumber, case.sensor_distance_um, case.area_um2)
     kernel: Any = _accumulate
     if case.behind is not None:
-        kernel, numbers = add_rays, (case.wavenumber, case.area_um2, *media_arrays(case.behind))
+        y_far, x_far = (np.abs(points[:, i]).max() + half for i, half in zip((1, 0), case.half_size_um, strict=True))
+        films = media_arrays(case.behind, case.wavenumber, float(np.hypot(y_far, x_far)))
+        kernel, numbers = add_rays, (case.wavenumber, case.area_um2, *films)
 
     def work(a: int, b: int) -> None:
         kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])

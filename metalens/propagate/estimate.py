@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from scipy.ndimage import uniform_filter
 
@@ -20,11 +19,10 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.threads import one_blas_thread, split
 from metalens.propagate.geometry import Case
-from metalens.propagate.layered import media_arrays, sum_rays
+from metalens.propagate.layered import curved, media_arrays, sum_nodes, sum_rays
 from metalens.propagate.operators import depth_factors
 from metalens.propagate.paths import kernel, reference_depth
 from metalens.propagate.pillars import Pupils
-from metalens.propagate.sincos import turns64
 
 MORE = 8
 POINTS, EVERY = 128, 32  # that an estimate looks at, and more than one in so many where a window has many
@@ -276,9 +274,10 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
     given = [_of_depths(case, one, (e, x), numbers, inverse) for one in light]
     re, im = (np.concatenate([parts[i] for parts in given], axis=1) for i in (0, 1))
     out = np.zeros((re.shape[1], len(points)), complex)
-    total: Any = _sum_nodes
+    total: Any = sum_nodes
     if case.behind is not None:
-        total, numbers = sum_rays, (case.wavenumber, *case.centre_um, *media_arrays(case.behind))
+        k = case.wavenumber
+        total, numbers = sum_rays, (k, *case.centre_um, *media_arrays(case.behind, k, case.reach_um))
     split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
     return np.asarray(out * case.area_um2).reshape(len(light), len(depths), -1)
 
@@ -287,7 +286,7 @@ def _of_depths(case: Case, light: Array, at_um: tuple[Array, Array], numbers: Ar
     """(real and imaginary, row, depth, column) light (row, column) with the phase of every depth."""
     e, x = at_um
     out = np.empty((2, len(e), len(inverse), len(x)))
-    turn: Any = _curved
+    turn: Any = curved
     if case.front:
         angle = depth_factors(case, e[:, None], x, case.tangents, inverse[:, None, None])
         turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
@@ -295,56 +294,3 @@ def _of_depths(case: Case, light: Array, at_um: tuple[Array, Array], numbers: Ar
     else:
         split(len(e), lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, out[0, a:b], out[1, a:b]))
     return out
-
-
-@numba.njit(inline="always")
-def _source(x, y, numbers, inverse):  # type: ignore[no-untyped-def]
-    tilt = 2 * (x * numbers[0] + y * numbers[1])
-    s2 = 1 + numbers[0] ** 2 + numbers[1] ** 2
-    top = (x * x + y * y) * inverse + tilt
-    return top / (np.sqrt(top * inverse + s2) + np.sqrt(s2))
-
-
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _curved(light, e, x, numbers, inverse, re, im):  # type: ignore[no-untyped-def]
-    """Light on the nodes (row, column) with the phase of every depth less the reference's, to (row, depth, column)."""
-    for i in range(e.size):
-        for z in range(inverse.size):
-            for j in range(x.size):
-                path = _source(x[j], e[i], numbers, inverse[z]) - _source(x[j], e[i], numbers, numbers[2])
-                t = path / numbers[6]
-                c, s = turns64(t - np.rint(t))
-                a, b = light[i, j].real, light[i, j].imag
-                re[i, z, j], im[i, z, j] = a * c - b * s, a * s + b * c
-
-
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
-def _kernel_row(X, Y, dy, x, numbers, re, im):  # type: ignore[no-untyped-def]
-    """Kernel of the plan module from a row of lens nodes to the window offset (X, Y)."""
-    distance, wavelength = numbers[5], numbers[6]
-    k = 2 * np.pi / wavelength
-    for j in range(x.size):
-        dx = numbers[3] - x[j]
-        w2 = dx * dx + dy * dy + distance * distance
-        q = X * X + Y * Y + 2 * (X * dx + Y * dy)
-        r = np.sqrt(w2 + q)
-        t = q / ((r + np.sqrt(w2)) * wavelength)
-        c, s = turns64(t - np.rint(t))
-        near = 1 / r
-        scale = distance / (2 * np.pi) * near * near
-        re[j], im[j] = scale * (c * near + k * s), scale * (s * near - k * c)
-
-
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _sum_nodes(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-def]
-    """Add light (row, depth, column) times the kernel to ``out`` (depth, point) at window offsets (point, [X, Y])."""
-    h_re, h_im = np.empty(x.size), np.empty(x.size)
-    for p in range(points.shape[0]):
-        for i in range(e.size):
-            _kernel_row(points[p, 0], points[p, 1], numbers[4] - e[i], x, numbers, h_re, h_im)
-            for z in range(re.shape[1]):
-                total_re, total_im = 0.0, 0.0
-                for j in range(x.size):
-                    total_re += re[i, z, j] * h_re[j] - im[i, z, j] * h_im[j]
-                    total_im += re[i, z, j] * h_im[j] + im[i, z, j] * h_re[j]
-                out[z, p] += complex(total_re, total_im)

@@ -5,6 +5,7 @@ A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chie
 """
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -93,6 +94,12 @@ class Case:
         """(y, x) distance from the window centre to its outermost sample, at least a hundredth of a step."""
         my, mx = self.samples
         return max(my - 1, 0.02) / 2 * self.step_um, max(mx - 1, 0.02) / 2 * self.step_um
+
+    @property
+    def reach_um(self) -> float:
+        """Farthest that light goes sideways from a site to a sample, at least."""
+        parts = zip(self.centre_um[::-1], self.half_window_um, self.half_size_um, strict=True)
+        return math.hypot(*(abs(c) + w + h for c, w, h in parts))
 
     @property
     def pillars_um(self) -> tuple[Array, Array]:

@@ -112,7 +112,7 @@ def intensity(
     for setting, kind in tries:
         dtype = torch.float64 if dim else kind
         result = _windowed(lit, dtype, max(setting, FINEST), moving)
-        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype])
+        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype], *map(paths.films_error, cases))
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
@@ -156,7 +156,8 @@ def _exact(lit: Lit, reason: str) -> Result:
             total = total + weight * sign * np.abs(field) ** 2
         if lit.mixing is not None:  # a scalar has no rays to be judged
             samples.append(_of_pillars((phase, level), case, weight, pupils))
-    found = Result(torch.as_tensor(total).to(lit.phase.dtype), EXACT[lit.phase.dtype], reason, power)
+    error = math.hypot(EXACT[lit.phase.dtype], *(paths.films_error(case) for case in lit.cases))
+    found = Result(torch.as_tensor(total).to(lit.phase.dtype), error, reason, power)
     return _from_middle(found, lit, [samples], [total])
 
 

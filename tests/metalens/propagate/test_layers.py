@@ -1,8 +1,8 @@
 """Films around the lens: against plane waves through the stack, and the engine against its own exact sum.
 
-Error budget of the rays against plane waves: the next term of the stationary phase, 1/(k L)² and the change of 1/(k L)
-over the aperture (1e-4 at 150 um and NA 0.2); the lattice of the referee folds back what leaves it (below 1e-3 of the
-field). The mean of s and p power stands for both: half their difference, 5e-3 of the PSF at the faces used here.
+Error budget of the exact sum against plane waves: the lattice of the referee folds back what leaves it (below 1e-3 of
+the field), and the mean of s and p power stands for both, 5e-3 of the PSF at the faces used here. Point by point it is
+the sum of all plane waves to 1e-9 (:mod:`tests.metalens.lens.test_waves`).
 """
 
 import dataclasses
@@ -62,6 +62,29 @@ def test_the_exact_sum_is_that_of_plane_waves_through_the_stack(angle_rad):
     got = np.abs(propagate.field_at(phase, level, case, points)[0].reshape(18, 18)) ** 2
     # energies count: nothing is normalised
     assert np.linalg.norm(got - want[near, near]) < 3e-3 * np.linalg.norm(want[near, near])
+
+
+def test_the_exact_sum_of_few_pillars_close_to_the_sensor_is_that_of_all_plane_waves():
+    """25 um away, where a ray by itself errs by 1e-3; each pillar by an integral over its plane waves."""
+    near = Layers(behind=(Film(Index(1.52), 11.0), Film(Index(2.1), 3.0)), cover=Index(1.0))
+    about = GEOMETRY | dict(sensor_distance_um=25.0, layers=near, depths_um=np.inf)
+    case = propagate.case((3, 4), **about, angle_rad=(0.3, -0.2))
+    phase, level = np.zeros((3, 4)), np.zeros((3, 4))
+    level[2, 1], level[0, 3], phase[0, 3] = 0.7, 0.9, 0.4
+    y, x = case.pillars_um
+    points = np.array([[10.0, -3.0], [0.0, 0.2], [4.0, -9.5]])
+    want = np.zeros(3, complex)
+    for i, j in ((2, 1), (0, 3)):
+        light = level[i, j] * np.exp(
+            1j * (phase[i, j] + case.wavenumber * from_source(case, x[j], y[i], case.tangents, 0.0))
+        )
+        reach = np.hypot(points[:, 0] - x[j], points[:, 1] - y[i])
+        want += (
+            light * PITCH**2 * referee.point_wave(case.behind.layers, (1.0, 1.52, 2.1), wavelength=0.85, reach=reach)
+        )
+    assert propagate.field_at(phase, level, case, points)[0] == pytest.approx(want, rel=1e-9)
+    stack = psf.psf_stack(phase, level, **about, angle_rad=(0.3, -0.2), integrate=False)
+    assert 4e-12 <= stack.error < 1e-7  # steep rays through thin films are known to that
 
 
 def test_a_source_behind_a_film_has_the_phase_of_its_plane_waves():
