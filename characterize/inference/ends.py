@@ -31,6 +31,7 @@ _TURNS = 14
 _HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
 _BELOW = 0.5  # of -2 ln L, by which a place is a better mode
 _BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
+_UNSURE = 0.5  # of what is still to go, by a straight model that does not hold yet
 _WORTH = 0.1  # sigma by which a begin must reach beyond what is found
 POINTS = 61  # of the curve of a walk
 _MODE = -1  # the first mode among stops of a walk; then -2 ...
@@ -82,10 +83,21 @@ def plain(low: float, high: float, middle: float, reach: float) -> bool:
     return bool(((ratio > PARABOLIC[0]) & (ratio < PARABOLIC[1])).all())
 
 
-def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None = None, most: float = math.inf) -> End:
+def end(
+    valley: Valley,
+    i: int,
+    sign: int,
+    goal: float,
+    *,
+    begin: Array | None = None,
+    most: float = math.inf,
+    beyond: float = -math.inf,
+) -> End:
     """The farthest to one side where the misfit has risen by no more than ``goal`` squared.
 
     begin: (p,) a place with less, instead of the valley's. most: by how much the parameter goes in a step.
+    beyond: times ``sign``, what is reached already. What promises less is given up: though what is still to go by the
+        straight model were half as much again, or half of it where it goes back.
     """
     here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
     lowest = valley.least - valley.above
@@ -103,6 +115,8 @@ def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None =
         if not held and (size < _NEAR or back):  # again, with slopes that hold here
             here, missed = Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)), 0.0
             continue
+        if steps and _at_most(sign * here.x[i], sign * step[i] * max(1.0, size / far)) < beyond:
+            break
         there, off = _moved(valley, here, step)
         steps, rise = steps + 1, there.misfit - lowest
         if rise < -_BELOW:
@@ -115,6 +129,11 @@ def end(valley: Valley, i: int, sign: int, goal: float, *, begin: Array | None =
             here, missed, far = there, missed + off, min(_FAR * goal, 2 * far)
     place = float(np.clip(here.x[i] + step[i], valley.prior.low[i], valley.prior.high[i]))
     return End(place, list(seen.items())[-3:], met, None, steps)
+
+
+def _at_most(place: float, way: float) -> float:
+    """Where an end may lie that is still to go a way by slopes that do not hold yet."""
+    return place + max((1 - _UNSURE) * way, (1 + _UNSURE) * way)
 
 
 def _moved(valley: Valley, here: Spot, step: Array) -> tuple[Spot, float]:
@@ -294,6 +313,6 @@ class Search:
         most = 2 * goal * sigma
         for k, begin, reach in begins:
             if reach > far + _WORTH * sigma:
-                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most)))
+                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most, beyond=far)))
                 far = max(far, sign * out[-1][1].place)
         return out

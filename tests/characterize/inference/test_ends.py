@@ -50,6 +50,31 @@ def test_ends_of_a_bent_valley_are_those_of_what_is_straight_in_the_data(top):
         assert rise == pytest.approx(want, abs=0.05 * max(want, 0.4))  # descents end within 0.02
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_an_end_that_others_have_passed_is_given_up_and_one_beyond_them_is_not(sign):
+    """e^x is known to its sigma times 1.96: from 1.5 the ends are logarithms, 0.9 lower and 0.5 higher, by three
+    images. What reaches a fifth of that farther is worth fewer; what reaches a twentieth less changes none."""
+    truth, asked = np.array([1.5, 0.6]), []
+
+    def counted(x, jacobian):
+        asked.append(jacobian)
+        return bent(x, jacobian)
+
+    def ended(reached):
+        valley = Valley(counted, seen(bent(truth, False)[0]), truth, Prior.none(np.zeros(2)))
+        asked.clear()
+        return ends.end(valley, 0, sign, REACH, beyond=reached), len(asked)
+
+    whole, images = ended(-math.inf)
+    way = abs(whole.place - 1.5)
+    assert images > 2
+    near, same = ended(sign * whole.place - 0.05 * way)
+    assert (near.place, same) == (whole.place, images)
+    short, few = ended(sign * whole.place + 0.2 * way)
+    assert few < images
+    assert sign * short.place < sign * whole.place + 0.2 * way
+
+
 def test_along_a_valley_the_rest_goes_with_the_covariance():
     """One sigma of the first parameter moves it by sigma and raises the parabola by 1; nothing cheaper does."""
     valley = Valley(bent, seen(bent(np.array([1.5, 0.6]), False)[0]), np.array([1.5, 0.6]), Prior.none(np.zeros(2)))
