@@ -138,7 +138,9 @@ def test_what_lies_within_three_sigma_of_a_walk_is_passed(straight):
     for times, near in ((2.99, True), (3.01, False)):
         off = np.array([step[0], 0.0, step[1]]) * times / length
         assert straight.passes(here + off) == near
-    assert not straight.passes(np.array([2.0, 5 + 6.01 * SIGMA, 7.0]))
+    for end in (-1, 1):  # stops are a tenth apart, and the last is at six
+        assert straight.passes(np.array([2.0, 5.0, 7.0]) + end * 5.97 * SIGMA * SLOPE)
+        assert not straight.passes(np.array([2.0, 5.0, 7.0]) + end * 6.01 * SIGMA * SLOPE)
 
 
 def test_what_is_held_has_no_spread_and_the_others_that_of_image_and_prior():
@@ -165,3 +167,94 @@ def test_outliers_count_linearly_saturated_pixels_where_they_are_too_dark_and_th
     got = walk._measured(about, data, np.array([7.0, 9.0, 7.0]), image)
     bent = huber * (2 * (huber + 2) - huber)
     assert got == pytest.approx(0.25 + bent + 1.0 + (6 / 4) ** 2, rel=1e-6)  # the pixel that is too bright: not counted
+
+
+def lopsided(left=1.7, right=2.9, cut=6.0):
+    """Half a Gaussian of either width about 5, the others along a line with one covariance; 201 stops."""
+    x = np.concatenate([left * np.linspace(-6, 0, 100, endpoint=False), right * np.linspace(0, cut, 101)])
+    value = np.array([2.0, 0.0, 7.0]) + x[:, None] * SLOPE
+    value[:, 1] = MIDDLE + x
+    rise = np.where(x < 0, x / left, x / right) ** 2
+    return Walk(1, value, rise, np.broadcast_to(OTHERS, (201, 3, 3)).copy())
+
+
+@pytest.mark.parametrize("i", [0, 2])
+def test_a_profile_of_another_parameter_rises_by_the_square_of_its_share(i):
+    """Least over x of (x / s)² + ((y - a x) / h)²: y² / (h² + a² s²), with the width s of the side that y calls for."""
+    share = np.array([-1.0, -0.6, -0.1, 0.0, 0.3, 0.8])
+    at, rise = lopsided().profile_of(i, share)
+    wide = np.where((share < 0) == (SLOPE[i] > 0), 1.7, 2.9)
+    want = np.array([2.0, 0.0, 7.0])[i] + share * np.sqrt(14 * (OTHERS[i, i] + SLOPE[i] ** 2 * wide**2))
+    assert at == pytest.approx(want, abs=0.01)  # places of 1201
+    assert rise == pytest.approx(14 * share**2, abs=0.06)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("i", [0, 2])
+def test_another_parameter_is_farthest_where_its_own_covariance_sends_all(straight, i, sign):
+    """(2, 5, 7) + sign sqrt(level / C_ii) C_i; a stop lies within half a step, 0.085, of where the walk would be."""
+    level, total = 5.1, covariance()
+    want = np.array([2.0, 5.0, 7.0]) + sign * np.sqrt(level / total[i, i]) * total[i]
+    ((k, place),) = straight.outermost(i, sign, level)
+    assert straight.value[k, 1] == pytest.approx(want[1], abs=0.086)
+    assert place[i] == pytest.approx(want[i], abs=0.02)  # flat at its greatest
+    held = np.sqrt(level - straight.rise[k])
+    assert place == pytest.approx(straight.value[k] + sign * held * OTHERS[i] / np.sqrt(OTHERS[i, i]), rel=1e-12)
+
+
+def test_a_walk_that_ends_inside_is_farthest_at_its_end():
+    made = lopsided(cut=1.5)
+    ((k, place),) = made.outermost(0, 1, 6.0)
+    assert k == 200
+    assert place[0] == pytest.approx(made.value[-1, 0] + np.sqrt(6.0 - 1.5**2) * 0.3)
+
+
+def test_two_valleys_go_farthest_each_by_itself_and_a_stop_that_nothing_holds_as_far_as_twice_a_usual_one():
+    """Stops of two parameters, the second at 0, 3 and 5 in the lows; 0.5 held, but for one of 90."""
+    at = np.arange(11.0)
+    value = np.column_stack([at, np.array([0.0, 0.4, 3.0, 0.8, 0.5, 0.2, 0.1, 5.0, 2.0, 9.0, 0.0])])
+    rise = np.array([9.0, 6.0, 0.0, 5.0, 4.0, 8.5, 2.0, 3.0, 8.5, 8.1, 9.0])
+    spread = np.zeros((11, 2, 2))
+    spread[:, 1, 1] = 0.25
+    made = Walk(0, value, rise, spread)
+    want = [5 + math.sqrt(5) * 0.5, 3 + math.sqrt(8) * 0.5]  # 9 lies above the level
+    assert [k for k, _ in made.outermost(1, 1, 8.0)] == [7, 2]
+    assert [place[1] for _, place in made.outermost(1, 1, 8.0)] == pytest.approx(want)
+    spread[4, 1, 1] = 90.0**2
+    free = Walk(0, value, rise, spread).outermost(1, -1, 8.0)
+    assert [k for k, _ in free] == [4, 6]
+    assert [place[1] for _, place in free] == pytest.approx([0.5 - math.sqrt(4) * 2 * 0.5, 0.1 - math.sqrt(6) * 0.5])
+
+
+@pytest.mark.parametrize("widened", [1.0, 1.9])
+def test_a_walk_into_more_room_is_drawn_where_the_room_is(widened):
+    """Volume of two others ~ exp(2 c x): a Gaussian of variance w s² about 5 + 2 c w s²; its mass, by the square."""
+    growth, x = 0.12, SIGMA * np.linspace(-6, 6, 241)
+    value = np.column_stack([2 + 0 * x, MIDDLE + x, 7 + 0 * x])
+    spread = OTHERS * np.exp(2 * growth * x)[:, None, None]
+    made = Walk(1, value, (x / SIGMA) ** 2, spread, 22.0 * widened)
+    drawn = made.draws(20_000, widened=widened, rng=np.random.default_rng(5))
+    variance = widened * SIGMA**2
+    assert drawn[:, 1].mean() == pytest.approx(MIDDLE + 2 * growth * variance, abs=0.05)  # four of 2.3 / sqrt(20000)
+    assert drawn[:, 1].var() == pytest.approx(variance, rel=0.04)
+    if widened == 1.0:
+        volume = math.sqrt(0.09 * 0.25 - 0.05**2)
+        want = math.log(SIGMA * math.sqrt(2 * math.pi) * volume) + (2 * growth * SIGMA) ** 2 / 2
+        assert made.log_mass() == pytest.approx(want, abs=2e-3)
+
+
+def test_every_share_of_the_mass_has_one_draw_evenly_between_its_places(monkeypatch):
+    """Three stops and nothing in between: of 1.5 / 2 · 4 and 0.625 / 2 · 6 of mass, in 1000 equal parts."""
+    monkeypatch.setattr(walk, "_FINE", 2)
+    value = np.array([[0.0, 3.0], [4.0, -1.0], [10.0, 2.0]])
+    spread = np.zeros((3, 2, 2))
+    spread[:, 1, 1] = 1e-18
+    made = Walk(0, value, -2 * np.log([1.0, 0.5, 0.125]), spread)
+    drawn = made.draws(1000, widened=1.0, rng=np.random.default_rng(7))
+    drawn = drawn[np.argsort(drawn[:, 0])]
+    mass = np.where(drawn[:, 0] < 4, drawn[:, 0] / 4 * 3.0, 3 + (drawn[:, 0] - 4) / 6 * 1.875) / 4.875 * 1000
+    part = mass - np.arange(1000)
+    assert part.min() > -1e-9
+    assert part.max() < 1 + 1e-9
+    assert part.std() == pytest.approx(12**-0.5, rel=0.1)  # anywhere in its share
+    assert drawn[:, 1] == pytest.approx(np.interp(drawn[:, 0], value[:, 0], value[:, 1]), abs=1e-7)
