@@ -22,7 +22,8 @@ def model(x, jacobian):
 
 def valley(**bounds):
     everywhere = np.ones(SHAPE, bool)
-    data = Data(model(MODE, False)[0], everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15))
+    seen = model(MODE, False)[0] + SIGMA * RNG.uniform(-2, 2, SHAPE)
+    data = Data(seen, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15))
     free = Prior.none(MODE)
     return Valley(model, data, MODE, Prior(free.mean, free.sigma, bounds.get("low", free.low), free.high))
 

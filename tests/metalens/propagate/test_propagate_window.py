@@ -338,11 +338,12 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (70, 130)])
-def test_torch_path_for_other_devices_equals_the_compiled_loops(shape):
-    """Field on the window and gradients: pillars themselves as nodes, against nodes of blocks."""
+def test_torch_path_for_other_devices_equals_the_compiled_loops(shape, monkeypatch):
+    """Field on the window and gradients: pillars themselves as nodes, some rows at a time, against nodes of blocks."""
     from metalens.propagate import pillars
     from metalens.propagate.window import from_moments, plan
 
+    monkeypatch.setattr(pillars, "DEVICE_ROWS", 32)
     made = plan(propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu"))
     blocks, case = made.moments, made.case
     places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)
