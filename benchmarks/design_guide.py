@@ -31,7 +31,7 @@ from benchmarks.design_guide_cells import FIELDS, LENS, Cell, cell_of, run_of
 from benchmarks.design_guide_image import forms
 from codesign.evaluate import reader
 from codesign.evaluate.reader import ReaderConfig, Scenery
-from codesign.evaluate.reader_lens import LensTraining, trained
+from codesign.evaluate.reader_lens import LensTraining, kept, trained
 from codesign.optics.stack import OpticsConfig
 from metalens.image import Imager, UniformImager
 from metalens.image.pupil import coordinates
@@ -42,6 +42,7 @@ CHOICE, DESIGN = 5, 77  # seeds of the runs that choose among lenses, and of the
 SEEDS = range(5)
 FREE, RADIAL = 63, 6  # terms of a free form and of an asphere
 TRAINING = LensTraining()
+LOOKS = (1.0,)  # shares of the training after which a lens is read, as its start is; the best is kept
 IMAGE, TRAINED = 0.05, 0.2  # tolerances of the image that is read, and of the one that lenses are trained on
 
 
@@ -93,15 +94,30 @@ def designed(work: Path, cell: Cell) -> Tensor:
     for line in kept_lines(work / DESIGNS):
         if line["design"] == cell.design:
             return torch.tensor(line["coefficients_rad"], dtype=torch.float64)
-    config = replace(cell.config, seed=DESIGN)
-    learn = scenery(config).learn
-    form = forms(FIELDS[cell.field].share)
-    end, loss = trained(optics_of(cell), start_of(cell), learn, config, TRAINING, forms=form)
-    last = max(len(loss) // 10, 1)
-    line: dict[str, Any] = {"design": cell.design, "loss": round(sum(loss[-last:]) / last, 4)}
-    line["coefficients_rad"] = [round(float(v), 4) for v in end]
+    line = {"design": cell.design} | trained_line(cell)
     keep_line(work / DESIGNS, line)
     return torch.tensor(line["coefficients_rad"], dtype=torch.float64)
+
+
+def trained_line(cell: Cell) -> dict[str, Any]:
+    """The best lens of a training by axial error on frames that it has not seen, never worse there than its start.
+
+    axial_mm: by turn, 0 the start. apart_rad: root-mean-square phase between the lens and its start.
+    """
+    config, begun = replace(cell.config, seed=DESIGN), time.process_time()
+    seen, form = scenery(config), forms(FIELDS[cell.field].share)
+    path, loss = trained(optics_of(cell), start_of(cell), seen.learn, config, TRAINING, forms=form)
+    path[1:], last = path[1:].round(decimals=4), max(len(loss) // 10, 1)
+
+    def error_mm(place: Tensor) -> float:
+        return float(reader.read(imaged(cell, place), seen, config).axial_mm.mean())
+
+    turn, told = kept(path, [round(share * TRAINING.turns) for share in LOOKS], error_mm)
+    return {
+        "loss": round(sum(loss[-last:]) / last, 4), "turn": turn, "axial_mm": {k: round(v, 4) for k, v in told.items()},
+        "apart_rad": round(float((path[turn] - path[0]).norm()), 3), "cpu_s": round(time.process_time() - begun, 1),
+        "coefficients_rad": path[turn].tolist(),
+    }  # fmt: skip
 
 
 @functools.lru_cache(maxsize=2)
@@ -123,6 +139,21 @@ def run_one(work: Path, name: str) -> dict[str, Any]:
     return {"run": f"{cell.name}/{seed}", "cpu_s": round(time.process_time() - start, 1)} | found
 
 
+def same_lens(work: Path, cell: Cell) -> str | None:
+    """The cell of the start, where training kept it: the same lens, of which every number is known already."""
+    if not any(line["design"] == cell.design and line.get("turn") == 0 for line in kept_lines(work / DESIGNS)):
+        return None
+    return replace(cell, lens=cell.lens.removeprefix("free-").removeprefix("radial-")).name
+
+
+def already_read(work: Path, name: str, lines: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """The line of a run, where it is that of the start."""
+    cell, seed = run_of(name)
+    start = same_lens(work, cell)
+    found = lines.get(f"{start}/{seed}")
+    return None if found is None else found | {"run": name, "read_as": start}
+
+
 def imaged(cell: Cell, place: Tensor) -> Imager | UniformImager:
     """The image of a cell's field and light through the lens of these coefficients."""
     settings, config = replace(optics_of(cell), image_tolerance=IMAGE), cell.config
@@ -133,6 +164,10 @@ def imaged(cell: Cell, place: Tensor) -> Imager | UniformImager:
 def bounded(work: Path, name: str) -> dict[str, Any]:
     """The line of a lens's bound."""
     cell = cell_of(name)
+    start = same_lens(work, cell)
+    for line in kept_lines(work / BOUNDS):
+        if line["cell"] == start:
+            return line | {"cell": name}
     place, config, field = designed(work, cell), cell.config, FIELDS[cell.field]
     whole = imaged(cell, place)
     if not isinstance(whole, Imager):
@@ -165,12 +200,16 @@ def chosen(lines: dict[str, dict[str, Any]], device: str, family: str) -> str | 
 
 
 def compared(lines: dict[str, dict[str, Any]], device: str) -> dict[str, str]:
-    """{role: cell} of a device: its chosen lenses, and those that are trained from the best focus, once known."""
+    """{role: cell} of a device: its chosen lenses, and those that are trained, once known.
+
+    An asphere is trained from the best focus, a free form from the best of all lenses that stand.
+    """
     found = {family: cell for family in ("focus", "designer") if (cell := chosen(lines, device, family))}
-    if "focus" in found:
-        best = cell_of(found["focus"])
-        if device in ASPHERES:
-            found["asphere"] = replace(best, lens=f"radial-{best.lens}").name
+    if "focus" in found and device in ASPHERES:
+        focus = cell_of(found["focus"])
+        found["asphere"] = replace(focus, lens=f"radial-{focus.lens}").name
+    if {"focus", "designer"} <= set(found):
+        best = cell_of(min(found["focus"], found["designer"], key=lambda cell: lines[f"{cell}/{CHOICE}"]["axial_mm"]))
         found["trained"] = replace(best, lens=f"free-{best.lens}").name
     return found
 
@@ -227,11 +266,13 @@ def run(work: Path, only: list[str] | None) -> None:
         open_runs = [name for name in only or plan(lines) if name not in lines]
         if not open_runs:
             break
-        line = run_one(work, open_runs[0])
+        line = already_read(work, open_runs[0], lines) or run_one(work, open_runs[0])
         keep_line(work / LINES, line)
         print(json.dumps(line), flush=True)
-    for cell in () if only else unbounded(work, lines):
-        keep_line(work / BOUNDS, bounded(work, cell))
+    named = {name.rpartition("/")[0] for name in only or ()}
+    for cell in unbounded(work, lines):
+        if not only or cell in named:
+            keep_line(work / BOUNDS, bounded(work, cell))
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from benchmarks.design_guide import (
     FOCI,
     KNOBS,
     LADDER,
+    LOOKS,
     NETWORK_FRAMES,
     RESULT,
     TRAINED,
@@ -168,12 +169,15 @@ FIELD = """
 ways. Frames are those of a camera that faces the eye; their images are those of that part of the field. Every lens of a
 family was chosen by axial error with a seed of its own, for that field and light. `focus`: hyperbolic, in focus at
 {foci} mm. `designer`: r² alone (blur of all angles alike) or, in the oblique field, free of aberrations at its
-middle, in focus at {designers} mm. `trained`: 63 free-form terms moved from the best focus along the exact gradient of
-the likelihood of the windows' depths ({turns} steps of the lens, {hold} of the reader's branch to each, 32 frames a
-step), trained once, on an image to {coarse:g} of the contrast, and read by every seed. `asphere`: six radial terms,
-likewise. `bound`: what the blur of one window alone can tell, the least standard deviation of its depth, mean over the
-windows of the field and the depths, for a patch of unknown 1/f texture of contrast 0.2, its contrast and fall unknown
-too, in the photons' noise, where depths spread by 3 mm beforehand; that less light falls towards the rim is left out.
+middle, in focus at {designers} mm. `trained`: 63 free-form terms moved from the best of all of these along the exact
+gradient of the likelihood of the windows' depths, as far as its running mean is longer than noise would leave it
+({turns} turns, {hold} steps of the reader's branch to each, 32 frames a step; the lens stands for the first
+{still:.0f} %), trained once, on an image to {coarse:g} of the contrast. The start and the lenses after {looks} % of the
+turns are read on frames that trained nothing, the one of least axial error is kept, and every seed reads it. `asphere`:
+six radial terms, from the best focus, likewise. `bound`: what the blur of one window alone can tell, the least standard
+deviation of its depth, mean over the windows of the field and the depths, for a patch of unknown 1/f texture of
+contrast 0.2, its contrast and fall unknown too, in the photons' noise, where depths spread by 3 mm beforehand; that
+less light falls towards the rim is left out.
 Readers see edges and neighbouring windows as well, and may do better.
 """
 RUNGS = """\
@@ -201,6 +205,7 @@ def page(lines: dict[str, dict[str, Any]], bounds: dict[str, float] | None = Non
         ", ".join(dict.fromkeys(n.lstrip("abcdefghijklmnopqrstuvwxyz") for n in names)) for names in (FOCI, DESIGNERS)
     )
     told = {"coarse": TRAINED, "turns": TRAINING.turns, "hold": TRAINING.hold, "foci": foci, "designers": designers}
+    told |= {"still": 100 * TRAINING.phase.start, "looks": " and ".join(f"{100 * share:g}" for share in LOOKS)}
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():
         parts += device_table(device, rows, lines, bounds or {})

@@ -112,6 +112,10 @@ def test_what_is_chosen_is_least_in_the_runs_that_choose_and_then_planned():
         "asphere": "lens=radial-focus70,field=oblique,fwhm=30",
         "trained": "lens=free-focus70,field=oblique,fwhm=30",
     }
+    designer = roles["designer"]
+    better = guide.compared(lines | _line(f"{designer}/{guide.CHOICE}", 0.89), device)
+    assert better["trained"] == "lens=free-oblique150,field=oblique,fwhm=30"
+    assert better["asphere"] == roles["asphere"]
     assert {f"{cell}/4" for cell in roles.values()} <= set(guide.plan(lines))
     first = next(iter(lines))
     assert guide.chosen({k: v for k, v in lines.items() if k != first}, device, "focus") is None
@@ -150,7 +154,9 @@ def test_a_run_trains_its_lens_once_and_goes_on_where_it_was(tmp_path, monkeypat
     assert [line["run"] for line in kept_lines(tmp_path / guide.LINES)] == names
     (design,) = kept_lines(tmp_path / guide.DESIGNS)
     assert len(design["coefficients_rad"]) == guide.RADIAL
-    assert any(design["coefficients_rad"])
+    assert design["axial_mm"][str(design["turn"])] == min(design["axial_mm"].values())
+    assert set(design["axial_mm"]) == {"0", "1"}  # before and after its one turn
+    assert any(design["coefficients_rad"]) == (design["turn"] > 0) == (design["apart_rad"] > 0)
     guide.run(tmp_path, names)
     assert (tmp_path / guide.LINES).read_bytes() == first
     other = tmp_path / "other"
@@ -159,6 +165,20 @@ def test_a_run_trains_its_lens_once_and_goes_on_where_it_was(tmp_path, monkeypat
     guide.run(other, names[1:])
     again, kept = kept_lines(other / guide.LINES)[0], kept_lines(tmp_path / guide.LINES)[1]
     assert {k: v for k, v in again.items() if k != "cpu_s"} == {k: v for k, v in kept.items() if k != "cpu_s"}
+
+
+def test_a_lens_that_training_left_where_it_was_is_not_read_again(tmp_path):
+    """Its runs, by either reader, and its bound are those of the start; a lens that moved is read."""
+    for lens, turn in (("free-oblique40", 0), ("free-focus70", 24)):
+        keep_line(tmp_path / guide.DESIGNS, {"design": f"lens={lens},field=line", "turn": turn})
+    keep_line(tmp_path / guide.BOUNDS, {"cell": "lens=oblique40,field=line", "bound_mm": 1.5})
+    lines = _line("lens=oblique40,field=line,frames=6400/3", 0.8) | _line("lens=focus70,field=line/3", 0.9)
+    found = guide.already_read(tmp_path, "lens=free-oblique40,field=line,frames=6400/3", lines)
+    assert (found["axial_mm"], found["read_as"]) == (0.8, "lens=oblique40,field=line,frames=6400")
+    assert found["run"] == "lens=free-oblique40,field=line,frames=6400/3"
+    assert guide.bounded(tmp_path, "lens=free-oblique40,field=line")["bound_mm"] == 1.5
+    for name in ("lens=free-oblique40,field=line,frames=6400/2", "lens=free-focus70,field=line/3", "base/3"):
+        assert guide.already_read(tmp_path, name, lines) is None
 
 
 def test_a_held_axis_of_the_field_has_the_psfs_of_its_middle():

@@ -98,14 +98,25 @@ def test_a_lens_that_stands_gathers_nothing_and_teaches_the_branch_all_the_same(
 def test_training_repeats_bit_for_bit_moves_by_its_rate_and_leaves_the_generator(learn):
     torch.manual_seed(11)
     before = torch.get_rng_state()
-    end, told = reader_lens.trained(OPTICS, BENT, learn, CONFIG, FEW)
+    path, told = reader_lens.trained(OPTICS, BENT, learn, CONFIG, FEW)
     again, _ = reader_lens.trained(OPTICS, BENT, learn, CONFIG, FEW)
     assert torch.equal(torch.get_rng_state(), before)
-    assert torch.equal(end, again)
-    assert len(told) == FEW.turns
+    assert torch.equal(path, again)
+    assert len(told) == FEW.turns == len(path) - 1
+    assert torch.equal(path[0], BENT)
     still, _ = reader_lens.trained(OPTICS, BENT, learn, CONFIG, replace(FEW, phase=Schedule(0.0)))
-    assert torch.equal(still, BENT)
-    assert 0 < float((end - BENT).abs().max()) <= 0.1 * FEW.turns  # Adam: at most about the rate a turn
+    assert torch.equal(still, BENT.expand_as(still))
+    assert torch.equal(path[1], BENT)  # one gradient tells nothing of its noise
+    assert float((path[-1] - BENT).norm()) < 0.1  # less than the rate a turn, all terms together
+
+
+def test_a_lens_that_moved_is_imaged_through_the_plan_of_another(whole):
+    """Its PSFs at the nodes are those that the engine forms of that lens; the lens that stands keeps its own."""
+    assert torch.equal(reader_lens.moved(OPTICS, whole, BENT).stack, whole.stack)
+    found, want = reader_lens.moved(OPTICS, whole, BENT + 0.2), _psfs(whole, BENT + 0.2)
+    assert torch.allclose(found.stack, want.stack, rtol=1e-9, atol=1e-12)
+    assert not torch.allclose(found.stack, whole.stack, rtol=1e-2)
+    assert not found.stack.requires_grad
 
 
 @pytest.mark.parametrize(
@@ -118,7 +129,7 @@ def test_optics_that_cannot_be_trained_are_refused(learn, change, message):
         reader_lens.trained(replace(OPTICS, **change), BENT, learn, CONFIG, FEW)
 
 
-@pytest.mark.parametrize("change", [{"turns": 0}, {"hold": 0}, {"batch": 0}, {"rate": 0.0}])
+@pytest.mark.parametrize("change", [{"turns": 0}, {"hold": 0}, {"batch": 0}, {"anew": 0}, {"rate": 0.0}])
 def test_impossible_trainings_are_refused(change):
     with pytest.raises(ConfigError, match="counts of 1 or more"):
         LensTraining(**change)

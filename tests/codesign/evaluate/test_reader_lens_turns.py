@@ -1,4 +1,7 @@
-"""Turns of a lens and its branch by stand-ins: rates by the share done, means over a turn, sums over a field."""
+"""Turns of a lens and its branch by stand-ins: rates by the share done, means over a turn, sums over a field.
+
+Steps of a descent by hand, and in noise; the lens of a path that is kept.
+"""
 
 from types import SimpleNamespace
 
@@ -7,10 +10,11 @@ import pytest
 import torch
 
 from codesign.evaluate import reader_lens
-from codesign.evaluate.reader_lens import LensTraining
+from codesign.evaluate.reader_lens import Descent, LensTraining
 from codesign.train import Schedule
 
-TRAINING = LensTraining(turns=4, hold=3, batch=2, phase=Schedule(0.04, 0.3, 1.0), rate=5e-3)
+TRAINING = LensTraining(turns=4, hold=3, batch=2, phase=Schedule(0.04, 0.3, 1.0), anew=3, rate=5e-3)
+SLOPE = torch.tensor([0.7, -0.2, 5.0], dtype=torch.float64)
 SHAPE = (2, 3, 1, 4, 4)  # rows and columns of the field, depths, window
 
 
@@ -23,7 +27,7 @@ class Whole:
 @pytest.fixture
 def told(monkeypatch):
     """What the loop asks of its parts; the loss of step s is s squared, its slope s + 1 everywhere."""
-    said = SimpleNamespace(rates=[], steps=[], gathered=[])
+    said = SimpleNamespace(rates=[], steps=[], gathered=[], planned=[], moved=[])
 
     class Reads:
         def __init__(self, parameters, lr, weight_decay):
@@ -41,7 +45,7 @@ def told(monkeypatch):
 
     def gradient(optics, whole, place, gathered):
         said.gathered.append(gathered)
-        return torch.tensor([0.7, -0.2, 5.0], dtype=torch.float64)
+        return SLOPE
 
     monkeypatch.setattr(torch.optim, "AdamW", Reads)
     monkeypatch.setattr(reader_lens, "Imager", Whole)
@@ -49,14 +53,19 @@ def told(monkeypatch):
 
     def forms(optics, place, frame, *, margin):
         assert (frame, margin) == (8, 2)
+        said.planned.append(place)
         return Whole()
 
+    def moved(optics, planned, place):
+        said.moved.append(place)
+        return planned
+
+    monkeypatch.setattr(reader_lens, "moved", moved)
     monkeypatch.setattr(reader_lens, "gone_backward", gone)
     monkeypatch.setattr(reader_lens, "lens_gradient", gradient)
     scenes = SimpleNamespace(batch=lambda step, size: SimpleNamespace(frames=None), margin=2)
     start = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
-    said.end, said.losses = reader_lens._descended(None, start, scenes, None, TRAINING, forms)
-    said.moved = said.end - start
+    said.path, said.losses = reader_lens._descended(None, start, scenes, None, TRAINING, forms)
     return said
 
 
@@ -68,10 +77,58 @@ def test_steps_run_on_through_the_turns_and_a_turn_tells_their_mean(told):
 
 
 def test_the_lens_goes_against_the_mean_slope_by_the_rate_of_its_turn(told):
-    """A gradient that stays is a step of the rate itself for Adam, whatever its size: here of two turns."""
+    """Not by the first; two that are equal have weights 9/19 and 10/19: 1 - Σ w² of the rate, whatever their size."""
     assert [float(one.flatten()[0]) for one in told.gathered] == pytest.approx([(7 + 8 + 9) / 3, (10 + 11 + 12) / 3])
-    way = TRAINING.phase.at(2 / 4) + TRAINING.phase.at(3 / 4)
-    assert told.moved.tolist() == pytest.approx([-way, way, -way], rel=1e-6)  # Adam's 1e-8 beside 0.2
+    steps = (told.path[1:] - told.path[:-1]).numpy()
+    rates = np.array([0, 0, 0, TRAINING.phase.at(3 / 4) * (1 - 181 / 361)])
+    assert steps == pytest.approx(-rates[:, None] * (SLOPE / SLOPE.norm()).numpy(), rel=1e-9, abs=1e-15)
+
+
+def test_the_image_is_planned_anew_after_its_turns_and_follows_a_lens_that_moved_between(told):
+    """Planned before turns 0 and 3; before turn 1 and 2 the lens had not moved yet."""
+    assert [one.tolist() for one in told.planned] == [told.path[0].tolist(), told.path[3].tolist()]
+    assert told.moved == []
+
+
+def _steps(gradients):
+    descent = Descent(torch.zeros(gradients.shape[1], dtype=torch.float64))
+    return torch.stack([descent.step(one) for one in gradients])
+
+
+def test_a_step_is_the_mean_gradient_less_the_share_of_noise_of_one_length_for_all_terms():
+    """3, 4 and -3, 4 of length 5: mean -0.03 and 0.76 over 0.95, of which (1 - 181/361 / 0.641) stays."""
+    first, second = _steps(torch.tensor([[3.0, 4.0], [-3.0, 4.0]], dtype=torch.float64)).tolist()
+    assert first == pytest.approx([0.0, 0.0], abs=1e-12)
+    x, y = -0.03 / 0.95, 0.76 / 0.95
+    stays = 1 - 181 / 361 / (x * x + y * y)
+    assert second == pytest.approx([-stays * x, -stays * y], rel=1e-9)
+    assert not _steps(torch.zeros(3, 2, dtype=torch.float64)).any()
+
+
+def test_a_lens_stands_in_noise_and_goes_where_gradients_agree():
+    """300 gradients of 63 terms without a mean, and with one as long as the noise.
+
+    Of noise the running mean's square is within 18 % (√(2 / 63)) of its share, so little passes; Adam's steps are √63 =
+    7.9 times 0.23 long there. Of the sum half of the square is noise, a nineteenth of it stays: cos² = 19/20, and
+    the length is √(1/2 · 20/19) (1 - 20/19 / 10 ...) = 0.65.
+    """
+    draws = torch.Generator().manual_seed(3)
+    noise = torch.randn(400, 63, generator=draws, dtype=torch.float64) / 63**0.5
+    way = torch.randn(63, generator=draws, dtype=torch.float64)
+    way = way / way.norm()
+    assert float(_steps(noise)[100:].norm(dim=1).mean()) < 0.03  # 0.23 with nothing taken off
+    moved = -_steps(way + noise)[100:]
+    assert float(torch.cosine_similarity(moved, way[None]).mean()) == pytest.approx((19 / 20) ** 0.5, abs=0.02)
+    assert 0.55 < float(moved.norm(dim=1).mean()) < 0.75
+
+
+def test_a_wrong_turn_is_not_kept():
+    """The start is read whether asked for or not; the first of equal lenses stays."""
+    path = torch.tensor([[0.0], [1.0], [2.0], [3.0]], dtype=torch.float64)
+    errors = {0.0: 0.7, 1.0: 0.1, 2.0: 0.8, 3.0: 0.7}
+    worse = reader_lens.kept(path, (2, 3), lambda place: errors[float(place)])
+    assert worse == (0, {0: 0.7, 2: 0.8, 3: 0.7})
+    assert reader_lens.kept(path, (0, 1), lambda place: errors[float(place)]) == (1, {0: 0.7, 1: 0.1})
 
 
 def test_the_branch_s_rate_follows_the_steps_of_the_whole_training(told):
