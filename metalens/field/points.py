@@ -183,7 +183,7 @@ def _one(
     light = light if factor is None else light * factor.to(torch.complex64)
     mixed = None
     if grid.components:
-        fields = polarised.factors(found, tangents, after.order[-1], flux=grid.flux)
+        fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
         mixed = strongest(fields, pupil.weight, grid.components)
     total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache

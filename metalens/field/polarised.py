@@ -17,22 +17,26 @@ import torch
 from torch import Tensor
 
 from metalens.field.rays import Rays
-from metalens.psf import Mixed, of_flux, turned
+from metalens.psf import Mixed, beyond_faces, of_flux, turned
 
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
 STEEPEST = 1e-3  # cos² of nodes beyond the rim, which have no light
 
 
-def factors(seen: Rays, tangents: Tensor, index: float, *, flux: bool) -> Mixed:
+def factors(seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool) -> Mixed:
     """Both polarisations on the nodes, float64: of the flux through the sensor's plane (8), or of |E|² (6 as
     :func:`metalens.psf.turned`); squares with their signs add up to 2, and to 2 / cos θ.
 
     Args:
-        tangents: slopes (x, y) of the chief ray in air. index: of the medium in which the rays reach the sensor.
+        tangents: slopes (x, y) of the chief ray in air. order: indices of the media from the pillars to the sensor.
     """
     q, p = torch.meshgrid(seen.aside + seen.middle[1], seen.aside + seen.middle[0], indexing="ij")
-    p, q = p / index, q / index
-    b = torch.stack([p, q, torch.sqrt((1 - p * p - q * q).clamp_min(STEEPEST))])
+    first, b = (_directions(p / n, q / n) for n in (order[0], order[-1]))
     slope = torch.cat([tangents, tangents.new_ones(1)])
-    electric = turned(slope / slope.norm(), b)
+    electric = beyond_faces(turned(slope / slope.norm(), first), first, order)
     return of_flux(electric, b) if flux else Mixed(electric, (1.0,) * OF_ENERGY)
+
+
+def _directions(p: Tensor, q: Tensor) -> Tensor:
+    """(3, y, x) unit vectors towards the sensor from their parts along x and y."""
+    return torch.stack([p, q, torch.sqrt((1 - p * p - q * q).clamp_min(STEEPEST))])

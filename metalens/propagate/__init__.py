@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from metalens.propagate.geometry import Case as Case
     from metalens.propagate.geometry import axis as axis
     from metalens.propagate.geometry import check_aperture as check_aperture
+    from metalens.propagate.paths import apart as apart
     from metalens.propagate.paths import chief_path as chief_path
     from metalens.propagate.paths import cosines as cosines
     from metalens.propagate.paths import kernel as kernel
@@ -55,6 +56,7 @@ __getattr__, __dir__, __all__ = attach(
         "Sample": "estimate",
         "angles": "verbs",
         "angular_spectrum": "verbs",
+        "apart": "paths",
         "axis": "geometry",
         "case": "verbs",
         "chief": "verbs",

@@ -23,6 +23,8 @@ from metalens.ground.paths import sensor_path as sensor_path_in_air
 from metalens.lens import media, saddle
 from metalens.propagate.geometry import Case
 
+SOME = 32  # pillars along an axis whose rays tell what films leave out
+
 
 def reference_depth(case: Case) -> float:
     """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the range."""
@@ -103,9 +105,39 @@ def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any, Any]:
     return level, 1 - turn * aside, turn * ahead
 
 
-def films_error(case: Case) -> float:
-    """Relative L2 error of PSFs by what the kernel leaves out of the plane waves through films; 0 in one medium."""
-    return 0.0 if case.behind is None else 2 * saddle(case.behind, case.wavenumber, case.reach_um).left
+def apart(case: Case, w: Array) -> tuple[Array, Array]:
+    """Amplitudes of s and of p light behind films over :func:`amplitude`, of rays of w = p²; complex."""
+    behind, k = case.behind, case.wavenumber
+    if behind is None:
+        return np.ones_like(w), np.ones_like(w)
+    powers = media.passed_apart(behind.order, w)
+    turn, (ahead, aside) = 1 / (k * media.whole_path(behind.layers, w)), saddle(behind, k, case.reach_um).at(w)
+    found = []
+    every = saddle(behind, k, case.reach_um, "s"), saddle(behind, k, case.reach_um, "p")
+    for own, power in zip(every, powers, strict=True):
+        own_ahead, own_aside = own.at(w)
+        waves = (1 - turn * own_aside + 1j * turn * own_ahead) / (1 - turn * aside + 1j * turn * ahead)
+        found.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
+    return found[0], found[1]
+
+
+def films_error(case: Case, level: Array) -> float:
+    """Relative L2 error of PSFs by what the kernel leaves out of the plane waves through films; 0 in one medium.
+
+    Root mean square over the light of some pillars (transmission ``level`` (y, x)), each seen from where the window is
+    farthest; twice that of the amplitude.
+    """
+    if case.behind is None:
+        return 0.0
+    some = tuple(slice(n // SOME // 2, None, max(1, n // SOME)) for n in case.shape)
+    y, x = (a[part] for a, part in zip(case.pillars_um, some, strict=True))
+    light = np.asarray(level[some], float) ** 2
+    if not light.sum() > 0:
+        light = np.ones_like(light)
+    far_y, far_x = (abs(c - a) + h for c, a, h in zip(case.centre_um[::-1], (y, x), case.half_window_um, strict=True))
+    w = media.square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
+    error = saddle(case.behind, case.wavenumber, case.reach_um).error(w)
+    return 2 * float(np.sqrt((light * error**2).sum() / light.sum()))
 
 
 def cosines(case: Case, across: Any, far: Any) -> Any:

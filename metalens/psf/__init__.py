@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from metalens.psf.spectrum import Source as Source
     from metalens.psf.stack import psf_stack as psf_stack
     from metalens.psf.vector import Mixed as Mixed
+    from metalens.psf.vector import beyond_faces as beyond_faces
     from metalens.psf.vector import of_flux as of_flux
     from metalens.psf.vector import strongest as strongest
     from metalens.psf.vector import turned as turned
@@ -69,5 +70,6 @@ __getattr__, __dir__, __all__ = attach(
         "spectrum": "",
         "strongest": "vector",
         "turned": "vector",
+        "beyond_faces": "vector",
     },
 )

@@ -58,10 +58,11 @@ class Budget:
 
     numerical: of the propagation, measured on the result. sampling: of the integration over the cells of the window.
     spectrum: of the quadrature over wavelengths. source: of a source of finite size, whose points are taken as alike.
-    polarisation: of one scalar in place of both polarisations; of both, of rays whose fields are those on their way to
-        the window's middle. neighbours: of pillars taken as if each stood among its like, or of the factor of solved
-        rows where the lens holds them. angle: of pillars that answer as at normal incidence. glass: of light that goes
-        twice between two faces.
+    polarisation: of one scalar in place of both polarisations (of plain maps only that of films, which let s and p
+        through unlike, measured on the light); of both, of rays whose fields are those on their way to the window's
+        middle. neighbours: of pillars taken as if each stood among its like, or of the factor of solved rows where the
+        lens holds them. angle: of pillars that answer as at normal incidence. glass: of light that goes twice between
+        two faces.
     outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
         show it, so it is in no total.
     """
@@ -139,11 +140,16 @@ def with_model(
     slanted = min(1.0, left_out.angle * math.sin(incidence_rad) ** 2)
     return replace(
         budget,
-        polarisation=scalar_error(aperture, uneven) if polarisation == "scalar" else budget.polarisation,
+        polarisation=_of_scalar(budget, aperture, uneven) if polarisation == "scalar" else budget.polarisation,
         neighbours=_neighbours(aperture, left_out.neighbours, polarisation, _Seen(light, slanted, lit)),
         angle=0.0 if has_angles else slanted,
         glass=ghost,
     )
+
+
+def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
+    """Of one scalar: of a perfect lens in one medium, and of films as measured on the light."""
+    return _together(scalar_error(aperture, uneven), budget.polarisation)
 
 
 def scalar_error(aperture: float, uneven: float = 0.0) -> float:

@@ -1,7 +1,7 @@
 """Intensity of one lens in one direction, by the cheapest method, checked and repeated until the tolerance is met."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from metalens.propagate import (
     pupil_error,
     relative_error,
 )
-from metalens.psf.vector import Mixing
+from metalens.psf.vector import Mixing, has_faces, s_and_p
 
 FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
 BRIGHT = 30.0  # times the light of random phases below which float32 loses what is left of the sum
@@ -54,8 +54,8 @@ class Result:
 
     power: sum of squares of the transmission over the pillars, wavelengths weighted. brightness: mean of the window at
         the darkest depth, against pillars of random phases. sampling: error of an integration over cells. source: of a
-        source of finite size taken as alike. rays: of both polarisations as rays to the window's middle have them, nan
-        of a scalar.
+        source of finite size taken as alike. rays: of both polarisations as rays to the window's middle have them; of a
+        scalar behind films, of the mean of s and p that it takes; nan of a scalar in one medium.
     """
 
     intensity: torch.Tensor
@@ -112,7 +112,7 @@ def intensity(
     for setting, kind in tries:
         dtype = torch.float64 if dim else kind
         result = _windowed(lit, dtype, max(setting, FINEST), moving)
-        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype], *map(paths.films_error, cases))
+        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype], lit.films)
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
@@ -137,6 +137,22 @@ class Lit:
             pupils = None if self.mixing is None else self.mixing.pupils(case)
             yield (self.phase[some], self.level[some]), case, weight, pupils
 
+    @property
+    def films(self) -> float:
+        """Relative L2 error of what is left out behind films, the worst over wavelengths."""
+        if self.cases[0].behind is None:
+            return 0.0
+        each = [(case, maps[1].detach()[0].cpu().numpy()) for maps, case, _, _ in self.each()]
+        return max(paths.films_error(case, level) for case, level in each)
+
+    @property
+    def judged(self) -> Callable[[Case], Pupils] | None:
+        """Factors on the light of single points that it is compared with: of both polarisations by their own rays, or
+        of s and p apart where a scalar meets faces of films."""
+        if self.mixing is not None:
+            return self.mixing.pupils
+        return s_and_p if has_faces(self.cases[0]) else None
+
     def power(self, case: Case, powers: list[float], level: torch.Tensor) -> float:
         """What the pillars of a wavelength let through, from the sums of squares of its maps."""
         return powers[0] if self.mixing is None else self.mixing.power(case, powers, level)
@@ -148,31 +164,31 @@ def _exact(lit: Lit, reason: str) -> Result:
     for (phase, level), case, weight, pupils in lit.each():
         powers = (level.double() ** 2).sum((-1, -2)).tolist()
         power += weight * lit.power(case, powers, level)
+        if lit.judged is not None:
+            samples.append(_of_pillars((phase, level), case, weight, pupils))
         if pupils is None:
             total = total + weight * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
             continue
         for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-        if lit.mixing is not None:  # a scalar has no rays to be judged
-            samples.append(_of_pillars((phase, level), case, weight, pupils))
-    error = math.hypot(EXACT[lit.phase.dtype], *(paths.films_error(case) for case in lit.cases))
+    error = math.hypot(EXACT[lit.phase.dtype], lit.films)
     found = Result(torch.as_tensor(total).to(lit.phase.dtype), error, reason, power)
     return _from_middle(found, lit, [samples], [total])
 
 
-def _of_pillars(maps: tuple[torch.Tensor, torch.Tensor], case: Case, weight: float, pupils: Pupils) -> Sample:
+def _of_pillars(maps: tuple[torch.Tensor, torch.Tensor], case: Case, weight: float, pupils: Pupils | None) -> Sample:
     """What a sum over all pillars took of a wavelength, to be judged."""
     y, x = case.pillars_um
     path = paths.from_source(case, x, y[:, None], case.tangents, paths.reference_depth(case))
     turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
     light = torch.polar(maps[1].double(), maps[0].double() + torch.as_tensor(turn)).numpy()
-    return Sample(case, weight, light, 0.0, 1, (y, x), pupils(y, x))
+    return Sample(case, weight, light, 0.0, 1, (y, x), None if pupils is None else pupils(y, x))
 
 
 def _from_middle(result: Result, lit: Lit, samples: list[list[Sample]], seen: list[Any]) -> Result:
-    """With what rays to the window's middle leave out of both polarisations."""
-    return result if lit.mixing is None else replace(result, rays=pupil_error(samples, seen, lit.mixing.pupils))
+    """With what rays to the window's middle leave out of both polarisations; of a scalar behind films, what it does."""
+    return result if lit.judged is None else replace(result, rays=pupil_error(samples, seen, lit.judged))
 
 
 def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Result:

@@ -14,7 +14,11 @@ H = b x E of every ray it is a sum of squares with signs, like that of E:
 
     S_z = Σ_c s_c |Σ_j f_c(j) S_j|²        S_j: the scalar's light; f_c: (Ex ± Hy)/2, (Ey ± Hx)/2; s_c = ±1
 
-Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where pillars treat them alike.
+Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where pillars treat them alike and no
+face of a film tells s from p.
+
+Rays leave the pillars into their cover; at the faces of films s stays across them and p turns with the ray, each by its
+own share of the power that passes (the scalar's light holds the mean of both).
 """
 
 import math
@@ -26,7 +30,8 @@ import torch
 from torch import Tensor
 
 from metalens.ground.arrays import Array
-from metalens.propagate import Case, Pupils, cosines
+from metalens.lens import media
+from metalens.propagate import Case, Pupils, apart, cosines
 from metalens.psf.among import Jones
 
 POOLED = 64  # blocks of pillars along an axis over which the cosine of a ray is taken as alike
@@ -60,21 +65,22 @@ class Mixing:
 
     def pupils(self, case: Case) -> Pupils:
         """Components of the light of a case: of one map four of the flux of light along x, which is that of light along
-        y, or six of the mean |E|²; of three maps eight of the mean flux, or six. Those that are 0 all over are left
-        out."""
+        y but behind films, or six of the mean |E|²; of three maps or behind films eight of the mean flux, or six. Those
+        that are 0 all over are left out."""
         return lambda y_um, x_um: self._components(case, (y_um, x_um))
 
     def _components(self, case: Case, at_um: tuple[Array, Array]) -> tuple[Array, Array]:
         """(components,) signs and (components, map, y, x) factors."""
-        b = rays_to(case, at_um)
+        order = order_behind(case)
+        first, b = rays_to(case, at_um, order[0]), rays_to(case, at_um)
         steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
         a = torch.tensor([case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep], dtype=torch.float64)
-        x, y = turned(a, b).chunk(2)
+        x, y = beyond_faces(turned(a, first), first, order).chunk(2)
         none = torch.zeros_like(x)
         both = [torch.cat(pair) for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])]
         fields = [of_flux(one, b) if self.flux else Mixed(one, (1.0,) * len(one)) for one in both]
         factors, signs = torch.stack([one.pupils for one in fields], 1).numpy(), np.array(fields[0].signs)
-        if self.flux and not self.apart:
+        if self.flux and not self.apart and not has_faces(case):
             factors, signs = factors[:4], signs[:4]
         else:
             factors = factors * math.sqrt(0.5)
@@ -103,12 +109,60 @@ class Mixing:
         return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
 
 
-def rays_to(case: Case, at_um: tuple[Array, Array]) -> Tensor:
-    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's centre, as they reach the sensor."""
+def order_behind(case: Case) -> tuple[float, ...]:
+    """Indices of the media from the pillars to the sensor; 1 for one medium, whose wavelength is its own."""
+    return (1.0,) if case.behind is None else case.behind.order
+
+
+def has_faces(case: Case) -> bool:
+    """Whether light goes from one medium to another behind the lens."""
+    return len(set(order_behind(case))) > 1
+
+
+def rays_to(case: Case, at_um: tuple[Array, Array], index: float | None = None) -> Tensor:
+    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's centre, as they reach the sensor, or
+    in a medium of this index."""
     across, down = at_um[1][None, :] - case.centre_um[0], (at_um[0] - case.centre_um[1])[:, None]
-    last = 1.0 if case.behind is None else case.behind.order[-1]
-    p, q = (torch.as_tensor(-cosines(case, *at) / last) for at in ((across, down), (down, across)))
+    n = index or order_behind(case)[-1]
+    p, q = (torch.as_tensor(-cosines(case, *at) / n) for at in ((across, down), (down, across)))
     return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
+
+
+def s_and_p(case: Case) -> Pupils:
+    """Two components of a scalar's light behind films: light that is s all over, and p, whose mean power is the light;
+    each over the one amplitude that the scalar takes for both, as they reach the window's middle."""
+
+    def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
+        b = rays_to(case, (y_um, x_um), 1.0).numpy()  # p = n sin θ
+        return np.ones(2), np.stack(apart(case, b[0] ** 2 + b[1] ** 2))[:, None] * math.sqrt(0.5)
+
+    return components
+
+
+def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> Tensor:
+    """(2 polarisations x 3 components, …) fields in the last medium of rays whose fields in the first are ``electric``.
+
+    E = √S (E·s) s + √P (E·p) p', times √(cos / cos') to keep |E|² cos θ: s across the plane of the ray, p and p' in it,
+    S and P the powers that pass over the mean of both.
+
+    Args:
+        first: (3, …) directions in the first medium. order: indices of the media.
+    """
+    if len(set(order)) == 1:
+        return electric
+    w = (first[0] ** 2 + first[1] ** 2) * order[0] ** 2
+    sine, least = torch.sqrt(w), torch.finfo(w.dtype).tiny
+    ux, uy = torch.where(sine > least, first[:2] * order[0] / sine.clamp_min(least), torch.ones_like(first[:2]))
+    steep, cosine = sine / order[-1], torch.sqrt(1 - w / order[-1] ** 2)
+    s_power, p_power = media.passed_apart(order, w)
+    both = (s_power + p_power) / 2 * cosine / first[2]
+    s_level, p_level = torch.sqrt(s_power / both), torch.sqrt(p_power / both)
+    out = []
+    for e in electric.reshape(2, 3, *electric.shape[1:]):
+        s = (ux * e[1] - uy * e[0]) * s_level
+        p = (first[2] * (ux * e[0] + uy * e[1]) - sine / order[0] * e[2]) * p_level
+        out += [p * cosine * ux - s * uy, p * cosine * uy + s * ux, -p * steep]
+    return torch.stack(out)
 
 
 def apart_maps(maps: tuple[Tensor, Tensor], fields: Jones) -> tuple[Tensor, Tensor]:

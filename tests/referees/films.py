@@ -34,14 +34,37 @@ class Stack:
 
     def fields(self, light, at=(0.0, 0.0)):
         """(2, y, x) fields of s and p light on the lattice about ``at``; light: (rows, columns) of the pillars."""
+        return np.fft.ifft2(self._waves(light, at) * self.transfer())
+
+    def flux(self, light, at=(0.0, 0.0)):
+        """(y, x) power through the sensor of light (2 polarisations, Ex and Ey at the pillars, rows, columns), mean of
+        both: every plane wave parted into s and p, each with its own Fresnel coefficients; H = n b x E."""
+        first, last = self.films[0][0], self.films[-1][0]
+        runs = self.p2 < (0.999 * min(n for n, _ in self.films)) ** 2
+        size = np.sqrt(np.where(runs, self.p2, 0))
+        ux = np.where(size > 0, self.px / np.where(size > 0, size, 1), 1.0)
+        uy = np.where(size > 0, self.py / np.where(size > 0, size, 1), 0.0)
+        near, far = np.sqrt(1 - (size / first) ** 2), np.sqrt(1 - (size / last) ** 2)
+        in_s, in_p = self.transfer() * np.sqrt(first * near / (last * far))
+        total = 0.0
+        for ex, ey in light:
+            ex, ey = self._waves(ex, at), self._waves(ey, at)
+            s, p = (ux * ey - uy * ex) * in_s, (ux * ex + uy * ey) / near * in_p
+            e = p * far * ux - s * uy, p * far * uy + s * ux
+            h = last * (-s * far * ux - p * uy), last * (-s * far * uy + p * ux)
+            e, h = (tuple(np.fft.ifft2(part) for part in both) for both in (e, h))
+            total = total + (e[0] * h[1].conj() - e[1] * h[0].conj()).real / 2
+        return total
+
+    def _waves(self, light, at):
+        """Plane waves of light (rows, columns) on the lattice, the middle of the lens at the origin and that of the
+        lattice of the sensor at ``at``."""
         grid = np.zeros((self.count, self.count), complex)
         rows, columns = light.shape
         grid[:rows, :columns] = light
-        # the middle of the lens and of the lattice of the sensor at the origin
         shift_x = at[0] - (self.count - 1) / 2 * self.step + (columns - 1) / 2 * self.step
         shift_y = at[1] - (self.count - 1) / 2 * self.step + (rows - 1) / 2 * self.step
-        move = np.exp(1j * self.k * (self.px * shift_x + self.py * shift_y))
-        return np.fft.ifft2(np.fft.fft2(grid) * self.transfer() * move)
+        return np.fft.fft2(grid) * np.exp(1j * self.k * (self.px * shift_x + self.py * shift_y))
 
 
 def source_phase(films, depth, beside, radii, wavelength, count=60000):
@@ -64,12 +87,13 @@ def source_phase(films, depth, beside, radii, wavelength, count=60000):
     return np.angle(field[1:] / field[0])
 
 
-def point_wave(films, order, *, wavelength, reach, turn=0.12, panels=1500):
-    """Field at distances ``reach`` (n,) from the foot of a point of light of unit area, every face's mean of s and p.
+def point_wave(films, order, *, wavelength, reach, turn=0.12, panels=1500, apart=False):
+    """Field at distances ``reach`` (n,) from the foot of a point of light of unit area, every face's mean of s and
+    p; or (2, n) of s and of p apart.
 
-    k²/2π times the integral of √T exp(ik sum t √(n² - p²)) J0(k p ρ) p over p, on a line ``turn`` rad below
-    the axis, where waves fade that do not run: Gauss-Legendre over panels, 1e-12; less where waves gain much on that
-    line, steep and far. films: (index, thickness); order: indices.
+    k²/2π times the integral of √T exp(ik sum t √(n² - p²)) J0(k p ρ) p over p, on a line ``turn`` rad below the axis,
+    where waves fade that do not run: Gauss-Legendre over panels, 1e-12; less where waves gain much on that line, steep
+    and far. films: (index, thickness); order: indices.
     """
     from scipy.special import jv
 
@@ -83,6 +107,37 @@ def point_wave(films, order, *, wavelength, reach, turn=0.12, panels=1500):
         ca, cb = np.sqrt(1 - p * p / a**2), np.sqrt(1 - p * p / b**2)
         root = 2 * np.sqrt(a * ca * b * cb)
         both *= np.array([root / (a * ca + b * cb), root / (b * ca + a * cb)])
-    level = np.sqrt((both**2).mean(0))
+    level = both if apart else np.sqrt((both**2).mean(0))
     wave = weight * p * level * np.exp(1j * k * sum(t * np.sqrt(n * n - p * p) for n, t in films))
-    return np.array([k * k / (2 * np.pi) * (wave * jv(0, k * p * r)).sum() for r in reach])
+    return np.stack([k * k / (2 * np.pi) * (wave * jv(0, k * p * r)).sum(-1) for r in reach], -1)
+
+
+def sums(light, at, points, films, order, wavelength):
+    """(2, n) fields of s and of p at points (n, 2) of light (m,) at pillars ``at`` (m, 2), each the sum of its plane
+    waves: :func:`point_wave` over exp(ik path) / path, a series in the cosine of the ray. Paths by bisection."""
+    k, rare = 2 * np.pi / wavelength, min(n for n, _ in films)
+
+    def lands(p):
+        return sum(t * p / np.sqrt(n * n - p * p) for n, t in films)
+
+    def plain(p):
+        path = sum(n * n * t / np.sqrt(n * n - p * p) for n, t in films)
+        return np.exp(1j * k * path) / path
+
+    far = np.hypot(points[:, None, 0] - at[:, 0], points[:, None, 1] - at[:, 1])
+    low, high = np.zeros(far.shape), np.full(far.shape, rare * (1 - 1e-9))
+    for _ in range(60):
+        p = (low + high) / 2
+        less = lands(p) < far
+        low, high = np.where(less, p, low), np.where(less, high, p)
+    for _ in range(2):  # the last digits by Newton's rule
+        p = p + (far - lands(p)) / sum(t * n * n / np.sqrt(n * n - p * p) ** 3 for n, t in films)
+    ends = np.sqrt(rare**2 - p.max() ** 2), np.sqrt(rare**2 - p.min() ** 2)
+    middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2 + 1e-9
+    node = np.cos(np.pi * (np.arange(18) + 0.5) / 18)
+    some = np.sqrt(rare**2 - (middle + half * node) ** 2)
+    length = sum(t for _, t in films)
+    waves = point_wave(films, order, wavelength=wavelength, reach=lands(some), apart=True, turn=min(0.12, 6 / length))
+    series = np.polynomial.chebyshev.chebfit(node, (waves / plain(some)).T, 17)
+    u = (np.sqrt(rare**2 - p * p) - middle) / half
+    return (np.polynomial.chebyshev.chebval(u, series) * plain(p)) @ light

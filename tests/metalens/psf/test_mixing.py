@@ -35,7 +35,7 @@ def turn(a, b):
 def plain(maps, jones, *, kind, index=1.0, layers=None):
     """(depth, y, x) mean over light along x and y of E x H* along z, or of |E|²: six exact sums of every pillar's.
 
-    Rays to the window's middle, by Snell's law where there are films: index is that before the sensor.
+    Rays to the window's middle, turned in the air behind the pillars; index is that before the sensor, where they bend.
     """
     about = dict(
         pitch_um=PITCH, wavelength_um=WAVE, sensor_distance_um=DISTANCE, angle_rad=ANGLE, **SEEN, layers=layers
@@ -43,20 +43,35 @@ def plain(maps, jones, *, kind, index=1.0, layers=None):
     case = propagate.case((COUNT, COUNT), **about)
     y, x = case.pillars_um
     dx, dy = case.centre_um[0] - x[None, :], case.centre_um[1] - y[:, None]
-    p, q = (propagate.cosines(case, along, across) / index for along, across in ((dx, dy), (dy, dx)))
+    p, q = (propagate.cosines(case, along, across) for along, across in ((dx, dy), (dy, dx)))
     b = np.stack([p, q, np.sqrt(1 - p * p - q * q)])
+    bent = np.stack([p / index, q / index, np.sqrt(1 - (p * p + q * q) / index**2)])
     a = np.array([*np.tan(ANGLE), 1.0]) / math.sqrt(1 + (np.tan(ANGLE) ** 2).sum())
     to_a = turn(np.array([0, 0, 1.0]), a[:, None, None])[..., 0, 0]
     total = 0
     for given in (0, 1):
         e = np.einsum("ijyx,jk,kyx->iyx", turn(a, b), to_a[:, :2], jones[:, given]) / np.sqrt(b[2])
-        h = np.cross(b, e, axis=0)
+        e = face(e, b, bent, index)
+        h = np.cross(bent, e, axis=0)
         wave = [np.array([summed(maps, part, about) for part in field]) for field in (e, h)]
         if kind == "flux":
             total = total + (wave[0][0] * wave[1][1].conj() - wave[0][1] * wave[1][0].conj()).real / 2
         else:
             total = total + (np.abs(wave[0]) ** 2).sum(0) / 2
     return total
+
+
+def face(e, b, bent, index):
+    """Field behind a face of air and glass over the root mean square of s and p power: Fresnel's amplitudes."""
+    unit = np.stack([b[0], b[1], 0 * b[0]]) / np.hypot(b[0], b[1])
+    s = np.stack([-unit[1], unit[0], 0 * b[0]])
+    level = []
+    for both in (b[2] + index * bent[2], index * b[2] + bent[2]):
+        level.append(2 * b[2] / both * np.sqrt(index * bent[2] / b[2]))  # amplitude whose square is power
+    mean = np.sqrt((level[0] ** 2 + level[1] ** 2) / 2)
+    along_s, along_p = (e * s).sum(0), (e * np.cross(s, b, axis=0)).sum(0)
+    out = along_s * level[0] * s + along_p * level[1] * np.cross(s, bent, axis=0)
+    return out / mean * np.sqrt(b[2] / bent[2])
 
 
 def summed(maps, factor, about):
