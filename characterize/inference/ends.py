@@ -24,6 +24,7 @@ from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 _CLOSE = 0.25  # sigma of a last step, which is not tried: slopes that hold are right to a tenth of it
+_SHORT = 0.15  # of the way from the mode, that such a step may go: on a flat tail a quarter of a sigma goes far
 _NEAR = 0.6  # sigma of a step from which on slopes must hold
 _STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell, in all, while these are said to hold
 _FAR = 1.25  # times the goal: a step at most
@@ -102,15 +103,15 @@ def end(
     here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
     lowest = valley.least - valley.above
     far, missed, back, steps = _FAR * goal, 0.0, False, 0
-    seen: dict[float, float] = {}
-    met: list[tuple[Array, float]] = []
+    seen, met = dict[float, float](), list[tuple[Array, float]]()
     for _ in range(_TURNS):
         step, least, size = _outwards(here, i, sign, lowest + goal**2, valley.prior, (far, most))
         if steps:
             seen[float(here.x[i])] = max(least - lowest, 0.0)
-        off_level = size < _CLOSE and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2
+        close = size < _CLOSE and abs(step[i]) <= min(_SHORT * abs(here.x[i] + step[i] - valley.mode[i]), 0.999 * most)
+        off_level = close and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2
         held = missed < _STRAIGHT and not off_level
-        if held and steps and size < _CLOSE:
+        if held and steps and close:
             break
         if not held and (size < _NEAR or back):  # again, with slopes that hold here
             here, missed = Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)), 0.0

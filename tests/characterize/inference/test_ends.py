@@ -50,6 +50,25 @@ def test_ends_of_a_bent_valley_are_those_of_what_is_straight_in_the_data(top):
         assert rise == pytest.approx(want, abs=0.05 * max(want, 0.4))  # descents end within 0.02
 
 
+@pytest.mark.parametrize("slope", [0.63, 0.35, 0.28])
+def test_ends_on_a_flat_tail_are_not_where_a_quarter_of_a_sigma_is_left(slope):
+    """slope ln(1 + x) has risen by 1.96 sigma at exp(1.96 sigma / slope) - 1: 7 to 53 sigma out, where the last quarter
+    of a sigma is a fifth to half of the way. Of a last step, 0.15 of it at most, the bend misses half the square, 1 %;
+    slopes brought up to date by images as much again."""
+    across, beside = np.linalg.qr(SHAPES.reshape(2, -1).T)[0].T.reshape(SHAPES.shape)
+
+    def flat(x, jacobian):
+        out = max(x[0], -0.99)
+        image = 5 + slope * math.log1p(out) * across + x[1] * beside
+        return image, np.stack([slope / (1 + out) * across, beside]) if jacobian else None
+
+    mode, want = np.array([0.0, 0.7]), math.expm1(REACH * NOISE / slope)
+    prior = Prior(mode, np.full(2, np.inf), np.array([-0.95, -99.0]), np.full(2, 1e9))
+    valley = Valley(flat, seen(flat(mode, False)[0]), mode, prior)
+    found = ends.end(valley, 0, 1, REACH, most=2 * REACH * float(valley.sigma[0]))  # no farther a step than a search
+    assert found.place == pytest.approx(want, rel=0.03)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_an_end_that_others_have_passed_is_given_up_and_one_beyond_them_is_not(sign):
     """e^x is known to its sigma times 1.96: from 1.5 the ends are logarithms, 0.9 lower and 0.5 higher, by three
