@@ -22,6 +22,7 @@ from benchmarks.mutation.server import Server
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "benchmarks" / "results" / "mutants.json"
 REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # path -> line's words -> change -> why none can tell
+PROMISED = "tests/test_defaults.py"  # reads defaults off the source
 LONGEST_S = 120.0  # of test files whose usual time is not known
 SEEN = ROOT / "build" / "mutants" / "reach.json"  # which tests run which lines, as seen before the first mutant
 
@@ -121,11 +122,16 @@ class Worker:
 
     @classmethod
     def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
-        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them."""
+        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them.
+
+        Where no function in memory changes it may be a default, of which the list of promised ones is asked first.
+        """
         tests = _near(cls.graph, module, cls.near)
-        asked = mutant.path, source, tests
-        answer = None if loops else cls.server.outcome(*asked, LONGEST_S)
-        outcome, spent = answer or cls.bench.outcome(*asked, LONGEST_S / 3, fresh=module in cls.graph.compiled)
+        answer = None if loops else cls.server.outcome(mutant.path, source, tests, LONGEST_S)
+        if answer is None and not loops:
+            tests = [PROMISED, *tests]
+        fresh = module in cls.graph.compiled
+        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, LONGEST_S / 3, fresh=fresh)
         said = "killed" if outcome == "failed" else "survived"
         return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
 

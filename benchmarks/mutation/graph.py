@@ -31,21 +31,21 @@ class Graph:
         return own | {home for name in own for home in self._uses(self.modules[name])}
 
     def related(self, module: str, seconds: dict[str, float], budget_s: float) -> list[str]:
-        """Test files that reach ``module``, within a budget: of its name, or of its folder with answers of their own
-        (``_TRUTHS``, these first); importing it and speaking of it most often (its folder counts for three times),
-        nearest, quickest (shortest)."""
+        """Test files that reach ``module``, within a budget: of its name (``_TRUTHS`` first), of its folder with
+        answers of their own; importing it and speaking of it most often (its folder counts for three times), nearest,
+        quickest (shortest)."""
         folder = self.modules[module].relative_to(self.root).parent
         stem = self.modules[module].stem
 
-        def order(test: Path) -> tuple[bool, bool, int, int, float, int]:
+        def order(test: Path) -> tuple[int, int, int, float, int]:
             own = self.root / "tests" / folder == test.parent
             named = re.search(rf"(^|_){stem}(_|$)", test.stem) is not None
             near = self._reach[test][module]
             spoken = len(re.findall(rf"\b{stem}\b", test.read_text(encoding="utf-8"))) if near == 1 else 0
             spent = seconds.get(self._name(test), 1.0)
             truths = _TRUTHS.search(test.stem) is not None
-            meant = own and (named or (truths and near == 1))
-            return not meant, not (meant and truths), -(spoken + 3 * own), near, spent, test.stat().st_size
+            kind = (0 if truths else 1) if named else 2 if truths and near == 1 else 3
+            return kind if own else 3, -(spoken + 3 * own), near, spent, test.stat().st_size
 
         chosen, spent = [], 0.0
         for test in sorted((t for t in self.tests if module in self._reach[t]), key=order):

@@ -146,7 +146,7 @@ def test_a_reason_is_for_one_line(tmp_path, monkeypatch):
 
 
 def test_test_files_of_closed_forms_are_asked_first(tree):
-    """Before the longer one of the module's own name, before one that only imports it, whatever their words."""
+    """Of the module's own name; after those come its other one, such files that import it, and the rest by words."""
     folder = tree / "tests" / "metalens"
     folder.mkdir(parents=True)
     said = "from metalens import numbers_of\n"
@@ -156,7 +156,7 @@ def test_test_files_of_closed_forms_are_asked_first(tree):
     asked = Graph(tree).related("metalens.numbers_of", {}, 40.0)
     assert [name.split("test_")[1] for name in asked] == [
         "numbers_of_truths.py",
-        "sums_parts.py",
         "numbers_of.py",
+        "sums_parts.py",
         "other.py",
     ]
