@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.propagate import (
     SHARE,
@@ -41,6 +42,7 @@ MANY = 8192  # samples of a window from which an estimate looks at few of them
 MISSED = 0.02  # of the setting of such a window: what rare errors those few may miss (0.002 and less were seen)
 SCATTER = 1.5  # times its estimate: errors beside a spot and where the window is dim are seen by few of the few
 EXACT = {torch.float32: 1e-7, torch.float64: 4e-12}  # rounding of exact sums and of what they are kept in
+HALF_DIGIT, SPREAD = 1.1e-16, 2.0  # rounding of a number in float64; sums of few pillars vary about their mean noise
 OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
 KEPT = {
     torch.float32: 1.5e-7,
@@ -160,10 +162,11 @@ class Lit:
 
 def _exact(lit: Lit, reason: str) -> Result:
     total: Any = 0.0
-    power, samples = 0.0, []
+    power, noise, samples = 0.0, 0.0, []
     for (phase, level), case, weight, pupils in lit.each():
         powers = (level.double() ** 2).sum((-1, -2)).tolist()
         power += weight * lit.power(case, powers, level)
+        noise = max(noise, _turned(phase, level, case) * _incoherent(sum(powers), case))
         if lit.judged is not None:
             samples.append(_of_pillars((phase, level), case, weight, pupils))
         if pupils is None:
@@ -172,9 +175,23 @@ def _exact(lit: Lit, reason: str) -> Result:
         for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-    error = math.hypot(EXACT[lit.phase.dtype], lit.films)
+    error = math.hypot(EXACT[lit.phase.dtype], lit.films, _noisy_sum(total, noise))
     found = Result(torch.as_tensor(total).to(lit.phase.dtype), error, reason, power)
     return _from_middle(found, lit, [samples], [total])
+
+
+def _turned(phase: torch.Tensor, level: torch.Tensor, case: Case) -> float:
+    """Rounding of a pillar's phase in float64, rad: of the paths to it and on to the window, and of its own phase."""
+    turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
+    return HALF_DIGIT * (turns + float((phase.double().abs() * (level != 0)).max()))
+
+
+def _noisy_sum(light: Array, noise: float) -> float:
+    """Relative L2 error of PSFs from light (depth, y, x) to whose field noise of this size is added: its part along the
+    field, 2 Re U* n. Nothing at a focus, where noise is of N pillars and light of N², and most beside the light."""
+    whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
+    share, square = light / whole[:, None, None], 2 * noise**2 / whole
+    return float(SPREAD * math.sqrt(square.sum() / (share**2).sum()))
 
 
 def _of_pillars(maps: tuple[torch.Tensor, torch.Tensor], case: Case, weight: float, pupils: Pupils | None) -> Sample:
