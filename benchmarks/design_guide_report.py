@@ -3,6 +3,7 @@
 import json
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -197,8 +198,12 @@ of {each} frames each.
 """
 
 
-def page(lines: dict[str, dict[str, Any]], bounds: dict[str, float] | None = None) -> str:
-    """Markdown of all tables, and what of the plan was not measured; ``bounds`` by cell."""
+def page(
+    lines: dict[str, dict[str, Any]],
+    bounds: dict[str, float] | None = None,
+    designs: Sequence[dict[str, Any]] = (),
+) -> str:
+    """Markdown of all tables, and what of the plan was not measured; ``bounds`` by cell, ``designs`` as trained."""
     runs, devices = by_cell(lines), device_rows(lines)
     parts = [HEAD.format(frames=cell_of("base").frames), "", *knob_table(knob_rows(runs))]
     foci, designers = (
@@ -209,16 +214,12 @@ def page(lines: dict[str, dict[str, Any]], bounds: dict[str, float] | None = Non
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():
         parts += device_table(device, rows, lines, bounds or {})
-    parts += [RUNGS, *ladder_table(device_rows(lines, LADDER), bounds or {}), ""]
+    parts += [RUNGS, *ladder_table(device_rows(lines, LADDER), bounds or {}), "", *(told_of(one) for one in designs)]
     parts += [*watched_table(role_rows(runs, watched(lines)), runs), "", *network_table(network_rows()), ""]
     absent = missing(lines)
     if absent:
-        parts += [
-            "## Planned and not measured",
-            "",
-            "Cells without a run: " + ", ".join(f"`{c}`" for c in absent) + ".",
-            "",
-        ]
+        cells = ", ".join(f"`{c}`" for c in absent)
+        parts += ["## Planned and not measured", "", f"Cells without a run: {cells}.", ""]
     return "\n".join(parts)
 
 
@@ -271,6 +272,15 @@ def _told(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
+def told_of(design: dict[str, Any]) -> str:
+    """What a training did by the reader that chose among its lenses."""
+    read = ", ".join(f"{error:.3f} mm after {turn} turns" for turn, error in design["axial_mm"].items())
+    end = f"kept after {design['turn']}, {design['apart_rad']:.2f} rad rms from the start" if design["turn"] else (
+        "kept the start: its runs are those of that lens"
+    )  # fmt: skip
+    return f"Training of `{design['design']}`: axial {read}, on the frames that choose; {end}.\n"
+
+
 def ladder_table(rungs: dict[str, list[dict[str, Any]]], bounds: dict[str, float]) -> list[str]:
     """A row a rung: its lenses, and the trained one against the others."""
     head = ("field", "best focus", "designer", "best focus, axial / mm", "designer to it", "trained to it",
@@ -278,14 +288,15 @@ def ladder_table(rungs: dict[str, list[dict[str, Any]]], bounds: dict[str, float
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for device, rows in rungs.items():
         of = {row["role"]: row for row in rows}
-        if not {"focus", "designer", "trained"} <= set(of):
+        if not {"focus", "designer"} <= set(of):
             continue
-        focus, designer, trained = (of[role] for role in ("focus", "designer", "trained"))
-        ends = (bounds.get(row["cell"]) for row in (trained, focus))
+        focus, designer, trained = of["focus"], of["designer"], of.get("trained", {})
+        ends = (bounds.get(row.get("cell", "")) for row in (trained, focus))
         least = [end for end in ends if end is not None]
         told = [f"`{cell_of(device).field}`", *(f"`{cell_of(row['cell']).lens}`" for row in (focus, designer))]
-        told += [focus["axial_mm"], designer["axial_mm_ratio"], trained["axial_mm_ratio"], trained["to_designer"]]
-        told += [trained["window_mm_ratio"], trained["trusted_mm_ratio"]]
+        told += [focus["axial_mm"], designer["axial_mm_ratio"]]
+        ratios = ("axial_mm_ratio", "to_designer", "window_mm_ratio", "trusted_mm_ratio")
+        told += [trained.get(name, "–") for name in ratios]
         told += [_told(least[0] / least[1] if len(least) == 2 else None)]
         out.append("| " + " | ".join(map(str, told)) + " |")
     return out
@@ -303,12 +314,8 @@ def watched_table(rows: list[dict[str, Any]], runs: dict[str, dict[int, dict[str
         macs, iou = (np.mean(list(measured(runs[row["cell"]], n).values())) for n in ("mmacs", "iou"))
         parts = [f"{row['role']}: `{cell_of(row['cell']).lens}`", f"{macs:.2f}", row["axial_mm"].seeds]
         parts += [row["axial_mm"], row.get("axial_mm_ratio", 1), row["window_mm"], row.get("window_mm_ratio", 1)]
-        parts += [
-            row["lateral_mm"],
-            f"{iou:.2f}",
-            interval(list(mine.values())),
-            1 if row is rows[0] else ratio(mine, base),
-        ]
+        gaze = interval(list(mine.values())), 1 if row is rows[0] else ratio(mine, base)
+        parts += [row["lateral_mm"], f"{iou:.2f}", *gaze]
         out.append("| " + " | ".join(map(str, parts)) + " |")
     for row in rows:
         if "to_designer" in row:
@@ -338,4 +345,5 @@ def write(work: Path) -> None:
     bounds = kept_lines(work / BOUNDS)
     kept = {"runs": list(lines.values()), "designs": kept_lines(work / DESIGNS), "bounds": bounds}
     store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
-    store.write_text(PAGE, page(lines, {line["cell"]: line["bound_mm"] for line in bounds}))
+    told = {line["cell"]: line["bound_mm"] for line in bounds}
+    store.write_text(PAGE, page(lines, told, kept["designs"]))

@@ -269,6 +269,21 @@ def test_the_page_has_the_rungs_with_bounds_and_the_network():
     assert "| 1.80 [1.80, 1.80] | 0.90 [0.90, 0.90] |\n" in page
 
 
+def test_the_page_says_what_a_training_kept_and_keeps_rungs_without_one():
+    """A rung with a best focus and a designer's lens alone has its row; numbers of a trained lens are dashes."""
+    device, lines = _scanned(guide.LADDER[0])
+    for seed in range(2):
+        for role, share in (("focus", 1.0), ("designer", 0.8)):
+            lines |= _line(f"{guide.compared(lines, device)[role]}/{seed}", share)
+    kept = {"design": "lens=free-focus70", "turn": 0, "axial_mm": {"0": 1.0443, "24": 1.0452}, "apart_rad": 0.0}
+    moved = kept | {"design": "lens=free-focus40", "turn": 24, "apart_rad": 0.613}
+    page = told.page(lines, designs=[kept, moved])
+    assert "| 0.80 [0.80, 0.80] | – | – | – | – | – |\n" in page
+    said = "axial 1.044 mm after 0 turns, 1.045 mm after 24 turns, on the frames that choose; "
+    assert f"`lens=free-focus70`: {said}kept the start" in page
+    assert f"`lens=free-focus40`: {said}kept after 24, 0.61 rad rms from the start." in page
+
+
 def test_a_plan_goes_on_from_the_committed_results(tmp_path):
     """All lines come over as they are; a folder that has lines keeps them."""
     guide.begin(tmp_path)
