@@ -16,10 +16,10 @@ from metalens.ground.errors import ProcessError
 MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
-_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece at first, the first that takes few: others' doses differ beside it
+_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece, the first that takes few: others' doses differ beside it
 _FEW_PIECES = 100_000
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
-_FEW = 3.0  # ranges at which a lens no longer counts
+_FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,43 +63,64 @@ def cut(
     if not wide.any() or not len(boxes):
         return np.asarray(boxes, np.int64), np.arange(len(boxes))
     around = PointExposure(point.widths_um[wide], point.weights[wide])
-    least, core = float(around.widths_um.min()), float(point.widths_um.min())
-    shortest = max(least / _SHORTEST, CORNER * core) / step_um
+    shortest = max(float(around.widths_um.min()) / _SHORTEST, CORNER * float(point.widths_um.min())) / step_um
     change = _SHARE * tolerance * CLEARS
+    usual, corners = _ranges(around, change)
     for ranges in _LONGEST:
         most = MOST_PIECES if ranges == _LONGEST[-1] else min(_FEW_PIECES, MOST_PIECES)
-        every = _halved(boxes, lattices, step_um, around, (shortest, ranges * least, change), most=most)
+        sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
+        if np.ceil(sides / (ranges * usual)).prod(1).sum() > most:
+            continue
+        caps = _Caps(shortest, ranges * usual, [(_FEW * width, ranges * width) for width in corners], change)
+        every = _halved(boxes, lattices, step_um, around, caps, most=most)
         if every is not None:
             order = np.argsort(every.of, kind="stable")
             return every.box[order], every.of[order]
     raise ProcessError(
         f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
-        f"backscatter ranges {least:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
+        f"backscatter ranges {usual:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
     )
 
 
-def _halved(
-    boxes: Array,
-    lattices: Array,
-    step_um: float,
-    around: PointExposure,
-    limits: tuple[float, float, float],
-    *,
-    most: int,
-) -> _Pieces | None:
-    """Boxes halved until they keep the limits: shortest side in grid steps, longest in um, change of the background;
-    None where that takes more than ``most``.
+@dataclass(frozen=True, slots=True)
+class _Caps:
+    """shortest: side in grid steps, which is halved no more. longest_um: of a piece, and ``corners`` how near to a
+    corner it is what, um. change: of the background from the middle of a piece.
     """
-    shortest, longest_um, least_change = limits
+
+    shortest: float
+    longest_um: float
+    corners: list[tuple[float, float]]
+    change: float
+
+
+def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
+    """Width that half of the scattered energy reaches, and the narrower ones, falling, whose energy counts at corners.
+
+    There a Gaussian gives an eighth of its weight less than in the middle of what it changes by. All that together
+    change by less than ``change`` are left out: the doses beside them are as even without.
+    """
+    order = np.argsort(around.widths_um)
+    widths, total = around.widths_um[order], np.cumsum(around.weights[order])
+    usual = float(widths[np.searchsorted(total, total[-1] / 2)])
+    return usual, widths[(widths < usual) & (total > 8 * change)][::-1].tolist()
+
+
+def _halved(
+    boxes: Array, lattices: Array, step_um: float, around: PointExposure, caps: _Caps, *, most: int
+) -> _Pieces | None:
+    """Boxes halved until they keep the limits; None where that takes more than ``most``."""
+    every = np.asarray(boxes) * step_um
+    pairs = pairs_near(every, every, around)
     done: list[_Pieces] = []
     open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
     while len(open_.box):
         if len(open_.box) + sum(len(p.box) for p in done) > most:
             return None
-        longest = _longest(open_, lattices, step_um, around, longest_um)
-        change = _change(open_, boxes, step_um, around) / least_change
+        longest = _longest(open_, lattices, every, step_um, around, caps)
+        change = _change(open_, every, pairs, step_um, around) / caps.change
         side = open_.box[:, 2:] - open_.box[:, :2]
-        split = (side >= 2 * shortest) & ((side > longest[:, None] / step_um) | (change > 1))
+        split = (side >= 2 * caps.shortest) & ((side > longest[:, None] / step_um) | (change > 1))
         across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))  # the longer side where both need it
         done.append(open_.some(np.asarray(~split.any(1))))
         open_ = _joined([open_.some(across[:, 0]).halved(0), open_.some(across[:, 1] & ~across[:, 0]).halved(1)])
@@ -110,10 +131,16 @@ def _joined(parts: list[_Pieces]) -> _Pieces:
     return _Pieces(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("box", "outer", "of")))
 
 
-def _longest(pieces: _Pieces, lattices: Array, step_um: float, around: PointExposure, most_um: float) -> Array:
-    """(n,) largest side, um: ``most_um``, less beside a lens."""
-    box = pieces.box * step_um
-    out = np.full(len(box), most_um)
+def _longest(
+    pieces: _Pieces, lattices: Array, every: Array, step_um: float, around: PointExposure, caps: _Caps
+) -> Array:
+    """(n,) largest side, um: that of ``caps``, less near a corner of the box it is of, least beside a lens."""
+    box, whole = pieces.box * step_um, every[pieces.of]
+    out = np.full(len(box), caps.longest_um)
+    ends = [np.minimum(box[:, k] - whole[:, k], whole[:, k + 2] - box[:, k + 2]) for k in (0, 1)]
+    from_corner = np.hypot(*ends)
+    for near, most in caps.corners:
+        out[from_corner < near] = most
     for width in np.sort(around.widths_um)[::-1].tolist():
         for left, bottom, right, top in np.asarray(lattices, float).tolist():
             x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)
@@ -122,18 +149,15 @@ def _longest(pieces: _Pieces, lattices: Array, step_um: float, around: PointExpo
     return out
 
 
-def _change(pieces: _Pieces, boxes: Array, step_um: float, around: PointExposure) -> Array:
+def _change(pieces: _Pieces, every: Array, pairs: tuple[Array, Array], step_um: float, around: PointExposure) -> Array:
     """(n, 2) half the change of the background of all boxes at unit dose along x and y: along outer sides, and from
-    one outer side to the opposite one.
+    one outer side to the opposite one. every: (boxes, 4) um, and ``pairs`` of them that see each other.
     """
-    box, every = pieces.box * step_um, np.asarray(boxes) * step_um
+    box = pieces.box * step_um
     middle = (box[:, :2] + box[:, 2:]) / 2
     xs = np.stack([box[:, 0], middle[:, 0], box[:, 2]], -1)
     ys = np.stack([box[:, 1], middle[:, 1], box[:, 3]], -1)
-    at = np.stack(np.broadcast_arrays(xs[:, None, :], ys[:, :, None]), -1)  # (n, y, x, 2)
-    one, two = pairs_near(box, every, around)
-    rows = np.repeat(np.arange(len(box)), 9)
-    field = sums_of_boxes(at.reshape(-1, 2), rows, every, (one, two), around).reshape(-1, 3, 3)
+    field = sums_of_boxes(xs, ys, pieces.of, every, pairs, around)
     along_x, along_y = (np.ptp(field, axis=axis) / 2 for axis in (2, 1))  # of the lines bottom to top, left to right
     held = pieces.outer
     x = np.maximum(along_x[:, 0] * held[:, 1], along_x[:, 2] * held[:, 3])

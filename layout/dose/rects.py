@@ -1,14 +1,16 @@
 """Exposure by rectangles: marks, labels, verniers and boxes, cut into pieces small enough for one dose each."""
 
+import math
+
 import numpy as np
 
 from layout.dose.bodies import Rects
 from layout.dose.exposure import PointExposure
 from layout.process import compiled
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 _OUTSIDE_UM = 1e-4  # a point that far outside an edge tells whether another piece goes on there
-_AT_ONCE = 1_000_000  # pairs
 CORNER = 2.0  # widths of the core: an edge is round that near its ends
 
 
@@ -22,18 +24,59 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     boxes, count = rects.box_um, len(rects.box_um)
     if not count:
         return np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
-    one, two = pairs_near(boxes, boxes, near)
-    same = rects.group[one] == rects.group[two]
-    one, two = one[same], two[same]
+    one, two = _pairs_of_shapes(rects, near)
     starts = np.searchsorted(one, np.arange(count + 1))
     core_um = float(near.widths_um.min()) if len(near.widths_um) else 0.0
     points, piece = _outer(rects, starts, two, CORNER * core_um)
     inner = np.bincount(piece, minlength=count) == 0
     at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
     of = np.concatenate([piece, np.flatnonzero(inner)])
-    total = np.bincount(of, sums_of_boxes(at, of, boxes, (one, two), near), minlength=count)
+    total = np.bincount(of, sums_of_boxes(at[:, :1], at[:, 1:], of, boxes, (one, two), near)[:, 0, 0], minlength=count)
     exposure = total / np.bincount(of, minlength=count)
     return np.where(inner, exposure / 2, exposure), at, of
+
+
+def _pairs_of_shapes(rects: Rects, point: PointExposure) -> tuple[Array, Array]:
+    """As :func:`pairs_near`, of the pieces of each shape among themselves: a shape has few, a mask many."""
+    order = np.lexsort((rects.box_um[:, 0], rects.group))
+    boxes, group = np.ascontiguousarray(rects.box_um[order]), rects.group[order]
+    starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1], True])
+    apart = _reach(point)
+    counts = np.zeros(len(boxes), np.int64)
+    _pairs(boxes, starts, apart, counts, np.empty(0, np.int64))
+    first = np.cumsum(counts) - counts
+    near = np.empty(int(counts.sum()), np.int64)
+    _pairs(boxes, starts, apart, first, near)
+    one, two = order[np.repeat(np.arange(len(boxes)), counts)], order[near]
+    rank = np.lexsort((two, one))
+    return one[rank], two[rank]
+
+
+def _reach(point: PointExposure) -> float:
+    """Six widths (exp(-36)), um, and as much as tells that two boxes touch."""
+    return 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
+
+
+@compiled
+def _pairs(boxes: Array, starts: Array, apart: float, at: Array, near: Array) -> None:
+    """Boxes of a shape (sorted by their left sides) within ``apart`` of each of its boxes: written to ``near`` from
+    ``at`` on, or counted there where ``near`` is empty.
+    """
+    for g in range(starts.shape[0] - 1):
+        for n in range(starts[g], starts[g + 1]):
+            found = 0
+            for m in range(starts[g], starts[g + 1]):
+                if boxes[m, 0] > boxes[n, 2] + apart:
+                    break
+                if boxes[m, 2] < boxes[n, 0] - apart:
+                    continue
+                if boxes[m, 1] > boxes[n, 3] + apart or boxes[m, 3] < boxes[n, 1] - apart:
+                    continue
+                if near.shape[0] > 0:
+                    near[at[n] + found] = m
+                found += 1
+            if near.shape[0] == 0:
+                at[n] = found
 
 
 def pairs_near(some: Array, boxes: Array, point: PointExposure) -> tuple[Array, Array]:
@@ -41,7 +84,7 @@ def pairs_near(some: Array, boxes: Array, point: PointExposure) -> tuple[Array, 
     from scipy.spatial import cKDTree
 
     middles, halves = zip(*(((b[:, :2] + b[:, 2:]) / 2, (b[:, 2:] - b[:, :2]) / 2) for b in (some, boxes)), strict=True)
-    apart = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
+    apart = _reach(point)
     size = np.frexp(np.hypot(*halves[1].T))[1]  # boxes of like size together, so that a long one pairs only itself
     ones, twos = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for level in np.unique(size).tolist():
@@ -62,28 +105,53 @@ def pairs_near(some: Array, boxes: Array, point: PointExposure) -> tuple[Array, 
     return one[order], two[order]
 
 
-def sums_of_boxes(at_um: Array, row: Array, boxes_um: Array, pairs: tuple[Array, Array], point: PointExposure) -> Array:
-    """(n,) exposure at points by those boxes of unit dose that ``pairs`` (sorted) hold for the row of each point."""
-    from scipy.special import erf
+def sums_of_boxes(
+    x_um: Array, y_um: Array, row: Array, boxes_um: Array, pairs: tuple[Array, Array], point: PointExposure
+) -> Array:
+    """Exposure at the crossings of lines by those boxes of unit dose that ``pairs`` (sorted) hold for a row.
 
+    Args:
+        x_um, y_um: (n, i) and (n, j) lines; row: (n,) whose boxes each of the n takes.
+
+    Returns:
+        (n, j, i) exposure, exact to rounding.
+    """
     one, two = pairs
     first, last = np.searchsorted(one, row), np.searchsorted(one, row, side="right")
-    total = np.zeros(len(at_um))
-    for part in np.array_split(np.arange(len(at_um)), max(1, int((last - first).sum()) // _AT_ONCE)):
-        count = (last - first)[part]
-        n = np.repeat(part, count)
-        box = boxes_um[
-            two[np.arange(len(n)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first[part], count)]
-        ]
-        value = np.zeros(len(n))
-        for width, weight in zip(point.widths_um.tolist(), point.weights.tolist(), strict=True):
-            x, y = (
-                (erf((box[:, k + 2] - at_um[n, k]) / width) - erf((box[:, k] - at_um[n, k]) / width)) / 2
-                for k in (0, 1)
-            )
-            value += weight * x * y
-        total += np.bincount(n, value, minlength=len(total))
-    return total
+    out = np.zeros((len(row), y_um.shape[1], x_um.shape[1]))
+    lines, boxes = (np.ascontiguousarray(x_um), np.ascontiguousarray(y_um)), np.ascontiguousarray(boxes_um, float)
+
+    def work(start: int, stop: int) -> None:
+        _sum(*lines, first, last, two, boxes, point.widths_um, point.weights, start, stop, out)
+
+    if len(row):
+        threads.split(len(row), work)
+    return out
+
+
+@compiled
+def _sum(
+    x: Array, y: Array, first: Array, last: Array, near: Array, boxes: Array, widths: Array, weights: Array,
+    start: int, stop: int, out: Array,
+) -> None:  # fmt: skip
+    """A Gaussian over a box is a product of differences of error functions; beyond six widths they are 0."""
+    across, along = np.empty(x.shape[1]), np.empty(y.shape[1])
+    for n in range(start, stop):
+        for k in range(widths.shape[0]):
+            reach, scale = 6 * widths[k], 1 / widths[k]
+            left, right = x[n].min() - reach, x[n].max() + reach
+            bottom, top = y[n].min() - reach, y[n].max() + reach
+            for m in range(first[n], last[n]):
+                b = boxes[near[m]]
+                if b[0] > right or b[2] < left or b[1] > top or b[3] < bottom:
+                    continue
+                for i in range(x.shape[1]):
+                    across[i] = math.erf((b[2] - x[n, i]) * scale) - math.erf((b[0] - x[n, i]) * scale)
+                for j in range(y.shape[1]):
+                    along[j] = math.erf((b[3] - y[n, j]) * scale) - math.erf((b[1] - y[n, j]) * scale)
+                for j in range(y.shape[1]):
+                    for i in range(x.shape[1]):
+                        out[n, j, i] += weights[k] / 4 * along[j] * across[i]
 
 
 def _outer(rects: Rects, starts: Array, near: Array, corner_um: float) -> tuple[Array, Array]:

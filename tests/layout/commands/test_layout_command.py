@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import layout
+from layout.commands import page
+from layout.dose.exposure import point_exposure
 from layout.files import dxf
-from layout.process.process import Rules
+from layout.process.process import Exposure, Rules
 from layout.rules import check as drc
 from layout.rules import markers
 from layout.shapes import polygon
@@ -49,6 +51,20 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     page = (target / "report.html").read_text()
     assert "violations" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(tmp_path):
+    """The table has a slow tail that no few Gaussians follow."""
+    radius = np.geomspace(0.01, 30.0, 40)
+    rows = np.c_[radius, np.exp(-((radius / 0.02) ** 2)) / 4e-4 + 3e-3 / (radius + 0.3) ** 3]
+    np.savetxt(tmp_path / "point.csv", rows, delimiter=",", header="radius_um,density", comments="")
+    measured = Exposure(csv=tmp_path / "point.csv")
+    point = point_exposure(measured)
+    assert 1e-3 < point.fit_error < 0.05
+    told = page._table_said(measured, point)
+    assert f"the table point.csv, as {len(point.weights)} Gaussians" in told
+    assert f"by up to {100 * point.fit_error:.2g} % of the whole" in told
+    assert page._table_said(Exposure(alpha_um=0.01, beta_um=40.0, eta=0.7), point) == ""
 
 
 def test_a_corrected_mask_is_certified_and_hands_on_its_lens(lens_file, tmp_path, capsys):

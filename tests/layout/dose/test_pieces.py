@@ -6,6 +6,7 @@ from scipy.special import erf
 
 from layout.dose import pieces
 from layout.dose.exposure import PointExposure
+from layout.dose.rects import pairs_near
 from metalens.ground.errors import ProcessError
 
 STEP_UM = 1e-3
@@ -84,7 +85,8 @@ def test_pieces_are_an_eighth_of_the_range_within_three_ranges_of_a_lens(dx, dy)
         bottom = lens[3] + dy * distance_um if dy > 0 else lens[1] + dy * distance_um - size[1] if dy < 0 else 55.0
         box = np.rint(np.array([[left, bottom, left + size[0], bottom + size[1]]]) / step_um).astype(np.int64)
         part = pieces._Pieces(box, np.ones((1, 4), bool), np.zeros(1, int))
-        return float(pieces._longest(part, np.array([lens]), step_um, point, 8.0)[0])
+        caps = pieces._Caps(1.0, 8.0, [], 1.0)
+        return float(pieces._longest(part, np.array([lens]), box * step_um, step_um, point, caps)[0])
 
     assert longest(5.9) == 2.0 / 8
     assert longest(6.1) == longest(14.9) == 5.0 / 8
@@ -117,5 +119,44 @@ def test_the_change_of_the_background_is_that_along_outer_sides_and_across_to_th
         ((1, 1, 1, 1), max(below, above, over), max(at_left, at_right, up)),
     ):
         part = pieces._Pieces(every[:1], np.array([outer], bool), np.zeros(1, int))
-        # boxes beyond the reach of their Gaussians are left out, which gives less than 1e-4
-        assert pieces._change(part, every, STEP_UM, point)[0] == pytest.approx([x, y], abs=2e-4)
+        pairs = pairs_near(boxes, boxes, point)
+        assert pieces._change(part, boxes, pairs, STEP_UM, point)[0] == pytest.approx([x, y], abs=1e-12)
+
+
+def test_the_longest_piece_is_that_of_the_range_of_half_the_scattered_energy():
+    """Narrower Gaussians count at corners as soon as an eighth of their weights, from the narrowest on, is enough."""
+    widths, weights = np.array([9.0, 0.3, 40.0, 1.1, 2.4]), np.array([0.15, 0.006, 0.35, 0.004, 0.03])
+    order = [1, 3, 4, 0, 2]  # by width; sums of weights 0.006, 0.010, 0.040, 0.190, 0.540
+    assert np.cumsum(weights[order])[2] / 8 == pytest.approx(0.005)
+    around = PointExposure(widths, weights)
+    assert pieces._ranges(around, 0.0049) == (40.0, [9.0, 2.4])
+    assert pieces._ranges(around, 0.0051) == (40.0, [9.0])
+    assert pieces._ranges(around, 0.001) == (40.0, [9.0, 2.4, 1.1])
+
+
+def test_near_a_corner_a_piece_is_as_short_as_the_range_that_changes_there():
+    box = np.array([[0, 0, 40_000, 24_000]])
+    caps = pieces._Caps(1.0, 20.0, [(27.0, 9.0), (3.0, 1.0)], 1.0)
+
+    def longest(left, bottom, right, top):
+        part = pieces._Pieces(np.array([[left, bottom, right, top]]), np.ones((1, 4), bool), np.zeros(1, int))
+        around = PointExposure(np.array([9.0]), np.array([1.0]))
+        return float(pieces._longest(part, NOTHING, box * STEP_UM, STEP_UM, around, caps)[0])
+
+    assert longest(2_900, 700, 5_000, 900) == 1.0  # 2.98 um from the corner at left below
+    assert longest(3_000, 700, 5_000, 900) == 9.0  # 3.08
+    assert longest(35_000, 20_000, 37_100, 23_200) == 9.0  # 3.01 from that at right above
+    assert longest(35_000, 20_000, 37_200, 23_200) == 1.0  # 2.91
+    assert longest(0, 0, 40_000, 200) == 1.0
+    wide = np.array([[0, 0, 90_000, 60_000]])
+    box = wide
+    assert longest(40_000, 0, 50_000, 900) == 20.0
+
+
+def test_a_middle_range_of_little_weight_does_not_cut_whole_marks():
+    """A measured point exposure has a ladder of ranges; pieces of the narrowest would be millions."""
+    point = PointExposure(np.array([0.01, 0.1, 0.4, 1.6, 30.0]), np.array([0.6, 0.002, 0.002, 0.03, 0.366]))
+    made, _ = pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=point, tolerance=0.01)
+    area_um2 = ((CROSS[:, 2] - CROSS[:, 0]) * (CROSS[:, 3] - CROSS[:, 1])).sum() * STEP_UM**2
+    assert len(made) < 3000
+    assert len(made) < area_um2 / 0.4**2 / 4  # squares of a range
