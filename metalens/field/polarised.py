@@ -20,7 +20,7 @@ from metalens.field.rays import Rays
 from metalens.psf import Mixed, beyond_faces, of_flux, turned
 
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
-STEEPEST = 1e-3  # cos² of nodes beyond the rim, which have no light
+STEEPEST = 1e-3  # cos² in the rarest medium of nodes beyond the rim, which have no light
 
 
 def factors(seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool) -> Mixed:
@@ -31,6 +31,8 @@ def factors(seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: boo
         tangents: slopes (x, y) of the chief ray in air. order: indices of the media from the pillars to the sensor.
     """
     q, p = torch.meshgrid(seen.aside + seen.middle[1], seen.aside + seen.middle[0], indexing="ij")
+    room = (1 - STEEPEST) * min(order) ** 2 / (p * p + q * q).clamp_min(STEEPEST)
+    p, q = (side * torch.sqrt(room.clamp_max(1)) for side in (p, q))
     first, b = (_directions(p / n, q / n) for n in (order[0], order[-1]))
     slope = torch.cat([tangents, tangents.new_ones(1)])
     electric = beyond_faces(turned(slope / slope.norm(), first), first, order)
@@ -39,4 +41,4 @@ def factors(seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: boo
 
 def _directions(p: Tensor, q: Tensor) -> Tensor:
     """(3, y, x) unit vectors towards the sensor from their parts along x and y."""
-    return torch.stack([p, q, torch.sqrt((1 - p * p - q * q).clamp_min(STEEPEST))])
+    return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])

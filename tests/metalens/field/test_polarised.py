@@ -14,6 +14,8 @@ from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
 from metalens.field.patches import relative
 from metalens.field.plan import polarised, unpolarised
+from metalens.field.polarised import factors
+from metalens.field.rays import Rays
 from metalens.ground.errors import PropagationError
 from metalens.image import Frames
 from metalens.psf import Mixed, Nodes, of_flux, strongest, turned
@@ -236,3 +238,18 @@ def test_one_scalar_is_the_flux_to_fourth_order(sine, flux, energy):
 
     assert apart(i0**2 - i2**2) == pytest.approx(flux, rel=0.15)
     assert apart(i0**2 + 2 * i1**2 + i2**2) == pytest.approx(energy, rel=0.1)
+
+
+@pytest.mark.parametrize("order", [(1.0, 1.5), (1.6, 1.0, 1.3)])
+def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
+    """No light is on them, but 0 times nan would be in every sum; those that pass carry a flux of 1 a polarisation."""
+    none = torch.zeros(0)
+    aside, middle = torch.linspace(-1.4, 1.4, 29, dtype=torch.float64), torch.tensor([0.2, -0.1], dtype=torch.float64)
+    rays = Rays(none, none, none, none, none, aside, middle, none, none)
+    found = factors(rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True)
+    assert torch.isfinite(found.pupils).all()
+    signs = torch.tensor(found.signs)[:, None, None]
+    flux = (signs * found.pupils**2).sum(0)
+    away = torch.hypot(aside[:, None] + middle[1], aside + middle[0])
+    torch.testing.assert_close(flux[away < 0.1], torch.full_like(flux[away < 0.1], 2.0), rtol=2e-3, atol=0)  # s and p part as p²
+    assert (away < 0.1).sum() >= 2
