@@ -242,7 +242,8 @@ def test_one_scalar_is_the_flux_to_fourth_order(sine, flux, energy):
 
 @pytest.mark.parametrize("order", [(1.0, 1.5), (1.6, 1.0, 1.3)])
 def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
-    """No light is on them, but 0 times nan would be in every sum; those that pass carry a flux of 1 a polarisation."""
+    """No light is on them, but 0 times nan would be in every sum; those that pass carry a flux of 1 a polarisation,
+    near the normal, where s and p are alike to p²."""
     none = torch.zeros(0)
     aside, middle = torch.linspace(-1.4, 1.4, 29, dtype=torch.float64), torch.tensor([0.2, -0.1], dtype=torch.float64)
     rays = Rays(none, none, none, none, none, aside, middle, none, none)
@@ -251,5 +252,5 @@ def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
     signs = torch.tensor(found.signs)[:, None, None]
     flux = (signs * found.pupils**2).sum(0)
     away = torch.hypot(aside[:, None] + middle[1], aside + middle[0])
-    torch.testing.assert_close(flux[away < 0.1], torch.full_like(flux[away < 0.1], 2.0), rtol=2e-3, atol=0)  # s and p part as p²
+    torch.testing.assert_close(flux[away < 0.1], torch.full_like(flux[away < 0.1], 2.0), rtol=2e-3, atol=0)
     assert (away < 0.1).sum() >= 2
