@@ -66,9 +66,9 @@ def cut(
     shortest = max(float(around.widths_um.min()) / _SHORTEST, CORNER * float(point.widths_um.min())) / step_um
     change = _SHARE * tolerance * CLEARS
     usual, corners = _ranges(around, change)
+    sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
     for ranges in _LONGEST:
         most = MOST_PIECES if ranges == _LONGEST[-1] else min(_FEW_PIECES, MOST_PIECES)
-        sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
         if np.ceil(sides / (ranges * usual)).prod(1).sum() > most:
             continue
         caps = _Caps(shortest, ranges * usual, [(_FEW * width, ranges * width) for width in corners], change)
@@ -111,7 +111,7 @@ def _halved(
 ) -> _Pieces | None:
     """Boxes halved until they keep the limits; None where that takes more than ``most``."""
     every = np.asarray(boxes) * step_um
-    pairs = pairs_near(every, every, around)
+    pairs = pairs_near(every, np.zeros(len(every)), around)
     done: list[_Pieces] = []
     open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
     while len(open_.box):

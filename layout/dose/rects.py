@@ -24,7 +24,7 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     boxes, count = rects.box_um, len(rects.box_um)
     if not count:
         return np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
-    one, two = _pairs_of_shapes(rects, near)
+    one, two = pairs_near(boxes, rects.group, near)
     starts = np.searchsorted(one, np.arange(count + 1))
     core_um = float(near.widths_um.min()) if len(near.widths_um) else 0.0
     points, piece = _outer(rects, starts, two, CORNER * core_um)
@@ -36,12 +36,12 @@ def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
     return np.where(inner, exposure / 2, exposure), at, of
 
 
-def _pairs_of_shapes(rects: Rects, point: PointExposure) -> tuple[Array, Array]:
-    """As :func:`pairs_near`, of the pieces of each shape among themselves: a shape has few, a mask many."""
-    order = np.lexsort((rects.box_um[:, 0], rects.group))
-    boxes, group = np.ascontiguousarray(rects.box_um[order]), rects.group[order]
+def pairs_near(boxes_um: Array, group: Array, point: PointExposure) -> tuple[Array, Array]:
+    """Pairs of rows (one, two), sorted, of boxes of one group that touch or lie within six widths (exp(-36))."""
+    order = np.lexsort((boxes_um[:, 0], group))
+    boxes, group = np.ascontiguousarray(boxes_um[order]), group[order]
     starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1], True])
-    apart = _reach(point)
+    apart = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
     counts = np.zeros(len(boxes), np.int64)
     _pairs(boxes, starts, apart, counts, np.empty(0, np.int64))
     first = np.cumsum(counts) - counts
@@ -50,11 +50,6 @@ def _pairs_of_shapes(rects: Rects, point: PointExposure) -> tuple[Array, Array]:
     one, two = order[np.repeat(np.arange(len(boxes)), counts)], order[near]
     rank = np.lexsort((two, one))
     return one[rank], two[rank]
-
-
-def _reach(point: PointExposure) -> float:
-    """Six widths (exp(-36)), um, and as much as tells that two boxes touch."""
-    return 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
 
 
 @compiled
@@ -77,32 +72,6 @@ def _pairs(boxes: Array, starts: Array, apart: float, at: Array, near: Array) ->
                 found += 1
             if near.shape[0] == 0:
                 at[n] = found
-
-
-def pairs_near(some: Array, boxes: Array, point: PointExposure) -> tuple[Array, Array]:
-    """Pairs (row of ``some``, row of ``boxes``), sorted, that touch or lie within six widths (exp(-36))."""
-    from scipy.spatial import cKDTree
-
-    middles, halves = zip(*(((b[:, :2] + b[:, 2:]) / 2, (b[:, 2:] - b[:, :2]) / 2) for b in (some, boxes)), strict=True)
-    apart = _reach(point)
-    size = np.frexp(np.hypot(*halves[1].T))[1]  # boxes of like size together, so that a long one pairs only itself
-    ones, twos = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for level in np.unique(size).tolist():
-        members = np.flatnonzero(size == level)
-        far = np.hypot(*halves[0].T) + np.hypot(*halves[1][members].T).max() + apart
-        found = cKDTree(middles[1][members]).query_ball_point(middles[0], far)
-        one, two = (
-            np.repeat(np.arange(len(some)), [len(f) for f in found]),
-            np.concatenate([*found, []]).astype(np.int64),
-        )
-        kept = (
-            np.abs(middles[0][one] - middles[1][members[two]]) <= halves[0][one] + halves[1][members[two]] + apart
-        ).all(1)
-        ones.append(one[kept])
-        twos.append(members[two[kept]])
-    one, two = np.concatenate(ones), np.concatenate(twos)
-    order = np.lexsort((two, one))
-    return one[order], two[order]
 
 
 def sums_of_boxes(

@@ -119,7 +119,7 @@ def test_the_change_of_the_background_is_that_along_outer_sides_and_across_to_th
         ((1, 1, 1, 1), max(below, above, over), max(at_left, at_right, up)),
     ):
         part = pieces._Pieces(every[:1], np.array([outer], bool), np.zeros(1, int))
-        pairs = pairs_near(boxes, boxes, point)
+        pairs = pairs_near(boxes, np.zeros(len(boxes)), point)
         assert pieces._change(part, boxes, pairs, STEP_UM, point)[0] == pytest.approx([x, y], abs=1e-12)
 
 

@@ -88,8 +88,8 @@ def test_pieces_of_a_shape_see_those_within_six_ranges_and_none_of_another():
     apart = 6 * 0.7 + 1e-4
     gap = np.maximum(boxes[:, None, :2] - boxes[None, :, 2:], boxes[None, :, :2] - boxes[:, None, 2:])
     want = np.argwhere((gap <= apart).all(-1) & (group[:, None] == group))
-    kept = rects._pairs_of_shapes(Rects(boxes, group, np.ones(150)), point)
+    kept = rects.pairs_near(boxes, group, point)
     np.testing.assert_array_equal(np.stack(kept, -1), want)
     assert 150 < len(want) < 150**2 / 3
-    empty = rects._pairs_of_shapes(Rects(np.empty((0, 4)), np.empty(0, np.int64), np.empty(0)), point)
+    empty = rects.pairs_near(np.empty((0, 4)), np.empty(0), point)
     assert [len(part) for part in empty] == [0, 0]
