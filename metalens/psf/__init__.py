@@ -56,6 +56,7 @@ __getattr__, __dir__, __all__ = attach(
         "View": "of_lens",
         "among": "",
         "aperture": "of_lens",
+        "beyond_faces": "vector",
         "export": "",
         "far_field": "directions",
         "from_lens": "of_lens",
@@ -70,6 +71,5 @@ __getattr__, __dir__, __all__ = attach(
         "spectrum": "",
         "strongest": "vector",
         "turned": "vector",
-        "beyond_faces": "vector",
     },
 )
