@@ -216,7 +216,7 @@ def _from_lens(made: lens.Lens, settings: Settings, provenance: Provenance) -> p
         made,
         settings.view,
         tolerance=settings.tolerance,
-        spectrum=settings.nodes(made),
+        spectrum=settings.spectrum_of(made),
         provenance=provenance,
         polarisation=settings.polarisation,
         left_out=found,

@@ -195,20 +195,14 @@ class Settings:
             return None
         return psf.Extent(self.source_shape, self.source_um, 2 * math.tan(math.radians(self.source_deg) / 2))
 
-    def nodes(self, made: lens.Lens) -> spectra.Nodes | None:
-        """Wavelengths and weights, no more than the tolerance needs; None for the design wavelength alone."""
+    def spectrum_of(self, made: lens.Lens) -> spectra.Nodes | spectra.Source | spectra.Measured | None:
+        """Wavelengths with weights, a diode or measured curves; None for the design wavelength alone."""
         if self.wavelengths_nm:
             share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
             return spectra.Nodes(np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0)
-        if self.led_fwhm_nm == 0 and not self.spectrum:
-            return None
-        path = spectra.path_span(made.diameters.radius_um, made.sensor_distance_um, min(self.view.depths_um))
-        source: spectra.Source | spectra.Measured
         if self.spectrum:
-            source = spectra.measured(self.spectrum, within_um=made.proxy.wavelengths_um)
-        else:
-            source = spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm)
-        return spectra.nodes(source, path_um=path, tolerance=self.tolerance / 2)
+            return spectra.measured(self.spectrum, within_um=made.proxy.wavelengths_um)
+        return spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm) if self.led_fwhm_nm else None
 
 
 def read(path: Path | None, over: dict[str, Any]) -> Settings:

@@ -128,12 +128,12 @@ def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
             "the cells be integrated, or give more samples"
         )
     guard = GUARD * math.ceil(limit / fine.step_um)
-    reach = _reach(fine, extent)
-    more = reach[0] + guard, reach[1] + guard
+    far = reach(fine, extent)
+    more = far[0] + guard, far[1] + guard
     samples = fine.samples[0] + 2 * more[0], fine.samples[1] + 2 * more[1]
     if max(samples) > MOST:
         raise PropagationError(
-            f"the image of the source is up to {2 * max(reach) * fine.step_um:.4g} um wide, which with the window "
+            f"the image of the source is up to {2 * max(far) * fine.step_um:.4g} um wide, which with the window "
             f"would take {max(samples)} samples along an axis, at most {MOST}: give a smaller source or window"
         )
     return replace(fine, samples=samples), more
@@ -143,7 +143,7 @@ def blurred(light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, in
     """(depth, y, x) light on the window from that on the widened one, and what is wrong at its edges, relative L2."""
     whole = _filtered(light, case, extent, 0)
     with torch.no_grad():
-        down, across = ((n - far) // 2 for n, far in zip(more, _reach(case, extent), strict=True))
+        down, across = ((n - far) // 2 for n, far in zip(more, reach(case, extent), strict=True))
         inner = torch.zeros_like(light)
         inner[..., down:-down, across:-across] = light[..., down:-down, across:-across]
         cut = _cropped(_filtered(inner, case, extent, 0) - whole, more)
@@ -151,7 +151,7 @@ def blurred(light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, in
     return _cropped(whole, more).clamp_min(0), edge
 
 
-def _reach(case: Case, extent: Extent) -> tuple[int, int]:
+def reach(case: Case, extent: Extent) -> tuple[int, int]:
     """(y, x) samples that the image of the source reaches from its middle, at the depth where that is most."""
     x, y = np.ceil(np.abs(images(case, extent)).sum(2).max(0) * REACH[extent.shape] / case.step_um)
     return int(y), int(x)

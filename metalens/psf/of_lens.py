@@ -8,18 +8,24 @@ from typing import Any
 import numpy as np
 import torch
 
+from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, media
+from metalens.propagate import paths
 from metalens.psf import among
+from metalens.psf import spectrum as spectra
 from metalens.psf.among import Jones
 from metalens.psf.budget import Budget, LeftOut, Polarisation, scalar_error, with_model, worst
-from metalens.psf.extended import Extent
+from metalens.psf.extended import Extent, reach
 from metalens.psf.record import PsfStack
-from metalens.psf.spectrum import Nodes
+from metalens.psf.spectrum import Measured, Nodes, Source
 from metalens.psf.stack import psf_stack
 
+PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
+ROWS, NEARBY = 64, 1e-4  # rows of pillars whose delays are taken, and how far apart their wavelengths are
+TRIES = 3  # at a spectrum: the light of one tells the paths for the next
 RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
@@ -53,7 +59,7 @@ def from_lens(
     view: View,
     *,
     tolerance: float = 1e-4,
-    spectrum: Nodes | None = None,
+    spectrum: Nodes | Source | Measured | None = None,
     provenance: Provenance | None = None,
     polarisation: Polarisation = "scalar",
     left_out: LeftOut | None = None,
@@ -66,7 +72,9 @@ def from_lens(
     own unlike neighbours where it holds their rows (``lens.neighbours``).
 
     Args:
-        spectrum: wavelengths and weights; by default the design wavelength alone. Its error is in the budget.
+        spectrum: wavelengths and weights, or a diode or measured curves, which get as few wavelengths as the tolerance
+            needs; by default the design wavelength alone. Its error, judged by the paths to where the light falls in
+            the window, is in the budget.
         polarisation: as for :func:`psf_stack`, or ``auto``: the scalar where its error
             (:func:`metalens.psf.scalar_error`) is below the tolerance, else the flux.
         left_out: what is known of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough
@@ -76,10 +84,105 @@ def from_lens(
         DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``vector`` for a lens
             of turned pillars (``auto`` takes the scalar there; its error is in the budget).
     """
-    nodes = spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    how: dict[str, Any] = {"tolerance": tolerance, "polarisation": polarisation, "own": left_out or _known(lens)}
+    how["provenance"] = provenance or Provenance()
+    if isinstance(spectrum, Source | Measured):
+        return _of_spectrum(lens, view, spectrum, **how)
+    return _of_nodes(lens, view, spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0), **how)
+
+
+def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any) -> PsfStack:
+    """PSFs of a spectrum: wavelengths for paths to the middle of the window, then for those to where the light fell."""
+    spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
+    middle = max(float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans)
+    nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
+    for last in range(TRIES):
+        stack = _of_nodes(lens, view, nodes, tolerance=tolerance, **how)
+        if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
+            break
+        asked = [
+            spectra.nodes(
+                source, path_um=span.ravel(), light=lit(light, span.shape[1:]).ravel(), tolerance=tolerance / 2
+            )
+            for span, light in zip(spans, stack.intensity, strict=True)
+        ]
+        nodes = max(asked, key=lambda one: len(one.weights))
+    return stack
+
+
+def paths_um(lens: Lens, view: View, angle_rad: tuple[float, float], source: Source | Measured) -> Array:
+    """(depth, y, x) largest difference of optical path through two pillars to places of the window, first to last.
+
+    Rays of some places of the aperture through the films, and the delays of the pillars themselves; a window that a
+    source of finite size blurs into is as much wider.
+    """
+    grid = lens.diameters.grid._asdict()
+    seen = {name: value for name, value in view.seen.items() if name != "source"} | grid
+    about: dict[str, Any] = {"wavelength_um": lens.wavelength_um, "sensor_distance_um": lens.sensor_distance_um}
+    about["layers"] = lens.layers
+    case = propagate.case(lens.diameters.diameter_um.shape, angle_rad=angle_rad, **seen, **about)
+    more = (0, 0) if view.source is None else reach(case, view.source)
+    radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
+    turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
+    x, y = (radius * np.cos(turn)).ravel(), (radius * np.sin(turn)).ravel()
+    come = np.array([paths.from_source(case, x, y, case.tangents, inverse) for inverse in case.inverse_depths_per_um])
+    down, across = (
+        np.linspace(-1, 1, min(PLACES, n)) * ((n - 1) / 2 + far) * case.step_um + middle
+        for n, far, middle in zip(case.samples, more, case.centre_um[::-1], strict=True)
+    )
+    goes = np.array([[paths.to_sensor(case, x, y, (float(i), float(j))) for i in across] for j in down])
+    return np.asarray(np.ptp(come[:, None, None] + goes, axis=-1) + _delay_um(lens, angle_rad, source))
+
+
+def _delay_um(lens: Lens, angle_rad: tuple[float, float], source: Source | Measured) -> float:
+    """Largest difference of the pillars' delays, d(phase)/dk, over some rows and three wavelengths of a spectrum."""
+    low, high = lens.proxy.wavelengths_um
+    if lens.pairs is not None or not high > low:
+        return 0.0
+    um, share = spectra.points(source)
+    rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
+    there, tilt, found = np.asarray(lens.diameters.diameter_um[rows]) > 0, incidence(lens, angle_rad), []
+    for quantile in (0.05, 0.5, 0.95):
+        middle = float(np.clip(um[np.searchsorted(np.cumsum(share), quantile)], low, high))
+        ends = max(low, middle * (1 - NEARBY)), min(high, middle * (1 + NEARBY))
+        turns = [lens.rows_phase_rad(rows, wave, tilt)[there] / (2 * np.pi) for wave in ends]
+        change = turns[0] - turns[1]
+        found.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
+    return float(max(found))
+
+
+def lit(light: Array, places: tuple[int, ...]) -> Array:
+    """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to places as in :func:`paths_um`."""
+    square = np.asarray(light, float) ** 2
+    for axis, count in zip((1, 2), places, strict=True):
+        first = np.ceil((np.arange(1, count) - 0.5) * (square.shape[axis] - 1) / max(count - 1, 1)).astype(int)
+        square = np.add.reduceat(square, [0, *first], axis=axis)
+    return np.asarray(square / square.sum())
+
+
+def _spectral(lens: Lens, view: View, angle_rad: tuple[float, float], stack: PsfStack, nodes: Nodes) -> float:
+    """Error of wavelengths that stand for a spectrum, by the paths to where the light of a direction fell."""
+    if nodes.source is None:
+        return nodes.error
+    span = paths_um(lens, view, angle_rad, nodes.source)
+    share = lit(stack.intensity[0], span.shape[1:])
+    return float(np.sqrt(share.ravel() @ spectra.missed(nodes, span.ravel()) ** 2))
+
+
+def _of_nodes(
+    lens: Lens,
+    view: View,
+    nodes: Nodes,
+    *,
+    tolerance: float,
+    polarisation: Polarisation,
+    own: LeftOut,
+    provenance: Provenance,
+) -> PsfStack:
+    """PSFs of wavelengths with weights."""
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
-    budgets, parts, own = [], [], left_out or _known(lens)
+    budgets, parts = [], []
     seen: tuple[float, bool] | None = None
     for angle in view.angles_rad:
         counted = _counted(lens, angle, polarisation, tolerance)
@@ -103,8 +206,9 @@ def from_lens(
                 neighbours=fields,
             ).numpy()
         )
-        budgets.append(_budget(lens, angle, parts[-1], nodes, counted, own))
-    return _told(_joined(parts, provenance or Provenance()), worst(budgets), tolerance, own)
+        judged = dataclasses.replace(nodes, error=_spectral(lens, view, angle, parts[-1], nodes))
+        budgets.append(_budget(lens, angle, parts[-1], judged, counted, own))
+    return _told(_joined(parts, provenance), worst(budgets), tolerance, own)
 
 
 def _told(stack: PsfStack, found: Budget, tolerance: float, own: LeftOut) -> PsfStack:

@@ -1,5 +1,6 @@
 """LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +9,11 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.ground.paths import path_difference
 
 MOST_NODES = 64
+STEP_NM = 0.25  # at most, between points of a measured spectrum
+PATHS = 129  # from 0 to the longest, at which a rule is judged
+_NUMBER = re.compile(r"[+-]?\d*[.,]?\d*([eE][+-]?\d+)?")
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
 
 
@@ -38,11 +41,16 @@ class Source:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nodes:
-    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band that was asked for."""
+    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band that was asked for.
+
+    source: the spectrum that they stand for, by which :func:`missed` judges them on any path; None for wavelengths as
+        such.
+    """
 
     wavelengths_um: Array
     weights: Array
     error: float
+    source: "Source | Measured | None" = None
 
 
 def weight(source: Source) -> tuple[Array, Array]:
@@ -67,41 +75,64 @@ def weight(source: Source) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Measured:
-    """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1."""
+    """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
+
+    beside: share of the light that is left out at its ends, outside of what the pillars are known for.
+    """
 
     wavelengths_um: Array
     share: Array
+    beside: float = 0.0
 
 
 def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measured:
-    """Product of measured curves (LED, filter, sensor), every 0.25 nm where all of them are known.
+    """Product of measured curves (LED, filter, sensor) where all of them are known.
 
     A file has two columns, wavelength in nm and value, parted by commas, semicolons or blanks; lines that start with #
-    or with a word are skipped. Values are interpolated linearly; a constant factor of each drops out.
+    or with a word are skipped. Where semicolons, tabs or blanks part the columns, a comma stands for the decimal
+    point. Values are interpolated linearly, and the product is integrated from one row of any of the curves to the
+    next, at two points each and at most 0.25 nm at a time, so that lines narrower than that are seen; a constant
+    factor of each drops out.
 
     Raises:
         PropagationError: a file that is missing or no such table, curves without a common range, or light outside
-            ``within_um``, which the pillars are known for.
+            ``within_um``, which the pillars are known for (less than 1e-4 of the largest value is left out there).
     """
     curves = [_curve(file) for file in files]
     low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
     if low >= high:
         raise PropagationError(f"spectrum: {', '.join(map(str, files))} share no wavelength")
-    nm = np.arange(low, high + 1e-9, 0.25)
+    rows = np.concatenate([c[:, 0] for c in curves] + [np.arange(low, high, STEP_NM)])
+    ends = np.unique(np.clip(rows, low, high))
+    half, middle = np.diff(ends) / 2, (ends[1:] + ends[:-1]) / 2
+    nm = np.stack([middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1).ravel()  # Gauss, of third degree
     value = np.prod([np.interp(nm, c[:, 0], c[:, 1]) for c in curves], axis=0)
-    if not value.sum() > 0:
+    share = value * np.repeat(half, 2)
+    if not share.sum() > 0:
         raise PropagationError(f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere")
-    share = value / value.sum()
-    lit = np.flatnonzero(share > 1e-4 * share.max())
-    nm, share = nm[lit[0] : lit[-1] + 1], share[lit[0] : lit[-1] + 1]
-    if within_um[1] > within_um[0] and not (
-        within_um[0] - 1e-6 <= nm[0] * 1e-3 and nm[-1] * 1e-3 <= within_um[1] + 1e-6
-    ):
+    share = share / share.sum()
+    first, last = _kept(nm, value, within_um)
+    nm, share = nm[first:last], share[first:last]
+    return Measured(nm * 1e-3, share / share.sum(), max(0.0, 1 - float(share.sum())))
+
+
+def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int, int]:
+    """First and last (excluded) point of what the pillars are known for; all that is lit, where that is one wavelength.
+
+    Raises:
+        PropagationError: light beyond.
+    """
+    lit = np.flatnonzero(value > 1e-4 * value.max())
+    low, high = (edge * 1e3 for edge in within_um)
+    if not high > low:
+        return int(lit[0]), int(lit[-1]) + 1
+    if not (low - 1e-3 <= nm[lit[0]] and nm[lit[-1]] <= high + 1e-3):
         raise PropagationError(
-            f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known from {within_um[0] * 1e3:g} to "
-            f"{within_um[1] * 1e3:g} nm: sweep a library over the spectrum"
+            f"spectrum: light from {nm[lit[0]]:g} to {nm[lit[-1]]:g} nm, the pillars are known from {low:g} to "
+            f"{high:g} nm: sweep a library over the spectrum"
         )
-    return Measured(nm * 1e-3, share / share.sum())
+    inside = np.flatnonzero((nm >= low - 1e-3) & (nm <= high + 1e-3) & (value > 0))
+    return int(inside[0]), int(inside[-1]) + 1
 
 
 def _curve(file: Path) -> Array:
@@ -112,7 +143,7 @@ def _curve(file: Path) -> Array:
     except (OSError, UnicodeDecodeError) as error:
         raise PropagationError(f"{file}: cannot be read as a table of wavelength and value: {error}") from None
     for number, line in enumerate(lines, 1):
-        words = line.replace(",", " ").replace(";", " ").split()
+        words = _words(line)
         if not words or words[0][0] in "#\"'" or words[0][0].isalpha():
             continue
         try:
@@ -127,29 +158,69 @@ def _curve(file: Path) -> Array:
     return table
 
 
-def nodes(source: Source | Measured, *, path_um: float, tolerance: float) -> Nodes:
+def _words(line: str) -> list[str]:
+    """Columns of a line; a comma is a decimal point where something else parts the columns: "840,5;0,3"."""
+    if ";" in line:
+        return line.replace(",", ".").replace(";", " ").split()
+    words = line.split()
+    apart = len(words) > 1 and not any(word[0] == "," or word[-1] == "," for word in words)
+    if apart and all(_NUMBER.fullmatch(word) for word in words[:2]):
+        return [word.replace(",", ".") for word in words]
+    return line.replace(",", " ").split()
+
+
+def nodes(source: Source | Measured, *, path_um: float | Array, tolerance: float, light: Array | None = None) -> Nodes:
     """As few wavelengths as meet the tolerance.
 
     Args:
-        path_um: largest difference in optical path between two parts of the lens, for light that reaches the window
-            (:func:`path_span`): intensities vary with wavelength as exp(2πi·path/λ), and no faster.
-        tolerance: of the mean over the spectrum of every such exponential.
+        path_um: largest difference in optical path between two parts of the lens, for light that reaches the window:
+            intensities vary with wavelength as exp(2πi·path/λ), and no faster. Or (n,) of parts of the window, with
+            ``light`` (n,), the share of each in its squared intensity.
+        tolerance: of the mean over the spectrum of every such exponential, root mean square over the parts.
 
     Raises:
         PropagationError: more than 64 wavelengths would be needed.
     """
-    um, share = (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
-    paths = np.linspace(0, path_um, 65)[:, None]
-    want = np.exp(2j * np.pi * paths / um) @ share
+    spans, light = np.atleast_1d(path_um), np.ones(1) if light is None else light
+    um, share = points(source)
+    judge = _Judge(source, float(spans.max()))
     for count in range(1, MOST_NODES + 1):
         x, w = gauss(um, share, count)
-        error = float(np.abs(np.exp(2j * np.pi * paths / x) @ w - want).max())
+        error = float(np.sqrt(light @ judge.missed(x, w, spans) ** 2))
         if error <= tolerance:
-            return Nodes(x, w, error)
+            return Nodes(x, w, error, source)
     raise PropagationError(
-        f"more than {MOST_NODES} wavelengths needed for paths of {path_um:.3g} um under a line from "
+        f"more than {MOST_NODES} wavelengths needed for paths of {spans.max():.3g} um under a line from "
         f"{um[0] * 1e3:.1f} to {um[-1] * 1e3:.1f} nm; raise the tolerance or narrow the line"
     )
+
+
+def missed(nodes: Nodes, span_um: Array) -> Array:
+    """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up to each of these."""
+    if nodes.source is None:
+        return np.full(len(span_um), nodes.error)
+    return _Judge(nodes.source, float(span_um.max())).missed(nodes.wavelengths_um, nodes.weights, span_um)
+
+
+def points(source: Source | Measured) -> tuple[Array, Array]:
+    """(wavelengths in um, shares of sum 1) of a spectrum."""
+    return (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
+
+
+class _Judge:
+    """Means of exp(2πi·path/λ) over a spectrum, of paths from 0 to the largest."""
+
+    def __init__(self, source: Source | Measured, longest_um: float) -> None:
+        um, share = points(source)
+        self.paths = np.linspace(0, longest_um, PATHS)
+        self.want = np.array([np.exp(2j * np.pi * path / um) @ share for path in self.paths])
+        self.beside = source.beside if isinstance(source, Measured) else 0.0
+
+    def missed(self, um: Array, weights: Array, span_um: Array) -> Array:
+        """(n,) of a rule, for paths up to each of these."""
+        error = np.abs(np.exp(2j * np.pi * self.paths[:, None] / um) @ weights - self.want)
+        place = np.searchsorted(self.paths, span_um * (1 - 1e-12)).clip(max=PATHS - 1)
+        return np.asarray(np.maximum.accumulate(error)[place] + self.beside)
 
 
 def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
@@ -167,8 +238,3 @@ def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
         q = r / beside[i] if beside[i] > 0 else r
     values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
     return values, vectors[0] ** 2 * share.sum()
-
-
-def path_span(radius_um: float, sensor_distance_um: float, nearest_depth_um: float) -> float:
-    """Path from axis to rim on both sides, um: bounds how fast a PSF changes with wavelength."""
-    return float(path_difference(radius_um**2, nearest_depth_um) + path_difference(radius_um**2, sensor_distance_um))

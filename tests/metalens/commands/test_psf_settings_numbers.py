@@ -60,8 +60,8 @@ def test_a_view_is_in_micrometres_and_radians_with_samples_as_far_apart_along_y(
 
 
 def test_wavelengths_have_their_weights_or_equal_ones():
-    made = Settings(wavelengths_nm=(820.0, 850.0, 870.0), weights=(1.0, 4.0, 3.0)).nodes(lens())
+    made = Settings(wavelengths_nm=(820.0, 850.0, 870.0), weights=(1.0, 4.0, 3.0)).spectrum_of(lens())
     assert made.wavelengths_um == pytest.approx([0.82, 0.85, 0.87])
     assert made.weights == pytest.approx([0.125, 0.5, 0.375])
-    assert Settings(wavelengths_nm=(820.0, 850.0)).nodes(lens()).weights == pytest.approx([0.5, 0.5])
-    assert Settings().nodes(lens()) is None
+    assert Settings(wavelengths_nm=(820.0, 850.0)).spectrum_of(lens()).weights == pytest.approx([0.5, 0.5])
+    assert Settings().spectrum_of(lens()) is None

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from metalens import psf
+from metalens.ground.errors import PropagationError
 from metalens.lens import Media
 from metalens.propagate import Case, Moving, blocks
 from metalens.psf import compute, direction, spectrum
@@ -95,11 +96,63 @@ def test_a_rule_has_the_whole_weight_and_a_narrow_line_201_points():
     assert len(spectrum.weight(spectrum.Source(850.0, 3.0))[0]) == 201  # 5 widths in fortieths
 
 
-def test_a_measured_spectrum_ends_where_it_falls_below_a_ten_thousandth(tmp_path):
+TAILS = [(800, 5e-5), (810, 5e-5), (810.25, 2e-4), (850, 1.0), (889.75, 3e-4), (890, 9e-5), (900, 9e-5)]
+
+
+def test_what_a_measured_spectrum_leaves_out_beyond_the_pillars_is_told(tmp_path):
+    """Tails below a ten-thousandth of the peak: kept where the pillars are known, else a share of the light that no
+    rule makes up for. Areas of the tails by hand, of all by trapezoids, which the rows bound."""
     file = tmp_path / "led.csv"
-    file.write_text("800,0.00005\n810,0.00005\n810.25,0.0002\n850,1\n889.75,0.0003\n890,0.00009\n900,0.00009\n")
-    found = spectrum.measured([file], within_um=(0.7, 1.0))
-    assert found.wavelengths_um[[0, -1]] * 1e3 == pytest.approx([810.25, 889.75])
+    file.write_text("\n".join(f"{nm},{value}" for nm, value in TAILS))
+    whole = spectrum.measured([file], within_um=(0.7, 1.0))
+    nm, value = np.array(TAILS).T
+    assert whole.beside == 0.0
+    assert whole.wavelengths_um[[0, -1]] * 1e3 == pytest.approx([800.05, 899.95], abs=0.01)
+    area = np.trapezoid(value, nm)
+    assert whole.share @ whole.wavelengths_um * 1e3 == pytest.approx(
+        sum(np.diff(nm) * (value[1:] + value[:-1]) / 2 * _middles(nm, value)) / area, rel=1e-12
+    )
+    less = spectrum.measured([file], within_um=(0.8101, 0.88996))
+    assert less.beside == pytest.approx((10 * 5e-5 + 10 * 9e-5) / area, rel=0.05)  # and pieces of two slopes
+    assert spectrum.nodes(less, path_um=0.0, tolerance=1e-3).error == pytest.approx(less.beside)
+    with pytest.raises(PropagationError, match=r"light from 810\.\d+ to 889\.\d+ nm, the pillars are known from 820"):
+        spectrum.measured([file], within_um=(0.82, 0.95))
+
+
+def _middles(nm, value):
+    """Centroids of trapezoids."""
+    a, b = value[:-1], value[1:]
+    return nm[:-1] + np.diff(nm) * (a + 2 * b) / (3 * (a + b))
+
+
+def test_lines_narrower_than_the_step_between_points_are_seen(tmp_path):
+    """A laser of 0.2 nm beside a diode: shares are those of the areas 0.1 * 40 and 10."""
+    laser, led = tmp_path / "laser.csv", tmp_path / "flat.csv"
+    laser.write_text("840,1\n849.9,1\n850.0,41\n850.1,1\n850.2,1\n850.3,1\n850.4,1\n")
+    led.write_text("840.1 1\n850.1 1\n")
+    found = spectrum.measured([laser, led], within_um=(0.8, 0.9))
+    line = found.share[np.abs(found.wavelengths_um * 1e3 - 850.0) < 0.1].sum()
+    assert line == pytest.approx((4.0 + 0.2) / (4.0 + 10.0), rel=1e-9)
+    alone = tmp_path / "alone.csv"
+    alone.write_text("849.93,0\n849.95,1\n849.97,0\n")
+    assert spectrum.measured([alone], within_um=(0.8, 0.9)).wavelengths_um.mean() == pytest.approx(0.84995, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nm;power\n840,5;0,3\n850,5;1,0\n860;0,2\n",
+        "840,5\t0,3\n850,5\t1,0\n860\t0,2\n",
+        "840,5 0,3 0,01\n850,5 1,0 0,01\n860,0 0,2 0,01\n",
+        "840.5, 0.3, 0.01\r\n850.5, 1.0, 0.01\r\n860, 0.2, 7\r\n",
+        "\ufeff860,0.2\n850.5,1\n840.5,0.3\n",
+        "840.5 0.3\n850.5 1\n860 0.2",
+    ],
+)
+def test_a_decimal_comma_is_told_from_one_that_parts_columns(tmp_path, text):
+    file = tmp_path / "led.csv"
+    file.write_bytes(text.encode())
+    assert spectrum._curve(file).tolist() == [[840.5, 0.3], [850.5, 1.0], [860.0, 0.2]]
 
 
 def needed(shape, kernel, axis=0):
