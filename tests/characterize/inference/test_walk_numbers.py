@@ -258,3 +258,103 @@ def test_every_share_of_the_mass_has_one_draw_evenly_between_its_places(monkeypa
     assert part.max() < 1 + 1e-9
     assert part.std() == pytest.approx(12**-0.5, rel=0.1)  # anywhere in its share
     assert drawn[:, 1] == pytest.approx(np.interp(drawn[:, 0], value[:, 0], value[:, 1]), abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("end", "most", "count", "kept"),
+    [(5.7, math.inf, 5, 5), (-3.0, math.inf, 4, 4), (-3.0, 109.0, 4, 2), (-3.0, 110.0, 4, 4), (1.0, math.inf, 0, 0)],
+)
+def test_a_side_goes_two_steps_at_a_time_and_then_to_the_place_left_out(monkeypatch, end, most, count, kept):
+    """From 1 in equal steps of 1 or less, the last one single where they are odd, until a stop is higher than asked."""
+    seen = []
+
+    def stop(task, part, here, i, goal, settings):
+        seen.append((here.value[i], goal))
+        return mode(goal, merit=100 + 5 * abs(goal - 1))
+
+    def amid(task, part, ends, i, goal, settings):
+        seen.append((*(one.value[i] for one in ends), goal))
+        return mode(goal, merit=0.0)
+
+    monkeypatch.setattr(walk, "_stop", stop)
+    monkeypatch.setattr(walk, "_amid", amid)
+    out = walk._side(None, None, mode(1.0), 1, end, step=1.0, settings=None, most=most)
+    at = [1 + (end - 1) * k / max(count, 1) for k in range(count + 1)]
+    assert [one.value[1] for one in out] == pytest.approx(at[1 : kept + 1])
+    want = []
+    for k in range(0, kept, 2):
+        want.append((at[k], at[min(k + 2, count)]))
+        want += [(at[k], at[k + 2], at[k + 1])] if k + 1 < count else []
+    assert [len(one) for one in seen] == [len(one) for one in want]
+    assert np.concatenate([*seen, ()]) == pytest.approx(np.concatenate([*want, ()]))
+
+
+def _begun(monkeypatch):
+    """What a fit of the others is given."""
+    told = []
+    monkeypatch.setattr(walk, "_fitted", lambda task, part, begin, known, settings, slopes=None: told.append(
+        (begin, known, slopes)
+    ))  # fmt: skip
+    return told
+
+
+@pytest.mark.parametrize("best", ["parabola", "here"])
+def test_a_stop_begins_where_the_parabola_or_the_place_itself_misses_less(monkeypatch, best):
+    """From (2, 1, 0.4) to 1.8 of the second: by C_i / C_ii, (0.2, 0.49, -0.3) / 0.49 times 0.8; within the bounds."""
+    told, about, part = _begun(monkeypatch), SimpleNamespace(prior=prior(high=8.0)), (None, None)
+    want = np.array([2 + 0.8 * 0.2 / 0.49, 1.8, 0.4 - 0.8 * 0.3 / 0.49]) if best == "parabola" else (2.0, 1.8, 0.4)
+    monkeypatch.setattr(walk, "_misfit", lambda task, part, x: float(np.abs(x - want).sum()))
+    walk._stop(about, part, mode(1.0), 1, 1.8, None)
+    ((begin, known, slopes),) = told
+    assert begin == pytest.approx(want, rel=1e-12)
+    assert slopes is None
+    assert (known.low.tolist(), known.high.tolist()) == ([-np.inf, 1.8, -9.0], [np.inf, 1.8, 9.0])
+    assert (about.prior.low[1], about.prior.high[1]) == (-5.0, 8.0)  # what was given stays
+
+
+def test_between_two_stops_all_goes_straight(monkeypatch):
+    """At 2.2 from 1 to 4: two fifths of the way; the third parameter is held at its bound of 9."""
+    told, about = _begun(monkeypatch), SimpleNamespace(prior=prior())
+    slopes = np.random.default_rng(2).normal(size=(2, 3, 1, 4, 5))
+    ends = mode(1.0, slopes=slopes[0]), mode(4.0, slopes=slopes[1])
+    ends[1].value = np.array([-3.0, 4.0, 99.0])
+    walk._amid(about, None, ends, 1, 2.2, None)
+    ((begin, known, mixed),) = told
+    assert begin == pytest.approx([2 - 0.4 * 5, 2.2, 9.0], rel=1e-12, abs=1e-12)
+    assert (known.low[1], known.high[1]) == (2.2, 2.2)
+    assert mixed == pytest.approx(0.6 * slopes[0] + 0.4 * slopes[1], rel=1e-12)
+
+
+def test_valleys_are_sought_on_few_frames_from_the_lowest_places_and_again_from_a_new_best(monkeypatch):
+    """The three lowest places of the walk but the best's own; a fit that is lower by more than 1 begins it anew."""
+    asked, followed = [], []
+    heights = {-6.0: 6.0, -5.0: 30.0, -3.0: 4.0, -2.0: 50.0, 3.0: 12.0, 4.0: 7.0, 5.0: 15.0, 6.0: 5.0}
+    free = {"information": np.eye(3), "slopes": np.arange(15.0).reshape(3, 5)}
+
+    def side(task, part, here, i, end, *, step, settings):
+        asked.append((part, here.value[i], here.merit, here.slopes.tolist(), end, step))
+        return [mode(at, merit=rise, **free) for at, rise in heights.items() if (at < here.value[i]) == (end < 0)]
+
+    news = iter([mode(-3.0, merit=10.0, **free), mode(2.0, merit=9.5, **free)])
+
+    def follow(task, best, begins):
+        followed.append((float(best.value[1]), [float(b[1]) for b in begins]))
+        return [next(news)]
+
+    monkeypatch.setattr(walk, "few_frames", lambda setting: np.array([1, 3]))
+    monkeypatch.setattr(walk, "_side", side)
+    monkeypatch.setattr(walk, "_misfit", lambda task, part, x: 2.0)
+    monkeypatch.setattr(walk, "followed", follow)
+    monkeypatch.setattr(walk, "distinct", lambda ends: sorted(ends, key=lambda e: e.merit))
+    monkeypatch.setattr(walk.dataclasses, "replace", lambda one, **new: SimpleNamespace(**vars(one) | new))
+    limits = {n: getattr(prior(low=-99.0), n) for n in ("mean", "sigma", "low", "high")}
+    about = SimpleNamespace(
+        prior=SimpleNamespace(**limits), names=("a", "bias_nm", "c"), model=SimpleNamespace(setting=None),
+        problem=lambda few: few.tolist(), data=SimpleNamespace(planes=lambda few: few.tolist()),
+    )  # fmt: skip
+    kept = walk.valleys(about, [mode(1.0, merit=20.0, **free)], "bias_nm")
+    assert [one.merit for one in kept] == [9.5, 10.0, 20.0]  # 9.5 is not lower than 10 by more than 1
+    assert followed == [(1.0, [-3.0, 6.0, -6.0]), (-3.0, [6.0, -6.0, 4.0])]
+    assert [one[:3] for one in asked] == [(([1, 3], [1, 3]), at, 2.0) for at in (1.0, 1.0, -3.0, -3.0)]
+    assert asked[0][3] == free["slopes"][:, [1, 3]].tolist()
+    assert [one[4:] for one in asked[:2]] == [(-7.0, pytest.approx(0.35 * 4)), (13.0, pytest.approx(0.35 * 4))]

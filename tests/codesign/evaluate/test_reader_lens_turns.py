@@ -26,6 +26,10 @@ class Whole:
 
 @pytest.fixture
 def told(monkeypatch):
+    return _told(monkeypatch, TRAINING)
+
+
+def _told(monkeypatch, training):
     """What the loop asks of its parts; the loss of step s is s squared, its slope s + 1 everywhere."""
     said = SimpleNamespace(rates=[], steps=[], gathered=[], planned=[], moved=[])
 
@@ -65,7 +69,7 @@ def told(monkeypatch):
     monkeypatch.setattr(reader_lens, "lens_gradient", gradient)
     scenes = SimpleNamespace(batch=lambda step, size: SimpleNamespace(frames=None), margin=2)
     start = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
-    said.path, said.losses = reader_lens._descended(None, start, scenes, None, TRAINING, forms)
+    said.path, said.losses = reader_lens._descended(None, start, scenes, None, training, forms)
     return said
 
 
@@ -90,6 +94,16 @@ def test_the_image_is_planned_anew_after_its_turns_and_follows_a_lens_that_moved
     assert told.moved == []
 
 
+def test_between_plans_the_image_is_that_of_the_lens_where_it_stands(monkeypatch):
+    """The first gradient moves nothing; turn 3 is planned anew, so the image follows before turns 2, 4 and 5."""
+    training = LensTraining(turns=6, hold=1, batch=2, phase=Schedule(0.04), anew=3)
+    told = _told(monkeypatch, training)
+    places = told.path.tolist()
+    assert places[1] == places[0]
+    assert [one.tolist() for one in told.planned] == [places[0], places[3]]
+    assert [one.tolist() for one in told.moved] == [places[2], places[4], places[5]]
+
+
 def _steps(gradients):
     descent = Descent(torch.zeros(gradients.shape[1], dtype=torch.float64))
     return torch.stack([descent.step(one) for one in gradients])
@@ -103,6 +117,16 @@ def test_a_step_is_the_mean_gradient_less_the_share_of_noise_of_one_length_for_a
     stays = 1 - 181 / 361 / (x * x + y * y)
     assert second == pytest.approx([-stays * x, -stays * y], rel=1e-9)
     assert not _steps(torch.zeros(3, 2, dtype=torch.float64)).any()
+
+
+def test_gradients_of_unlike_lengths_are_measured_by_their_mean_square():
+    """5 and 13 long: (0.99 · 25 + 169) / 1.99 the mean square; 9 and 10 nineteenths the shares of the mean."""
+    given = torch.tensor([[3.0, 4.0], [5.0, 12.0]], dtype=torch.float64)
+    square = (0.99 * 25 + 169) / 1.99
+    x, y = (9 * 3 + 10 * 5) / 19, (9 * 4 + 10 * 12) / 19
+    stays = 1 - 181 / 361 / ((x * x + y * y) / square)
+    _, second = _steps(given).tolist()
+    assert second == pytest.approx([-stays * x / square**0.5, -stays * y / square**0.5], rel=1e-9)
 
 
 def test_a_lens_stands_in_noise_and_goes_where_gradients_agree():

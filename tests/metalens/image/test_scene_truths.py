@@ -89,6 +89,17 @@ def test_weights_of_one_field_point_go_straight_in_inverse_depth_and_stay_beyond
         assert got[k].numpy() == pytest.approx(want, abs=3e-4)  # depths are coded in 4096 steps of their range
 
 
+def test_a_depth_takes_the_nearest_of_4096_steps_of_inverse_depth():
+    """A weight that goes from 0 to 1 tells the depth: by half a step at most, and half a step it is met."""
+    nodes = torch.tensor([9e3, 45e3], dtype=torch.float64)
+    psf = PsfBasis(torch.ones(1, 3, 3), torch.tensor([0.0, 1.0]).double().view(1, 1, 2, 1), nodes, 0.0, 0.0)
+    unit = torch.from_numpy(RNG.uniform(0, 1, (1, 40, 50)))
+    depth = 1 / (1 / 9e3 + unit * (1 / 45e3 - 1 / 9e3))
+    off = ((scene.weight_maps(psf, depth)[0] - unit) * 4095).numpy()
+    assert np.abs(off).max() <= 0.5 + 1e-6
+    assert (off.min(), off.max()) == pytest.approx((-0.5, 0.5), abs=0.01)  # of 2000 depths
+
+
 def test_border_pixels_go_on_half_to_either_side():
     row = torch.arange(4.0).reshape(1, 1, 4)
     got = scene._padded(row, (1, 9))[0, 0].tolist()
