@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.inference import explore
+from characterize.inference import explore, posterior
 from characterize.inference.ends import Profile
+from characterize.inference.walk import Walk
 
 NAMES = ("bias_nm", "height_nm", "coma_x_rad", "index")
 
@@ -67,3 +68,109 @@ def test_a_better_lens_met_on_the_way_out_ends_the_search_of_ends(monkeypatch, g
     assert refined == (["place"] if followed else [])
     assert (other is not None) == left
     assert profiles == ({} if left else {"bias_nm": "profile 0", "height_nm": "profile 1"})
+
+
+REACH = 1.959964
+BEST = np.array([1.0, -2.0, 0.5])
+OWN = np.array([[0.49, 0.1, -0.2], [0.1, 1.44, 0.3], [-0.2, 0.3, 0.81]])
+COMMON = np.array([[0.2, -0.15, 0.05], [-0.15, 0.5, 0.1], [0.05, 0.1, 0.3]])  # of dark and flat
+HELD = np.array([[0.0, 0.0, 0.0], [0.0, 0.36, 0.12], [0.0, 0.12, 0.25]])  # of the others, along the walk
+
+
+def lens(value, rise=0.0, spread=1.0, covariance=OWN):
+    """(mode, valley) of a parabola."""
+    mode = SimpleNamespace(value=np.asarray(value), merit=70.0 + rise, chi2_per_dof=spread)
+    sigma = np.sqrt(np.diag(covariance))
+    return mode, SimpleNamespace(sigma=sigma, covariance=covariance, least=70.0 + rise, calibration=lambda: COMMON)
+
+
+def walked(width=0.9):
+    """Of the first parameter: a Gaussian about the best, the others along a line with one covariance."""
+    x = width * np.linspace(-6, 6, 121)
+    value = BEST + x[:, None] * np.array([1.0, 0.7, -1.1])
+    return Walk(0, value, (x / width) ** 2, np.broadcast_to(HELD, (121, 3, 3)).copy(), shown=20.0)
+
+
+def about(low=-99.0, high=99.0):
+    prior = SimpleNamespace(low=np.full(3, low), high=np.full(3, high))
+    return SimpleNamespace(names=("bias_nm", "height_nm", "log_gain"), prior=prior)
+
+
+def test_ends_of_what_has_no_profile_reach_as_far_as_the_walk():
+    """Of the third: 1.96 times the root of 0.25 and (1.1 · 0.9)², where that is beyond its own; the others' profiles
+    stay. What a walk shows to be farther than 1.18 of the parabola is none."""
+    mode, valley = lens(BEST)
+    profiles = {
+        "bias_nm": Profile(-1.0, 2.9, np.zeros(1), np.zeros(1), parabolic=True),
+        "height_nm": Profile(-6.0, 0.6, np.zeros(1), np.zeros(1), parabolic=True),
+    }
+    low, high, parabolic = explore._intervals(about(), [mode], [valley], profiles, {"bias_nm": walked()})
+    half = REACH * np.hypot(0.5, 1.1 * 0.9)
+    assert half > REACH * 0.9
+    assert low == pytest.approx([-1.0, -6.0, 0.5 - half], abs=0.01)  # places of 1201
+    assert high == pytest.approx([2.9, 0.6, 0.5 + half], abs=0.01)
+    ratios = 2.0 / (REACH * 0.7), 4.0 / (REACH * 1.2), half / (REACH * 0.9)
+    assert parabolic.tolist() == [ratio < 1.18 for ratio in ratios] == [False, False, False]
+    places = (("bias_nm", 1.0, 1.15 * REACH * 0.7), ("height_nm", -2.0, 1.21 * REACH * 1.2))
+    narrow = {name: Profile(at - r, at + r, np.zeros(1), np.zeros(1), parabolic=True) for name, at, r in places}
+    _, _, parabolic = explore._intervals(about(), [mode], [valley], narrow, {"bias_nm": walked(0.6)})
+    assert parabolic.tolist() == [True, False, True]
+    # fewer degrees of misfit than of freedom widen nothing
+    assert explore._intervals(about(), [lens(BEST, spread=0.3)[0]], [valley], {}, {})[1] == pytest.approx(
+        BEST + REACH * np.array([0.7, 1.2, 0.9])
+    )
+
+
+def test_draws_scatter_by_what_all_frames_have_in_common_and_their_sigma_is_that_of_the_intervals(monkeypatch):
+    """Of draws that all lie at one place: dark's and flat's covariance. 24 000 of them: a hundredth of it."""
+    monkeypatch.setattr(posterior, "DRAWS", 24_000)
+    monkeypatch.setattr(posterior, "draws", lambda valleys: np.tile(BEST, (24_000, 1)))
+    mode, valley = lens(BEST)
+    bent = {"bias_nm": Profile(-1.0, 3.5, np.zeros(1), np.zeros(1), parabolic=False)}
+    found = explore._joined(about(), [mode], [valley], bent, {})
+    size = np.sqrt(np.diag(COMMON))
+    assert np.abs((np.cov(found.draws.T) - COMMON) / np.outer(size, size)).max() < 0.03
+    assert np.abs((found.draws.mean(0) - BEST) / size).max() < 0.03
+    sigma = (found.high - found.low) / (2 * REACH)
+    assert sigma[1] == pytest.approx(np.sqrt(1.44 + 0.5))
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(sigma)
+    correlation = 0.8 * COMMON / np.outer(size, size) + 0.2 * OWN / np.outer(valley.sigma, valley.sigma)
+    assert found.covariance / np.outer(sigma, sigma) == pytest.approx(correlation, abs=0.02)
+    assert found.profiles["bias_nm"].low == found.low[0]
+    cut = explore._joined(about(low=-1.8, high=1.1), [mode], [valley], bent, {})
+    assert cut.draws == pytest.approx(np.clip(found.draws, -1.8, 1.1))
+    assert (cut.low.min(), cut.high.max()) == (-1.8, 1.1)
+
+
+@pytest.mark.parametrize(("share", "drawn"), [(0.995, False), (0.985, True)])
+def test_draws_are_made_where_a_second_lens_has_a_hundredth(monkeypatch, share, drawn):
+    monkeypatch.setattr(posterior, "draws", lambda valleys: np.tile(BEST, (posterior.DRAWS, 1)))
+    monkeypatch.setattr(posterior, "shares", lambda valleys: np.array([share, 1 - share]))
+    both = lens(BEST), lens(BEST + 9, rise=30.0)
+    found = explore._joined(about(), [one[0] for one in both], [one[1] for one in both], {}, {})
+    assert len(found.draws) == (posterior.DRAWS if drawn else 0)
+    assert found.parabolic.all()
+
+
+def test_a_lens_beside_the_walk_is_drawn_by_the_mass_of_its_parabola(monkeypatch):
+    """exp(-rise / 2) √(2π)³ √det of each over three parameters, those of the walk along it: 0.9 and the others'."""
+    monkeypatch.setattr(posterior, "DRAWS", 30_000)
+    asked = []
+
+    def draws(valleys, count):
+        asked.append((valleys, count))
+        return np.full((count, 3), 50.0)
+
+    monkeypatch.setattr(posterior, "draws", draws)
+    on, beside = lens(BEST), lens(BEST + 8, rise=1.3, covariance=0.4 * OWN)
+    made = explore._drawn([on[0], beside[0]], [on[1], beside[1]], [walked()], 1.0)
+    mass = 0.9 * np.sqrt(np.linalg.det(HELD[1:, 1:])), np.exp(-1.3 / 2) * np.sqrt(np.linalg.det(0.4 * OWN))
+    ((valleys, count),) = asked
+    assert valleys == [beside[1]]
+    assert count / 30_000 == pytest.approx(mass[1] / sum(mass), abs=0.012)  # four sigma; the walk ends at 20: 1e-5
+    assert len(made) == 30_000
+    assert (made[:, 0] == 50.0).sum() == count
+    rest = made[made[:, 0] != 50.0]
+    assert np.cov(rest.T)[0, 0] == pytest.approx(0.81, rel=0.05)
+    halves = (made[:15_000, 0] == 50.0).sum(), (made[15_000:, 0] == 50.0).sum()
+    assert halves[0] == pytest.approx(halves[1], rel=0.1)  # mixed, so that a part of them is as good

@@ -93,8 +93,9 @@ def test_intervals_of_a_gaussian_are_those_of_its_covariance(straight):
     middle, half = np.array([2.0, 5.0, 7.0]), 1.96 * np.sqrt(np.diag(covariance()))
     assert low == pytest.approx(middle - half, abs=near)
     assert high == pytest.approx(middle + half, abs=near)
-    nowhere = Walk(1, straight.value, straight.rise + 9.0, straight.spread)
-    assert nowhere.interval(3.8)[0] == pytest.approx(middle, abs=1e-6)
+    for above in (9.0, 30.0):  # of another lens; the second is no profile at all
+        nowhere = Walk(1, straight.value, straight.rise + above, straight.spread)
+        assert nowhere.interval(3.8)[0] == pytest.approx(middle, abs=1e-6)
 
 
 def test_the_mass_of_a_gaussian_is_its_integral_and_the_others_volume(straight):

@@ -178,3 +178,30 @@ def test_the_gradient_is_the_mean_over_the_field_and_the_weighted_one_over_the_w
     assert got.numpy() == pytest.approx(want, rel=1e-12)
     assert sorted(asked) == [(point, wave) for point in range(6) for wave in range(3)]
     assert place.grad is None
+
+
+def test_every_step_of_every_seed_has_noise_of_its_own(monkeypatch):
+    """As far as steps go: a million of one seed before those of the next."""
+    made, weight = [], torch.ones(1, requires_grad=True)
+    for name in ("irradiance", "depth_um"):
+        monkeypatch.setattr(reader_lens, name, lambda *_, **__: torch.ones(1))
+    monkeypatch.setattr(reader_lens.blur, "window_vergence", lambda depth: depth)
+    monkeypatch.setattr(reader_lens.losses, "depth", lambda found, true: (found - true).sum())
+
+    def read_out(light, sample_um, pitch_um, sensor, *, generator, exact):
+        assert not exact
+        made.append(generator.initial_seed())
+        return light
+
+    monkeypatch.setattr(reader_lens, "read_out", read_out)
+    scenes = SimpleNamespace(batch=lambda step, size: SimpleNamespace(frames=None), margin=2)
+    config = SimpleNamespace(pitch_um=9.0, sensor=None)
+    for seed in (0, 1, 2):
+        for step in (0, 1, 7):
+            training = LensTraining(seed=seed)
+            reader_lens.gone_backward(
+                lambda seen: (seen * weight, None), None, Whole(), scenes, config, training, step=step, live=False
+            )
+    steps = np.reshape(made, (3, 3))
+    assert (steps - steps[:, :1]).tolist() == [[0, 1, 7]] * 3
+    assert np.diff(steps[:, 0]).min() > 1e6
