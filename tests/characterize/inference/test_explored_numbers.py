@@ -115,6 +115,12 @@ def test_ends_of_what_has_no_profile_reach_as_far_as_the_walk():
     narrow = {name: Profile(at - r, at + r, np.zeros(1), np.zeros(1), parabolic=True) for name, at, r in places}
     _, _, parabolic = explore._intervals(about(), [mode], [valley], narrow, {"bias_nm": walked(0.6)})
     assert parabolic.tolist() == [True, False, True]
+    lopsided = {"bias_nm": Profile(0.8, 1.0 + 1.21 * REACH * 0.7, np.zeros(1), np.zeros(1), parabolic=True)}
+    assert not explore._intervals(about(), [mode], [valley], lopsided, {"bias_nm": walked(0.6)})[2][0]
+    # another lens that is 0.3 short of the level
+    far = lens(BEST + 9, rise=REACH**2 - 0.3)
+    high = explore._intervals(about(), [mode, far[0]], [valley, far[1]], {}, {})[1]
+    assert high == pytest.approx(BEST + 9 + 0.3**0.5 * np.array([0.7, 1.2, 0.9]))
     # fewer degrees of misfit than of freedom widen nothing
     assert explore._intervals(about(), [lens(BEST, spread=0.3)[0]], [valley], {}, {})[1] == pytest.approx(
         BEST + REACH * np.array([0.7, 1.2, 0.9])
@@ -174,3 +180,40 @@ def test_a_lens_beside_the_walk_is_drawn_by_the_mass_of_its_parabola(monkeypatch
     assert np.cov(rest.T)[0, 0] == pytest.approx(0.81, rel=0.05)
     halves = (made[:15_000, 0] == 50.0).sum(), (made[15_000:, 0] == 50.0).sum()
     assert halves[0] == pytest.approx(halves[1], rel=0.1)  # mixed, so that a part of them is as good
+
+
+@pytest.mark.parametrize("far", [2000.0, -2000.0])
+def test_masses_are_compared_where_none_is_a_number_of_its_own(monkeypatch, far):
+    """e^2000 and e^-2000 are beyond double precision; e^-1 of them stays what it is."""
+    monkeypatch.setattr(posterior, "DRAWS", 30_000)
+    monkeypatch.setattr(Walk, "log_mass", lambda self: far)
+    monkeypatch.setattr(explore, "_log_mass", lambda mode, valley, least: far - 1.0)
+    monkeypatch.setattr(posterior, "draws", lambda valleys, count: np.full((count, 3), 50.0))
+    on, beside = lens(BEST), lens(BEST + 8)
+    made = explore._drawn([on[0], beside[0]], [on[1], beside[1]], [walked()], 1.0)
+    assert (made[:, 0] == 50.0).mean() == pytest.approx(1 / (1 + np.e), abs=0.012)
+    monkeypatch.setattr(explore, "_log_mass", lambda mode, valley, least: far - 900.0)
+    assert not (explore._drawn([on[0], beside[0]], [on[1], beside[1]], [walked()], 1.0)[:, 0] == 50.0).any()
+
+
+def test_the_profile_that_a_walk_is_has_points_from_end_to_end():
+    made = explore._whole(walked(), lens(BEST)[0], np.array([-1.0, 9, 9]), np.array([3.0, 9, 9]))
+    value, _ = walked().profile()
+    assert (made.low, made.high, made.parabolic) == (-1.0, 3.0, False)
+    assert len(made.value) == len(made.rise) == 61
+    assert (made.value[0], made.value[-1]) == (value[0], value[-1])
+    assert (np.diff(made.value) > 0).all()
+    assert made.rise == pytest.approx(((made.value - 1.0) / 0.9) ** 2, abs=1e-3)
+
+
+def test_a_parameter_whose_draws_all_agree_keeps_a_covariance():
+    draws = np.random.default_rng(4).normal(size=(40, 3)) * [0.7, 0.0, 0.9]
+    got = explore._covariance(draws, lens(BEST)[1], np.array([0.3, 0.5, 0.8]))
+    own = 0.2 * OWN[1] / (1.2 * np.array([0.7, 1.2, 0.9])) * 0.5 * np.array([0.3, 0.5, 0.8])
+    assert got[1] == pytest.approx(own + np.array([0, 0.8 * 0.25, 0]))
+    assert np.isfinite(got).all()
+
+
+def test_less_misfit_than_noise_narrows_no_covariance():
+    mode, valley = lens(BEST, spread=0.3)
+    assert explore._joined(about(), [mode], [valley], {}, {}).covariance == pytest.approx(OWN + COMMON)

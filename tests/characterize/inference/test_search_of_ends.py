@@ -50,7 +50,9 @@ def test_ends_are_asked_from_each_mode_at_the_level_of_the_misfit(monkeypatch):
     told = Told(four())
     monkeypatch.setattr(ends, "end", told)
     second = valley((4.0, -3.5), above=2.0)
-    search = Search(None, MODE, None, [valley(), second])
+    hopeless, little = valley((7.0, 9.0), above=GOAL**2 + 0.1), valley((1.0, -3.0), above=GOAL**2 - 0.5)
+    search = Search(None, MODE, None, [valley(), second, hopeless, little])
+    assert [k for k, *_ in search._begins(1, 1)] == [-1, -2, -4]
     assert search.ends(WANTED) == []
     for _, i, _, goal, _, most, _ in told.asked:
         assert (goal, most) == pytest.approx((GOAL, 2 * GOAL * SIGMA[i]))
@@ -83,11 +85,17 @@ def test_slopes_met_by_one_end_are_known_to_those_asked_later_and_once(monkeypat
 
 
 def test_a_place_beyond_an_end_is_asked_once_and_the_farther_end_stays(monkeypatch):
-    """3.08 lies 0.08 beyond 3 of an interval of 11, a fiftieth of which is 0.22: too near; 3.3 is asked."""
+    """3.08 lies 0.08 beyond 3 of an interval of 11, a fiftieth of which is 0.22: too near; 3.3 is asked. So is -0.56
+    too near to -0.5 of an interval of 3.4."""
     told = Told(four())
     monkeypatch.setattr(ends, "end", told)
     search = Search(None, MODE, None, [valley()])
-    search.ends(WANTED)
+    search.ends(WANTED[2:])
+    assert search.beyond() == []  # nothing met yet
+    search.ends(WANTED[:2])
+    assert search.beyond() == []
+    told.by[0, 1].met.append((np.array([-0.56, -4.0]), 2.5))
+    search.ends(WANTED[:2])
     assert search.beyond() == []
     far = np.array([0.2, 3.3])
     told.by[1, 1] = End(2.7, [], [(far, 3.0), (np.array([-0.66, 1.0]), 3.0)], steps=2)
@@ -127,11 +135,14 @@ def test_a_profile_is_what_was_seen_on_the_way_to_both_ends(monkeypatch):
 
 
 def walk(places, rise):
-    curve = np.array([[-9.0, 20.0], [-6.9, 9.0], [-4.0, 1.0], [-3.0, 0.0], [1.0, 2.0], [1.8, 2.8], [9.0, 30.0]])
+    own = np.array([[-0.7, 4.0], [1.0, 0.0], [3.1, 5.0]])
+    curve = np.array(
+        [[-9.0, 20.0], [-6.9, 9.0], [-4.0, 1.0], [-3.0, 0.0], [1.0, 2.0], [1.8, 2.8], [2.4, 4.0], [9.0, 30.0]]
+    )
 
     def profile_of(i, share):
-        assert (i, share.tolist()) == (1, np.linspace(-1, 1, 61).tolist())
-        return curve[:, 0], curve[:, 1]
+        assert share.tolist() == np.linspace(-1, 1, 61).tolist()
+        return (curve if i else own).T
 
     stops = [SimpleNamespace(value=np.array(x)) for x in places]
     return SimpleNamespace(value=np.array(places), rise=np.array(rise), stops=stops, profile_of=profile_of,
@@ -150,8 +161,33 @@ def test_a_profile_along_a_walk_is_the_walk_between_what_was_seen_and_its_own_st
     ]  # fmt: skip
     search.ends(WANTED)
     assert asked == [(by.stops[2], 5.0)]
+    assert search.beyond() == []
+    assert [k for k, *_ in search._begins(1, 1)] == [2, -1]  # a stop as long as the walk asks for it, and no mode
+    assert search.profile(0).parabolic
     made = search.profile(1)
     assert (made.low, made.high, made.parabolic) == (-8.0, 3.0, False)
     assert list(zip(made.value, made.rise, strict=True)) == [
         (-7.0, 2.5), (-4.0, 1.0), (-3.0, 0.0), (1.0, 2.0), (1.8, 2.8), (2.0, 3.0)
     ]  # fmt: skip
+
+
+def test_a_walk_beyond_both_ends_gives_way_to_what_was_seen_there(monkeypatch):
+    """Stops from -9.5 to 9: the curve between -6.8, the nearest that the lower end has seen, and 2."""
+    low = End(-8.0, [(-7.0, 2.5), (-6.8, 2.4)], [], steps=3)
+    high = End(3.0, [(1.9, 2.9), (2.0, 3.0)], [], steps=3)
+    monkeypatch.setattr(ends, "end", Told(four() | {(1, -1): low, (1, 1): high}))
+    monkeypatch.setattr(ends, "valley_of", lambda task, at, rise: valley(at.value))
+    search = Search(None, MODE, walk([[1.0, -9.5], [0.0, 9.0], [2.0, 1.7]], [2.0, 3.0, 5.0]), [valley()])
+    search.ends(WANTED)
+    made = search.profile(1)
+    assert made.value.tolist() == [-7.0, -6.8, -4.0, -3.0, 1.0, 1.8, 1.9, 2.0]
+
+
+def test_a_begin_must_reach_beyond_the_farthest_end_so_far(monkeypatch):
+    """Ends at 3 and 5; what reaches 4.5 is not asked, nor what reaches 5.06, by less than 0.07."""
+    places = iter([3.0, 5.0, 9.0])
+    monkeypatch.setattr(ends, "end", lambda *_, **__: End(next(places), [], []))
+    search = Search(None, MODE, None, [valley()])
+    begins = [(-1, None, reach) for reach in (6.0, 5.5, 4.5, 5.06)]
+    found = search._farthest(((0, 1, begins), search._valleys))
+    assert [one.place for _, one in found] == [3.0, 5.0]
