@@ -40,7 +40,7 @@ def pairs_near(boxes_um: Array, group: Array, point: PointExposure) -> tuple[Arr
     """Pairs of rows (one, two), sorted, of boxes of one group that touch or lie within six widths (exp(-36))."""
     order = np.lexsort((boxes_um[:, 0], group))
     boxes, group = np.ascontiguousarray(boxes_um[order]), group[order]
-    starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1], True])
+    starts = np.flatnonzero(np.r_[np.ones(len(group[:1]), bool), group[1:] != group[:-1], True])
     apart = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
     counts = np.zeros(len(boxes), np.int64)
     _pairs(boxes, starts, apart, counts, np.empty(0, np.int64))
