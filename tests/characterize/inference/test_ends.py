@@ -284,3 +284,12 @@ def test_modes_that_are_stops_of_the_walk_too_begin_once_and_begins_count_by_a_t
         tried = []
         begins = [(-1, None, 4.2), (2, None, reach)]
         assert len(found._farthest(((1, 1, begins), {-1: valley, 2: valley}))) == count == len(tried)
+
+
+@pytest.mark.parametrize(("most", "reach"), [((99.0, 99.0), 5.0), ((2.0, 99.0), 2.0), ((99.0, 0.7), 0.7)])
+def test_a_step_outwards_is_as_long_as_asked_and_no_longer_than_its_limits(most, reach):
+    """r = (x, y - x): from (0, 0) as far as x = 5 with y along, five sigma; its length, or that of x, may be held."""
+    here = posterior.Spot(np.zeros(2), np.zeros(2), np.array([[1.0, 0.0], [-1.0, 1.0]]))
+    step, least, size = ends._outwards(here, 0, 1, 25.0, Prior.none(np.zeros(2)), most)
+    assert step == pytest.approx([reach, reach])
+    assert (least, size) == pytest.approx((0.0, 0.7 if most[1] < 1 else 5.0))

@@ -91,5 +91,11 @@ def test_pieces_of_a_shape_see_those_within_six_ranges_and_none_of_another():
     kept = rects.pairs_near(boxes, group, point)
     np.testing.assert_array_equal(np.stack(kept, -1), want)
     assert 150 < len(want) < 150**2 / 3
+
+
+def test_no_boxes_have_no_pairs(monkeypatch):
+    """Not compiled, so that a place beyond the arrays is refused."""
+    monkeypatch.setattr(rects, "_pairs", rects._pairs.py_func)
+    point = PointExposure(np.array([0.7]), np.array([1.0]))
     empty = rects.pairs_near(np.empty((0, 4)), np.empty(0), point)
     assert [len(part) for part in empty] == [0, 0]
