@@ -16,12 +16,12 @@ import h5py
 import numpy as np
 
 from characterize.captures import colour, stage, tiff_tags
+from characterize.captures.bits import right_align
 from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
-_DEPTHS = (8, 10, 12, 14, 16)
 _DENSEST, _MOST_BYTES = 1040, 1 << 34  # values' bytes for a byte of the file, at best; of all frames of a file
 _LEAST_PNG = 33  # bytes of a PNG's mark and head
 
@@ -122,44 +122,12 @@ def read_images(path: Path, channel: object = None) -> Array:
     return images
 
 
-def right_align(images: Array, bits: int | None, where: str) -> tuple[Array, int, str]:
-    """Undo a left shift of 10 to 14-bit counts in 16-bit words and find the depth of the converter.
-
-    Args:
-        bits: as stated with the capture; None finds it from the counts.
-
-    Returns:
-        (counts, bits, note in words).
-
-    Raises:
-        CaptureError: the counts do not fit into the stated bits, shifted or not.
-    """
-    if images.dtype.kind == "f" or images.min() < 0:
-        return images, bits or 16, "counts are real numbers: taken as they are"
-    used = int(np.bitwise_or.reduce(images.astype(np.int64), axis=None))
-    shift = (used & -used).bit_length() - 1 if used else 0
-    width = used.bit_length()
-    if bits is not None and width - shift > bits:
-        raise CaptureError(
-            f"{where}: counts use {width - shift} bits, the capture states {bits}; correct bits, or the bit shift"
-        )
-    if bits is not None and width <= bits:
-        return images, bits, f"{bits} bits as stated"
-    if bits is not None:
-        return images >> (16 - bits), bits, f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
-    if shift and width > 12 and images.dtype.itemsize == 2:
-        depth = 16 - shift
-        return images >> shift, depth, f"lowest {shift} bits never used: {depth}-bit counts shifted back"
-    depth = next((d for d in _DEPTHS if width <= d), 16) if images.dtype.itemsize > 1 else 8
-    return images, depth, f"largest count {int(images.max())}: taken as a {depth}-bit converter"
-
-
 def _load_file(path: Path) -> Capture:
     about = stage.read_beside(path)
     channel = about.pop("channel", None)
     images = read_images(path, channel)
     tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
-    images, bits, note = right_align(images, about.pop("bits", None), str(path))
+    images, bits, note, _ = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
     step = about.get("step_um", math.nan)
     position = np.arange(n) * step if math.isfinite(step) else tags.position_um
@@ -193,10 +161,10 @@ def _load_folder(folder: Path) -> Capture:
         frames = _listed_frames(folder, rows, channel)
     stacks = {name: read_images(p, channel) for name, p in special.items()}
     bits = about.pop("bits", None)
-    frames, depth, note = right_align(frames, bits, str(folder))
+    frames, depth, note, aligned = right_align(frames, bits, str(folder), beside=tuple(stacks.values()))
+    extra = dict(zip(stacks, aligned, strict=True))
     if "step_um" in about and not np.isfinite(rows.position_um).any():
         rows = dataclasses.replace(rows, position_um=np.arange(len(frames)) * float(about["step_um"]))
-    extra = {name: right_align(s, depth, str(special[name]))[0] for name, s in stacks.items()}
     return Capture(
         frames,
         rows.position_um,

@@ -74,8 +74,8 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, boo
     rows = [_plain(row) for row in found.frames]
     values: dict[str, object] = {
         "frames": rows,
-        "best_depth_um": found.best_depth_um,
-        "distortion": found.distortion,
+        "best_depth": _by_field(found.best_depth_um, "depth_um"),
+        "distortion": _by_field(found.distortion, "distortion"),
         "notes": list(found.notes),
     }
     store.write_text(folder / "frames.csv", _table(rows))
@@ -87,9 +87,13 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, boo
         f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
         for r in found.frames
     ]
-    lines += [f"  sharpest at {angle:g} deg: {z:.5g} um" for angle, z in found.best_depth_um.items()]
-    lines += [f"  distortion at {angle:g} deg: {d:+.3%}" for angle, d in found.distortion.items()]
+    lines += [f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um" for (x, y), z in found.best_depth_um.items()]
+    lines += [f"  distortion at {x:g}, {y:g} deg: {d:+.3%}" for (x, y), d in found.distortion.items()]
     return values, "\n".join(lines), True
+
+
+def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, float]]:
+    return [{"angle_deg": x, "angle_y_deg": y, name: value} for (x, y), value in values.items()]
 
 
 def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:

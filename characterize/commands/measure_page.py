@@ -12,7 +12,8 @@ from metalens.ground.arrays import Array
 COLUMNS = {  # of a frame's record, and as the page has them
     "name": "frame",
     "depth_um": "depth / µm",
-    "angle_deg": "angle / deg",
+    "angle_deg": "angle along x / deg",
+    "angle_y_deg": "angle along y / deg",
     "spot.fwhm_um": "width at half maximum / µm",
     "spot.ee80_um": "radius of 80 % of the light / µm",
     "mtf50_x_per_um": "MTF is one half, x / (1/µm)",
@@ -32,12 +33,13 @@ def frames_page(path: Path, found: frames.Quality) -> None:
         report.Section("Frames", "", [report.Table(tuple(known), list(zip(*known.values(), strict=True)))]),
         report.Section("Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]),
     ]
-    fields = list(found.best_depth_um.items())
+    fields = [(x, y, depth) for (x, y), depth in found.best_depth_um.items()]
     if fields:
-        head = ("angle / deg", "depth of the sharpest frame / µm")
+        head = ("angle along x / deg", "angle along y / deg", "depth of the sharpest frame / µm")
         sections.append(report.Section("Field curvature", "", [report.Table(head, fields)]))
     if found.distortion:
-        table = report.Table(("angle / deg", "distortion"), [(a, f"{d:+.3%}") for a, d in found.distortion.items()])
+        head = ("angle along x / deg", "angle along y / deg", "distortion")
+        table = report.Table(head, [(x, y, f"{d:+.3%}") for (x, y), d in found.distortion.items()])
         sections.append(report.Section("Distortion", "", [table]))
     sections.append(report.Section("Put right or assumed on the way", "\n\n".join(found.notes)))
     report.write(path, "Image quality of the captures", sections)

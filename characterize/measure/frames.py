@@ -1,10 +1,15 @@
-"""Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths; distortion, field curvature."""
+"""Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths; distortion, field curvature.
+
+The Strehl ratio compares like with like: the Airy pattern of the design's aperture is laid under the pixels where the
+spot lies (a pixel as wide as the spot's core holds from half to all of its peak as that may be), and loses the median
+of its border as the frame does.
+"""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from characterize.captures import Capture, clean
 from characterize.measure import metrics
@@ -14,12 +19,15 @@ from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
 
 _FINE = 15  # samples a pixel side under the ideal spot
+_CORE = 5  # pixels on each side of the brightest one, over which the ideal spot is laid on a frame's
+Field = tuple[float, float]  # angle along x and y, degrees
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a design. peak_e: background off.
 
+    angle_deg, angle_y_deg: of the field along x and y.
     mtf50_x_per_um, mtf50_y_per_um: of the spot, pixel included. efficiency: share of the reference's light within
     ``circle_um`` (three times the FWHM) about the centroid, nan without a reference.
     """
@@ -27,6 +35,7 @@ class Frame:
     name: str
     depth_um: float
     angle_deg: float
+    angle_y_deg: float
     spot: Spot
     mtf50_x_per_um: float
     mtf50_y_per_um: float
@@ -35,20 +44,26 @@ class Frame:
     efficiency: float
     peak_e: float
 
+    @property
+    def field(self) -> Field:
+        """Angles along x and y that one position of the source has in all frames."""
+        return round(self.angle_deg, 6), round(self.angle_y_deg, 6)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Quality:
     """All frames, and what they say together.
 
-    best_depth_um: {field angle in degrees: source depth of the sharpest spot}: field curvature.
-    distortion: {field angle: (place on the sensor over d tan(angle)) - 1}, relative to the smallest angle; empty where
-    frames were taken at one angle, or windows move with the chief ray (``window`` in the capture's description).
+    best_depth_um: {field angles (x, y) in degrees: source depth of the sharpest spot}: field curvature.
+    distortion: {field angles: (place on the sensor along the field over d tan(angle)) - 1}, relative to the smallest
+    angle; empty where frames were taken at one angle, or windows move with the chief ray (``window`` in the capture's
+    description).
     light: (n, y, x) electrons above background. step_um: of a pixel.
     """
 
     frames: tuple[Frame, ...]
-    best_depth_um: dict[float, float]
-    distortion: dict[float, float]
+    best_depth_um: dict[Field, float]
+    distortion: dict[Field, float]
     light: Array
     step_um: float
     notes: tuple[str, ...]
@@ -72,7 +87,6 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
     notes = list(frames.corrections)
     if frames.saturated.any():
         notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
-    ideal = None if design is None else airy(design, capture, light.shape[1:])
     rows = []
     for i, image in enumerate(light):
         spot = metrics.spot(image, step_um=step)
@@ -85,10 +99,11 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
                 capture.names[i],
                 float(capture.position_um[i]),
                 float(np.degrees(capture.angle_rad[i, 0])),
+                float(np.degrees(capture.angle_rad[i, 1])),
                 spot,
                 metrics.mtf_of_psf(image, step_um=step, axis="x").mtf50_per_um,
                 metrics.mtf_of_psf(image, step_um=step, axis="y").mtf50_per_um,
-                math.nan if ideal is None else metrics.strehl(image, ideal),
+                math.nan if design is None else _strehl(image, design, capture),
                 circle,
                 share,
                 float(image.max()),
@@ -97,20 +112,45 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
     return Quality(tuple(rows), _best(rows), _distortion(rows, capture, design), light, step, tuple(notes))
 
 
-def airy(design: Lens, capture: Capture, shape: tuple[int, ...]) -> Array:
-    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's pixels."""
+def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Field = (0.0, 0.0)) -> Array:
+    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's pixels.
+
+    place_px: (x, y) of its middle from the window's.
+    """
     wave = capture.wavelength_um if math.isfinite(capture.wavelength_um) else design.wavelength_um
     sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.sensor_distance_um)
-    y, x = ((np.arange(n * _FINE) - (n * _FINE - 1) / 2) / _FINE for n in shape)
+    y, x = (
+        (np.arange(n * _FINE) - (n * _FINE - 1) / 2) / _FINE - p for n, p in zip(shape, place_px[::-1], strict=True)
+    )
     u = 2 * math.pi * sine / wave * capture.pixel_um * np.hypot(x[None], y[:, None])
     safe = np.maximum(u, 1e-9)
     fine = np.where(u > 1e-9, (2 * special.j1(safe) / safe) ** 2, 1.0)
     return np.asarray(fine.reshape(shape[0], _FINE, shape[1], _FINE).mean((1, 3)))
 
 
+def _strehl(image: Array, design: Lens, capture: Capture) -> float:
+    """Strehl ratio against the Airy pattern where it is most like the spot (largest normalised correlation)."""
+    peak = [int(i) for i in np.unravel_index(int(image.argmax()), image.shape)]
+    half = min(_CORE, (min(image.shape) - 1) // 2)
+    middle = [min(max(i, half), n - 1 - half) for i, n in zip(peak, image.shape, strict=True)]
+    core = image[tuple(slice(i - half, i + half + 1) for i in middle)]
+
+    def unlike(at: Array) -> float:
+        ideal = airy(design, capture, core.shape, place_px=(float(at[0]), float(at[1])))
+        return -float((ideal * core).sum() / np.linalg.norm(ideal))
+
+    start = np.array([peak[1] - middle[1], peak[0] - middle[0]], float)
+    simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4]])
+    options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-9 * float(np.abs(core).sum())}
+    found = optimize.minimize(unlike, start, method="Nelder-Mead", options=options).x
+    x, y = (float(f) + m - (n - 1) / 2 for f, m, n in zip(found, middle[::-1], image.shape[::-1], strict=True))
+    ideal = airy(design, capture, image.shape, place_px=(x, y))
+    return metrics.strehl(image, ideal - np.median(_rim(ideal)))
+
+
 def _above(electrons: Array, usable: Array) -> Array:
     """The frame above the median of its border; 0 where it is masked."""
-    rim = np.concatenate([electrons[0], electrons[-1], electrons[1:-1, 0], electrons[1:-1, -1]])
+    rim = _rim(electrons)
     light = electrons - np.median(rim)
     light = np.where(usable, light, 0.0)
     noise = 1.4826 * float(np.median(np.abs(rim - np.median(rim))))
@@ -119,11 +159,16 @@ def _above(electrons: Array, usable: Array) -> Array:
     return np.asarray(light)
 
 
-def _best(rows: list[Frame]) -> dict[float, float]:
+def _rim(image: Array) -> Array:
+    """Border pixels, each once."""
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+
+
+def _best(rows: list[Frame]) -> dict[Field, float]:
     """Depth of the highest peak share at each angle, by a parabola in 1/z through the best three."""
     out = {}
-    for angle in sorted({round(r.angle_deg, 6) for r in rows}):
-        own = sorted((r for r in rows if round(r.angle_deg, 6) == angle), key=lambda r: r.depth_um)
+    for field in sorted({r.field for r in rows}):
+        own = sorted((r for r in rows if r.field == field), key=lambda r: r.depth_um)
         if len(own) < 3 or not all(math.isfinite(r.depth_um) for r in own):
             continue
         sharp = np.array([1 / r.spot.ee80_um**2 for r in own])
@@ -131,24 +176,24 @@ def _best(rows: list[Frame]) -> dict[float, float]:
         k = int(np.clip(np.argmax(sharp), 1, len(own) - 2))
         a, b, _ = np.polyfit(place[k - 1 : k + 2], sharp[k - 1 : k + 2], 2)
         top = -b / (2 * a) if a < 0 else place[int(np.argmax(sharp))]
-        out[angle] = float(1 / np.clip(top, place.min(), place.max()))
+        out[field] = float(1 / np.clip(top, place.min(), place.max()))
     return out
 
 
-def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dict[float, float]:
+def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dict[Field, float]:
     """Only where the window stands still (``window = "fixed"`` in capture.toml) and the design gives the distance."""
     if design is None or capture.about.get("window") != "fixed":
         return {}
-    places: dict[float, list[float]] = {}
+    places: dict[Field, list[Field]] = {}
     for row in rows:
-        places.setdefault(round(row.angle_deg, 6), []).append(row.spot.centroid_um[0])
-    zero = np.mean(places.get(0.0, [0.0]))
-    ratio = {
-        angle: float((np.mean(x) - zero) / (design.sensor_distance_um * math.tan(math.radians(angle))))
-        for angle, x in places.items()
-        if angle
-    }
-    if not ratio:
-        return {}
-    least = ratio[min(ratio, key=abs)]
-    return {angle: value / least - 1 for angle, value in sorted(ratio.items())}
+        places.setdefault(row.field, []).append(row.spot.centroid_um)
+    zero = np.mean(places.get((0.0, 0.0), [(0.0, 0.0)]), axis=0)
+    ratio, least = {}, math.inf
+    for field in sorted(places, key=lambda f: math.hypot(*f)):
+        tangent = np.tan(np.radians(field))
+        if not tangent.any():
+            continue
+        straight = design.sensor_distance_um * tangent
+        ratio[field] = float((np.mean(places[field], axis=0) - zero) @ straight / (straight @ straight))
+        least = ratio[field] if math.isinf(least) else least
+    return {field: value / least - 1 for field, value in sorted(ratio.items())}

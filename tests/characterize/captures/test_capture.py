@@ -60,6 +60,33 @@ def test_counts_shifted_into_the_high_bits_are_shifted_back(tmp_path, bits):
     assert "shifted back" in found.corrections[0]
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_dark_and_flat_are_shifted_back_with_the_frames(tmp_path, stated):
+    """12-bit counts in the high bits: those of the dark (37 to 44) take 10 bits with their shift, and fit into 12."""
+    dark = RNG.integers(37, 45, (3, 12, 16)).astype(np.uint16)
+    flat = RNG.integers(1500, 2600, (2, 12, 16)).astype(np.uint16)
+    about = "pixel_um = 3.0\nwavelength_um = 0.85\n" + "bits = 12\n" * stated
+    folder(tmp_path, frames=FRAMES << 4, about=about)
+    tifffile.imwrite(tmp_path / "dark.tif", dark << 4, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "flat.tif", flat << 4, photometric="minisblack")
+    found = capture.load(tmp_path)
+    assert found.bits == 12
+    for name, counts in (("frames", FRAMES), ("dark", dark), ("flat", flat)):
+        assert np.array_equal(getattr(found, name), counts), name
+    average = (dark << 4).mean(0).astype(np.float32)
+    tifffile.imwrite(tmp_path / "dark.tif", average)
+    assert capture.load(tmp_path).dark[0] == pytest.approx(average / 16)
+
+
+def test_dim_frames_beside_bright_flats_have_the_bits_of_the_flats(tmp_path):
+    flat = RNG.integers(1500, 2600, (2, 12, 16)).astype(np.uint16)
+    folder(tmp_path, frames=FRAMES // 8)
+    tifffile.imwrite(tmp_path / "flat.tif", flat, photometric="minisblack")
+    found = capture.load(tmp_path)
+    assert found.bits == 12
+    assert np.array_equal(found.flat, flat)
+
+
 def test_imagej_spacing_gives_the_positions(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, metadata={"spacing": 300.0, "unit": "nm", "axes": "ZYX"})
     assert np.allclose(capture.load(tmp_path / "a.tif").position_um, [0, 0.3, 0.6, 0.9])

@@ -46,7 +46,9 @@ def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
         assert float(row["centroid_y_um"]) == pytest.approx(-0.4, abs=0.1)
         assert float(row["efficiency"]) != float(row["efficiency"])  # no reference: not known
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
-    assert 690 < told["best_depth_um"]["0.0"] < 760
+    (best,) = told["best_depth"]
+    assert 690 < best["depth_um"] < 760
+    assert (best["angle_deg"], best["angle_y_deg"]) == (0.0, 0.0)
     assert (tmp_path / "out" / "measure.html").is_file()
 
 

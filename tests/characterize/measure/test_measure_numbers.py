@@ -125,9 +125,9 @@ def test_a_spot_stands_five_robust_sigma_above_the_rim(top, seen):
             frames._above(frame, np.ones(frame.shape, bool))
 
 
-def row(depth, angle, ee80, x=0.0):
-    spot = metrics.Spot(1.0, ee80, (1.0, 1.0), (x, 0.3))
-    return frames.Frame("f", depth, angle, spot, 1.0, 1.0, 1.0, 3.0, 1.0, 9.0)
+def row(depth, angle, ee80, x=0.0, *, angle_y=0.0, y=0.3):
+    spot = metrics.Spot(1.0, ee80, (1.0, 1.0), (x, y))
+    return frames.Frame("f", depth, angle, angle_y, spot, 1.0, 1.0, 1.0, 3.0, 1.0, 9.0)
 
 
 def test_the_sharpest_depth_is_the_top_of_a_parabola_in_its_inverse():
@@ -137,10 +137,12 @@ def test_the_sharpest_depth_is_the_top_of_a_parabola_in_its_inverse():
     rows = [row(z, 0.0, s**-0.5) for z, s in zip(depths, sharp, strict=True)]
     rows += [row(z, 5.0, s) for z, s in ((18e3, 2.0), (21e3, 3.0), (24e3, 5.0))]  # sharpest at the near end
     rows += [row(z, 9.0, 1.0) for z in (18e3, 21e3)]  # too few
+    rows += [row(z, 0.0, s, angle_y=-7.0) for z, s in ((18e3, 5.0), (21e3, 3.0), (24e3, 2.0))]  # another field
     made = frames._best(rows[::-1])
-    assert set(made) == {0.0, 5.0}
-    assert made[0.0] == pytest.approx(23e3, rel=1e-6)
-    assert made[5.0] == pytest.approx(18e3)
+    assert set(made) == {(0.0, 0.0), (5.0, 0.0), (0.0, -7.0)}
+    assert made[0.0, 0.0] == pytest.approx(23e3, rel=1e-6)
+    assert made[5.0, 0.0] == pytest.approx(18e3)
+    assert made[0.0, -7.0] == pytest.approx(24e3)
 
 
 @pytest.mark.parametrize("best", [19e3, 23.5e3, 29e3])
@@ -153,7 +155,7 @@ def test_the_parabola_goes_through_the_sharpest_three_of_many(best):
         if abs(i - np.clip(near, 1, 5)) > 1:
             sharp[i] = 0.7 + 0.01 * i
     rows = [row(z, 2.0, s**-0.5) for z, s in zip(depths, sharp, strict=True)]
-    assert frames._best(rows)[2.0] == pytest.approx(best, rel=1e-6)
+    assert frames._best(rows)[2.0, 0.0] == pytest.approx(best, rel=1e-6)
     unknown = [*rows[:-1], row(math.nan, 2.0, 1.0)]
     assert frames._best(unknown) == {}
 
@@ -186,11 +188,23 @@ def test_distortion_is_the_place_over_that_of_a_straight_ray_relative_to_the_sma
     rows = [row(20e3, 0.0, 1.0, 3.1 - 0.4), row(30e3, 0.0, 1.0, 3.1 + 0.4)]
     rows += [row(20e3, a, 1.0, x + 3.1) for a, x in place.items()]
     found = frames._distortion(rows, capture(about={"window": "fixed"}), design)
-    want = {a: (0.98 + 1e-3 * a**2) / (0.98 + 1e-3 * 16) - 1 for a in sorted(place)}
-    assert list(found) == sorted(place)
+    want = {(a, 0.0): (0.98 + 1e-3 * a**2) / (0.98 + 1e-3 * 16) - 1 for a in sorted(place)}
+    assert list(found) == sorted(want)
     assert found == pytest.approx(want, rel=1e-9)
     assert frames._distortion(rows, capture(), design) == {}
     assert frames._distortion(rows[:2], capture(about={"window": "fixed"}), design) == {}
+
+
+def test_distortion_is_measured_along_the_field_whichever_way_it_lies():
+    """Spots of oblique fields at (0.97 + k |angle|) of the straight ray's place from that of the axis, (1.7, -2.9)."""
+    design = SimpleNamespace(sensor_distance_um=1900.0)
+    share = {(0.0, -5.0): 0.97, (6.0, 8.0): 0.99, (0.0, 11.0): 1.01}
+    rows = [row(20e3, 0.0, 1.0, 1.7, y=-2.9)]
+    for (ax, ay), k in share.items():
+        x, y = (1900 * k * math.tan(math.radians(a)) for a in (ax, ay))
+        rows.append(row(20e3, ax, 1.0, x + 1.7, angle_y=ay, y=y - 2.9))
+    found = frames._distortion(rows, capture(about={"window": "fixed"}), design)
+    assert found == pytest.approx({field: k / 0.97 - 1 for field, k in share.items()}, abs=1e-9)
 
 
 def test_the_airy_pattern_falls_to_nothing_at_its_first_ring():
@@ -228,6 +242,7 @@ def test_frames_are_measured_along_their_own_axes():
     ):
         assert (row.name, row.depth_um) == (name, depth)
         assert row.angle_deg == pytest.approx(angle)
+        assert row.angle_y_deg == pytest.approx(3 * angle)
         assert row.peak_e == pytest.approx(peak, rel=1e-6)
         assert row.spot.centroid_um == pytest.approx((2 * pixel, -2 * pixel), abs=0.02)
         assert row.spot.d4sigma_um == pytest.approx((4 * sy * pixel, 4 * sx * pixel), rel=0.02)
