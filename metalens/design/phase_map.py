@@ -15,6 +15,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError, StoreError, nearest
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
+CORE, MANY = 8, 256  # samples from a vortex to a ring that is fine enough; places in all of them
 SAME_STEP = 1e-6  # relative difference within which two spacings are one
 
 
@@ -60,6 +61,9 @@ def read(shape: PhaseMap) -> Samples:
 def interpolate(samples: Samples, x_um: Array, y_um: Array, *, radius_um: float = math.inf) -> Array:
     """Phase between the samples, (y, x), by bilinear interpolation of the phasor exp(i phase).
 
+    About a vortex, whose phase goes through whole turns around a point however fine the map is, that of the nearest
+    sample, up to CORE samples from it.
+
     Args:
         x_um: (x,) positions; y_um: (y,) positions, all inside the map.
         radius_um: of the aperture; outside it the map may have no data, or be too coarse.
@@ -84,12 +88,34 @@ def interpolate(samples: Samples, x_um: Array, y_um: Array, *, radius_um: float 
     place = f"near row {row[worst[0]]:.1f}, column {column[worst[1]]:.1f}"
     if empty.any():
         raise LensError(f"the phase map has no data {place}, inside the aperture; fill it or take a smaller aperture")
-    if size.min() < 0.5:
+    coarse = np.argwhere(size < 0.5)
+    known = [_vortex(samples.phase_rad, float(row[i]), float(column[k])) for i, k in coarse[:MANY]]
+    if len(coarse) > MANY or None in known:
         raise LensError(
             f"the phase map turns by more than 2/3 of half a turn between samples {place}; "
             f"give it on a finer pitch than {max(step_x, step_y)} um"
         )
-    return np.asarray(np.angle(between))
+    found = np.angle(between)
+    for (i, k), phase in zip(coarse, known, strict=True):
+        found[i, k] = phase
+    return np.asarray(found)
+
+
+def _vortex(phase_rad: Array, row: float, column: float) -> float | None:
+    """Phase of the sample nearest to a place, where a closed ring of samples around it is fine enough to tell that the
+    phase turns about it; None where none does."""
+    rows, columns = phase_rad.shape
+    i, k = (min(max(math.floor(at), 0), n - 2) for at, n in ((row, rows), (column, columns)))
+    for half in range(2, CORE + 1):
+        if min(i, k) < half - 1 or i + half >= rows or k + half >= columns:
+            return None
+        block = phase_rad[i - half + 1 : i + half + 1, k - half + 1 : k + half + 1]
+        ring = np.concatenate([block[0, :-1], block[:-1, -1], block[-1, :0:-1], block[:0:-1, 0]])
+        steps = np.diff(ring, append=ring[:1]) / (2 * np.pi)
+        steps = steps - np.rint(steps)
+        if np.abs(steps).max() < 1 / 3 and abs(steps.sum()) > 0.5:  # nan compares as neither
+            return float(phase_rad[round(row), round(column)])
+    return None
 
 
 def _blend(samples: Array, position: Array) -> Array:

@@ -171,3 +171,34 @@ def test_damaged_files_are_refused_or_read(tmp_path_factory, kind, data):
     except LensError:
         return
     assert samples.phase_rad.ndim == 2
+
+
+@pytest.mark.parametrize("charge", [1, -2, 5])
+@pytest.mark.parametrize("count", [81, 84])
+def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
+    """exp(i m phi) beside a saddle, on pillars that stand on its axis or beside it: within half of the turn from a
+    sample to the next beyond four samples, the phase of a sample nearby within."""
+    x = (np.arange(count) - (count - 1) / 2) * 0.25
+    x0, y0 = 0.31, -0.82
+    phase = charge * np.arctan2(x[:, None] - y0, x - x0) + 0.03 * x * x[:, None]
+    samples = phase_map.Samples(phase, (0.25, 0.25))
+    for at in (np.arange(-25, 26) * 0.3, np.arange(-25, 25) * 0.3 + 0.15):
+        found = phase_map.interpolate(samples, at + x0, at + y0, radius_um=8.0)
+        want = charge * np.arctan2(at[:, None], at) + 0.03 * (at + x0) * (at[:, None] + y0)
+        off = np.abs(np.angle(np.exp(1j * (found - want))))
+        radius = np.hypot(at, at[:, None])
+        far = (radius > 1.0) & (radius < 7.0)
+        assert (off[far] < abs(charge) * 0.25**2 / radius[far] ** 2 + 5e-3).all()
+        samples_near = phase[np.hypot(x - x0, x[:, None] - y0) < 1.0]
+        turns = (found[radius < 0.4, None] - samples_near) / (2 * np.pi)
+        assert (np.abs(turns - np.rint(turns)).min(1) < 0.1).all()
+
+
+def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():
+    """Steps of 0.8 half-turns along x; a step of a half-turn along a line; both with a vortex of charge 2 in them."""
+    x = np.arange(-20, 21) * 0.5
+    vortex = 2 * np.arctan2(x[:, None] + 0.1, x - 0.1)
+    for more in (0.8 * np.pi / 0.5 * x, np.where(x > 0.2, np.pi, 0.0)):
+        samples = phase_map.Samples(vortex + more, (0.5, 0.5))
+        with pytest.raises(LensError, match="finer pitch"):
+            phase_map.interpolate(samples, np.arange(-20, 20) * 0.3 + 0.25, np.arange(-20, 20) * 0.3)
