@@ -1,13 +1,18 @@
 """Settings of the trained optics and what follows from them, by the formulas of their docstrings."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from codesign.optics import families, lens_errors
 from codesign.optics import stack as optics
+from codesign.optics.lens_errors import LensError
 from codesign.optics.stack import OpticsConfig, Stack
+from metalens.design import profiles
+from metalens.image import coordinates
 
 OWN = OpticsConfig(
     aperture_mm=0.7, sensor_distance_mm=1.6, wavelength_nm=790.0, focus_mm=17.0, depths_mm=(11.0, 47.0), depth_count=7,
@@ -69,8 +74,16 @@ def test_light_of_the_stack_is_that_of_the_pupil_by_plain_sums():
     """Rayleigh's quadratic lens seen at two depths: |Σ light of the nodes exp(i f x)|² over whole samples, by sums over
     all frequencies that a sample's grid can show; the share of the light of the aperture."""
     made = optics.stack(OWN, torch.zeros(0)).intensity.double().numpy()
-    carriers, _ = optics._carriers(OWN)
-    pupil, light = OWN.pupil, carriers[4].numpy()
+    want = summed(OWN, 0.0)
+    scale = want.sum() / made[4].sum()
+    assert made[4] == pytest.approx(want / scale, abs=2e-3 * made[4].max())
+    assert scale == pytest.approx(1.0, rel=1e-3)
+
+
+def summed(settings, phase_rad):
+    """(window, window) light of the fifth depth behind the nodes' phase, as a share."""
+    carriers, _ = optics._carriers(settings)
+    pupil, light = settings.pupil, carriers[4].numpy() * np.exp(1j * phase_rad)
     nodes = light.shape[0]
     most = math.floor(pupil.period_um / 14.0)
     auto = np.fft.fft2(np.abs(np.fft.fft2(light, s=(3 * nodes, 3 * nodes))) ** 2) / (3 * nodes) ** 2
@@ -79,7 +92,68 @@ def test_light_of_the_stack_is_that_of_the_pupil_by_plain_sums():
     place = (np.arange(21) - 10) * 7.0
     wave = np.exp(2j * np.pi * np.outer(place, harmonic) / pupil.period_um) * sinc
     kept = auto[np.ix_(harmonic, harmonic)]
-    want = (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / (np.abs(light) ** 2).sum()
-    scale = want.sum() / made[4].sum()
-    assert made[4] == pytest.approx(want / scale, abs=2e-3 * made[4].max())
-    assert scale == pytest.approx(1.0, rel=1e-3)
+    return (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / (np.abs(light) ** 2).sum()
+
+
+BENT = replace(OWN, polynomials=4, zones=2)
+RAD = torch.tensor([0.7, -0.4, 0.5, 1.1], dtype=torch.float64)
+WRONG = LensError({"tilt_waves": 0.2, "astigmatism_waves": -0.13, "bias_nm": 4.0, "gradient_nm": 9.0}, 0.7)
+
+
+def by_hand(x, y, *, wrong=False):
+    """Phase on top of the hyperbolic one at places over the radius: terms made orthonormal on the pupil's nodes."""
+    nodes = [c.numpy() / 350 for c in coordinates(BENT.pupil)]
+    inside = np.hypot(*nodes) <= 1
+    raw = np.stack(families.terms(*nodes, 4, "free"))[:, inside].T
+    mix = np.linalg.inv(np.linalg.qr(raw)[1]) * math.sqrt(len(raw))
+    assert (raw @ mix).T @ (raw @ mix) / len(raw) == pytest.approx(np.eye(4), abs=1e-9)
+    total = np.tensordot(mix @ RAD.numpy(), np.stack(families.terms(x, y, 4, "free")), 1)
+    ring = np.ceil(2 * (x**2 + y**2)).clip(1, 2)
+    total += (2 * ring - 1) * np.arctan2(y, x)  # a double helix of two rings
+    if wrong:
+        total += 2 * np.pi * (0.2 * (x**2 + y**2) * x - 0.13 * (x**2 - y**2))
+        total += lens_errors.wave_front_rad(WRONG.state(), *map(torch.from_numpy, (x, y))).numpy()
+    return total
+
+
+def test_the_phase_at_pillars_is_that_of_the_polynomials_over_the_radius():
+    """Places of their own along x and y: rows and columns are not alike."""
+    x, y = np.array([-0.8, 0.35, 0.1, 0.62]), np.array([0.55, -0.2, 0.05])
+    across, down = np.meshgrid(x, y)
+    places = torch.from_numpy(350 * across), torch.from_numpy(350 * down)
+    assert optics.phase_at(BENT, RAD, *places).numpy() == pytest.approx(by_hand(across, down), rel=1e-9)
+    made = optics.phase_at(BENT, RAD, *places, error=WRONG).numpy()
+    assert made == pytest.approx(by_hand(across, down, wrong=True), rel=1e-9)
+    whole = optics.phase_of(BENT, RAD.numpy())(350 * x, 350 * y)
+    assert whole - profiles.hyperbolic(350 * x, 350 * y[:, None], BENT.focus) == pytest.approx(
+        by_hand(across, down), rel=1e-9
+    )
+    plain = replace(BENT, polynomials=0, zones=0)
+    assert not optics.phase_at(plain, RAD[:0], *places).any()
+    assert optics.phase_of(plain, np.zeros(0))(350 * x, 350 * y) == pytest.approx(
+        profiles.hyperbolic(350 * x, 350 * y[:, None], BENT.focus)
+    )
+
+
+def test_a_lens_made_wrong_has_the_light_of_its_bent_phase_and_the_haze_of_its_pillars():
+    x, y = (c.numpy().astype(float) / 350 for c in torch.broadcast_tensors(*coordinates(BENT.pupil)))
+    phase = np.where(np.hypot(x, y) <= 1, by_hand(x, y, wrong=True), 0.0)
+    kept = math.exp(-lens_errors.variance_rad2(WRONG.state()))
+    assert kept < 0.99
+    want = kept * summed(BENT, phase) + (1 - kept) * 49 / (math.pi * 350**2)
+    made = optics.stack(BENT, RAD, error=WRONG).intensity[4].double().numpy()
+    assert made == pytest.approx(want, abs=2e-3 * want.max())
+    right = optics.stack(BENT, RAD).intensity[4].double().numpy()
+    assert np.abs(right - made).max() > 0.05 * want.max()
+
+
+def test_polynomials_of_light_from_the_side_lie_where_its_rays_leave_the_lens():
+    slanted = replace(BENT, angle_deg=9.0, zones=0)
+    seen = optics._seen(slanted)
+    lit = seen.weight.numpy() > 0
+    got = optics.added_phase(slanted, RAD).numpy()
+    x, y = (c.double().numpy() / 350 for c in (seen.x_um, seen.y_um))
+    ring = np.ceil(2 * (x**2 + y**2)).clip(1, 2)
+    want = by_hand(x, y) - (2 * ring - 1) * np.arctan2(y, x)
+    assert got[lit] == pytest.approx(want[lit], rel=1e-6, abs=1e-6)
+    assert 0.5 < lit.mean() < 0.9
