@@ -93,12 +93,15 @@ def test_pieces_are_an_eighth_of_the_range_within_three_ranges_of_a_lens(dx, dy)
     assert longest(15.1) == 8.0
 
 
-def test_the_change_of_the_background_is_that_along_outer_sides_and_across_to_the_opposite_one():
+@pytest.mark.parametrize("mirror", [(1, 1), (-1, 1), (1, -1)])
+def test_the_change_of_the_background_is_that_along_outer_sides_and_across_to_the_opposite_one(mirror):
     """Half of the range over ends and middle of a side that the shape has, and half of the difference between two
     opposite ones, of a box with other boxes on no side alike; by products of differences of erf."""
     every = np.array(
         [[0, 0, 3_000, 5_000], [3_400, -900, 6_000, 900], [-2_600, 3_800, -300, 4_700], [1_100, 5_100, 2_000, 7_000]]
     )
+    ends = every.reshape(-1, 2, 2) * np.array(mirror)
+    every = np.hstack([ends.min(1), ends.max(1)])
     point = PointExposure(np.array([1.3, 2.9]), np.array([0.6, 0.4]))
     (left, bottom, right, top), boxes = every[0] * STEP_UM, every * STEP_UM
     xs, ys = (left, (left + right) / 2, right), (bottom, (bottom + top) / 2, top)
@@ -160,3 +163,72 @@ def test_a_middle_range_of_little_weight_does_not_cut_whole_marks():
     area_um2 = ((CROSS[:, 2] - CROSS[:, 0]) * (CROSS[:, 3] - CROSS[:, 1])).sum() * STEP_UM**2
     assert len(made) < 3000
     assert len(made) < area_um2 / 0.4**2 / 4  # squares of a range
+
+
+@pytest.mark.parametrize("widths", [[0.4], [0.4, 1.59], [1.5, 0.4]])
+def test_ranges_within_four_of_the_core_cut_nothing(widths):
+    """They belong to the edge: 1.59 is less than four times 0.4."""
+    point = PointExposure(np.array(widths), np.full(len(widths), 1 / len(widths)))
+    made, of = pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=point, tolerance=0.01)
+    assert made.tolist() == CROSS.tolist()
+    assert of.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("core_um", "shortest"), [(0.01, 8 / 64), (0.3, 0.6)])
+def test_the_shortest_pieces_are_a_64th_of_the_narrowest_range_or_two_of_the_core(core_um, shortest):
+    """At a tolerance that nothing keeps, near the corners: halved until another half would be shorter than that."""
+    point = PointExposure(np.array([core_um, 8.0, 300.0]), np.array([0.6, 0.3, 0.1]))
+    box = np.array([[0, 0, 1024, 999]])
+    made, _ = pieces.cut(box, NOTHING, step_um=STEP_UM * 4, point=point, tolerance=1e-7)
+    least = float((made[:, 2:] - made[:, :2]).min()) * STEP_UM * 4
+    assert shortest - STEP_UM * 4 < least < 2 * shortest  # halves of an odd number of grid steps
+
+
+def asked_of(monkeypatch, boxes, point, tolerance=0.01):
+    """Caps and limits that the cutting is tried with, one after the other, where none keeps its limit."""
+    asked = []
+    monkeypatch.setattr(pieces, "_halved", lambda *given, most: asked.append((given[4], most)))
+    with pytest.raises(ProcessError):
+        pieces.cut(boxes, NOTHING, step_um=STEP_UM, point=point, tolerance=tolerance)
+    return asked
+
+
+def test_pieces_grow_from_half_a_range_to_four_until_they_are_few(monkeypatch):
+    """Of 30 by 70 mm at a range of 12 um 437 500 quarters would be too many for all but the last try, and 109 375 too;
+    of 3 by 7 mm all are tried. Within three ranges of a corner they go by the narrower range that counts there."""
+    point = PointExposure(np.array([0.01, 12.0, 3.0]), np.array([0.5, 0.4, 0.1]))
+    small = np.array([[0, 0, 3_000_000, 7_000_000]])
+    tried = asked_of(monkeypatch, small // 3, point)
+    assert [(caps.longest_um, most) for caps, most in tried] == [
+        (6.0, 100_000), (12.0, 100_000), (24.0, 100_000), (48.0, 500_000)
+    ]  # fmt: skip
+    assert [caps.corners for caps, _ in tried] == [[(9.0, r * 3.0)] for r in (0.5, 1.0, 2.0, 4.0)]
+    assert {(caps.shortest, caps.change) for caps, _ in tried} == {(3.0 / 64 / STEP_UM, 0.2 * 0.01 * 0.5)}
+    tried = asked_of(monkeypatch, small, point)  # 250 by 584 of 12 um, 125 by 292 of 24
+    assert [(caps.longest_um, most) for caps, most in tried] == [(24.0, 100_000), (48.0, 500_000)]
+    tried = asked_of(monkeypatch, 3 * small, point)  # 188 by 438 of 48 um
+    assert [(caps.longest_um, most) for caps, most in tried] == [(48.0, 500_000)]
+
+
+def test_the_usual_range_is_where_half_of_the_energy_is_reached():
+    around = PointExposure(np.array([50.0, 2.0, 9.0]), np.array([0.2, 0.1, 0.3]))
+    assert pieces._ranges(around, 1e-3) == (9.0, [2.0])
+
+
+def test_halving_stops_at_what_is_asked_to_be_the_most():
+    point = beam(8.0)
+    around = PointExposure(point.widths_um[1:], point.weights[1:])
+    caps = pieces._Caps(250.0, 8.0, [(24.0, 4.0)], 1e-3)
+    made = pieces._halved(CROSS, NOTHING, STEP_UM, around, caps, most=10_000)
+    count = len(made.of)
+    assert len(pieces._halved(CROSS, NOTHING, STEP_UM, around, caps, most=count).of) == count
+    assert pieces._halved(CROSS, NOTHING, STEP_UM, around, caps, most=count - 1) is None
+
+
+def test_a_side_of_twice_the_shortest_is_halved_once_more():
+    around = PointExposure(np.array([5.0]), np.array([1.0]))
+    box = np.array([[0, 0, 64, 8]])
+    made = pieces._halved(box, NOTHING, STEP_UM, around, pieces._Caps(4.0, 1e-3, [], 1.0), most=100)
+    assert sorted(map(tuple, made.box.tolist())) == [
+        (4 * i, 4 * j, 4 * i + 4, 4 * j + 4) for i in range(16) for j in (0, 1)
+    ]

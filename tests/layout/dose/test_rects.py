@@ -69,13 +69,13 @@ def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
 
 
 def test_samples_of_rectangles_stand_in_the_middle_of_cells_no_longer_than_a_step():
-    """The first in 4 by 2 cells of a quarter, the second, 0.3 by 0.2, in 2 by 1."""
-    boxes = np.array([[0.0, 1.0, 1.0, 1.5], [5.0, 5.0, 5.3, 5.2]])
+    """The first in 4 by 2 cells of a quarter, the second, 0.6 by 0.2, in 3 by 1."""
+    boxes = np.array([[0.0, 1.0, 1.0, 1.5], [5.0, 5.0, 5.6, 5.2]])
     points, area, of = rects.samples(Rects(boxes, np.zeros(2, int), np.ones(2)), 0.25)
     first = [(0.125 + 0.25 * i, 1.125 + 0.25 * j) for j in range(2) for i in range(4)]
-    assert points == pytest.approx(np.array([*first, (5.075, 5.1), (5.225, 5.1)]), abs=1e-12)
-    assert area == pytest.approx([0.0625] * 8 + [0.03] * 2, abs=1e-12)
-    assert of.tolist() == [0] * 8 + [1] * 2
+    assert points == pytest.approx(np.array([*first, (5.1, 5.1), (5.3, 5.1), (5.5, 5.1)]), abs=1e-12)
+    assert area == pytest.approx([0.0625] * 8 + [0.04] * 3, abs=1e-12)
+    assert of.tolist() == [0] * 8 + [1] * 3
 
 
 def test_pieces_of_a_shape_see_those_within_six_ranges_and_none_of_another():
@@ -99,3 +99,81 @@ def test_no_boxes_have_no_pairs(monkeypatch):
     point = PointExposure(np.array([0.7]), np.array([1.0]))
     empty = rects.pairs_near(np.empty((0, 4)), np.empty(0), point)
     assert [len(part) for part in empty] == [0, 0]
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """The loops not compiled, so that a place beyond the arrays is refused."""
+    for name in ("_pairs", "_sum", "_free"):
+        monkeypatch.setattr(rects, name, getattr(rects, name).py_func)
+
+
+def nine():
+    """Three by three boxes of unlike sizes that abut, shuffled; which of them is the middle one."""
+    x, y = [0.0, 1.3, 2.4, 4.1], [0.2, 0.9, 2.3, 2.9]
+    boxes = np.array([[a, b, c, d] for b, d in itertools.pairwise(y) for a, c in itertools.pairwise(x)])
+    order = np.array([4, 2, 7, 0, 8, 5, 1, 6, 3])
+    return boxes[order], 0
+
+
+def by_boxes(x, y, boxes, point):
+    """Exposure at one place: for each Gaussian the product of two differences of erf, halved."""
+    return sum(
+        weight / 4 * (erf((b[2] - x) / a) - erf((b[0] - x) / a)) * (erf((b[3] - y) / a) - erf((b[1] - y) / a))
+        for a, weight in zip(point.widths_um, point.weights, strict=True)
+        for b in boxes
+    )
+
+
+def test_a_piece_within_others_has_the_exposure_of_its_middle_less_half(interpreted):
+    """Its middle, (1.85, 1.6), is the point; another shape beside it gives nothing."""
+    boxes, middle = nine()
+    point = PointExposure(np.array([0.1, 1.7]), np.array([0.6, 0.4]))
+    more = np.vstack([boxes, [[5.0, 0.2, 6.0, 2.9]]])
+    exposure, at, of = rects.own(Rects(more, np.r_[np.zeros(9, int), 1], np.ones(10)), point)
+    ((x, y),) = at[of == middle]
+    assert (x, y) == pytest.approx((1.85, 1.6))
+    assert exposure[middle] == pytest.approx(by_boxes(1.85, 1.6, boxes, point) / 2, rel=1e-12)
+    for n in range(9):  # an outer one: the mean over its points
+        want = [by_boxes(*place, boxes, point) for place in at[of == n]]
+        assert exposure[n] == pytest.approx(np.mean(want) * (0.5 if n == middle else 1.0), rel=1e-12)
+
+
+def test_pieces_in_another_order_have_the_same_points(interpreted):
+    boxes, _ = nine()
+    point = PointExposure(np.array([0.1]), np.array([1.0]))
+    first = rects.own(Rects(boxes, np.zeros(9, int), np.ones(9)), point)
+    turned = rects.own(Rects(boxes[::-1], np.zeros(9, int), np.ones(9)), point)
+    assert turned[0][::-1] == pytest.approx(first[0])
+    assert sorted(map(tuple, turned[1])) == sorted(map(tuple, first[1]))
+
+
+def test_without_a_gaussian_there_is_no_exposure_and_an_edge_is_straight_to_its_corner(interpreted):
+    """Two boxes that abut: three free sides each, judged in their middles."""
+    boxes = np.array([[0.0, 0.0, 2.0, 1.0], [2.0, 0.0, 3.0, 1.0]])
+    none = PointExposure(np.empty(0), np.empty(0))
+    exposure, at, of = rects.own(Rects(boxes, np.zeros(2, int), np.ones(2)), none)
+    assert exposure.tolist() == [0.0, 0.0]
+    assert sorted(map(tuple, at[of == 0])) == [(0.0, 0.5), (1.0, 0.0), (1.0, 1.0)]
+    assert sorted(map(tuple, at[of == 1])) == [(2.5, 0.0), (2.5, 1.0), (3.0, 0.5)]
+
+
+def test_one_box_alone_has_four_sides(interpreted):
+    point = PointExposure(np.array([0.05]), np.array([1.0]))
+    exposure, at, of = rects.own(Rects(np.array([[0.0, 0.0, 3.0, 2.0]]), np.zeros(1, int), np.ones(1)), point)
+    assert sorted(map(tuple, at)) == [(0.0, 1.0), (1.5, 0.0), (1.5, 2.0), (3.0, 1.0)]
+    assert of.tolist() == [0] * 4
+    assert exposure == pytest.approx([0.5])
+    nothing = rects.own(Rects(np.empty((0, 4)), np.empty(0, int), np.empty(0)), point)
+    assert [part.shape for part in nothing] == [(0,), (0, 2), (0,)]
+
+
+def test_exposure_at_crossings_has_lines_of_y_before_those_of_x(interpreted):
+    """Two by three lines of one row, of the boxes that it sees: the first and the third."""
+    boxes = np.array([[0.0, 0.0, 1.0, 2.0], [1.0, 0.0, 2.0, 3.0], [-2.0, 1.0, -0.5, 4.0]])
+    point = PointExposure(np.array([0.8, 1.9]), np.array([0.7, 0.3]))
+    x, y = np.array([[0.2, 1.4]]), np.array([[0.3, 1.1, 2.6]])
+    got = rects.sums_of_boxes(x, y, np.array([5]), boxes, (np.array([4, 5, 5, 6]), np.array([1, 0, 2, 1])), point)
+    want = [[by_boxes(a, b, boxes[[0, 2]], point) for a in x[0]] for b in y[0]]
+    assert got.shape == (1, 3, 2)
+    assert got[0] == pytest.approx(np.array(want), rel=1e-12)
