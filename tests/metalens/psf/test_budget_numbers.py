@@ -48,6 +48,15 @@ def apart(one, other, radius):
     return math.sqrt((one - other) ** 2 @ radius / (other**2 @ radius))
 
 
+NODE, WEIGHT = np.polynomial.legendre.leggauss(200)
+
+
+def airy(aperture, factor=lambda p: 1.0 + 0j):
+    """(radius in 1/k, |U|²) of a perfect lens with a factor on its light."""
+    p, radius = aperture * (NODE + 1) / 2, np.linspace(0, 30 / aperture, 240)
+    return radius, np.abs((WEIGHT * p / (1 - p * p) * factor(p)) @ special.jv(0, np.outer(p, radius))) ** 2
+
+
 def test_the_models_own_terms_are_integrals_over_the_aperture():
     """1 / (1 - p²) dp² is the solid angle twice over; flux: I0² - I2², √cos θ (1 ± cos θ), of Richards and Wolf."""
     aperture = 0.61
@@ -113,11 +122,7 @@ def test_light_unlike_that_of_the_rows_has_its_own_terms_with_the_factor_of_unli
     radius = np.linspace(0, 30 / aperture, 240)
 
     def light(scale):
-        parts = [
-            [radial(aperture, r, 0, lambda p, of=of: of(known.mean(scale * p)) / (1 - p * p)) for r in radius]
-            for of in (np.real, np.imag)
-        ]
-        return np.hypot(*np.array(parts)) ** 2
+        return airy(aperture, lambda p: known.mean(scale * p))[1]
 
     def left(**more):
         given = dict(aperture=aperture, polarisation="flux", has_angles=True, ghost=0.0, incidence_rad=0.0) | more
@@ -194,3 +199,53 @@ def _power_kept(known, aperture):
         for of in (lambda p: float(abs(known.mean(p)) ** 2), lambda p: 1.0)
     ]
     return power[0] / power[1]
+
+
+def test_scattered_light_counts_beside_rough_neighbours_too():
+    """Squares add: 2 <|n|²> ∫|U|² over ∫|U|⁴, <|n|²> the lost power over the area; that of |1 + a s + b s²|²."""
+    aperture, lit, rough = 0.55, 700.0, budget.LeftOut((0.05 - 0.3j, -0.4 + 0.1j), of="made up")
+    given = dict(aperture=aperture, polarisation="flux", has_angles=True, ghost=0.0, incidence_rad=0.0, left_out=rough)
+    found, endless = (budget.with_model(Budget(0.0), **given, lit=area).neighbours for area in (lit, math.inf))
+
+    def factor(p):
+        return 1 + (0.05 - 0.3j) * p + (-0.4 + 0.1j) * p * p
+
+    assert endless == pytest.approx(apart(airy(aperture, factor)[1], airy(aperture)[1], airy(aperture)[0]), rel=1e-6)
+    p = aperture * (NODE + 1) / 2
+    power = WEIGHT * p / (1 - p * p) ** 2
+    kept = float(power @ np.abs(factor(p)) ** 2 / power.sum())
+    radius, light = airy(aperture, factor)
+    ring = 2 * math.pi * radius * (radius[1] - radius[0]) / (2 * math.pi) ** 2  # squared wavelengths
+    want = 2 * (1 - kept) / kept / lit * (light @ ring) ** 2 / (light**2 @ ring)
+    assert found**2 - endless**2 == pytest.approx(want, rel=1e-6)
+    assert want > 0.05 * endless**2
+
+
+def test_of_rows_left_out_the_one_that_matters_most_counts():
+    aperture = 0.5
+    factor = np.array([[0.8 + 0.1j, 0.85 - 0.2j, 0.7 + 0.3j], [0.9 - 0.1j, 0.75 + 0.2j, 0.8 - 0.3j]])
+    known = Neighbours(np.array([0.3, 0.45, 0.6]), np.zeros(3, bool), factor, factor, np.zeros(3), 0.85)
+    radius, mean = airy(aperture, known.mean)
+    less = [apart(airy(aperture, other.mean)[1], mean, radius) for other in known.others]
+    assert len(less) == 3
+    assert max(less) > 1.5 * min(less)
+    change = apart(airy(aperture)[1], mean, radius)
+    made = budget.with_model(
+        Budget(0.0), aperture=aperture, polarisation="flux", has_angles=False, ghost=0.0, incidence_rad=0.3,
+        left_out=budget.LeftOut(known), light=(np.array([0.8, 0.9]), np.array([0.3, 0.7])),
+    )  # fmt: skip
+    away = [apart(airy(aperture, lambda p, w=w: known.mean(p * w / 0.85))[1], mean, radius) for w in (0.8, 0.9)]
+    side = math.hypot(0.2, 2.5 * math.sin(0.3) ** 2) * change
+    want = math.sqrt((max(less) + side) ** 2 + 0.3 * away[0] ** 2 + 0.7 * away[1] ** 2)
+    assert made.neighbours == pytest.approx(want, rel=1e-3)  # C has kinks at the rows, which nodes step over
+
+
+def test_words_of_what_is_left_out_say_whose_numbers_they_are():
+    rows = Neighbours(np.array([0.3, 0.6]), np.zeros(2, bool), *2 * [np.ones((2, 2), complex)], np.zeros(2), 0.94)
+    assert "of this cell" in budget.LeftOut((0j, 0j), of="this cell").words
+    assert "the default cell, rough (" in budget.LeftOut().words
+    assert budget.LeftOut(rows).words.endswith(
+        "2 solved rows at 0.94 um and normal incidence; angle: of the default cell, rough"
+    )
+    assert budget.LeftOut(rows, of="this cell").words.endswith("at 0.94 um and normal incidence")
+    assert "beside the window" not in Budget(0.02).text
