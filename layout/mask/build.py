@@ -114,7 +114,7 @@ def surroundings(
     """
     own = dataclasses.replace(process, die=dataclasses.replace(process.die, size_um=size_um, label=label))
     made = prepare(source, own, name=name, furniture="none", with_doses=False)
-    whole = die.furnish(made.plan, own, radius_um=clear_um, label=label)
+    whole = die.furnish(made.plan, own, radius_um=clear_um, label=label, around=True)
     figures = [f for f in whole.figures if f.name != "APERTURE"]
     aperture = next(f for f in whole.figures if f.name == "APERTURE")
     openings = {layer: shapes[1:] for layer, shapes in aperture.polygons.items()}  # without that of the lens

@@ -5,6 +5,7 @@ the openings of an opaque film over the lens, the marks and the test structures.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -25,14 +26,16 @@ _TESTED, _WITNESSED = 6, 8  # diameters that are repeated in the dose array and 
 _ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
 
 
-def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str) -> MaskPlan:
+def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str, around: bool = False) -> MaskPlan:
     """``plan`` (the lens alone) with everything else that stands on its die.
 
     Args:
         radius_um: of the aperture. label: text, where the process gives none.
+        around: other things stand there, which ``radius_um`` from the middle leaves room for along x.
 
     Raises:
-        ProcessError: the die is too small for the aperture and its test structures, or the label cannot be drawn.
+        ProcessError: the die is too small for the aperture and its test structures, which would lie on each other, or
+            the label cannot be drawn.
     """
     unit = Units(plan)
     die = _outline(process, unit, radius_um)
@@ -40,6 +43,18 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str) -
     crosses, mark_windows = marks.crosses(process, unit, die)
     scales = marks.scales(process, unit, die)
     words, label_window = _label(process, unit, die, label)
+    _refuse_overlaps(
+        {
+            "DOSETEST": windows[:1],
+            "WITNESS": windows[1:],
+            "MARKS": mark_windows,
+            "VERNIERS": [marks.around(shape) for shape in (*scales.drawn, *scales.openings)],
+            "LABEL": [label_window],
+        },
+        (plan.axis, 0.0 if around else radius_um * unit.per_um),
+        unit,
+        die,
+    )
     openings = [disc(radius_um * unit.per_um, plan.axis, plan.grid)]
     openings += [unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)]
     openings += scales.openings
@@ -149,6 +164,29 @@ def _tests(
         lattices.append(lattice)
         windows.append(box.grown(unit(CLEAR_UM / 2)))
     return _same_length([*doses, *witnesses], plan), lattices, windows
+
+
+def _refuse_overlaps(
+    boxes: dict[str, list[Box]], aperture: tuple[tuple[float, float], float], unit: Units, die: Box
+) -> None:
+    """Raises: ProcessError: a structure stands on another one or on the aperture, by name."""
+    (x, y), radius = aperture
+    found = [
+        f"{name} and the aperture"
+        for name, own in boxes.items()
+        for box in own
+        if math.hypot(max(box.left - x, x - box.right, 0), max(box.bottom - y, y - box.top, 0)) < radius
+    ]
+    found += [
+        f"{one} and {other}"
+        for one, other in itertools.combinations(boxes, 2)
+        if any(a.meets(b) for a in boxes[one] for b in boxes[other])
+    ]
+    if found:
+        size = f"{(die.right - die.left) / unit.per_um:.0f} x {(die.top - die.bottom) / unit.per_um:.0f} um"
+        ways = {"VERNIERS": "set die.verniers = false", "MARKS": "draw smaller marks (die.mark_um)"}
+        more = "".join(f", or {way}" for name, way in ways.items() if name in found[0])
+        raise ProcessError(f"{found[0]} overlap on a die of {size}; raise die.margin_um or die.size_um{more}")
 
 
 def _variant(made: PillarClass, name: str, layer: tuple[int, int], dose: float) -> PillarClass:

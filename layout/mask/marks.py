@@ -45,6 +45,16 @@ class Box:
         """A rectangle that is larger by ``by`` on each side."""
         return Box(self.left - by, self.bottom - by, self.right + by, self.top + by)
 
+    def meets(self, other: "Box") -> bool:
+        """Whether both have more than their edges in common."""
+        across = self.left < other.right and other.left < self.right
+        return across and self.bottom < other.top and other.bottom < self.top
+
+
+def around(polygon: Array) -> Box:
+    """The box around a polygon."""
+    return Box(*(int(v) for v in (*polygon.min(0), *polygon.max(0))))
+
 
 class Units:
     """From micrometres to database units on the grid."""

@@ -117,3 +117,35 @@ def test_a_step_below_the_grid_and_a_die_without_room_are_refused_by_key():
         layout.plan(lens_map(), coarse)
     with pytest.raises(ProcessError, match=r"die is too narrow for VERNIERS: \d+ um are needed"):
         layout.plan(lens_map(), process(size_um=(640.0, 900.0)))
+
+
+SMALL = {"mark_um": 23.0, "mark_width_um": 2.0, "street_um": 7.0}
+
+
+@pytest.mark.parametrize(
+    ("die", "words"),
+    [
+        ({"margin_um": 180.0, **SMALL}, r"WITNESS and VERNIERS overlap on a die of 367 x 367 um.*die.verniers = false"),
+        ({"size_um": (700.0, 72.0), "verniers": False}, "DOSETEST and LABEL overlap .*raise die.margin_um or die.size"),
+        ({"size_um": (900.0, 110.0), "verniers": False, **SMALL, "mark_um": 40.0}, "LABEL and the aperture overlap"),
+    ],
+)
+def test_structures_that_stand_on_each_other_are_refused_by_name(die, words):
+    """Dies that are wide enough for each structure alone, around an aperture of 7 um."""
+    with pytest.raises(ProcessError, match=words):
+        layout.plan(lens_map(), process(**die))
+
+
+def test_a_die_just_wide_enough_keeps_its_structures_apart():
+    """Boxes around marks, verniers and label share nothing with those of dose test and witness cells."""
+    plan = layout.plan(lens_map(), process(margin_um=190.0, **SMALL))
+    drawn = [
+        p for f in plan.figures if f.name in ("MARKS", "VERNIERS", "LABEL") for s in f.polygons.values() for p in s
+    ]
+    low, high = (np.array([getattr(p, end)(0) for p in drawn]) for end in ("min", "max"))
+    assert len(plan.lattices) == 3
+    for lattice in plan.lattices[1:]:
+        left, top = lattice.x0, lattice.y0
+        right, bottom = (left + (lattice.columns - 1) * lattice.pitch, top - (lattice.rows - 1) * lattice.pitch)
+        over = (low < (right, top)) & (high > (left, bottom))
+        assert not over.all(1).any()
