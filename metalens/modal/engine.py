@@ -17,7 +17,7 @@ from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
-from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, scattering, zero_order
+from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, nearness, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space
@@ -36,8 +36,9 @@ class Solution:
     matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of how far the forms are apart,
     for the wavenumbers of the layer modes and beyond. drift: change of the matrix per relative error of the transverse
     wavenumbers squared of the layer modes, which both forms share. grazing: change of the matrix for what the mesh
-    misplaces cutoffs. bloch: half the Bloch phase. size: wavelengths in a pitch, in the densest medium. strange: as in
-    ``Case``; where it is, damping of round trips in the layer. energy: mean of both forms. unknowns: of both forms.
+    misplaces cutoffs. beside: how near an order is to its cutoff, see ``match.nearness``. bloch: half the Bloch phase.
+    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where it is, damping of round trips
+    in the layer. energy: mean of both forms. unknowns: of both forms.
     """
 
     matrix: np.ndarray
@@ -47,6 +48,7 @@ class Solution:
     energy: float
     unknowns: int
     grazing: float = 0.0
+    beside: float = 0.0
     bloch: float = 0.0
     size: float = 0.0
     strange: float = 0.0
@@ -205,6 +207,7 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         energy=(first.energy + second.energy) / 2,
         unknowns=first.unknowns + second.unknowns,
         grazing=max(first.grazing, second.grazing),
+        beside=max(nearness(case.k0**2 * e, case.bloch) for e in (case.below, case.above)),
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
         strange=case.strange,

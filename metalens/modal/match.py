@@ -16,7 +16,8 @@ from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import LayerModes, axial
 from metalens.modal.pencil import Pencil
 
-NEAR = 0.1  # relative distance of k² from its cutoff within which an order takes its exact wavenumber
+NEAR = 0.4  # relative distance of k² from its cutoff within which an order takes its exact wavenumber
+AT = 0.1  # and within which it counts as at its cutoff
 KNOWN = 0.02  # relative error of k² up to which a mode of the mesh is that order
 CARRY = 1e-13  # modes that decay below this over the height cannot change a result of double precision
 
@@ -57,14 +58,30 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     close = np.flatnonzero((np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9)))
     if not len(close):
         return square
-    reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
-    along, across = bloch + np.pi * np.arange(-reach, reach + 1), np.pi * np.arange(reach + 1)
-    exact = (along[:, None] ** 2 + across**2).ravel()
+    exact = lattice(cutoff, bloch)
     nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
     known = np.abs(nearest - square[close]) < KNOWN * nearest
     out = square.copy()
     out[close[known]] = nearest[known]
     return out
+
+
+def nearness(cutoff: float, bloch: float) -> float:
+    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over the distance, to 0 at ``NEAR``.
+
+    An admittance answers to the error of a wavenumber squared as one over its distance from the cutoff.
+    """
+    exact = lattice(cutoff, bloch)
+    apart = float(np.abs(exact[exact > bloch**2 * (1 + 1e-9)] / cutoff - 1).min())
+    return min(1.0, max(0.0, (NEAR / max(apart, AT) - 1) / (NEAR / AT - 1)))
+
+
+def lattice(cutoff: float, bloch: float) -> np.ndarray:
+    """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
+    reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
+    along, across = bloch + np.pi * np.arange(-reach, reach + 1), np.pi * np.arange(reach + 1)
+    wavenumbers: np.ndarray = (along[:, None] ** 2 + across**2).ravel()
+    return wavenumbers
 
 
 @dataclass(frozen=True, eq=False, slots=True)

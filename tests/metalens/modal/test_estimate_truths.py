@@ -10,7 +10,7 @@ from metalens.modal import engine, match
 from metalens.modal.engine import Form
 
 RNG = np.random.default_rng(77)
-CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42, strange=2.5)
+CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42, strange=2.5, below=2.2, above=1.21)
 
 
 def matrix(scale=1.0):
@@ -39,6 +39,8 @@ def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_ne
     assert found.energy == pytest.approx(0.95)
     assert (found.unknowns, found.grazing, found.bloch, found.strange) == (440, 0.011, 0.31, 2.5)
     assert found.damping == 0.21
+    apart = (math.pi - 0.31) ** 2 / (1.7**2 * 2.2) - 1  # the nearer one, of the substrate
+    assert found.beside == pytest.approx((0.4 / apart - 1) / 3, rel=1e-9)
     assert found.size == pytest.approx(1.7 * math.sqrt(abs(9.0 + 0.2j)) / math.pi, rel=1e-12)
     mean = (first.matrix + second.matrix) / 2
     assert np.abs(found.matrix - mean).max() < 0.05 * np.abs(first.matrix - second.matrix).max()  # second order
@@ -122,9 +124,18 @@ def test_half_spaces_admit_modes_as_plane_waves_of_their_own_kind():
 
 
 def test_orders_near_their_cutoff_take_the_wavenumbers_of_the_lattice():
-    """(0.4 - pi)² + pi² = 17.386 near a cutoff of 17: within a tenth of it, and 2 % of what the mesh has."""
+    """(0.4 - pi)² + pi² = 17.386 near a cutoff of 17: within two fifths of it, and 2 % of what the mesh has."""
     exact = (0.4 - math.pi) ** 2 + math.pi**2
     squares = np.array([1.01 * exact, 1.03 * exact, 0.4**2, 0.8 * exact, 0.995 * exact])
     got = match.near_cutoff(squares, 17.0, 0.4)
     assert got == pytest.approx([exact, 1.03 * exact, 0.16, 0.8 * exact, exact])
     assert match.near_cutoff(squares, 40.0, 0.4) is squares
+
+
+@pytest.mark.parametrize(
+    ("apart", "want"), [(0.0, 1.0), (-0.07, 1.0), (0.1, 1.0), (-0.16, 0.5), (0.25, 0.2), (0.4, 0.0), (0.6, 0.0)]
+)
+def test_an_order_counts_as_at_its_cutoff_by_one_over_the_distance(apart, want):
+    """The least order (pi - 1.1)², ``apart`` of the cutoff beyond it or short of it; the next is far."""
+    cutoff = (math.pi - 1.1) ** 2 / (1 + apart)
+    assert match.nearness(cutoff, 1.1) == pytest.approx(want, abs=1e-9)

@@ -19,6 +19,7 @@ UNSEEN = 0.02 * 1e-2
 
 def found(t=0.6 + 0.1j, **other):
     usual = {"rim": 0.02, "waves": 0.05, "drift": 1.7, "grazing": 0.0, "bloch": 0.0, "size": 1.3, "strange": 0.0}
+    usual["beside"] = 0.0
     all_ = {"matrix": np.array([[0.1, t], [t, 0.2j]]), "damping": 1.0} | usual | other
     return SimpleNamespace(**all_, spread=all_["rim"] + all_["waves"])
 
@@ -42,11 +43,14 @@ def test_the_estimate_adds_rim_waves_and_drift_by_the_width_of_the_disc_and_the_
 
 
 def test_near_a_cutoff_the_difference_counts_more_and_so_do_exact_cutoffs():
-    """Each mesh has a least factor there; a change by exact cutoffs counts in part, whatever the mesh."""
-    at = found(grazing=0.04)
+    """Each mesh has a least factor there, which fades with the distance; a change by exact cutoffs counts in part."""
+    at = found(grazing=0.04, beside=1.0)
     assert RUNG.error(at, 0.8) == pytest.approx(3.1 * 0.07 + 1e-4 * 1.7 + 0.15 * 0.04, rel=1e-9)
     thin = 2.6 * 0.07 + (2e-4 + 7e-4 * 0.65**6) * 1.7 + 0.15 * 0.04
     assert RUNG.error(at, 0.5) == pytest.approx(thin, rel=1e-9)
+    half = max(0.7, 3.1 / 2) * 0.02 + max(0.9, 3.1 / 2) * 0.05 + 1e-4 * 1.7
+    assert RUNG.error(found(beside=0.5), 0.8) == pytest.approx(half, rel=1e-9)
+    assert RUNG.error(found(beside=0.1), 0.8) == RUNG.error(found(), 0.8)
     assert RUNG.error(found(grazing=0.04, strange=1.0), 0.5) > RUNG.error(found(strange=1.0), 0.5) + 0.005
 
 

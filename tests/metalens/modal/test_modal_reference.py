@@ -110,7 +110,7 @@ def test_error_estimate_holds_for_many_waves_in_a_pitch():
     for rung in (RUNGS[0], RUNGS[2]):
         got = evaluate(case, rung.choice(case.rho).plan)
         error = np.abs(got.matrix - best.matrix).max()
-        assert 20 * error > rung.error(got, case.rho) > error - doubt
+        assert 30 * error > rung.error(got, case.rho) > error - doubt
         assert got.size == pytest.approx(math.sqrt(11.8613) * 2.3157 / math.pi, rel=1e-9)
 
 
