@@ -170,11 +170,29 @@ def test_one_box_alone_has_four_sides(interpreted):
 
 
 def test_exposure_at_crossings_has_lines_of_y_before_those_of_x(interpreted):
-    """Two by three lines of one row, of the boxes that it sees: the first and the third."""
-    boxes = np.array([[0.0, 0.0, 1.0, 2.0], [1.0, 0.0, 2.0, 3.0], [-2.0, 1.0, -0.5, 4.0]])
+    """Two by three lines of one row, of the boxes that it sees: all but the second. Far lines have boxes there."""
+    boxes = np.array(
+        [
+            [0.0, 0.0, 1.0, 2.0],
+            [1.0, 0.0, 2.0, 3.0],
+            [-2.0, 1.0, -0.5, 4.0],
+            [19.0, 0.0, 20.0, 1.0],
+            [0.0, 30.0, 1.0, 31.0],
+        ]
+    )
     point = PointExposure(np.array([0.8, 1.9]), np.array([0.7, 0.3]))
-    x, y = np.array([[0.2, 1.4]]), np.array([[0.3, 1.1, 2.6]])
-    got = rects.sums_of_boxes(x, y, np.array([5]), boxes, (np.array([4, 5, 5, 6]), np.array([1, 0, 2, 1])), point)
-    want = [[by_boxes(a, b, boxes[[0, 2]], point) for a in x[0]] for b in y[0]]
+    x, y = np.array([[0.2, 19.6]]), np.array([[0.3, 1.1, 30.2]])
+    pairs = np.array([4, 5, 5, 5, 5, 6]), np.array([1, 0, 2, 3, 4, 1])
+    got = rects.sums_of_boxes(x, y, np.array([5]), boxes, pairs, point)
+    want = [[by_boxes(a, b, boxes[[0, 2, 3, 4]], point) for a in x[0]] for b in y[0]]
     assert got.shape == (1, 3, 2)
     assert got[0] == pytest.approx(np.array(want), rel=1e-12)
+
+
+def test_what_neighbours_leave_of_a_side_are_its_free_parts(interpreted):
+    """On top two that cover 1 to 2 and 3 to 3.9, on the right one from 0.5 to the top less half of 0.1 nm."""
+    boxes = np.array([[0.0, 0.0, 5.0, 2.0], [3.0, 2.0, 3.9, 3.0], [1.0, 2.0, 2.0, 3.0], [5.0, 0.5, 6.0, 2.0 - 5e-5]])
+    none = PointExposure(np.empty(0), np.empty(0))
+    _, at, of = rects.own(Rects(boxes, np.zeros(4, int), np.ones(4)), none)
+    top = [(0.5, 2.0), (2.5, 2.0), (4.45, 2.0)]
+    assert sorted(map(tuple, at[of == 0].round(9))) == sorted([(0.0, 1.0), (2.5, 0.0), (5.0, 0.25), *top])
