@@ -1,10 +1,14 @@
 """Small parts of the networks in closed form: centres of mass, scaled frames, a cost between whole sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from codesign.network import cost, supernet
+from codesign.network import blur, cost, supernet
+from codesign.network.architecture import Block
+from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID
 
 
 def test_a_centre_counts_probabilities_above_a_twentieth_by_what_they_exceed_it():
@@ -44,8 +48,6 @@ def test_a_cost_counts_the_pixels_of_every_stride_rounded_up():
 
 def test_a_backbone_costs_its_stem_and_its_blocks_at_their_own_strides():
     """Stem 1 to 6 by 5 x 5 at stride 2; a block without expansion; one with, of stride 2 and a squeeze of 3."""
-    from codesign.network.architecture import Block
-
     fields = Block.__dataclass_fields__
     about = {name: 0 for name in fields}
     first = Block(**(about | {"inputs": 6, "hidden": 6, "outputs": 10, "kernel": 3, "stride": 1, "squeeze": 0}))
@@ -58,3 +60,109 @@ def test_a_backbone_costs_its_stem_and_its_blocks_at_their_own_strides():
 def test_an_input_has_the_pixels_of_its_window():
     assert cost.input_size(900.0, 12.0, 0.6) == pytest.approx(45.0)
     assert cost.coarsest_um(900.0, 0.6) == pytest.approx(33.75)
+
+
+def filled(module, seed=2):
+    """The module with weights, biases and statistics of norms drawn, in double precision, as it is used."""
+    draw = torch.Generator().manual_seed(seed)
+    for part in (*module.parameters(), *(b for b in module.buffers() if b.is_floating_point())):
+        part.data = torch.rand(part.shape, generator=draw, dtype=torch.float64) + 0.2 - 0.7 * (part.ndim > 1)
+    return module.double().eval()
+
+
+def folded(conv, inputs, outputs, kernel=1, stride=1):
+    """What a sliced convolution is by hand: the middle of its kernel on the first channels, then its norm."""
+    side = conv.weight.shape[-1]
+    inside = slice(side // 2 - kernel // 2, side // 2 + kernel // 2 + 1)
+    weight = conv.weight[:outputs, : 1 if conv.depthwise else inputs, inside, inside].detach()
+    norm = conv.norm
+    scale, mean, shift = (
+        a[:outputs, None, None] for a in (norm.weight / (norm.variance + 1e-5) ** 0.5, norm.mean, norm.bias)
+    )
+
+    def by_hand(x):
+        n = kernel // 2
+        wide = torch.nn.functional.pad(x, (n, n, n, n))
+        rows, columns = (range(0, s, stride) for s in x.shape[-2:])
+        seen = torch.stack(
+            [torch.stack([wide[..., i : i + kernel, j : j + kernel] for j in columns], 2) for i in rows], 2
+        )
+        words = "nchwij,cij->nchw" if conv.depthwise else "nchwij,dcij->ndhw"
+        made = torch.einsum(words, seen, weight[:, 0] if conv.depthwise else weight)
+        return ((made - mean) * scale + shift).detach()
+
+    return by_hand
+
+
+def hardswish(x):
+    return x * (x + 3).clamp(0, 6) / 6
+
+
+@pytest.mark.parametrize(("stride", "outputs"), [(2, 4), (1, 4), (1, 6)])
+def test_a_block_is_its_first_channels_and_the_middle_of_its_kernel(stride, outputs):
+    """7 of 12 hidden channels, 3 of 5 of the kernel, 2 of 4 of the squeeze; added to what came in where sizes agree."""
+    most = Block(inputs=6, hidden=12, outputs=6, kernel=5, stride=stride, squeeze=4, activation="hardswish")
+    block = replace(most, hidden=7, outputs=outputs, kernel=3, squeeze=2)
+    whole = filled(supernet.ElasticBlock(most))
+    x = torch.from_numpy(np.random.default_rng(1).normal(size=(2, 6, 5, 7)))
+    y = hardswish(folded(whole.expand, 6, 7)(x))
+    y = hardswish(folded(whole.depthwise, 7, 7, 3, stride)(y))
+    down, up = whole.squeeze.down, whole.squeeze.up
+    inside = (y.mean((2, 3)) @ down.weight[:2, :7].T + down.bias[:2]).clamp(min=0)
+    gate = ((inside @ up.weight[:7, :2].T + up.bias[:7] + 3) / 6).clamp(0, 1)
+    want = folded(whole.project, 7, outputs)(y * gate[..., None, None])
+    want = want + x if stride == 1 and outputs == 6 else want
+    assert torch.allclose(whole(x, block), want, rtol=1e-9, atol=1e-9)
+    same = replace(block, hidden=6, activation="relu")  # nothing to expand
+    y = folded(whole.depthwise, 6, 6, 3, stride)(x).clamp(min=0)
+    inside = (y.mean((2, 3)) @ down.weight[:2, :6].T + down.bias[:2]).clamp(min=0)
+    gate = ((inside @ up.weight[:6, :2].T + up.bias[:6] + 3) / 6).clamp(0, 1)
+    want = folded(whole.project, 6, outputs)(y * gate[..., None, None])
+    want = want + x if stride == 1 and outputs == 6 else want
+    assert torch.allclose(whole(x, same), want, rtol=1e-9, atol=1e-9)
+
+
+def test_a_mask_adds_its_strides_from_coarse_to_fine():
+    head = filled(supernet.PerceptionHead([3, 5, 4]))
+    draw = np.random.default_rng(3)
+    fine, middle, coarse = (
+        torch.from_numpy(draw.normal(size=(2, c, *size))) for c, size in ((3, (8, 12)), (5, (4, 6)), (4, (2, 3)))
+    )
+    laterals = [
+        hardswish(folded(conv, x.shape[1], MASK_CHANNELS)(x))
+        for conv, x in zip(head.laterals, (fine, middle, coarse), strict=True)
+    ]
+
+    def doubled(x):
+        return x.repeat_interleave(2, -1).repeat_interleave(2, -2)
+
+    total = laterals[0] + doubled(laterals[1] + doubled(laterals[2]))
+    want = hardswish(folded(head.smooth, 1, MASK_CHANNELS, 3)(total))
+    logits, decoded = head([fine, middle, coarse])
+    assert torch.allclose(decoded, want, rtol=1e-9, atol=1e-9)
+    weight, bias = head.mask.weight[0, :, 0, 0], head.mask.bias
+    assert torch.allclose(logits, torch.einsum("c,ncyx->nyx", weight, want) + bias, rtol=1e-9, atol=1e-9)
+
+
+def test_slip_is_read_from_both_features_and_its_uncertainty_shapes_neither():
+    head = filled(supernet.CalibrationHead(5))
+    draw = np.random.default_rng(8)
+    features = torch.from_numpy(draw.normal(size=(2, 5, 2 * SLIP_GRID, SLIP_GRID)))
+    depths = torch.from_numpy(draw.normal(size=(2, blur.SLIP_FEATURES)))
+    features.requires_grad_()
+    slip, spread = head(features, depths)
+    reduced = hardswish(folded(head.reduce, 5, SLIP_CHANNELS)(features.detach()))
+    grid = reduced.reshape(2, SLIP_CHANNELS, SLIP_GRID, 2, SLIP_GRID).mean(3).flatten(1)
+
+    def linear(layer, x):
+        return x @ layer.weight.T + layer.bias
+
+    joined = hardswish(
+        linear(head.joined, hardswish(torch.cat([linear(head.hidden, grid), linear(head.depths, depths)], 1)))
+    )
+    assert torch.allclose(slip, linear(head.slip, joined), rtol=1e-9)
+    assert torch.allclose(spread, linear(head.spread, joined).clamp(-4, 2), rtol=1e-9)
+    spread.sum().backward(retain_graph=True)
+    assert features.grad is None
+    slip.sum().backward()
+    assert float(features.grad.abs().sum()) > 0

@@ -88,9 +88,9 @@ def test_pieces_are_an_eighth_of_the_range_within_three_ranges_of_a_lens(dx, dy)
         caps = pieces._Caps(1.0, 8.0, [], 1.0)
         return float(pieces._longest(part, np.array([lens]), box * step_um, step_um, point, caps)[0])
 
-    assert longest(5.9) == 2.0 / 8
-    assert longest(6.1) == longest(14.9) == 5.0 / 8
-    assert longest(15.1) == 8.0
+    assert longest(5.99) == 2.0 / 8
+    assert longest(6.01) == longest(14.99) == 5.0 / 8
+    assert longest(15.01) == 8.0
 
 
 @pytest.mark.parametrize("mirror", [(1, 1), (-1, 1), (1, -1)])
@@ -182,6 +182,11 @@ def test_the_shortest_pieces_are_a_64th_of_the_narrowest_range_or_two_of_the_cor
     made, _ = pieces.cut(box, NOTHING, step_um=STEP_UM * 4, point=point, tolerance=1e-7)
     least = float((made[:, 2:] - made[:, :2]).min()) * STEP_UM * 4
     assert shortest - STEP_UM * 4 < least < 2 * shortest  # halves of an odd number of grid steps
+
+
+def test_no_boxes_are_no_pieces():
+    made, of = pieces.cut(np.empty((0, 4), int), NOTHING, step_um=STEP_UM, point=beam(8.0), tolerance=0.01)
+    assert (made.shape, of.shape) == ((0, 4), (0,))
 
 
 def asked_of(monkeypatch, boxes, point, tolerance=0.01):
