@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from codesign.network import blur, cost, supernet
-from codesign.network.architecture import Block
-from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID
+from codesign.network.architecture import Block, smallest
+from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, lateral_strides
+from metalens.ground.errors import TrainingError
 
 
 def test_a_centre_counts_probabilities_above_a_twentieth_by_what_they_exceed_it():
@@ -21,9 +22,11 @@ def test_a_centre_counts_probabilities_above_a_twentieth_by_what_they_exceed_it(
 
 
 def test_frames_are_averaged_by_whole_factors_and_then_drawn_between():
-    frames = torch.arange(48.0).reshape(1, 1, 6, 8)
+    frames = torch.from_numpy(np.random.default_rng(5).uniform(1, 9, (1, 1, 6, 8)))
     half = supernet.scaled(frames, 0.5)
-    assert half[0, 0].tolist() == frames[0, 0].reshape(3, 2, 4, 2).mean((1, 3)).tolist()
+    assert half[0, 0].numpy() == pytest.approx(frames[0, 0].reshape(3, 2, 4, 2).mean((1, 3)).numpy(), rel=1e-12)
+    quarter = supernet.resampled(frames, (6, 2))  # fours: drawn between two of them alone, it would be another
+    assert quarter[0, 0].numpy() == pytest.approx(frames[0, 0].reshape(6, 2, 4).mean(2).numpy(), rel=1e-12)
     odd = supernet.resampled(frames, (4, 3))  # 8 to 4 by pairs, then 4 to 3; 6 to 4 as they are
     pooled = frames[0, 0].reshape(6, 4, 2).mean(2).numpy()
     for i in range(4):
@@ -146,6 +149,7 @@ def test_a_mask_adds_its_strides_from_coarse_to_fine():
 
 def test_slip_is_read_from_both_features_and_its_uncertainty_shapes_neither():
     head = filled(supernet.CalibrationHead(5))
+    head.spread.weight.data[0] *= 1e-4  # the first within its limits, the others beyond both
     draw = np.random.default_rng(8)
     features = torch.from_numpy(draw.normal(size=(2, 5, 2 * SLIP_GRID, SLIP_GRID)))
     depths = torch.from_numpy(draw.normal(size=(2, blur.SLIP_FEATURES)))
@@ -162,7 +166,86 @@ def test_slip_is_read_from_both_features_and_its_uncertainty_shapes_neither():
     )
     assert torch.allclose(slip, linear(head.slip, joined), rtol=1e-9)
     assert torch.allclose(spread, linear(head.spread, joined).clamp(-4, 2), rtol=1e-9)
+    assert ((spread > -4) & (spread < 2)).tolist() == [[True, False, False]] * 2
     spread.sum().backward(retain_graph=True)
     assert features.grad is None
     slip.sum().backward()
     assert float(features.grad.abs().sum()) > 0
+
+
+@pytest.mark.parametrize(("depthwise", "shape"), [(False, (600, 7, 3, 3)), (True, (600, 1, 3, 3))])
+def test_weights_begin_with_the_variance_that_keeps_light_as_strong(depthwise, shape):
+    """2 over what one input feeds: 9 places, of all outputs or of its own alone (He et al. 2015)."""
+    torch.manual_seed(1)
+    weight = supernet.SlicedConv(7, 600, 3, depthwise=depthwise).weight.detach()
+    assert weight.shape == shape
+    want = 2 / (9 * (1 if depthwise else 600))
+    assert float(weight.var()) == pytest.approx(want, rel=4 * (2 / weight.numel()) ** 0.5)
+    assert supernet.SlicedConv(7, 5).weight.shape == (5, 7, 1, 1)
+
+
+@pytest.mark.parametrize("measuring", [False, True])
+def test_a_norm_that_is_trained_or_measured_goes_by_its_own_batch(measuring):
+    """Mean 0 and variance 1 of each channel in use, times its weight and more its bias."""
+    norm = supernet.SlicedNorm(5).double()
+    norm.weight.data, norm.bias.data = torch.arange(1.0, 6.0).double(), torch.arange(5.0).double()
+    norm.train(not measuring)
+    norm.measuring = measuring
+    x = torch.from_numpy(np.random.default_rng(9).normal(3.0, 2.0, (4, 3, 5, 6)))
+    got = norm(x).detach()
+    assert got.mean((0, 2, 3)).numpy() == pytest.approx([0.0, 1.0, 2.0], abs=1e-9)
+    assert got.std((0, 2, 3), unbiased=False).numpy() == pytest.approx([1.0, 2.0, 3.0], rel=1e-5)
+    assert int(norm.batches) == measuring  # what is trained measures nothing
+    assert norm.mean[3:].tolist() == [0.0, 0.0]
+
+
+def test_slip_along_the_axis_is_that_of_the_features_and_that_of_the_depths():
+    """The branch of the blur adds to the third of it; the mask is read from the strides that it is made of."""
+    torch.manual_seed(3)
+    net, seen = supernet.Supernet(), {}
+    for name in ("perception", "calibration", "blur"):
+        part = getattr(net, name)
+        part.register_forward_hook(lambda module, given, made, name=name: seen.__setitem__(name, (given, made)))
+    net.eval()
+    with torch.no_grad():
+        made = net(torch.randn(2, 1, 64, 64), replace(smallest(net.space), resolution=1.0))
+    (features,), (logits, decoded) = seen["perception"]
+    (_, given), (depth, told, axial) = seen["blur"]
+    (last, depths), (slip, spread) = seen["calibration"]
+    assert axial.abs().min() > 0
+    assert torch.allclose(made.slip[:, :2], slip[:, :2])
+    assert torch.allclose(made.slip[:, 2], slip[:, 2] + axial)
+    assert made.slip.shape == made.slip_log_sd.shape == (2, 3)
+    assert made.slip_log_sd is spread
+    assert made.depth is depth
+    assert (depths is told, given is decoded, made.mask_logits is logits) == (True, True, True)
+    assert torch.equal(made.centre, supernet.soft_argmax(logits))
+    strides = [64 // one.shape[-1] for one in features]
+    assert strides == [stride for _, stride in lateral_strides(net.space)]
+    assert last is features[-1] or last.shape[-1] <= features[-1].shape[-1]
+
+
+def test_recalibration_forgets_what_was_measured_before():
+    """A norm alone as the network, whose architecture is of no matter."""
+
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.norm = supernet.SlicedNorm(3)
+
+        def forward(self, x, architecture):
+            return self.norm(x)
+
+    net, draw = Net(), torch.Generator().manual_seed(2)
+    batches = [torch.randn(4, 2, 3, 5, generator=draw) * 3 + 1 for _ in range(2)]
+    net.norm.mean.fill_(7.0)
+    net.norm.variance.fill_(0.3)
+    supernet.recalibrate(net, None, iter(batches))
+    mean = torch.stack([one.mean((0, 2, 3)) for one in batches]).mean(0)
+    variance = torch.stack([one.var((0, 2, 3)) for one in batches]).mean(0)
+    assert torch.allclose(net.norm.mean, torch.cat([mean, torch.zeros(1)]))
+    assert torch.allclose(net.norm.variance, torch.cat([variance, torch.ones(1)]))  # unused: as nothing
+    assert not net.norm.measuring
+    assert not net.training
+    with pytest.raises(TrainingError, match="found none"):
+        supernet.recalibrate(net, None, iter([]))
