@@ -26,8 +26,8 @@ class Quality:
     efficiency: |sum T exp(i error)|² / N²: power in the ideal spot, against a perfect lens without loss.
     transmission: mean |T|², the light that passes.
     strehl: |sum T exp(i error)|² / (sum T)²: what the phase errors of the pillars leave of the peak.
-    field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a Strehl ratio of 0.8
-        (Maréchal's criterion on the wave-front error).
+    field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a Strehl ratio of 0.8 on its
+        sensor, which is flat (Maréchal's criterion on the wave-front error).
     max_phase_error_rad: largest difference between wanted and made phase.
     rms_phase_error_rad: root mean square of it over the pillars.
     turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the phases that none has.
@@ -223,9 +223,10 @@ class Sums:
 
 
 def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:
-    """Half field in rad at which coma and astigmatism of the hyperbolic lens leave exp(-sigma²) = ``strehl``.
+    """Half field in rad at which coma, astigmatism and curvature of the field of the hyperbolic lens leave
+    exp(-sigma²) = ``strehl`` on its sensor, which is flat.
 
-    sigma is the wave-front error over the aperture, with piston, tilt and best focus taken out.
+    sigma is the wave-front error over the aperture, with piston and tilt taken out: at most 60 degrees.
     """
     low, high = 0.0, np.pi / 3
     for _ in range(40):
@@ -244,7 +245,7 @@ def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> flo
     path = profiles.hyperbolic(x, y, focus)
     for one in focus.paths_from(x, y, tangent):
         path = path + 2 * np.pi / focus.wavelength_um * one
-    basis = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=1)
+    basis = np.stack([np.ones_like(x), x, y], axis=1)
     basis /= np.abs(basis).max(axis=0)
     residual = path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]
     return float((residual**2).mean())

@@ -99,10 +99,10 @@ def passed_at(order: Sequence[float], w: Any) -> Any:
 
 
 def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
-    """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel)."""
+    """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel); 0 beyond a critical angle."""
     s_power, p_power = w * 0 + 1, w * 0 + 1
     for a, b in itertools.pairwise(order):
-        ca, cb = (1 - w / a**2) ** 0.5, (1 - w / b**2) ** 0.5
+        ca, cb = ((rest * (rest.real > 0)) ** 0.5 for rest in (1 - w / a**2, 1 - w / b**2))
         s_power = s_power * (1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2)
         p_power = p_power * (1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2)
     return s_power, p_power

@@ -52,7 +52,8 @@ def case(
             an area of p² sqrt(3) / 2, and 0 transmission at every other site.
 
     Raises:
-        PropagationError: a length that is not positive, an angle of 90° or more, no depth, an offset that is no pair.
+        PropagationError: a length that is not positive, an angle of 90° or more, no depth, an offset that is no pair,
+            films without a gap and rays beyond their critical angle.
     """
     step_um, cells = window_of(window_um, samples)
     ax, ay = angles(angle_rad)
@@ -63,7 +64,7 @@ def case(
     if layers is not None and not layers.plain and d > 0:
         films = around(layers, float(d), float(wavelength_um))
     meets = [chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i]) for i in (0, 1)]
-    return Case(
+    made = Case(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
         wavelength_um=float(wavelength_um),
@@ -77,6 +78,24 @@ def case(
         site_um2=float(site_um2),
         **films,
     )
+    _check_rays(made)
+    return made
+
+
+def _check_rays(case: Case) -> None:
+    """Refuse rays that no face lets through: where films fill the whole gap, those that its cover cannot hold."""
+    if case.behind is None or case.behind.thickness_um[0] > 0:
+        return
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    (high, wide), (down, across) = case.half_size_um, case.half_window_um
+    x = np.abs(np.abs(case.centre_um[0]) + across + wide * np.cos(turn))  # the rim of a round lens, the far corner
+    y = np.abs(np.abs(case.centre_um[1]) + down + high * np.sin(turn))
+    steepest, most = float(media.direction(case.behind, np.hypot(x, y).max())), min(case.behind.order)
+    if steepest >= most:
+        raise PropagationError(
+            f"layers: the films fill the way from lens to sensor, and rays of n sin θ = {steepest:.3g} from the rim to "
+            f"the window do not leave the cover of index {most:g}: need a gap, a nearer window or a smaller angle"
+        )
 
 
 def _depths(depths_um: Any, offset_um: Any) -> Array:

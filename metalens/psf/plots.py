@@ -14,10 +14,10 @@ PIXEL_UM = 3.0
 
 
 def pictures(stack: PsfStack) -> dict[str, bytes]:
-    """{name: PNG}: ``xz``, ``montage``, ``mtf``, and ``information`` where there are two depths or more."""
+    """{name: PNG}: ``xz``, ``montage``, ``mtf``, and ``information`` where neighbours of two depths or more differ."""
     plain = stack.numpy()
     found = {"xz": slices(plain), "montage": montage(plain), "mtf": transfer(plain)}
-    if len(plain.depths_um) > 1 and np.isfinite(plain.depths_um).all():
+    if len(plain.depths_um) > 1 and np.isfinite(plain.depths_um).all() and np.diff(plain.depths_um).all():
         found["information"] = information(plain)
     return found
 
@@ -45,7 +45,7 @@ def slices(stack: PsfStack) -> bytes:
         rows = psf[order, psf.shape[1] // 2]
         image = rows / rows.max(1, keepdims=True)
         panel.pcolormesh(stack.x_um, np.arange(len(depths)), image, shading="nearest", rasterized=True)
-        panel.set(title=_angle_name(angle), xlabel="x from chief ray / µm")
+        panel.set(title=_angle_name(angle), xlabel="x from the window's middle / µm")
         panel.grid(False)
     picks = np.unique(np.linspace(0, len(depths) - 1, min(len(depths), 6)).round().astype(int))
     axes[0, 0].set_yticks(picks, [_depth_name(depths[order][i]) for i in picks])
@@ -60,17 +60,20 @@ def montage(stack: PsfStack, *, most: int = 7) -> bytes:
     picks = np.unique(np.linspace(0, len(stack.depths_um) - 1, min(most, len(stack.depths_um))).round().astype(int))
     size = (1.3 * len(picks) + 0.7, 1.35 * len(light) + 0.6)
     figure, axes = canvas(len(light), len(picks), size=size, squeeze=False)
-    half = stack.step_um * light.shape[-1] / 2
+    across, down = (stack.step_um * n / 2 for n in light.shape[:-3:-1])
     for row, (psfs, angle) in enumerate(zip(light, stack.angles_rad, strict=True)):
         for column, i in enumerate(picks):
             panel = axes[row, column]
-            panel.imshow(np.sqrt(psfs[i]), extent=(-half, half, half, -half), vmin=0)
+            seen = np.sqrt(np.maximum(psfs[i], 0))  # the flux of steep rays is below 0 at places
+            panel.imshow(seen, extent=(-across, across, down, -down), vmin=0)
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
             if row == 0:
                 panel.set_title(_depth_name(stack.depths_um[i]))
         axes[row, 0].set_ylabel(_angle_name(angle))
-    figure.suptitle(f"√PSF over depth and field angle, {2 * half:.3g} µm wide, +x right, +y down", fontsize=10)
+    figure.suptitle(
+        f"√PSF over depth and field angle, {2 * across:.3g} x {2 * down:.3g} µm, +x right, +y down", fontsize=10
+    )
     return png(figure)
 
 
