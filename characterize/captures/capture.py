@@ -7,6 +7,7 @@ import re
 import struct
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -194,15 +195,23 @@ def _all_frames(files: Sequence[Path], folder: Path, channel: object) -> tuple[t
 
 
 def _listed_frames(folder: Path, rows: stage.Rows, channel: object) -> Array:
-    """The frames that the stage file names, in its order; pages of a stack where it names one file for all."""
+    """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn."""
     stacks: dict[str, Array] = {}
     images = []
-    for row, (name, page) in enumerate(zip(rows.files, rows.page, strict=True), 2):
+    rows_of, met = Counter(rows.files), Counter[str]()
+    for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
         path = folder / name
         if not path.is_file():
             raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
         stack = stacks[name] if name in stacks else read_images(path, channel)
         stacks[name] = stack
+        page = min(met[name], len(stack) - 1) if stated is None else stated
+        met[name] += 1
+        if stated is None and len(stack) not in (1, rows_of[name]):
+            raise CaptureError(
+                f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and stands in {rows_of[name]} rows; say "
+                "with a column page (from 0) which one each row means"
+            )
         if not 0 <= page < len(stack):
             raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
         images.append(stack[page][None])

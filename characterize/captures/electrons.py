@@ -10,6 +10,8 @@ from characterize.captures.capture import Capture
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
+_SURE = 3.0  # standard errors from which on noise is taken to grow with light
+
 
 @dataclass(frozen=True, slots=True)
 class Gain:
@@ -62,7 +64,8 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
         dark: (k, y, x) counts; the offset, and with k >= 2 the read noise.
 
     Raises:
-        CaptureError: fewer than two flats, flats without noise (one frame copied), or saturated ones.
+        CaptureError: fewer than two flats, flats without noise (one frame copied), or saturated ones: their noise
+            does not grow with light, or is above that of the dark by less than three standard errors.
     """
     flat = np.asarray(flat, float)
     if len(flat) < 2:
@@ -77,9 +80,13 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
         raise CaptureError("photon transfer: flats without noise or light; take them anew, evenly lit to half the well")
     base = floor or 0.0
     expected = base + mean * (variance - base).sum() / mean.sum()  # of the variance: its own would favour low ones
+    dark_known = floor is not None
     inverse, sigma, floor = _line(mean, variance, expected * math.sqrt(2 / flat[0].size), floor)
-    if inverse <= 0:
-        raise CaptureError("photon transfer: the noise does not grow with light; the flats are saturated or processed")
+    if inverse <= (_SURE * sigma if dark_known else 0):
+        raise CaptureError(
+            "photon transfer: the noise does not grow with light (by "
+            f"{inverse:.2g} +- {sigma:.2g} counts² a count); the flats are saturated or processed"
+        )
     gain = 1 / inverse
     read = math.sqrt(max(floor - 1 / 12, 0)) * gain
     return Gain(gain, gain**2 * sigma, read)

@@ -1,10 +1,12 @@
 """Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or .json with what else is known."""
 
 import csv
+import difflib
 import json
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,22 @@ _ALIASES = {
     for unit, scale in (("um", 1.0), ("nm", 1e-3))
     if f"{name}_{unit}" != entry
 }
+_ABOVE = ("above 0", lambda v: v > 0)
+_FROM_0 = ("from 0 on", lambda v: v >= 0)
+_TILT = ("between -90 and 90", lambda v: abs(v) < 90)
+_NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "pixel_um": _ABOVE,
+    "wavelength_um": _ABOVE,
+    "gain_e": _ABOVE,
+    "step_um": ("above 0, or below", lambda v: v != 0),
+    "bits": ("above 0, whole, at most 32", lambda v: v == round(v) and 0 < v <= 32),
+    "offset": ("of counts", lambda v: True),
+    "glass_tilt_x_deg": _TILT,
+    "glass_tilt_y_deg": _TILT,
+    **dict.fromkeys(("read_noise_e", "wavelength_sigma_nm", "pixel_sigma_um", "pinhole_um", "glass_um"), _FROM_0),
+}
+_KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "window")
+_MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
 _COLUMNS = {"file", "page", "exposure_s", "angle_y_deg", "angle_y_rad"} | set(_POSITIONS) | set(_ANGLES)
 
 
@@ -35,11 +53,12 @@ _COLUMNS = {"file", "page", "exposure_s", "angle_y_deg", "angle_y_rad"} | set(_P
 class Rows:
     """One row a frame, as listed in the stage file.
 
-    files: image names; page: index inside that image file; source: the stage file, for messages.
+    files: image names; page: index inside that image file, None where the table has no such column; source: the stage
+    file, for messages.
     """
 
     files: tuple[str, ...]
-    page: tuple[int, ...]
+    page: tuple[int | None, ...]
     position_um: Array
     angle_rad: Array
     exposure_s: Array
@@ -49,14 +68,15 @@ class Rows:
     def unknown(cls, names: tuple[str, ...]) -> "Rows":
         """Rows for frames of which nothing but the name is known."""
         n = len(names)
-        return cls(names, (0,) * n, np.full(n, np.nan), np.zeros((n, 2)), np.full(n, np.nan), "")
+        return cls(names, (None,) * n, np.full(n, np.nan), np.zeros((n, 2)), np.full(n, np.nan), "")
 
 
 def read_stage(folder: Path) -> Rows | None:
     """The stage file of a capture folder; None where there is none.
 
-    Columns: ``file``, ``page`` (default 0), one of depth/z/position with unit (``depth_um``, ``z_nm``,
-    ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``. JSON: a list of such objects.
+    Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in turn), one of depth/z/position
+    with unit (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``. JSON: a list of
+    such objects.
 
     Raises:
         CaptureError: unknown column, no column ``file``, a value that is no number; file and row are named.
@@ -72,7 +92,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     """Entries of ``capture.toml`` or ``capture.json`` in a capture folder; empty where there is none.
 
     Raises:
-        CaptureError: not TOML or JSON, or a number that must be above 0 is not.
+        CaptureError: not TOML or JSON, a misspelt name, or an impossible number.
     """
     paths = [folder / "capture.toml", folder / "capture.json"]
     return _about(next((path for path in paths if path.is_file()), None))
@@ -107,12 +127,22 @@ def _about(path: Path | None) -> dict[str, Any]:
         if not isinstance(voxel, list) or len(voxel) != 3:
             raise CaptureError(f"{path}: voxel_um = {voxel!r}, need [z, y, x]")
         about = {"step_um": voxel[0], "pixel_um": voxel[2]} | about
-    for name in ("pixel_um", "wavelength_um", "bits", "step_um"):
-        value = about.get(name, 1)
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not 0 < (abs(value) if name == "step_um" else value) < math.inf:
-            raise CaptureError(f"{path}: {name} = {value!r}, need a number above 0")
-    return about
+    return _checked(about, path)
+
+
+def _checked(about: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Entries as they are, whole bits; misspelt names and impossible numbers refused, notes of the user's own kept."""
+    for name, value in about.items():
+        close = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=_MISSPELT)
+        if name not in _KNOWN and close:
+            raise CaptureError(f"{path}: unknown entry {name!r}; did you mean {close[0]!r}?")
+        if name not in _NUMBERS:
+            continue
+        need, right = _NUMBERS[name]
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or not right(value):
+            raise CaptureError(f"{path}: {name} = {value!r}, need a number {need}")
+    return about | ({"bits": int(about["bits"])} if "bits" in about else {})
 
 
 def ome_positions(xml: str) -> Array:
@@ -155,7 +185,7 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
     columns = [_column(table, key, path) * s for key, s in zip(angle, scales, strict=True)]
     return Rows(
         files=tuple(str(entries["file"]) for entries in table),
-        page=tuple(int(v) for v in _column(table, "page" if "page" in head else None, path)),
+        page=tuple(int(v) for v in _column(table, "page", path)) if "page" in head else (None,) * len(table),
         position_um=_column(table, place, path, np.nan) * _POSITIONS.get(place or "", 1.0),
         angle_rad=np.stack(columns, 1),
         exposure_s=_column(table, "exposure_s" if "exposure_s" in head else None, path, np.nan),

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -52,11 +53,15 @@ def freed(
 
 
 class _Images:
-    """Images by the parameters of a pupil and the logarithms of the factors; the pupil is sampled alike for all."""
+    """Images by the parameters of a pupil and the logarithms of the factors; the pupil is sampled alike for all.
+
+    So is the kind of the model: one that turned vectorial at some aperture on the way would jump there.
+    """
 
     def __init__(self, spec: PupilSpec, position_um: Array) -> None:
-        self.spec, self.position_um = spec, position_um
         widest = dataclasses.replace(spec, numerical_aperture=min(1.2 * spec.numerical_aperture, 0.97 * spec.index))
+        kind: Literal["vector", "scalar"] = "vector" if widest.vectorial else "scalar"
+        self.spec, self.position_um = dataclasses.replace(spec, model=kind), position_um
         self.orders = {"phase_order": min(spec.phase_order, 6), "amplitude_order": min(spec.amplitude_order, 2)}
         self.nodes = PupilModel(widest, 1.1 * position_um, **self.orders).nodes
         self.model = self._at(np.zeros(len(spec.free)))

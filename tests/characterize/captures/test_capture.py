@@ -214,3 +214,17 @@ def test_several_channels_are_refused(tmp_path):
     tifffile.imwrite(tmp_path / "c.tif", frames, imagej=True, metadata={"axes": "ZCYX", "channels": 2})
     with pytest.raises(CaptureError, match="2 channels"):
         capture.load(tmp_path / "c.tif")
+
+
+def test_a_stack_without_a_column_of_pages_has_a_row_for_each_page(tmp_path):
+    """Rows of one file are its pages in turn, beside a single image; a stack of other length is not guessed at."""
+    folder(tmp_path, stage="file,depth_um\n" + "s.tif,7\nframe_1.tif,8\ns.tif,9\ns.tif,11\n")
+    tifffile.imwrite(tmp_path / "s.tif", FRAMES[[2, 0, 3]], photometric="minisblack")
+    found = capture.load(tmp_path)
+    assert np.array_equal(found.frames, FRAMES[[2, 1, 0, 3]])
+    assert found.position_um.tolist() == [7, 8, 9, 11]
+    (tmp_path / "stage.csv").write_text("file,depth_um\ns.tif,7\ns.tif,9\n")
+    with pytest.raises(CaptureError, match=r"row 2: 's.tif' holds 3 pages and stands in 2 rows.*column page"):
+        capture.load(tmp_path)
+    (tmp_path / "stage.csv").write_text("file,page,depth_um\ns.tif,2,7\ns.tif,0,9\n")
+    assert np.array_equal(capture.load(tmp_path).frames, FRAMES[[3, 2]])

@@ -39,6 +39,18 @@ def test_flats_that_are_copies_are_refused():
         clean.photon_transfer(np.stack([one, one]))
 
 
+def test_flats_of_full_wells_have_no_gain():
+    """All pixels full before the converter is: their noise is that of the readout, as in the dark, whatever the light.
+
+    Differences of noise that by chance are above 0 gave gains of 1e4 and more electrons a count.
+    """
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        dark, flat = (np.round(rng.normal(level, 1.3, (8, 26, 24))) for level in (37.0, 1850.0))
+        with pytest.raises(CaptureError, match=r"does not grow with light.*saturated"):
+            clean.photon_transfer(flat, dark)
+
+
 def test_hot_dead_and_dead_row_are_masked_and_the_peak_is_not():
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:40, :40] - 20

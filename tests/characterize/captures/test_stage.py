@@ -32,7 +32,7 @@ def test_what_is_not_listed_is_unknown_and_along_the_axis(tmp_path):
     rows = stage.read_stage(tmp_path)
     assert np.isnan(rows.position_um).all()
     assert np.isnan(rows.exposure_s).all()
-    assert rows.page == (0,)
+    assert rows.page == (None,)
     assert rows.angle_rad == pytest.approx(np.array([[0.1, math.radians(2)]]))
 
 
@@ -65,7 +65,7 @@ def test_rows_are_named_as_an_editor_counts_them(tmp_path):
 
 def test_frames_of_which_only_names_are_known():
     rows = stage.Rows.unknown(("a", "b", "c"))
-    assert rows.page == (0, 0, 0)
+    assert rows.page == (None, None, None)
     assert rows.angle_rad.tolist() == [[0, 0]] * 3
     assert np.isnan(rows.position_um).tolist() == np.isnan(rows.exposure_s).tolist() == [True] * 3
 
@@ -74,3 +74,35 @@ def test_planes_of_ome_xml_carry_their_unit():
     xml = '<Plane PositionZ="1.5" PositionZUnit="mm"/><Plane PositionZ="-2"/><Plane PositionZ="7" PositionZUnit="µm"/>'
     assert stage.ome_positions(xml).tolist() == [1500.0, -2.0, 7.0]
     assert stage.ome_positions('<Plane PositionZ="30" PositionZUnit="nm"/>') == pytest.approx([0.03])
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("gain_e = 0", "gain_e = 0, need a number above 0"),
+        ("gain_e = -2.3", "gain_e = -2.3, need a number above 0"),
+        ('gain_e = "high"', "gain_e = 'high', need a number"),
+        ("gain_e = true", "gain_e = True, need a number"),
+        ("read_noise_e = -1.5", "read_noise_e = -1.5, need a number from 0 on"),
+        ("offset = nan", "offset = nan, need a number"),
+        ("bits = 11.5", "bits = 11.5, need a number above 0, whole"),
+        ("bits = 33", "bits = 33, need a number above 0, whole, at most 32"),
+        ("step_um = 0", "step_um = 0, need a number"),
+        ("glass_um = -5.0", "glass_um = -5.0, need a number from 0 on"),
+        ("glass_tilt_y_deg = 97.0", "glass_tilt_y_deg = 97.0, need a number between"),
+        ("wavelength_sigma_nm = -0.1", "need a number from 0 on"),
+        ("gain = 2.1", "unknown entry 'gain'; did you mean 'gain_e'"),
+        ("pixels_um = 2.1", "unknown entry 'pixels_um'; did you mean 'pixel_um'"),
+    ],
+)
+def test_what_no_camera_has_is_refused_and_misspelt_names_are_told(tmp_path, line, words):
+    (tmp_path / "capture.toml").write_text(line + "\n")
+    with pytest.raises(CaptureError, match="capture.toml: .*" + words):
+        stage.read_about(tmp_path)
+
+
+def test_notes_of_the_user_and_whole_bits_are_kept(tmp_path):
+    (tmp_path / "capture.toml").write_text('bits = 14.0\noffset = -3.5\noperator = "E. Q."\ncamera = "XB-7"\n')
+    found = stage.read_about(tmp_path)
+    assert found == {"bits": 14, "offset": -3.5, "operator": "E. Q.", "camera": "XB-7"}
+    assert isinstance(found["bits"], int)

@@ -111,3 +111,13 @@ def test_what_was_freed_is_said_beside_what_was_stated():
         "step_um = 2.34 +- 0.05 was fitted",
     ]
     assert math.isnan(SPEC.step_um)
+
+
+@pytest.mark.parametrize(("aperture", "kind"), [(0.58, "vector"), (0.49, "scalar")])
+def test_the_kind_of_the_model_is_the_same_at_every_aperture_on_the_way(aperture, kind):
+    """``auto`` turns vectorial at 0.6: 0.58 may lead there (0.70 at the widest), 0.49 does not (0.588)."""
+    near = dataclasses.replace(SPEC, numerical_aperture=aperture, free=("numerical_aperture",))
+    images = free._Images(near, Z)
+    assert {images.optics(np.log([factor]))[0].model for factor in (0.9, 1.0, 1.02, 1.2)} == {kind}
+    stated = dataclasses.replace(near, model="scalar")
+    assert free._Images(stated, Z).optics(np.zeros(1))[0].model == "scalar"
