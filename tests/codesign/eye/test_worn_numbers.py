@@ -309,3 +309,49 @@ def test_a_deep_socket_darkens_the_eye_and_a_dark_iris_is_a_share_of_its_albedo(
     want = states.trait("iris") * torch.tensor([1.0, 0.23, 0.41], dtype=torch.float64)
     assert torch.equal(found.trait("iris"), want)
     assert torch.equal(found.trait("pupil"), states.trait("pupil"))
+
+
+@pytest.mark.parametrize(("length", "angle"), [(4.6, 0.37), (3.3, 2.2), (0.7, -0.9)])
+def test_a_slanted_line_gives_each_pixel_the_tent_about_it(length, angle):
+    """1 - |u| along x times the same along y, of 32 places along the line through the middle."""
+    kernel = wear.line_kernel(length, angle).double().numpy()
+    reach = math.ceil(length / 2)
+    assert kernel.shape == (2 * reach + 1, 2 * reach + 1)
+    pixel = np.arange(-reach, reach + 1)
+    along = ((np.arange(32) + 0.5) / 32 - 0.5) * length
+    x, y = (np.maximum(1 - np.abs(along[:, None] * f(angle) - pixel), 0) for f in (math.cos, math.sin))
+    assert kernel == pytest.approx(np.einsum("kj,ki->ij", x, y) / 32, abs=1e-7)
+
+
+def test_a_line_without_length_is_one_pixel():
+    assert wear.line_kernel(0.0, 1.0).tolist() == [[1.0]]
+
+
+def test_two_windows_are_mirrored_where_a_draw_says_two():
+    """What three windows have more than two is the third."""
+    draws = DRAWS.copy()
+    draws[0] = 0.5  # 1 + int(3 x 0.5)
+    three, two = put_on(reflection=0.45)[0], put_on(draws, reflection=0.45)[0]
+    k = 2
+    at_x, at_y = (0.83 + 0.61 * k) % 1 - 0.5, (0.27 + 0.43 * k) % 1 - 0.5
+    half_x, half_y = 0.02 + 0.1 * ((0.41 + 0.29 * k) % 1), 0.02 + 0.08 * ((0.58 + 0.53 * k) % 1)
+    lean = 0.6 * (0.76 - 0.5)
+    u, v = (X - at_x) + lean * (Y - at_y), (Y - at_y) - lean * (X - at_x)
+    third = 0.45 / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+    assert three - two == pytest.approx(third * scene().frames.coverage[FRAME].double().numpy(), abs=2e-5)
+
+
+def test_a_soft_picture_is_the_mean_over_a_square_of_its_width():
+    picture = torch.from_numpy(RNG.uniform(0, 1, (9, 12)))
+    got = wear._soft(picture, 6.0).numpy()  # three to each side
+    wide = np.pad(picture.numpy(), 3, mode="edge")
+    assert got == pytest.approx(sum(wide[i : i + 9, j : j + 12] for i in range(7) for j in range(7)) / 49, rel=1e-9)
+
+
+def test_a_rim_before_closed_lids_lies_before_the_skin():
+    """No depth of an eye: 0.7 of that of the skin, 15 mm."""
+    made = scene()
+    made.frames.depth_um[:, 1] = 0.0
+    sizes = {name: np.zeros(2) for name in wear.CAUSES} | {"rim": np.array([0.0, 0.09])}
+    depth = wear.dressed(made, wear.Worn(sizes, np.stack([np.zeros(12), DRAWS]))).frames.depth_um[FRAME, 0]
+    assert sorted(set(depth.flatten().tolist())) == pytest.approx([0.7 * 15e3, 15e3])
