@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from layout.dose import nodes
 from layout.dose.bodies import Body
 from layout.dose.exposure import PointExposure
 from layout.dose.nodes import Axis, Grid, convolution, gather, spread
@@ -34,18 +35,22 @@ def test_cubics_are_interpolated_exactly_and_the_rest_to_fourth_order():
     assert error[0] / error[1] == pytest.approx(16, rel=0.25)
 
 
-def test_rows_of_a_lattice_are_deposits_at_its_sites():
+WIDE = Grid(Axis.over(-7.3, 21.9, 1.7), Axis.over(-9.9, 46.5, 1.7))
+
+
+@pytest.mark.parametrize("grid", [GRID, WIDE])
+def test_rows_of_a_lattice_are_deposits_at_its_sites(grid):
     index = RNG.integers(0, 4, (13, 9)).astype(np.uint8)
     body = Body(13, 9, 1.3, 4.0, 20.1, lambda first, end: index[first:end])
     value = np.array([[0.0, 1.7, 2.9, 0.4]])
-    out, nodes = np.zeros((1, *GRID.shape)), RNG.normal(size=GRID.shape)
-    lines = *GRID.y.at(body.rows_um(0, 13)), *GRID.x.at(body.columns_um)
+    out, nodes = np.zeros((1, *grid.shape)), RNG.normal(size=grid.shape)
+    lines = *grid.y.at(body.rows_um(0, 13)), *grid.x.at(body.columns_um)
     gather(index, value, *lines, out)
     y, x = np.meshgrid(body.rows_um(0, 13), body.columns_um, indexing="ij")
-    assert out[0] == pytest.approx(GRID.deposit(x.ravel(), y.ravel(), value[0][index].ravel()))
+    assert out[0] == pytest.approx(grid.deposit(x.ravel(), y.ravel(), value[0][index].ravel()))
     sites = np.empty((13, 9), np.float32)
     spread(nodes, *lines, sites)
-    assert sites.ravel() == pytest.approx(GRID.sample(nodes, x.ravel(), y.ravel()), rel=1e-5, abs=1e-6)
+    assert sites.ravel() == pytest.approx(grid.sample(nodes, x.ravel(), y.ravel()), rel=1e-5, abs=1e-6)
 
 
 @pytest.mark.parametrize("hollow", [True, False])
@@ -53,9 +58,37 @@ def test_convolution_is_the_plain_sum_of_gaussians(hollow):
     point = PointExposure(np.array([0.9, 4.0]), np.array([0.7, 0.3]))
     mass = RNG.uniform(size=(17, 23))
     field = convolution((17, 23), 0.5, point=point, hollow=hollow)(mass)
+    assert field.shape == (17, 23)
     y, x = np.mgrid[:17, :23] * 0.5
     for row, column in ((0, 0), (16, 22), (8, 3)):
         weight = point.density(np.hypot(y - y[row, column], x - x[row, column]))
         if hollow:
             weight[row, column] = 0
         assert field[row, column] == pytest.approx((weight * mass).sum(), rel=1e-9)
+
+
+def test_a_narrow_gaussian_does_not_reach_round_to_the_other_border():
+    """Five of its widths, 4.5 um, are added to 40 and 31 nodes."""
+    point, mass = PointExposure(np.array([0.9]), np.array([1.0])), np.zeros((40, 31))
+    mass[0, 0] = mass[-1, 7] = 1.0
+    field = convolution((40, 31), 0.5, point=point, hollow=False)(mass)
+    y, x = np.mgrid[:40, :31] * 0.5
+    want = point.density(np.hypot(y, x)) + point.density(np.hypot(y - 19.5, x - 3.5))
+    assert field == pytest.approx(want, abs=1e-9 * want.max())  # exp(-25)
+
+
+def test_every_place_lies_between_the_middle_two_of_its_four_nodes():
+    axis = Axis.over(-3.1, 11.0, 1.7)
+    at = np.linspace(-3.1, 11.0, 200)
+    first, _ = axis.at(at)
+    place = (at - axis.origin_um) / 1.7 - first
+    assert (place.min() >= 1, place.max() < 2) == (True, True)
+    assert (first.min() >= 0, first.max() + 3 < axis.count) == (True, True)
+
+
+def test_nodes_of_a_die_are_as_fine_as_its_gaussian_asks():
+    made, half = Grid.over((2.0, -5.0, 30.0, 9.0), 4.0), Grid.over((2.0, -5.0, 30.0, 9.0), 2.0)
+    assert made.x.spacing_um == made.y.spacing_um == 2 * half.x.spacing_um
+    assert made.x.spacing_um == pytest.approx(4.0 / nodes._PER_WIDTH)
+    assert (made.y.count, made.x.count) == made.shape
+    assert made.x.count > 1.7 * made.y.count  # 28 um by 14
