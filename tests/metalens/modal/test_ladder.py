@@ -17,6 +17,11 @@ RUNG = Rung("typed", (Choice(THIN_PLAN, 0.6, THIN, AFTER), Choice(WIDE_PLAN, 1.0
 UNSEEN = 0.02 * 1e-2
 
 
+def whole(first):
+    """Of a cell of lenses: with the orders beyond the first."""
+    return ladder.beyond(first)
+
+
 def found(t=0.6 + 0.1j, **other):
     usual = {"rim": 0.02, "waves": 0.05, "drift": 1.7, "grazing": 0.0, "bloch": 0.0, "size": 1.3, "strange": 0.0}
     usual["beside"] = 0.0
@@ -39,17 +44,17 @@ def test_the_estimate_adds_rim_waves_and_drift_by_the_width_of_the_disc_and_the_
     """What elements of degree three get wrong of a wave rises as the sixth power of its number."""
     assert RUNG.choice(rho).plan is (THIN_PLAN if rho <= 0.6 else WIDE_PLAN)
     unseen = UNSEEN if bloch else 0.0  # at normal incidence a plane wave is uniform, which elements follow
-    assert RUNG.error(found(bloch=bloch, size=size), rho) == pytest.approx(want + unseen, rel=1e-9)
+    assert RUNG.error(found(bloch=bloch, size=size), rho) == pytest.approx(whole(want) + unseen, rel=1e-9)
 
 
 def test_near_a_cutoff_the_difference_counts_more_and_so_do_exact_cutoffs():
     """Each mesh has a least factor there, which fades with the distance; a change by exact cutoffs counts in part."""
     at = found(grazing=0.04, beside=1.0)
-    assert RUNG.error(at, 0.8) == pytest.approx(3.1 * 0.07 + 1e-4 * 1.7 + 0.15 * 0.04, rel=1e-9)
+    assert RUNG.error(at, 0.8) == pytest.approx(whole(3.1 * 0.07 + 1e-4 * 1.7 + 0.15 * 0.04), rel=1e-9)
     thin = 2.6 * 0.07 + (2e-4 + 7e-4 * 0.65**6) * 1.7 + 0.15 * 0.04
-    assert RUNG.error(at, 0.5) == pytest.approx(thin, rel=1e-9)
+    assert RUNG.error(at, 0.5) == pytest.approx(whole(thin), rel=1e-9)
     half = max(0.7, 3.1 / 2) * 0.02 + max(0.9, 3.1 / 2) * 0.05 + 1e-4 * 1.7
-    assert RUNG.error(found(beside=0.5), 0.8) == pytest.approx(half, rel=1e-9)
+    assert RUNG.error(found(beside=0.5), 0.8) == pytest.approx(whole(half), rel=1e-9)
     assert RUNG.error(found(beside=0.1), 0.8) == RUNG.error(found(), 0.8)
     assert RUNG.error(found(grazing=0.04, strange=1.0), 0.5) > RUNG.error(found(strange=1.0), 0.5) + 0.005
 
@@ -58,9 +63,9 @@ def test_a_mesh_meant_for_wider_discs_is_judged_as_the_own_and_the_wider_one():
     """The larger of both: neither was chosen on thin discs on the mesh of wide ones."""
     wide, thin = RUNG.choices[1], RUNG.error(found(), 0.5)
     of_wide = 0.7 * 0.02 + 0.9 * 0.05 + 1e-4 * 1.7
-    assert RUNG.error(found(), 0.5, mesh=wide) == pytest.approx(max(thin, of_wide), rel=1e-9)
+    assert RUNG.error(found(), 0.5, mesh=wide) == pytest.approx(max(thin, whole(of_wide)), rel=1e-9)
     much_rim = found(rim=1.1)
-    assert RUNG.error(much_rim, 0.5, mesh=wide) == pytest.approx(0.7 * 1.1 + 0.9 * 0.05 + 1.7e-4, rel=1e-9)
+    assert RUNG.error(much_rim, 0.5, mesh=wide) == pytest.approx(whole(0.7 * 1.1 + 0.9 * 0.05 + 1.7e-4), rel=1e-9)
 
 
 @pytest.mark.parametrize("strange", [1.0, 3.0])
@@ -116,4 +121,14 @@ def test_a_mesh_may_usually_meet_less_for_some_discs(monkeypatch):
 def test_off_normal_incidence_waves_may_count_more():
     slanted = Rung("slanted", (Choice(THIN_PLAN, 1.0, Factors(0.3, 1.4, slanted=2.1), AFTER),), 1e-9, alone=ALONE)
     for bloch, factor in ((0.0, 1.4), (0.2, 2.1)):
-        assert slanted.error(found(bloch=bloch), 0.5) == pytest.approx(0.3 * 0.02 + factor * 0.05, rel=1e-8)
+        assert slanted.error(found(bloch=bloch), 0.5) == pytest.approx(whole(0.3 * 0.02 + factor * 0.05), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("share", "want"), [(0.001, 1e-4 / 0.999), (0.3, 0.03 / 0.7), (0.5, 0.1), (0.8, 0.16), (1.7, 0.2), (4.0, 0.4)]
+)
+def test_an_estimate_reckons_with_a_resonance_that_it_moves_towards(share, want):
+    """0.1 d / (d - shift) at the distance d from a pole: first order 0.1 share; twice that at most, and 0.2."""
+    assert whole(0.1 * share) == pytest.approx(want, rel=1e-9)
+    strange = found(strange=2.0, rim=1e-3, waves=0.0, drift=0.0)
+    assert RUNG.error(strange, 0.5) == pytest.approx(2.0 * 2.2e-3, rel=1e-9)  # of such cells the factors hold it

@@ -100,13 +100,18 @@ AT_CUTOFF = (  # within 0.2 % of the cutoff of an order of the substrate, where 
     Light(0.834092407),
 )
 DARK = cell(0.4, 0.7, 3.6, 1.4525, 1.0, 1.0), 0.272, Light(0.85, math.radians(5), "p")  # a sharp oblique resonance
+TOWARDS = (  # the coarse mesh moves the answer towards a resonance: to first order its bar was 0.73 of the error
+    cell(0.4, 0.531554632, 3.733563396, 1.380462079, 1.242016263, 1.158479481),
+    0.266161189,
+    Light(0.86002158, 0.106500461, "p"),
+)
 FORMS_ALIKE = cell(0.4364, 1.8514, 2.9316, 1.302, 1.0744, 1.1737), 0.2165, Light(0.8488)
 TIGHT = [
-    ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, COARSE),
     ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, EVEN),
     ("tall", TALL, 0.69795654 + 0.65842580j, -0.06944216 + 0.27296506j, FAIR),
     ("dark", DARK, 0.19752507 - 0.08091882j, -0.43306048 - 0.87572519j, COARSE),
     ("dark", DARK, 0.19752507 - 0.08091882j, -0.43306048 - 0.87572519j, EVEN),
+    ("towards", TOWARDS, 0.47494602 - 0.74169206j, -0.37879414 - 0.28431349j, COARSE),
     ("forms alike", FORMS_ALIKE, 0.21386131 - 0.91826247j, -0.31857679 - 0.09780695j, FAIR),
     ("many orders", MANY_ORDERS, -0.38280652 + 0.40235310j, -0.06895376 + 0.10798189j, EVEN),
     ("taller", TALLER, 0.21283293 + 0.65345647j, 0.17572653 + 0.16581570j, FAIR),
