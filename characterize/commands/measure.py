@@ -29,8 +29,8 @@ class Options(Common):
     Attributes:
         source: capture folder or stack; or one picture of pillars from above (TIFF, PNG), with --pixel-nm or --bar-nm;
             or one of a straight edge tilted by 2 to 20 degrees, with --edge-um.
-        output: folder to write: measure.json, a table of frames or pillars, a page; of a micrograph on a design the
-            bias table of PROCESS.toml too.
+        output: folder to write: measure.json, a table of frames or pillars, a page; of a micrograph that clearly lies
+            in one place of a design the bias table of PROCESS.toml too.
         design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a micrograph.
         reference_e: electrons of the beam through an empty aperture of the lens's size, for the focusing efficiency.
         edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation transfer across it (ISO 12233).
@@ -128,7 +128,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     table: overlay.Table = []
     if options.design is not None:
         laid = overlay.overlay(found, lenses.load_plain(options.design).diameters)
-        table = overlay.bias_table(laid)
+        table = overlay.bias_table(laid) if laid.clearly else []  # elsewhere, other diameters were drawn
         found = overlay.numbered(found, laid)
     values = _summary(found, laid, table, pixel)
     store.write_text(folder / "pillars.csv", _table(_pillars(found, laid)))
@@ -205,8 +205,8 @@ def _words(found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Ta
         f"collapsed; mean {found.mean_nm:.2f} nm, 3 sigma {found.three_sigma_nm:.2f} nm"
     ]
     if laid is not None:
-        sure = "" if laid.clearly else " (not clear: other places fit nearly as well; take a wider picture)"
-        lines.append(f"  on the mask from row {laid.row}, column {laid.column}{sure}")
+        unsure = " (not clear: other places fit nearly as well; no bias table; take a wider picture)"
+        lines.append(f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}")
         lines += [f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)" for d, b, s, n in table]
     return "\n".join(lines)
 

@@ -14,7 +14,11 @@ from scipy import special
 sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
 import test_sem
 
+from metalens import lens as lenses
+from metalens.cell import Cell, Index
 from metalens.cli import main
+from metalens.lens import DiameterMap, Lens
+from metalens.pillars.proxy import Proxy
 
 
 def spots(folder, sigma_um, pixel_um=0.9):
@@ -86,3 +90,22 @@ def test_a_micrograph_gives_every_pillar(tmp_path):
     assert len(error) == 15
     assert np.abs(np.mean(error)) < 1.2
     assert main(arguments) == 2  # exists
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats):
+    """A mask of unlike pillars holds the picture once; where all its rows and columns come again, it may lie twice."""
+    drawn = np.random.default_rng(4).uniform(160, 280, (4, 4))
+    mask = np.tile(drawn, (2, 2)) if repeats else np.pad(drawn, 2, mode="wrap")[:7, :7] + np.arange(7) ** 2
+    cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
+    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    drawn_map = DiameterMap(mask * 1e-3, cell.pitch_um)
+    lenses.save(tmp_path / "lens.h5", Lens(drawn_map, cell, proxy, 0.85, 100.0, 1e3, "map"))
+    image = test_sem.render(drawn if repeats else mask[2:6, 2:6])
+    tifffile.imwrite(tmp_path / "sem.tif", np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16))
+    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    told = json.loads((tmp_path / "out" / "measure.json").read_text())
+    assert told["place_is_clear"] != repeats
+    assert bool(told["bias_nm"]) != repeats
+    assert (tmp_path / "out" / "bias.toml").is_file() != repeats
