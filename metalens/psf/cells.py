@@ -2,7 +2,11 @@
 
 |U|² holds spatial frequencies up to B = (largest - least n sin θ) / λ of the rays to the window; samples farther apart
 than 1/(2B) fold them. Such a cell is the mean of m x m points of half that distance or less, corrected for what the
-midpoint rule leaves of second differences, h²/24 f''; the rest falls with the fourth power of their distance.
+midpoint rule leaves of second and fourth differences along both axes,
+
+    1 + (δx² + δy²)/24 - 17 (δx⁴ + δy⁴)/5760 + δx² δy²/576 + …    (the inverse of (2/δ) asinh(δ/2) along each)
+
+and the rest falls with the sixth power of their distance.
 """
 
 import math
@@ -15,6 +19,7 @@ from metalens.ground.errors import PropagationError
 from metalens.propagate import Case, cosines
 
 MOST = 6000  # fine samples along an axis
+BORDER = 2  # points around the window, for its differences
 FINER = (2, 4, 8)  # points in Nyquist's step that are tried
 
 
@@ -22,13 +27,13 @@ FINER = (2, 4, 8)  # points in Nyquist's step that are tried
 class Cells:
     """points: along each axis of a cell, 1 where samples are close enough; case: with the finer window.
 
-    left: of the correction by second differences, what remains: 0.114 (pi f h)², f the highest frequency; a perfect
-        lens's light leaves 0.088, a wave at f alone, which no lens sends, 0.32.
+    left: of a wave at the highest frequency, which has most: what remains over the correction by fourth differences,
+        and that correction over the one by second differences.
     """
 
     points: int
     case: Case
-    left: float = 0.0
+    left: tuple[float, float] = (0.0, 0.0)
 
 
 def nyquist_um(case: Case) -> float:
@@ -52,26 +57,45 @@ def cells(case: Case, finer: int = FINER[0]) -> Cells:
     if case.step_um <= limit * (1 + 1e-9):
         return Cells(1, case)
     points = finer * math.ceil(case.step_um / limit)
-    count = max(case.samples) * points + 2
+    count = max(case.samples) * points + 2 * BORDER
     if count > MOST:
         raise PropagationError(
             f"a window step of {case.step_um:.3g} um is above Nyquist's {limit:.3g} um of this aperture, and its cells "
             f"would take {count} points along an axis, at most {MOST}: give more samples or a smaller window"
         )
-    fine = replace(
-        case, step_um=case.step_um / points, samples=(case.samples[0] * points + 2, case.samples[1] * points + 2)
-    )
-    return Cells(points, fine, 0.114 * (math.pi / (2 * finer)) ** 2)
+    down, across = (n * points + 2 * BORDER for n in case.samples)
+    fine = replace(case, step_um=case.step_um / points, samples=(down, across))
+    return Cells(points, fine, _left(math.sin(math.pi / (2 * finer))))
+
+
+def _left(s: float) -> tuple[float, float]:
+    """Of a wave that turns by 2 asin(s) from point to point, whose mean over the step between them is s / asin(s)."""
+    second, fourth = s**2 / 6, 17 / 360 * s**4
+    return (1 - second - fourth - s / math.asin(s)) / fourth, fourth / second
 
 
 def integrated(light: torch.Tensor, fine: Cells) -> tuple[torch.Tensor, float]:
-    """(…, y, x) means over the cells of fine samples with a border of one, and the error of the integration."""
-    points = fine.points
-    inner = light[..., 1:-1, 1:-1]
-    beside = light[..., 2:, 1:-1] + light[..., :-2, 1:-1] + light[..., 1:-1, 2:] + light[..., 1:-1, :-2]
-    plain, bent = _means(inner, points), _means(beside - 4 * inner, points) / 24
-    size = float(plain.detach().norm())
-    return plain + bent, fine.left * float(bent.detach().norm()) / size if size else 0.0
+    """(…, y, x) means over the cells of fine samples with a border of two, and the error of the integration.
+
+    Within cells the differences add up to those of slopes at their borders, which may meet at 0 in the fourth order
+    and not in the sixth: the second vouches for it.
+    """
+    points, whole = fine.points, slice(BORDER, -BORDER)
+    across, down = _second(light, -1), _second(light, -2)
+    bent = (across[..., whole, 1:-1] + down[..., 1:-1, whole]) / 24
+    fourth = -17 / 5760 * (_second(across, -1)[..., whole, :] + _second(down, -2)[..., whole])
+    fourth = fourth + _second(across, -2)[..., 1:-1, 1:-1] / 576
+    first, second, last = (_means(part, points) for part in (light[..., whole, whole], bent, fourth))
+    size, *sizes = (float(part.detach().norm()) for part in (first, second, last))
+    error = fine.left[0] * math.hypot(sizes[1], fine.left[1] * sizes[0]) / size if size else 0.0
+    return first + second + last, error
+
+
+def _second(light: torch.Tensor, axis: int) -> torch.Tensor:
+    """Second differences along an axis, two fewer."""
+    count = light.shape[axis]
+    low, middle, high = (light.narrow(axis, start, count - 2) for start in range(3))
+    return low + high - 2 * middle
 
 
 def _means(light: torch.Tensor, points: int) -> torch.Tensor:
