@@ -112,3 +112,61 @@ def test_the_mean_of_frames_is_their_light_over_their_coverage():
         coverage=torch.tensor([1.0, 0.5, 0.0, 1.5]).reshape(1, 2, 1, 2),
     )
     assert float(scene._mean(frames)) == pytest.approx(4.0)
+
+
+def by_loops(source, kernel):
+    """(y, x) sum of shifted pictures, the kernel's middle at (h // 2, w // 2); zeros outside."""
+    (h, w), (high, wide) = kernel.shape, source.shape
+    padded = np.pad(source, ((h, h), (w, w)))
+    out = np.zeros(source.shape)
+    for i, j in np.ndindex(h, w):
+        y, x = h - (i - h // 2), w - (j - w // 2)
+        out += kernel[i, j] * padded[y : y + high, x : x + wide]
+    return out
+
+
+@pytest.mark.parametrize(
+    ("field", "kind"),
+    [((1, 1), torch.float32), ((1, 1), torch.float64), ((2, 3), torch.float64), ((3, 1), torch.float64)],
+)
+def test_an_image_is_the_near_sheet_over_the_far_one_each_blurred_by_its_depths(field, kind):
+    """Five frames of 12 by 17 pixels, two at a time, kernels of 5 by 3: inside a margin of two, by plain sums."""
+    rng = np.random.default_rng(23)
+    cover = rng.uniform(0.0, 1.0, (5, 1, 12, 17))
+    cover[4] = 1.0  # nothing seen of the far sheet
+    cover = np.concatenate([cover, 1 - cover], 1)
+    light = cover * rng.uniform(0.2, 2.0, cover.shape)
+    depth = rng.uniform(9e3, 50e3, cover.shape)
+    kernels = rng.uniform(0.1, 1.0, (2, 5, 3))
+    weights = rng.uniform(0.3, 1.0, (*field, 3, 2)) / 15
+    nodes = torch.tensor([10e3, 18e3, 42e3], dtype=torch.float64)
+    psf = PsfBasis(torch.tensor(kernels, dtype=kind), torch.tensor(weights, dtype=kind), nodes, 0.0, 0.0)
+    frames = Frames(*(torch.tensor(a, dtype=kind) for a in (light, cover, depth)))
+    optics = scene.uniform_imager(psf, (12, 17), margin=2)
+    got = scene.image(frames, optics, margin=2).double().numpy()
+    assert got.shape == (5, 8, 13)
+    maps = scene.weight_maps(psf, frames.depth_um).double().numpy()  # (rank, frames, sheets, y, x)
+    for n in range(5):
+        seen = np.zeros((2, 2, 12, 17))
+        for kind_of, picture in enumerate((light, cover)):
+            for sheet in (0, 1):
+                for r in range(2):
+                    seen[kind_of, sheet] += by_loops(maps[r, n, sheet] * picture[n, sheet], kernels[r])
+        (near, far), (front, back) = seen
+        share = np.clip(back / scene.FAINT, 0, 1)
+        behind = np.clip(1 - front, 0, 1) * share * (3 - 2 * share) / np.maximum(back, scene.FAINT)
+        want = (near + behind * far) / np.maximum(front + behind * back, scene.FAINT)
+        assert got[n] == pytest.approx(want[2:-2, 2:-2], rel=1e-4 if kind is torch.float32 else 1e-9)
+    wide = scene.uniform_imager(psf, (12, 17))
+    assert all(have >= need for have, need in zip(wide.shape, (12 + 4, 17 + 4), strict=True))  # two to either side
+    plain = scene.image(frames, wide).double()
+    kept = scene.image_spectra(scene.spectra(frames, wide), wide, (12, 17)).double()
+    assert kept.numpy() == pytest.approx(plain.numpy(), rel=1e-3 if kind is torch.float32 else 1e-9)
+    assert plain[:, 2:-2, 2:-2].numpy() == pytest.approx(got, rel=1e-4 if kind is torch.float32 else 1e-9)
+
+
+def test_a_far_sheet_fades_in_smoothly():
+    """Of a coverage of 0.004 of 0.01: 0.4² (3 - 0.8) = 0.352 of the weight that it would have."""
+    got = scene._over(sheets(0.2, 0.003), sheets(0.3, 0.004), 0.0)
+    behind = 0.7 * 0.352 / 0.004
+    assert float(got) == pytest.approx((0.2 + behind * 0.003) / (0.3 + behind * 0.004), rel=1e-9)
