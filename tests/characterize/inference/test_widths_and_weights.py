@@ -172,3 +172,34 @@ def test_every_plane_of_the_data_is_turned_with_the_frames():
     ):
         assert np.array_equal(made, given[order][:, ::-1, ::-1])  # half a turn
     assert (found.common_floor, found.common_light) == (0.3, 0.02)
+
+
+@pytest.mark.parametrize(("unseen", "told"), [(0.99, False), (1.01, True), (float("nan"), False)])
+def test_structure_is_sought_in_residuals_of_one_sigma_and_in_what_frames_share_over_it(monkeypatch, unseen, told):
+    """Shares of 3 and 8 e of pixels whose sigma is the root of 4 and 25 e²; the light is that of the fit."""
+    asked = []
+    monkeypatch.setattr(
+        estimate.verdict, "structure", lambda left, shared: asked.append((left, shared)) or ["structure"]
+    )
+    monkeypatch.setattr(estimate.missing, "words", lambda leans: [f"causes of {leans}"])
+    data = SimpleNamespace(variance=lambda light: 2.0 * light, shared=lambda light: light * [1.5, 0.64])
+    solution = SimpleNamespace(image=np.array([2.0, 12.5]), residual_sigma="left")
+    unseen *= estimate._LEFT_OUT
+    got = estimate._seen(SimpleNamespace(data=data), solution, SimpleNamespace(leans="leans"), unseen)
+    ((left, shared),) = asked
+    assert left == "left"
+    assert shared == pytest.approx([3.0 / 2.0, 8.0 / 5.0])
+    assert got[:2] == ["structure", "causes of leans"]
+    assert [f"chi-square {unseen:.2f} a pixel" in words for words in got[2:]] == [True] * told
+
+
+def test_what_stays_open_is_what_is_bent_what_goes_together_and_causes_that_nobody_fitted(monkeypatch):
+    monkeypatch.setattr(estimate.explore, "words", lambda task, found: ["bent"])
+    monkeypatch.setattr(
+        estimate.knowable, "degeneracies", lambda names, covariance, sigma: [(names, covariance, sigma)]
+    )
+    monkeypatch.setattr(estimate.missing, "untold", lambda leans: [f"untold {leans}"])
+    task = SimpleNamespace(names="names", prior=SimpleNamespace(sigma="sigma"))
+    pairs = ("names", "covariance", "sigma")
+    assert estimate._open(task, None, "covariance", SimpleNamespace(leans=3)) == ("bent", pairs, "untold 3")
+    assert estimate._open(task, None, "covariance", None) == ("bent", pairs)
