@@ -80,6 +80,8 @@ def read(path: Path, most: int | None = None, *, keep: int | None = None) -> Mas
     Raises:
         MaskFileError: more than these, or a file that cannot be read.
     """
+    if found := reading.foreign(path):
+        raise MaskFileError(f"{path}: {found}, need GDSII or OASIS")
     is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
     return (oasis_read.read if is_oasis else gdsii_read.read)(
         path, limit=foreign.most_of(path) if most is None else most, keep=keep

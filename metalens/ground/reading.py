@@ -313,6 +313,7 @@ _FOREIGN = {  # first bytes of what is often given in place of an artefact, in w
     b"MM\0*": "a TIFF picture",
     b"\x89PNG": "a PNG picture",
     b"MATLAB 5": "a MATLAB file",
+    b"\x1f\x8b": "a compressed file (gzip: unpack it)",
 }
 
 
