@@ -120,14 +120,16 @@ class Rung:
         """Error estimate of the mean of both forms.
 
         before: solutions on coarser meshes, which cells unlike those of lenses are judged by where there are any.
-        mesh: what was solved on, if not the rung's own for the diameter; the wider of both estimates counts.
+        mesh: what was solved on; where that is not the rung's own for the diameter, the wider of both estimates counts.
         """
         if found.strange and before:
             bound = self.choice(rho).after.bound(found, before)
         elif found.strange:
             bound = found.strange * self.alone.bound(found)
         else:
-            bound = max(one.factors.bound(found) for one in (self.choice(rho), mesh or self.choice(rho)))
+            own = self.choice(rho)
+            judges = (own, mesh) if mesh and mesh.plan != own.plan else (own,)
+            bound = max(one.factors.bound(found) for one in judges)
             bound = beyond(bound)
         return bound + UNSEEN * self.usual * (found.bloch > 0) + 1e-12
 

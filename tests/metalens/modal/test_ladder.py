@@ -68,6 +68,12 @@ def test_a_mesh_meant_for_wider_discs_is_judged_as_the_own_and_the_wider_one():
     assert RUNG.error(much_rim, 0.5, mesh=wide) == pytest.approx(whole(0.7 * 1.1 + 0.9 * 0.05 + 1.7e-4), rel=1e-9)
 
 
+def test_factors_of_wider_discs_do_not_count_where_the_mesh_is_the_own():
+    """The same matrices: the estimate is that of a solve of this disc alone."""
+    wider = Choice(THIN_PLAN, 0.9, Factors(5.0, 5.0, flat=1e-2), AFTER)
+    assert RUNG.error(found(), 0.5, mesh=wider) == RUNG.error(found(), 0.5)
+
+
 @pytest.mark.parametrize("strange", [1.0, 3.0])
 def test_cells_unlike_those_of_lenses_are_judged_by_one_mesh_more_widely(strange):
     want = strange * (2.2 * 0.02 + 5.1 * 0.05 + 6e-4 * 1.7)
