@@ -10,7 +10,7 @@ derivatives by complex steps. Squares (w = p², reach²) are used where a root w
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,9 +100,18 @@ def passed_at(order: Sequence[float], w: Any) -> Any:
 
 def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
     """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel); 0 beyond a critical angle."""
+    return _fresnel(order, w, lambda rest: (rest * (rest.real > 0)) ** 0.5)
+
+
+def passed_on(order: Sequence[float], w: Any) -> tuple[Any, Any]:
+    """As :func:`passed_apart` of complex w, without a cut: the analytic function that sums over plane waves need."""
+    return _fresnel(order, w, lambda rest: rest**0.5)
+
+
+def _fresnel(order: Sequence[float], w: Any, cosine: Callable[[Any], Any]) -> tuple[Any, Any]:
     s_power, p_power = w * 0 + 1, w * 0 + 1
     for a, b in itertools.pairwise(order):
-        ca, cb = ((rest * (rest.real > 0)) ** 0.5 for rest in (1 - w / a**2, 1 - w / b**2))
+        ca, cb = cosine(1 - w / a**2), cosine(1 - w / b**2)
         s_power = s_power * (1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2)
         p_power = p_power * (1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2)
     return s_power, p_power

@@ -81,8 +81,8 @@ def _saddle(behind: Media, wavenumber: float, most: float, light: Light) -> Sadd
     turns = wavenumber * np.asarray(media.whole_path(behind.layers, w))
     mean, apart = _settled(behind, wavenumber, w, light)
     want = (mean - 1) * turns / 1j
-    # grazing rays are known poorly: they bend the series where they are alone
-    series = np.polynomial.chebyshev.chebfit(u, want, DEGREES - 1, w=1 / (turns * (apart + ROUNDING)))
+    # grazing rays are known poorly: they bend the series where they are alone, and not at all beyond rounding (full)
+    series, _ = np.polynomial.chebyshev.chebfit(u, want, DEGREES - 1, w=1 / (turns * (apart + ROUNDING)), full=True)
     kept = np.abs(series) > ROUNDING * turns.min()
     power = np.polynomial.chebyshev.cheb2poly(series[: int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 1])
     real, imaginary = (np.ascontiguousarray(part) for part in (power.real, power.imag))
@@ -119,7 +119,7 @@ def waves(behind: Media, wavenumber: float, w: Array, count: int = WAVES[-1], li
 
 def _passed(order: tuple[float, ...], w: Any, light: Light) -> Any:
     """Power of this light that the faces let through."""
-    s_power, p_power = media.passed_apart(order, w)
+    s_power, p_power = media.passed_on(order, w)
     return {"s": s_power, "p": p_power, "mean": (s_power + p_power) / 2}[light]
 
 

@@ -133,3 +133,15 @@ def test_the_series_ends_at_a_quarter_power_of_two_beyond_the_steepest_ray():
 def test_the_series_ends_before_a_ray_that_grazes_a_medium_of_no_thickness():
     grazing = saddle(Media((1.1, 1.8), (0.0, 5.0)), 2 * math.pi / 0.85, 20.0)
     assert 1.8**2 - (grazing.middle - grazing.half) ** 2 == pytest.approx((0.9999 * 1.1) ** 2, rel=1e-9)
+
+
+def test_beyond_a_critical_angle_power_is_cut_for_rays_and_continued_for_waves():
+    """At p = 1.2 from 1.1 into 1.8 nothing passes; the analytic function there is that of complex cosines."""
+    w, order = np.array([1.44, 0.5]), (1.1, 1.8)
+    s_power, p_power = media.passed_apart(order, w)
+    assert (s_power[0], p_power[0]) == (0, 0)
+    a, b = (np.sqrt(1 - (w + 0j) / n**2) * n for n in order)
+    on = media.passed_on(order, w + 0j)
+    assert on[0] == pytest.approx(1 - ((a - b) / (a + b)) ** 2, rel=1e-12)
+    assert s_power[1] == pytest.approx(on[0][1].real, rel=1e-12)
+    assert p_power[1] == pytest.approx(on[1][1].real, rel=1e-12)
