@@ -191,8 +191,9 @@ def _artefacts(folder: Path) -> None:
     about = {"radiance": light, "coverage": light[:, 0], "depth_um": light.astype(np.uint16), "pupil": light[:, 0]}
     store.save(folder / "shard" / "f.h5", "scene", about | {"labels/slip_um": np.zeros((1, 3))})
     frames = {"light": light[0], "depth_um": light[0].astype(np.uint16), "mask": light[0]}
-    places = {"place_um": np.ones((2, 3)), "here_um": np.ones(3), "depths_um": np.ones(2)}
-    store.save(folder / "pool" / "f.h5", "pool", frames | places)
+    places = {"place_um": np.ones((2, 3)), "seen_um": np.ones((2, 3)), "here_um": np.ones(3), "depths_um": np.ones(2)}
+    pose = {"axis": np.ones((2, 3), np.float32), "points": np.zeros((2, 10, 2), np.float32)}
+    store.save(folder / "pool" / "f.h5", "pool", frames | places | pose)
 
 
 def _frames(folder: Path) -> None:

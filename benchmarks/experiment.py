@@ -55,6 +55,7 @@ QUANTITIES = (
     "slip_mm",
     "slip_axial_mm",
     "slip_lateral_mm",
+    "slip_rest_mm",
     "iou",
 )
 

@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.batches import parallel as parallel
     from codesign.batches.batch import Batch as Batch
+    from codesign.batches.batch import Pose as Pose
     from codesign.batches.batch import Scenes as Scenes
     from codesign.batches.flat import Flat as Flat
     from codesign.batches.flat import depth_um as depth_um
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "Flat": "flat",
         "Pool": "pool",
         "PoolScenes": "pool",
+        "Pose": "batch",
         "SceneConfig": "scenes",
         "Scenes": "batch",
         "TEST": "scenes",

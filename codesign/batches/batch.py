@@ -10,16 +10,33 @@ from metalens.image import Frames
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Pose:
+    """How the eye stands before the camera.
+
+    shift_mm: (batch, 3) displacement of the head as the camera sees it (:class:`codesign.eye.Labels`): what a network
+        can learn of the slippage. axis: (batch, 3) optic axis, a unit vector in the camera's frame.
+    points: (batch, points, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's middle: x, y as a fraction of
+        the image from its middle, beyond 0.5 outside of it.
+    """
+
+    shift_mm: Tensor
+    axis: Tensor
+    points: Tensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Batch:
     """Rendered frames with what is true of them.
 
     frames: on the image grid, ``margin`` samples wider on every side.
     mask: (batch, y, x) pupil coverage without the margin. slip_mm: (batch, 3).
+    pose: of the eye; None where nobody trains on it.
     """
 
     frames: Frames | Flat
     mask: Tensor
     slip_mm: Tensor
+    pose: Pose | None = None
 
 
 class Scenes(Protocol):

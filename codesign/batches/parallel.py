@@ -61,9 +61,14 @@ def part_of(batch: Batch) -> Batch:
     if odd:
         raise TrainingError(f"a batch of {len(batch.slip_mm)} frames on {ranks()} processes: need a multiple of them")
     mine = slice(rank() * size, (rank() + 1) * size)
-    kind = type(batch.frames)
-    frames: Frames | Flat = kind(*(getattr(batch.frames, name)[mine] for name in kind.__slots__))
-    return replace(batch, frames=frames, mask=batch.mask[mine], slip_mm=batch.slip_mm[mine])
+    frames: Frames | Flat = _rows(batch.frames, mine)
+    pose = None if batch.pose is None else _rows(batch.pose, mine)
+    return replace(batch, frames=frames, mask=batch.mask[mine], slip_mm=batch.slip_mm[mine], pose=pose)
+
+
+def _rows(record: Any, rows: slice) -> Any:
+    """Some of the frames of a record of tensors."""
+    return type(record)(*(getattr(record, name)[rows] for name in type(record).__slots__))
 
 
 def average(parameters: Iterable[nn.Parameter]) -> None:

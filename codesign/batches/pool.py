@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from codesign.batches.batch import Batch
+from codesign.batches.batch import Batch, Pose
 from codesign.batches.flat import Flat, flattened
-from codesign.batches.scenes import EyeScenes, decoupled
+from codesign.batches.scenes import EyeScenes, decoupled, pose_of
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
@@ -24,7 +24,8 @@ class Pool:
     """Frames at unit scale, with their labels; what :class:`PoolScenes` draws from.
 
     light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil coverage without the margin.
-    place_um: (n, 3) nominal place and slippage together, at unit scale. here_um: (3,) nominal place.
+    place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3) the same as the camera sees it.
+    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.Pose`. here_um: (3,) nominal place.
     depths_um: (2,) range of the depth.
     """
 
@@ -32,6 +33,9 @@ class Pool:
     depth_um: Array
     mask: Array
     place_um: Array
+    seen_um: Array
+    axis: Array
+    points: Array
     here_um: Array
     depths_um: Array
 
@@ -44,9 +48,9 @@ def fill(scenes: EyeScenes, count: int) -> Pool:
     parts = []
     for number, start in enumerate(range(0, count, CHUNK)):
         parts.append(_part(scenes, number, min(CHUNK, count - start)))
-    light, depth, mask, place = (np.concatenate([p[i] for p in parts]) for i in range(4))
     here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
-    return Pool(light, depth, mask, place, here, np.array(scenes.depths_um))
+    light, depth, mask, place, seen, axis, points = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    return Pool(light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um))
 
 
 def save(path: Path, pool: Pool) -> None:
@@ -64,7 +68,8 @@ def load(path: Path) -> Pool:
     return Pool(**store.load(path, "pool").arrays)
 
 
-def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, Array, Array, Array]:
+def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
+    """The first seven arrays of a :class:`Pool`."""
     made = scenes.rendered(number, count)
     states = scenes.states(number, count)
     flat = flattened(made.frames, states.scale)
@@ -73,8 +78,12 @@ def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, Array, Arr
     if mask.shape[-1] % MASK == 0:
         mask = F.avg_pool2d(mask, mask.shape[-1] // MASK)
     coverage = (mask[:, 0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
-    return flat.light, flat.depth_um, coverage, here + states.slip_um.numpy()
+    here = torch.tensor([*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64)
+    place, seen = (
+        ((here + moved) / states.scale[:, None]).numpy() for moved in (made.labels.slip_um, made.labels.shift_um)
+    )
+    pose = pose_of(made, scenes.margin)
+    return flat.light, flat.depth_um, coverage, place, seen, pose.axis.numpy(), pose.points.numpy()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,6 +119,7 @@ class PoolScenes:
         here, place = torch.from_numpy(pool.here_um), torch.from_numpy(pool.place_um[rows])
         low, high = self.pool.depths_um
         scale = decoupled(place[:, 2], (float(low), float(high)), self.spread, generator)
-        slip = (scale[:, None] * place - here) * 1e-3
+        slip, shift = ((scale[:, None] * p - here) * 1e-3 for p in (place, torch.from_numpy(pool.seen_um[rows])))
+        pose = Pose(shift.float(), torch.from_numpy(pool.axis[rows]), torch.from_numpy(pool.points[rows]))
         flat = Flat(pool.light[rows], pool.depth_um[rows], scale.numpy().astype(np.float32))
-        return Batch(flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float())
+        return Batch(flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float(), pose)

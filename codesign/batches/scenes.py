@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches.batch import Batch
+from codesign.batches.batch import Batch, Pose
 from codesign.eye import (
     POPULATION,
     Camera,
@@ -180,4 +180,12 @@ def as_batch(made: Rendered, margin: int) -> Batch:
     """Rendered frames as a training batch: the mask without its margin, the slippage in mm."""
     inside = slice(margin, made.pupil.shape[-1] - margin)
     frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
-    return Batch(frames, made.pupil[:, inside, inside], (made.labels.slip_um * 1e-3).to(torch.float32))
+    return Batch(frames, made.pupil[:, inside, inside], (made.labels.slip_um * 1e-3).float(), pose_of(made, margin))
+
+
+def pose_of(made: Rendered, margin: int) -> Pose:
+    """How the eyes of rendered frames stand."""
+    size, labels = made.pupil.shape[-1], made.labels
+    places = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
+    points = (places - (size - 1) / 2) / (size - 2 * margin)
+    return Pose((labels.shift_um * 1e-3).float(), labels.optic_axis.float(), points.float())

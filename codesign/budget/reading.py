@@ -2,7 +2,7 @@
 
     true pupil and slippage -> the person's calibration          subject and calibration
     where the person really looks                                fixation
-    pupil and slippage read from noiseless frames                reader, pupil and slippage
+    pupil, then slippage and axis read from noiseless frames     reader, pupil and slippage
     noise of the sensor                                          sensor noise
     what training left out of its image                          field, radiometry, spectrum
 
@@ -26,7 +26,7 @@ from codesign.budget.entry import NONE, Entry
 from codesign.budget.person import told
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Rendered, render
-from codesign.gaze import PersonalGaze, angle_deg
+from codesign.gaze import Own, PersonalGaze, angle_deg
 from codesign.optics import Device, OpticsConfig, device, formed, image_difference
 from codesign.train import assess
 from metalens.ground.arrays import Array
@@ -35,14 +35,16 @@ from metalens.lens import Layers
 
 THINNED = 320  # frames that small changes of the optics are judged on
 
-Read = tuple[Array, Array]  # pupil (n, 2) on the sensor and slippage (n, 3), mm
+Read = tuple[
+    Array, Array, Array | None
+]  # pupil (n, 2) on the sensor and slippage (n, 3), mm; axis (n, 2), deg, if read
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stand:
     """Persons calibrated on the device as it is, and the frames on which a change of the optics is judged."""
 
-    people: dict[int, PersonalGaze]
+    people: dict[int, PersonalGaze] | dict[int, Own]
     frames: tuple[Rendered, ...]
     trial: gaze_experiment.Trial
 
@@ -57,6 +59,7 @@ class Reading:
         width = fwhm_nm or believed.fwhm_nm
         self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
         self.believed = gaze_experiment.ready(source, image="trained")
+        self.people = gaze_experiment.learnt(source, self.believed, config)
         self.subjects: list[Rendered] = []
         trials = []
         for subject in range(config.subjects):
@@ -99,12 +102,14 @@ class Reading:
         """Entries from the true pupil to the answered gaze, and what was measured at its end."""
         still = replace(self.config, fixation_deg=0.0)
         people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
-        yield self._grown("subject and calibration", told(still, self.scenes), f"true pupil and slippage; {people}")
-        true = told(self.config, self.scenes)
+        yield self._grown(
+            "subject and calibration", (*told(still, self.scenes), None), f"true pupil and slippage; {people}"
+        )
+        true = (*told(self.config, self.scenes), None)
         yield self._grown("fixation", true, f"scatter of {self.config.fixation_deg:g} deg about the stimulus")
         said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
         read = self._read(self.believed, quiet=True)
-        yield self._grown("reader, pupil", (read[0], true[1]), said)
+        yield self._grown("reader, pupil", (read[0], true[1], None), said)
         yield self._grown("reader, slippage", read, said)
         read = self._read(self.believed)
         yield self._grown("sensor noise", read, "frames with the sensor's noise")
@@ -169,15 +174,14 @@ class Reading:
         if stand is None:
             raise RuntimeError("changes are judged once the path is through")
         one, other = (
-            gaze_experiment.answered(stand.people, *self._frames(stand.frames, o, quiet=True), stand.trial)
-            for o in (optics, base)
+            self._gaze(stand.people, self._frames(stand.frames, o, quiet=True), stand.trial) for o in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
     def _settle(self, read: Read) -> None:
         """Keep the persons of the last state, what it measured, and a thin sample of the judged frames."""
-        people = gaze_experiment.taught(*read, self.trial, self.config, rig=self.scenes.rig)
-        error = angle_deg(gaze_experiment.answered(people, *read, self.trial), self.trial.stimulus_deg)
+        people = self._taught(read)
+        error = angle_deg(self._gaze(people, read, self.trial), self.trial.stimulus_deg)
         judged = self._judged()
         for kind in self.measured_deg:
             self.measured_deg[kind] = float(error[judged & self.trial.group(kind)].mean())
@@ -202,8 +206,18 @@ class Reading:
 
     def _answers(self, read: Read) -> Array:
         """(n, 2) gaze, every person calibrated on what was read."""
-        people = gaze_experiment.taught(*read, self.trial, self.config, rig=self.scenes.rig)
-        return gaze_experiment.answered(people, *read, self.trial)
+        return self._gaze(self._taught(read), read, self.trial)
+
+    def _taught(self, read: Read) -> dict[int, PersonalGaze] | dict[int, Own]:
+        pupil, slip, axis = read
+        return gaze_experiment.taught(
+            pupil, slip, self.trial, self.config, rig=self.scenes.rig, axis_deg=axis, people=self.people
+        )
+
+    @staticmethod
+    def _gaze(people: dict[int, PersonalGaze] | dict[int, Own], read: Read, trial: gaze_experiment.Trial) -> Array:
+        pupil, slip, axis = read
+        return gaze_experiment.answered(people, pupil, slip, trial, axis_deg=axis)
 
     def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> Read:
         return self._frames(self.subjects, optics, quiet=quiet)
@@ -220,8 +234,7 @@ class Reading:
                 self.source, made, optics, seed=gaze_experiment.NOISE + subject, snr_db=self.config.snr_db, quiet=quiet
             )
             found.append(assess.predict(net, self.source.architecture, seen, inner))
-        centre, slip = (torch.cat([getattr(a, f) for a in found]).double().numpy() for f in ("centre", "slip_mm"))
-        return centre * self.source.run.window_um * 1e-3, slip
+        return gaze_experiment.read_from(found, self.source)
 
 
 def _part(made: Rendered, rows: torch.Tensor) -> Rendered:

@@ -79,7 +79,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
                 "goal": GOALS.get(quantity, ""),
             })  # fmt: skip
     about = {"subjects": config.subjects, "frames": config.frames, "seed": config.seed, "share": config.share,
-             "points": config.points, "fixation_deg": config.fixation_deg}  # fmt: skip
+             "points": config.points, "people": config.people, "fixation_deg": config.fixation_deg}  # fmt: skip
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
 
 
@@ -114,6 +114,7 @@ def _per_subject(result: Result) -> dict[str, Any]:
         "slip_mm": result.per_subject(error.mean(1)),
         "slip_axial_mm": result.per_subject(error[:, 2]),
         "slip_lateral_mm": result.per_subject(error[:, :2].mean(1)),
+        "slip_rest_mm": result.per_subject(result.slip_rest_mm.mean(1)),
         "iou": result.per_subject(result.iou),
     }
 
@@ -159,6 +160,7 @@ COLUMNS = {  # of the page's table: what the numbers are called in the result, a
     "slip_mm": "slip error / mm",
     "slip_axial_mm": "its axial part / mm",
     "slip_lateral_mm": "its lateral part / mm",
+    "slip_rest_mm": "slip error from where its wearer calibrated / mm",
     "iou": "overlap of pupil masks",
 }
 CAPTIONS = {
@@ -197,9 +199,10 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
 def _told(about: dict[str, Any]) -> str:
     """How the numbers were made."""
     return (
-        f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each subject's eye (sphere "
-        f"and regressor of one hidden layer) is fitted to {about['share']:.0%} of the stimuli, "
-        f"{PLACED[about['points']]}, and judged on the rest; subjects "
+        f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each is calibrated on "
+        f"{about['share']:.0%} of the stimuli, {PLACED[about['points']]}, and judged on the rest: what is read (axis, "
+        f"pupil, slippage) becomes gaze by a linear mixed model learned from {about['people']} other people, or, of a "
+        "network that tells no axis, by a sphere and a regressor of one hidden layer. Subjects "
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
-        "error under axial slip is that of the pupil alone. Intervals are over subjects."
+        "error under axial slip is that of pupil, sphere and regressor alone. Intervals are over subjects."
     )

@@ -15,11 +15,14 @@ import numpy as np
 import torch
 
 from codesign.adapt import Source, network
-from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
+from codesign.batches import EXPERIMENT, VALIDATION, EyeScenes, as_batch, irradiance
+from codesign.evaluate.shown import AXIAL as AXIAL
+from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
+from codesign.evaluate.shown import Trial as Trial
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
-from codesign.gaze import PersonalGaze, angle_deg, personal
+from codesign.gaze import Own, People, PersonalGaze, angle_deg, bench, face_angles, personal, shared
 from codesign.network import recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, read_out
@@ -27,28 +30,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import Imager, UniformImager, low_snr
 
-AXIAL, LATERAL = "axial", "lateral"
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Trial:
-    """Of every frame (n,): subject, stimulus, slippage state; and what was true.
-
-    stimulus_deg: (n, 2). slip_mm: (n, 3).
-    """
-
-    subject: Array
-    stimulus: Array
-    state: Array
-    stimulus_deg: Array
-    slip_mm: Array
-
-    def group(self, kind: str) -> Array:
-        """(n,) frames of the axial or lateral states, the origin among both."""
-        along = 2 if kind == AXIAL else 0
-        other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
-        return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
+BEFORE, EACH = 31, 40  # stream of the people who calibrated before, and their frames
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -56,9 +39,9 @@ class Result:
     """One run in the experiment.
 
     slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
-    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where the
-    regressor is told the true slippage: what the reading of the pupil alone leaves. reach_mm: largest slippage along x,
-    y, z that the run's training saw.
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
+    and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
+    slippage along x, y, z that the run's training saw.
     """
 
     name: str
@@ -85,6 +68,20 @@ class Result:
     def slip_error_mm(self) -> Array:
         """(n, 3) absolute errors of the slippage."""
         return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
+
+    @property
+    def slip_rest_mm(self) -> Array:
+        """(n, 3) absolute errors beside the mean error of the subject's calibration, nan for frames that calibrated.
+
+        What is constant of a person (size of the face, and the camera's turn on it) is no slippage: a device is zeroed
+        where its wearer calibrates.
+        """
+        error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
+        out = np.full_like(error, math.nan)
+        for subject in np.unique(self.trial.subject):
+            mine = self.trial.subject == subject
+            out[mine & judged] = np.abs(error[mine & judged] - error[mine & ~judged].mean(0))
+        return out
 
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
         """(subjects,) means of (n,) values, of which nan are left out."""
@@ -153,10 +150,10 @@ def experiment(
     """
     _check(sources)
     scenes = sources[0].run.scenes(EXPERIMENT)
-    prepared, trials = [], []
+    trials: list[Trial] = []
     answers: list[list[Answers]] = [[] for _ in sources]
-    for source in sources:
-        prepared.append(ready(source, image=config.image))
+    prepared = [ready(source, image=config.image) for source in sources]
+    before = [learnt(source, imager, config) for source, imager in zip(sources, prepared, strict=True)]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
@@ -171,8 +168,8 @@ def experiment(
     yield (
         config.subjects,
         [
-            _result(label, source, kept, whole, config)
-            for label, source, kept in zip(labels, sources, answers, strict=True)
+            _result(label, source, kept, whole, config, people)
+            for label, source, kept, people in zip(labels, sources, answers, before, strict=True)
         ],
     )
 
@@ -209,45 +206,108 @@ def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> Unif
     return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin)
 
 
-def _result(name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig) -> Result:
-    slip, centre, iou = (
-        torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("slip_mm", "centre", "iou")
-    )
-    pupil_mm, rig = centre * source.run.window_um * 1e-3, source.run.scenes(EXPERIMENT).rig
-    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig)
+@torch.no_grad()
+def learnt(source: Source, imager: UniformImager | Imager, config: ExperimentConfig) -> People | None:
+    """What a network's readings tell of the gaze of people who calibrated before; None for one that tells no axis.
+
+    ``config.people`` of the validation's stream, whom neither training nor the experiment shows, each looking and
+    slipping in EACH ways within what training saw, at their own scale, through the run's lens, light and noise.
+    """
+    scenes = source.run.scenes(VALIDATION)
+    scenes = replace(scenes, settings=replace(scenes.settings, scale=0.0))
+    crowd = bench.people(scenes, config.people, EACH, seed=BEFORE)
+    found = []
+    for person in range(config.people):
+        states = crowd.states[slice(person * EACH, (person + 1) * EACH)]
+        made = render(states, rig=scenes.rig, camera=scenes.camera)
+        seen = through(source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db)
+        found.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
+    pupil_mm, slip_mm, axis_deg = read_from(found, source)
+    if axis_deg is None:
+        return None
+    looked = face_angles(crowd.labels.visual_axis.numpy(), scenes.rig.elevation_rad)
+    return shared.learn(axis_deg, pupil_mm, slip_mm, looked, np.arange(len(looked)) // EACH)
+
+
+def read_from(kept: Sequence[Answers], source: Source) -> tuple[Array, Array, Array | None]:
+    """Pupil (n, 2) on the sensor and slippage (n, 3), mm, and angles (n, 2) of the optic axis, deg, if it is told."""
+    centre, slip = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "slip_mm"))
+    axes = [a.axis for a in kept if a.axis is not None]
+    tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
+    angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
+    return centre * source.run.window_um * 1e-3, slip, angles
+
+
+def _result(
+    name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig, people: People | None
+) -> Result:
+    pupil_mm, slip, axis_deg = read_from(kept, source)
+    rig = source.run.scenes(EXPERIMENT).rig
+    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig, axis_deg=axis_deg, people=people)
     told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=rig)
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
     mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
+    centre, iou = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "iou"))
     return Result(name, mmacs, trial, slip, centre, iou, error, predicted, told_error, reach)
 
 
 def calibrated(
-    pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
+    pupil_mm: Array,
+    slip_mm: Array,
+    trial: Trial,
+    config: ExperimentConfig,
+    *,
+    rig: Rig,
+    axis_deg: Array | None = None,
+    people: People | None = None,
 ) -> tuple[Array, Array]:
     """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
-    people = taught(pupil_mm, slip_mm, trial, config, rig=rig)
-    return answered(people, pupil_mm, slip_mm, trial), ~np.isin(np.arange(len(pupil_mm)), calibrating(trial, config))
+    own = taught(pupil_mm, slip_mm, trial, config, rig=rig, axis_deg=axis_deg, people=people)
+    judged = ~np.isin(np.arange(len(pupil_mm)), calibrating(trial, config))
+    return answered(own, pupil_mm, slip_mm, trial, axis_deg=axis_deg), judged
 
 
 def taught(
-    pupil_mm: Array, slip_mm: Array, trial: Trial, config: ExperimentConfig, *, rig: Rig
-) -> dict[int, PersonalGaze]:
-    """Every subject's calibration by number, fitted to the stimuli of :func:`calibrating`."""
-    known, people = calibrating(trial, config), {}
-    for subject in np.unique(trial.subject):
-        rows = known[trial.subject[known] == subject]
-        people[int(subject)] = personal.fit(
-            pupil_mm[rows], slip_mm[rows], trial.stimulus_deg[rows], rig=rig, hidden=config.hidden, seed=config.seed
-        )
-    return people
+    pupil_mm: Array,
+    slip_mm: Array,
+    trial: Trial,
+    config: ExperimentConfig,
+    *,
+    rig: Rig,
+    axis_deg: Array | None = None,
+    people: People | None = None,
+) -> dict[int, PersonalGaze] | dict[int, Own]:
+    """Every subject's calibration by number, fitted to the stimuli of :func:`calibrating`.
+
+    By what people have in common where the axis is read and ``people`` tell it; by sphere and regressor otherwise.
+    """
+    known = calibrating(trial, config)
+    mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
+    looked = trial.stimulus_deg
+    if axis_deg is not None and people is not None:
+        return {s: people.person(axis_deg[r], pupil_mm[r], slip_mm[r], looked[r]) for s, r in mine.items()}
+    return {
+        s: personal.fit(pupil_mm[r], slip_mm[r], looked[r], rig=rig, hidden=config.hidden, seed=config.seed)
+        for s, r in mine.items()
+    }
 
 
-def answered(people: dict[int, PersonalGaze], pupil_mm: Array, slip_mm: Array, trial: Trial) -> Array:
+def answered(
+    people: dict[int, PersonalGaze] | dict[int, Own],
+    pupil_mm: Array,
+    slip_mm: Array,
+    trial: Trial,
+    *,
+    axis_deg: Array | None = None,
+) -> Array:
     """(n, 2) gaze of frames, each by its subject's calibration."""
     predicted = np.empty((len(pupil_mm), 2))
     for subject in np.unique(trial.subject):
-        rows = np.flatnonzero(trial.subject == subject)
-        predicted[rows] = people[int(subject)](pupil_mm[rows], slip_mm[rows])
+        rows, person = np.flatnonzero(trial.subject == subject), people[int(subject)]
+        if isinstance(person, PersonalGaze):
+            predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
+        elif axis_deg is not None:
+            predicted[rows] = person(axis_deg[rows], pupil_mm[rows], slip_mm[rows])
     return predicted
 
 

@@ -9,6 +9,27 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 
 Points = Literal["random", "spread"]
+AXIAL, LATERAL = "axial", "lateral"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trial:
+    """Of every frame (n,): subject, stimulus, slippage state; and what was true.
+
+    stimulus_deg: (n, 2). slip_mm: (n, 3).
+    """
+
+    subject: Array
+    stimulus: Array
+    state: Array
+    stimulus_deg: Array
+    slip_mm: Array
+
+    def group(self, kind: str) -> Array:
+        """(n,) frames of the axial or lateral states, the origin among both."""
+        along = 2 if kind == AXIAL else 0
+        other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
+        return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +40,9 @@ class ExperimentConfig:
     axial_mm, lateral_mm: slippage states beside the origin, along z and x.
     share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
         at random or spread over the field, as a calibration screen would show them.
-    hidden: neurons of the regressor. fixation_deg: standard deviation of where a subject really looks.
+    people: who calibrated before, and tell what readings mean for all of them: the prior of every subject.
+    hidden: neurons of the regressor, of networks that tell no axis.
+    fixation_deg: standard deviation of where a subject really looks.
     image: "true", what the device shows, whatever the run was trained on; "trained", the image that the run knows.
     pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
     snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
@@ -32,6 +55,7 @@ class ExperimentConfig:
     lateral_mm: tuple[float, ...] = (-2.5, -5.0)
     share: float = 0.2
     points: Points = "random"
+    people: int = 32
     hidden: int = 10
     fixation_deg: float = 0.3
     pupil_sd: float = 0.05
@@ -46,6 +70,8 @@ class ExperimentConfig:
                 f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
                 "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
             )
+        if self.people < 2:
+            raise ConfigError(f"people {self.people}: need two or more, to tell how people differ")
 
     @property
     def stimuli_deg(self) -> Array:

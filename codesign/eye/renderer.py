@@ -8,7 +8,7 @@ from torch import Tensor
 
 from codesign.eye import model, textures
 from codesign.eye.landmarks import NAMES, iris_to_camera, landmark_points
-from codesign.eye.population import Rig, States, directions, parameters
+from codesign.eye.population import Rig, States, _turn, directions, parameters
 from codesign.eye.view import View
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
@@ -45,6 +45,7 @@ class Labels:
     """What is true of each frame, in the camera's frame; lengths with the scale of the state applied.
 
     slip_um: (n, 3) displacement of the head from the rig's nominal place.
+    shift_um: (n, 3) the same as the camera sees it: with what its own turn and the person's depth displace the head.
     optic_axis, visual_axis: (n, 3) unit vectors, pointing out of the eye.
     centre_um, pupil_um: (n, 3) centre of rotation and of the pupil.
     pupil_px: (n, 2) where the refracted centre of the pupil lands (x, y).
@@ -54,6 +55,7 @@ class Labels:
     """
 
     slip_um: Tensor
+    shift_um: Tensor
     optic_axis: Tensor
     visual_axis: Tensor
     centre_um: Tensor
@@ -137,6 +139,7 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
     centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
     return Labels(
         slip_um=scale * across * (here + states.slip_um) - here,
+        shift_um=scale * across * (_seen_place(states, rig) + states.slip_um) - here,
         optic_axis=optic.detach(),
         visual_axis=visual.detach(),
         centre_um=scale * across * centre,
@@ -146,6 +149,12 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
         visible=(weight / area.clamp_min(1e-6)).clamp(0, 1),
         landmarks_px=camera.position_px(landmark_points(p) / wide[:, None, None], rig),
     )
+
+
+def _seen_place(states: States, rig: Rig) -> Tensor:
+    """(n, 3) where a pupil that looks straight ahead stands before a camera turned by its mounting; not slipped."""
+    depth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) * states.trait("depth_um")[:, None]
+    return _turn(torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64) + depth, states.mount_rad)
 
 
 def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:

@@ -7,17 +7,25 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.gaze import bench as bench
     from codesign.gaze import personal as personal
+    from codesign.gaze import shared as shared
     from codesign.gaze.bench import GazeErrors as GazeErrors
     from codesign.gaze.personal import PersonalGaze as PersonalGaze
     from codesign.gaze.personal import angle_deg as angle_deg
+    from codesign.gaze.personal import face_angles as face_angles
+    from codesign.gaze.shared import Own as Own
+    from codesign.gaze.shared import People as People
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "GazeErrors": "bench",
+        "Own": "shared",
+        "People": "shared",
         "PersonalGaze": "personal",
         "angle_deg": "personal",
         "bench": "",
+        "face_angles": "personal",
         "personal": "",
+        "shared": "",
     },
 )

@@ -20,6 +20,8 @@ from metalens.ground.errors import ConfigError
 # widths of the heads; the networks and the count share them
 LEAST_SIZE = 16  # pixels along the edge of an input
 MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN = 24, 16, 8, 64
+POINTS = 10  # landmarks of the eye that are sought, and the pupil's middle
+POINT_FEATURES = 3 * POINTS  # their places, and how wide their maps are
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +68,11 @@ def network(space: Space, architecture: Architecture) -> Cost:
     for stage, stride in laterals:
         per_pixel[stride] = per_pixel.get(stride, 0) + rows[stage][-1].outputs * MASK_CHANNELS
     finest = laterals[0][1]
-    per_pixel[finest] += MASK_CHANNELS * (9 + 1)  # depthwise 3x3, then the mask itself
+    per_pixel[finest] += MASK_CHANNELS * (9 + 1 + POINTS)  # depthwise 3x3, then the mask itself and the landmarks
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
-    heads = (SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES) * SLIP_HIDDEN + SLIP_HIDDEN * (2 * SLIP_HIDDEN + 6)
+    told = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
+    heads = told * SLIP_HIDDEN + SLIP_HIDDEN * ((3 + 2) * SLIP_HIDDEN + 3 * 3)
     heads += blur.content_macs(MASK_CHANNELS)
     return Cost(per_pixel, body.constant + heads, blur=True)
 

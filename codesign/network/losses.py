@@ -7,6 +7,8 @@ from torch.nn import functional as F
 from codesign.network.supernet import Prediction
 
 SPREAD_WEIGHT = 0.1  # of the uncertainty's own loss: it moves its own layer alone
+POINT_UNIT, AXIS_UNIT = 0.05, 0.1  # of the image's width; of a unit vector: 6 degrees
+POINT_KNEE, AXIS_KNEE = 0.1, 0.3  # of these units: straight beyond half a per cent of the image, and 2 degrees
 
 
 def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
@@ -22,7 +24,12 @@ def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
 
 
 def segmentation(logits: Tensor, mask: Tensor) -> Tensor:
-    """Dice loss plus cross entropy, which carries the gradient while the mask is still far off."""
+    """Dice loss plus cross entropy, which carries the gradient while the mask is still far off.
+
+    On the finer grid of the two, to which the logits are interpolated, as who scores them does.
+    """
+    if mask.shape[-1] > logits.shape[-1]:
+        logits = F.interpolate(logits[:, None], size=mask.shape[-2:], mode="bilinear", align_corners=False)[:, 0]
     target = resized(mask, logits)
     return dice(logits, target) + F.binary_cross_entropy_with_logits(logits, target)
 
@@ -74,6 +81,23 @@ def reading(
     """
     told = found.slip.new_zeros(()) if found.depth is None else depth_weight * depth(found.depth, vergence)
     return told + SPREAD_WEIGHT * spread(found, slip_mm / scale_mm)
+
+
+def pose(
+    found: Prediction, axis: Tensor, points: Tensor, *, axis_weight: float = 2.0, point_weight: float = 0.5
+) -> Tensor:
+    """Landmarks that lie in the image, and the optic axis; 0 for a network that tells neither.
+
+    Args:
+        axis: (batch, 3) unit vectors. points: (batch, points, 2) as a fraction of the image from its middle.
+    """
+    if found.points is None or found.axis is None:
+        return found.slip.new_zeros(())
+    inside = (points.abs() < 0.5).all(-1)
+    miss = F.smooth_l1_loss(found.points / POINT_UNIT, points / POINT_UNIT, beta=POINT_KNEE, reduction="none").mean(-1)
+    seen = (miss * inside).sum() / inside.sum().clamp_min(1)
+    turned = F.smooth_l1_loss(found.axis / AXIS_UNIT, axis / AXIS_UNIT, beta=AXIS_KNEE)
+    return axis_weight * turned + point_weight * seen
 
 
 def place(centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3) -> Tensor:

@@ -17,7 +17,16 @@ from torch.nn import functional as F
 from codesign.batches import parallel
 from codesign.network import blur
 from codesign.network.architecture import Architecture, Block, Space, blocks, largest, stem_channels
-from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, SLIP_HIDDEN, lateral_strides, network
+from codesign.network.cost import (
+    MASK_CHANNELS,
+    POINT_FEATURES,
+    POINTS,
+    SLIP_CHANNELS,
+    SLIP_GRID,
+    SLIP_HIDDEN,
+    lateral_strides,
+    network,
+)
 from codesign.network.running import RunningNorm
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
@@ -33,6 +42,9 @@ class Prediction:
     depth: (batch, 2, windows, windows) what blur tells of each window's depth (:mod:`codesign.network.blur`): vergence
         and the logarithm of its standard deviation; None of a network without that branch.
     slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``; None of a network that does not tell it.
+    points: (batch, POINTS, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's middle, as ``centre`` is told;
+        None of a network that seeks none.
+    axis: (batch, 3) optic axis of the eye in the camera's frame, not normalised; likewise.
     """
 
     mask_logits: Tensor
@@ -40,6 +52,8 @@ class Prediction:
     slip: Tensor
     depth: Tensor | None = None
     slip_log_sd: Tensor | None = None
+    points: Tensor | None = None
+    axis: Tensor | None = None
 
 
 class SlicedNorm(nn.Module):
@@ -137,27 +151,33 @@ class ElasticBlock(nn.Module):
 
 
 class PerceptionHead(nn.Module):
-    """Pupil mask from the last features of every stride, added up from coarse to fine; and what it is decoded from."""
+    """Pupil mask and maps of landmarks from the last features of every stride, added up from coarse to fine.
+
+    ``forward(features) -> (mask, maps, decoded)``: the last is what both are decoded from.
+    """
 
     def __init__(self, channels: list[int]) -> None:
         super().__init__()
         self.laterals = nn.ModuleList(SlicedConv(c, MASK_CHANNELS) for c in channels)
         self.smooth = SlicedConv(MASK_CHANNELS, MASK_CHANNELS, 3, depthwise=True)
         self.mask = nn.Conv2d(MASK_CHANNELS, 1, 1)
+        self.points = nn.Conv2d(MASK_CHANNELS, POINTS, 1)
 
-    def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor]:
+    def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         total = F.hardswish(self.laterals[-1](features[-1], MASK_CHANNELS))
         for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
             total = F.interpolate(total, size=feature.shape[-2:], mode="nearest")
             total = total + F.hardswish(lateral(feature, MASK_CHANNELS))
         decoded = F.hardswish(self.smooth(total, MASK_CHANNELS, kernel=3))
-        return self.mask(decoded)[:, 0], decoded
+        return self.mask(decoded)[:, 0], self.points(decoded), decoded
 
 
 class CalibrationHead(nn.Module):
-    """Slip from the flattened last feature map, so that place in the image is kept (paper Eq. 7), and from the depths.
+    """Slip and optic axis from the flattened last feature map, so that place in the image is kept (paper Eq. 7), from
+    the depths and from the landmarks: ``forward(features, depths, points) -> (slip, spread, axis)``.
 
-    Its uncertainty is read from the same features, but does not shape them.
+    What no depth changes, the axis, is read without depths. The uncertainty is read from what the slip is read from,
+    but does not shape it.
     """
 
     def __init__(self, channels: int) -> None:
@@ -165,16 +185,20 @@ class CalibrationHead(nn.Module):
         self.reduce = SlicedConv(channels, SLIP_CHANNELS)
         self.hidden = nn.Linear(SLIP_CHANNELS * SLIP_GRID**2, SLIP_HIDDEN)
         self.depths = nn.Linear(blur.SLIP_FEATURES, SLIP_HIDDEN)
-        self.joined = nn.Linear(2 * SLIP_HIDDEN, SLIP_HIDDEN)
+        self.points = nn.Linear(POINT_FEATURES, SLIP_HIDDEN)
+        self.joined = nn.Linear(3 * SLIP_HIDDEN, SLIP_HIDDEN)
         self.slip = nn.Linear(SLIP_HIDDEN, 3)
         self.spread = nn.Linear(SLIP_HIDDEN, 3)
+        self.turned = nn.Linear(2 * SLIP_HIDDEN, SLIP_HIDDEN)
+        self.axis = nn.Linear(SLIP_HIDDEN, 3)
 
-    def forward(self, features: Tensor, depths: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor, depths: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         reduced = F.hardswish(self.reduce(features, SLIP_CHANNELS))
         grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
-        both = torch.cat([self.hidden(grid.flatten(1)), self.depths(depths)], 1)
-        joined = F.hardswish(self.joined(F.hardswish(both)))
-        return self.slip(joined), self.spread(joined.detach()).clamp(-4, 2)
+        seen = F.hardswish(torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1))
+        joined = F.hardswish(self.joined(torch.cat([seen, F.hardswish(self.depths(depths))], 1)))
+        axis = self.axis(F.hardswish(self.turned(seen)))
+        return self.slip(joined), self.spread(joined.detach()).clamp(-4, 2), axis
 
 
 class Supernet(nn.Module):
@@ -204,11 +228,12 @@ class Supernet(nn.Module):
                 x = module(x, block)
             if i in kept:
                 features.append(x)
-        logits, decoded = self.perception(features)
+        logits, maps, decoded = self.perception(features)
         depth, told, axial = self.blur(seen, decoded)
-        slip, spread = self.calibration(x, told)
+        points, spread_out = places(maps)
+        slip, spread, axis = self.calibration(x, told, torch.cat([points.flatten(1), spread_out], 1))
         slip = slip + F.pad(axial[:, None], (2, 0))
-        return Prediction(logits, soft_argmax(logits), slip, depth, spread)
+        return Prediction(logits, soft_argmax(logits), slip, depth, spread, points, axis)
 
     def counts(self, architecture: Architecture, sizes: Array) -> Array:
         """Multiply-accumulates of a member for square frames of these sizes after scaling (integers), exact."""
@@ -246,6 +271,23 @@ def soft_argmax(logits: Tensor) -> Tensor:
     x = (torch.arange(width, device=logits.device) + 0.5) / width - 0.5
     y = (torch.arange(height, device=logits.device) + 0.5) / height - 0.5
     return torch.stack([(weight.sum(1) * x).sum(1) / total, (weight.sum(2) * y).sum(1) / total], -1)
+
+
+def places(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """(batch, points, 2) centre of mass x, y of every map's softmax, fraction of the image from its middle, and
+    (batch, points) its root mean square width: wide where the point is not seen, or out of the image.
+
+    Args:
+        maps: (batch, points, y, x).
+    """
+    height, width = maps.shape[-2:]
+    share = torch.softmax(maps.flatten(2), 2).view(maps.shape)
+    columns, rows = share.sum(2), share.sum(3)
+    x = (torch.arange(width, dtype=maps.dtype, device=maps.device) + 0.5) / width - 0.5
+    y = (torch.arange(height, dtype=maps.dtype, device=maps.device) + 0.5) / height - 0.5
+    middle = torch.stack([columns @ x, rows @ y], -1)
+    around = (columns * (x - middle[..., :1]) ** 2).sum(-1) + (rows * (y - middle[..., 1:]) ** 2).sum(-1)
+    return middle, torch.sqrt(around + 1e-6)
 
 
 @torch.no_grad()

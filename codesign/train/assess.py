@@ -71,6 +71,7 @@ class Answers:
     slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of one that gives none.
     depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its spread; likewise.
     mask: (n, y, x) logits of the pupil on the network's own grid; likewise.
+    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise.
     """
 
     slip_mm: Tensor
@@ -79,6 +80,7 @@ class Answers:
     slip_sd_mm: Tensor | None = None
     depth: Tensor | None = None
     mask: Tensor | None = None
+    axis: Tensor | None = None
 
 
 @torch.no_grad()
@@ -94,6 +96,7 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
     shared = losses.overlap(mask, seen.mask, pixels=pixels)
     spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
     depth = [f.depth for f in found if f.depth is not None]
+    axis = [f.axis for f in found if f.axis is not None]
     return Answers(
         slip,
         torch.cat([f.centre for f in found]),
@@ -101,6 +104,7 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
         torch.cat(spread).exp() * torch.tensor(inner.slip_scale_mm) if spread else None,
         torch.cat(depth) if depth else None,
         mask if mask.numel() else None,
+        torch.nn.functional.normalize(torch.cat(axis), dim=1) if axis else None,
     )
 
 

@@ -12,7 +12,7 @@ from metalens.ground import config
 from metalens.ground.errors import TrainingError
 from metalens.ground.store import replacing
 
-VERSION = 8
+VERSION = 9
 ABOUT = "about"
 _TENSOR = "\0tensor"
 

@@ -252,13 +252,13 @@ class Trainer:
         frames = {False: given.seen} if given.seen is not None else {
             resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
         }  # fmt: skip
-        batch, parts = given.batch, []
+        batch, pose, parts = given.batch, given.batch.pose, []
+        shift = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
             answer = self.model.net(frames[finer[a]], a)
-            parts.append(losses.task(answer, batch.mask, batch.slip_mm, scale, slip_weight=self.inner.slip_weight))
-            parts[-1] = parts[-1] + losses.reading(
-                answer, given.vergence, batch.slip_mm, scale, depth_weight=self.inner.depth_weight
-            )
+            loss = losses.task(answer, batch.mask, shift, scale, slip_weight=self.inner.slip_weight)
+            loss = loss + losses.reading(answer, given.vergence, shift, scale, depth_weight=self.inner.depth_weight)
+            parts.append(loss if pose is None else loss + losses.pose(answer, pose.axis, pose.points))
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), macs
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import Batch
+from codesign.batches.batch import Batch, Pose
 from metalens.ground.errors import TrainingError
 from metalens.image.scene import Frames
 
@@ -125,3 +125,15 @@ def test_an_uneven_share_of_a_batch_is_refused(monkeypatch):
     frames = Frames(*(torch.rand(3, 2, 4, 4) for _ in range(3)))
     with pytest.raises(TrainingError, match="a batch of 3 frames on 2 processes"):
         parallel.part_of(Batch(frames, torch.zeros(3, 4, 4), torch.zeros(3, 3)))
+
+
+def test_every_process_takes_its_frames_with_their_pose(monkeypatch):
+    monkeypatch.setattr(parallel, "ranks", lambda: 2)
+    monkeypatch.setattr(parallel, "rank", lambda: 1)
+    frames = Frames(*(torch.rand(4, 2, 5, 5) for _ in range(3)))
+    pose = Pose(torch.arange(12.0).view(4, 3), torch.rand(4, 3), torch.rand(4, 10, 2))
+    batch = parallel.part_of(Batch(frames, torch.rand(4, 5, 5), torch.rand(4, 3), pose))
+    assert batch.pose.shift_mm.tolist() == [[6.0, 7.0, 8.0], [9.0, 10.0, 11.0]]
+    assert torch.equal(batch.pose.axis, pose.axis[2:])
+    assert torch.equal(batch.pose.points, pose.points[2:])
+    assert torch.equal(batch.frames.radiance, frames.radiance[2:])

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from codesign.batches import pool
 from codesign.batches.scenes import TEST, TRAINING, EyeScenes, SceneConfig
 from metalens.ground.errors import ConfigError
 
@@ -68,3 +70,36 @@ def test_variety_widens_looks_and_nothing_else():
     assert float(wide.aperture.min()) < 0.52 < 0.74 < float(plain.aperture.min())
     with pytest.raises(ConfigError, match="variety = 5"):
         SceneConfig(variety=5.0)
+
+
+def test_the_shift_is_where_the_pupil_of_an_eye_that_looks_straight_ahead_stands():
+    """Turn of the mount, depth of the person, slippage and scale at once; the pupil is the renderer's own label."""
+    scenes = replace(_scenes(), settings=replace(SMALL, depth_sd_mm=1.3))
+    states = scenes.states(2, 6)
+    ahead = replace(states, gaze_rad=0 * states.gaze_rad, scale=1 + 0.1 * torch.arange(6, dtype=torch.float64))
+    from codesign.eye.renderer import render
+
+    labels = render(ahead, rig=scenes.rig, camera=scenes.camera).labels
+    here = torch.tensor([*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64)
+    torch.testing.assert_close(labels.shift_um, labels.pupil_um - here, rtol=1e-9, atol=1e-5)
+    apart = (labels.shift_um - labels.slip_um).abs().mean(0)
+    assert float(apart[:2].min()) > 90  # a degree of mounting at 21 mm, spread evenly: 180 um in the mean of many
+    assert float(apart[2]) > 300  # depth of the person
+
+
+def test_poses_of_a_pool_are_those_of_the_renderer_whatever_the_view():
+    """Other cameras see wider fields: landmarks and places shrink across, the axis turns with the face."""
+    wide = EyeScenes(replace(SMALL, variety=3.0), 18.0, 2000.0, 4)
+    direct, made = wide.batch(0, 24), pool.fill(wide, 24)
+    states = wide.states(0, 24)
+    drawn = pool.PoolScenes(made, wide.margin, 0.0, seed=1).rows(np.arange(24), np.random.default_rng(0))
+    here = torch.tensor([*wide.rig.aim_um, wide.rig.distance_um], dtype=torch.float64) * 1e-3
+    for ours, theirs in ((drawn.slip_mm, direct.slip_mm), (drawn.pose.shift_mm, direct.pose.shift_mm)):
+        scaled = states.scale[:, None] * (ours.double() + here) - here
+        torch.testing.assert_close(scaled, theirs.double(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(drawn.pose.axis, direct.pose.axis)
+    torch.testing.assert_close(drawn.pose.points, direct.pose.points)
+    labels = wide.rendered(0, 24).labels
+    side = wide.camera.pixels
+    x = (labels.pupil_px[:, 0] + 0.5) * 18.0 - 18.0 * side / 2  # um on the sensor, from the axis
+    torch.testing.assert_close(direct.pose.points[:, -1, 0].double(), x / (48 * 18.0), rtol=1e-5, atol=1e-6)

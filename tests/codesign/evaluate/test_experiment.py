@@ -19,7 +19,7 @@ from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
-from codesign.gaze import personal, regressor
+from codesign.gaze import personal, regressor, shared
 from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
 from tests.referees.seen_pupil import pupil_of
@@ -178,3 +178,54 @@ def test_places_that_cover_a_plane_are_each_the_farthest_from_all_before():
     places = np.array([[0.0, 0.0], [1.0, 0.2], [9.0, 1.0], [8.0, 7.0], [0.5, 6.0], [4.6, 3.6]])
     assert experiment.spread(places, 5, first=1).tolist() == [1, 3, 2, 4, 5]
     assert experiment.spread(places, 1, first=4).tolist() == [4]
+
+
+def test_slippage_is_told_from_where_its_wearer_calibrated():
+    """Two subjects read off by constants of their own and by (0.1, -0.2, 0.3) mm on judged frames alone."""
+    trial = _trial(SMALL, 2)
+    judged = trial.stimulus % 3 > 0
+    off = np.array([[0.5, 0.0, -0.7], [-0.4, 0.9, 0.2]])[trial.subject]
+    read = trial.slip_mm + off + judged[:, None] * np.array([0.1, -0.2, 0.3])
+    blank, error = np.zeros((len(read), 2)), np.where(judged, 1.0, np.nan)
+    found = experiment.Result("a", 1.0, trial, read, blank, error, error, blank, error).slip_rest_mm
+    assert np.isnan(found[~judged]).all()
+    assert found[judged] == pytest.approx(np.tile([0.1, 0.2, 0.3], (judged.sum(), 1)))
+
+
+def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
+    """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and pupil are told nothing."""
+    rng, config = np.random.default_rng(3), ExperimentConfig(subjects=2)
+    trial, rig = _trial(config, 2), Rig()
+
+    def misread(gaze, slip, kappa):
+        return gaze + kappa + 0.1 * slip[:, [0]] * slip[:, [2]] + 0.1 * slip[:, [2]] ** 2
+
+    person = np.repeat(np.arange(12), 20)
+    gaze, slip = rng.uniform(-17, 17, (240, 2)), rng.uniform(-5, 5, (240, 3))
+    pupil = rng.normal(0, 0.3, (240, 2))
+    people = shared.learn(misread(gaze, slip, rng.normal(5, 2, (12, 2))[person]), pupil, slip, gaze, person)
+    axis = misread(trial.stimulus_deg, trial.slip_mm, np.array([[3.0, -1.0], [7.0, 4.0]])[trial.subject])
+    blind = np.zeros((len(axis), 2))
+    given = {"rig": rig, "axis_deg": axis, "people": people}
+    predicted, judged = experiment.calibrated(blind, trial.slip_mm, trial, config, **given)
+    assert personal.angle_deg(predicted, trial.stimulus_deg)[judged].mean() < 0.05
+    alone = experiment.taught(blind, trial.slip_mm, trial, replace(config, hidden=0), rig=rig, axis_deg=axis)
+    assert isinstance(alone[0], personal.PersonalGaze)
+
+
+def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
+    source = retraining.load(folder / "run")
+    config, imager = replace(SMALL, people=2), experiment.ready(source)
+    found, again, dim = (
+        experiment.learnt(source, imager, c) for c in (config, config, replace(config, snr_db=3.0))
+    )  # fmt: skip
+    assert found.model.mean.shape == (36, 2)
+    assert np.isfinite(found.model.mean).all()
+    assert np.array_equal(found.model.mean, again.model.mean)
+    assert not np.allclose(found.middle, dim.middle, rtol=1e-3)  # in the light of the experiment
+
+
+@pytest.mark.parametrize("people", [0, 1])
+def test_one_person_tells_not_how_people_differ(people):
+    with pytest.raises(ConfigError, match=f"people {people}"):
+        replace(SMALL, people=people)

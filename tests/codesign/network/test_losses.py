@@ -1,5 +1,7 @@
 """Losses: closed values at the ends, finite on empty masks, gradients by finite differences."""
 
+import math
+
 import pytest
 import torch
 
@@ -82,8 +84,9 @@ def test_task_adds_mask_and_twice_the_slip():
     kinds = {"mask_logits": logits, "slip": slip}
     names = Prediction.__dataclass_fields__ if hasattr(Prediction, "__dataclass_fields__") else Prediction._fields
     found = Prediction(**{n: kinds.get(n, torch.zeros(2, 2)) for n in names})
-    bce = torch.nn.functional.binary_cross_entropy_with_logits(logits, losses.resized(mask, logits))
-    want = losses.dice(logits, losses.resized(mask, logits)) + bce + 2 * losses.slip(slip, truth, scale)
+    fine = torch.nn.functional.interpolate(logits[:, None], scale_factor=2, mode="bilinear", align_corners=False)[:, 0]
+    bce = torch.nn.functional.binary_cross_entropy_with_logits(fine, mask)
+    want = losses.dice(fine, mask) + bce + 2 * losses.slip(slip, truth, scale)
     assert float(losses.task(found, mask, truth, scale)) == pytest.approx(float(want), rel=1e-6)
 
 
@@ -92,3 +95,32 @@ def test_dice_of_a_half_covered_mask_in_closed_form():
     mask = torch.zeros(1, 4, 6, dtype=torch.float64)
     mask[0, :, :2] = 1
     assert float(losses.dice(logits, mask, smooth=3.0)) == pytest.approx(1 - (2 * 4 + 3) / (12 + 8 + 3), rel=1e-12)
+
+
+def test_masks_are_held_to_the_finer_grid_of_the_two():
+    """An edge at a third of a cell: no logit of that cell costs less than the entropy of a third; on pixels it can."""
+    mask = torch.zeros(1, 12, 12, dtype=torch.float64)
+    mask[0, :, :7] = 1  # cells of three pixels: the third holds one of them
+    steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(1, 4, 4)  # 0 at x = 7 pixels
+    assert float(losses.segmentation(steep, mask)) < 0.1
+    entropy = (math.log(3) + 2 * math.log(3 / 2)) / 3 / 4  # of one column of four
+    assert float(losses.segmentation(steep, torch.nn.functional.avg_pool2d(mask, 3))) > entropy > 0.15
+
+
+def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
+    """Off by 0.002 of the image (under the knee of 0.005), by 0.1 (beyond), outside; by 0.01 and 0.2 of the axis."""
+    from codesign.network.supernet import Prediction
+
+    points = torch.tensor([[[0.1, -0.4], [0.2, 0.3], [0.1, 0.51]]])
+    axis = torch.tensor([[0.2, -0.7, -0.66]])
+    told = points + torch.tensor([[[0.002, 0.0], [0.0, 0.1], [3.0, 3.0]]])
+    turned = axis + torch.tensor([[0.01, 0.0, -0.2]])
+    found = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3), points=told, axis=turned)
+    seen = (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2  # two coordinates, two points inside
+    looked = (0.1**2 / 2 / 0.3 + (2.0 - 0.15)) / 3
+    got = losses.pose(found, axis, points, axis_weight=0.7, point_weight=3.0)
+    assert float(got) == pytest.approx(0.7 * looked + 3.0 * seen, rel=1e-5)
+    nothing = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3))
+    assert float(losses.pose(nothing, axis, points)) == 0
+    away = losses.pose(found, axis, points + 2, axis_weight=0.0)
+    assert float(away) == 0  # no landmark in the image: finite

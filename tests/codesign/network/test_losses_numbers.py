@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 
 from codesign.network import blur, losses
 
@@ -59,19 +60,24 @@ def test_slippage_is_squared_to_three_tenths_of_its_scale_and_linear_beyond():
 
 
 def test_a_task_is_its_mask_and_twice_its_slippage():
-    """Dice 1 - (2 Σpm + 1) / (Σp + Σm + 1) and cross entropy on a mask of the logits' size."""
+    """Dice 1 - (2 Σpm + 1) / (Σp + Σm + 1) and cross entropy on the mask's pixels, between the middles of logits."""
+
+    def seen(logits, mask):
+        p = 1 / (1 + np.exp(-logits))
+        dice = (1 - (2 * (p * mask).sum((1, 2)) + 1) / (p.sum((1, 2)) + mask.sum((1, 2)) + 1)).mean()
+        return dice - (mask * np.log(p) + (1 - mask) * np.log(1 - p)).mean()
+
     logits, mask = RNG.normal(0, 2, (4, 5, 6)), RNG.uniform(0, 1, (4, 5, 6))
-    p = 1 / (1 + np.exp(-logits))
-    dice = (1 - (2 * (p * mask).sum((1, 2)) + 1) / (p.sum((1, 2)) + mask.sum((1, 2)) + 1)).mean()
-    entropy = -(mask * np.log(p) + (1 - mask) * np.log(1 - p)).mean()
     off = np.abs(SLIP - TRUTH)
     slip = np.where(off < 0.3, off**2 / 0.6, off - 0.15).mean()
     given = torch.from_numpy(mask), torch.from_numpy(TRUTH * SCALE), torch.from_numpy(SCALE)
     got = losses.task(found(mask_logits=torch.from_numpy(logits)), *given)
-    assert float(got) == pytest.approx(dice + entropy + 2 * slip, rel=1e-9)
-    fine = torch.from_numpy(mask).repeat_interleave(3, 1).repeat_interleave(2, 2)
-    got = losses.task(found(mask_logits=torch.from_numpy(logits)), fine, *given[1:], slip_weight=0.7)
-    assert float(got) == pytest.approx(dice + entropy + 0.7 * slip, rel=1e-9)
+    assert float(got) == pytest.approx(seen(logits, mask) + 2 * slip, rel=1e-9)
+    fine = RNG.uniform(0, 1, (4, 15, 12))
+    y, x = np.meshgrid((np.arange(15) + 0.5) / 3 - 0.5, (np.arange(12) + 0.5) / 2 - 0.5, indexing="ij")
+    drawn = np.stack([map_coordinates(one, [y, x], order=1, mode="nearest") for one in logits])
+    got = losses.task(found(mask_logits=torch.from_numpy(logits)), torch.from_numpy(fine), *given[1:], slip_weight=0.7)
+    assert float(got) == pytest.approx(seen(drawn, fine) + 0.7 * slip, rel=1e-9)
 
 
 def test_a_network_without_a_mask_is_held_to_the_centroid():

@@ -158,7 +158,7 @@ def test_the_layers_are_the_dense_ones_that_every_member_uses_whole():
     assert [names[id(p)] for p in soap.layers(net)] == [
         "blur.first.weight", "blur.around.0.mix.weight", "blur.around.1.mix.weight", "blur.second.weight",
         "blur.depth.weight", "blur.content.weight", "calibration.hidden.weight", "calibration.depths.weight",
-        "calibration.joined.weight",
+        "calibration.points.weight", "calibration.joined.weight", "calibration.turned.weight",
     ]  # fmt: skip
     assert soap.layers(nn.Linear(20, 20)) == []  # no part of it reads blur
 

@@ -21,6 +21,33 @@ def test_a_centre_counts_probabilities_above_a_twentieth_by_what_they_exceed_it(
     assert y == pytest.approx((0.5 * (0.5 / 4 - 0.5) + 0.1 * (3.5 / 4 - 0.5)) / 0.6, rel=1e-4)
 
 
+def test_a_landmark_is_the_centre_of_its_map_and_tells_how_wide_it_is():
+    """Shares of 3/4 and 1/4 at two pixels; an even map of n by m pixels has variance (1 - 1/n²) / 12 a side."""
+    maps = torch.full((1, 2, 4, 10), -1e3, dtype=torch.float64)
+    maps[0, 0, 1, 7], maps[0, 0, 3, 2] = np.log(3.0), 0.0
+    maps[0, 1] = 0.3
+    middle, width = supernet.places(maps)
+    x, y = 0.75 * 0.25 + 0.25 * -0.25, 0.75 * -0.125 + 0.25 * 0.375  # of pixels (7, 1) and (2, 3)
+    assert middle[0].numpy() == pytest.approx(np.array([[x, y], [0.0, 0.0]]), abs=1e-6)
+    apart = 0.75 * 0.25 * (0.5**2 + 0.5**2)
+    even = (1 - 1 / 100) / 12 + (1 - 1 / 16) / 12
+    assert width[0].numpy() == pytest.approx(np.sqrt([apart, even]), rel=1e-5)
+
+
+@torch.no_grad()
+def test_the_axis_is_told_without_depths_and_the_slip_with_them_both_from_landmarks():
+    torch.manual_seed(2)
+    head = supernet.CalibrationHead(24).eval()
+    features, depths, points = torch.randn(2, 24, 6, 6), torch.randn(2, blur.SLIP_FEATURES), torch.randn(2, 30)
+    slip, _, axis = head(features, depths, points)
+    other_slip, _, other_axis = head(features, depths + 1, points)
+    assert torch.equal(axis, other_axis)
+    assert float((slip - other_slip).abs().min()) > 1e-4
+    moved_slip, _, moved_axis = head(features, depths, points + 1)
+    assert float((moved_axis - axis).abs().min()) > 1e-4
+    assert float((moved_slip - slip).abs().min()) > 1e-4
+
+
 def test_frames_are_averaged_by_whole_factors_and_then_drawn_between():
     frames = torch.from_numpy(np.random.default_rng(5).uniform(1, 9, (1, 1, 6, 8)))
     half = supernet.scaled(frames, 0.5)

@@ -1,0 +1,153 @@
+"""Gaze of one person from few points, with what is common to people learned from others: a linear mixed model.
+
+A network reads the optic axis, the pupil and the slippage of every frame, each with errors of its own. Over people,
+gaze follows them as
+
+    g = a + F (β + u_p) + e,    u_p ~ N(0, diag τ²),  e ~ N(0, σ²),    F = (1, x, x xᵀ),  x = (a, pupil, slippage)
+
+(Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all, u_p is of one person. β, τ²
+and σ² come from people whom nobody judges (:func:`learn`: expectation maximisation); a person's u_p is its mean under
+that prior, given a few frames. So terms by which people hardly differ, as how a network misreads large slippage, need
+no points of theirs, and kappa, by which they differ most, gets nearly all of them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.errors import TrainingError
+
+ROUNDS = 40  # of expectation maximisation: answers stand by then, variances near 0 still fall
+KAPPA_DEG, OTHERS_DEG = 5.0, 1.0  # first guess of how people differ: by an offset, and by any other term a unit
+LEAST = 1e-9  # deg²: a variance that people do not show stays above 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Mixed:
+    """What people have in common, and how far they differ.
+
+    mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of answers in degrees.
+    """
+
+    mean: Array
+    variance: Array
+    noise: Array
+
+    def own(self, design: Array, answers: Array) -> Array:
+        """(terms, 2) coefficients β + u of one person, the mean under the prior given its frames.
+
+        Args:
+            design: (n, terms). answers: (n, 2).
+        """
+        return np.stack([self.mean[:, k] + self._of(design, answers, k)[0] for k in range(2)], 1)
+
+    def _of(self, design: Array, answers: Array, k: int) -> tuple[Array, Array]:
+        """Mean (terms,) and covariance (terms, terms) of u in one answer."""
+        cov = np.linalg.inv(design.T @ design / self.noise[k] + np.diag(1 / self.variance[:, k]))
+        return cov @ (design.T @ (answers[:, k] - design @ self.mean[:, k])) / self.noise[k], cov
+
+
+def mixed(design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS) -> Mixed:
+    """The model of greatest likelihood, from ``rounds`` of expectation maximisation.
+
+    Args:
+        design: (n, terms). answers: (n, 2), deg. person: (n,) numbers of people.
+        first: (terms,) variances to begin from.
+
+    Raises:
+        TrainingError: fewer than two people, or fewer frames than terms.
+    """
+    people = [np.flatnonzero(person == p) for p in np.unique(person)]
+    if len(people) < 2 or len(design) <= design.shape[1]:
+        raise TrainingError(
+            f"{len(design)} frames of {len(people)} people tell not how people differ in {design.shape[1]} terms: give "
+            "two people or more, and more frames than terms"
+        )
+    mean = np.linalg.lstsq(design, answers, rcond=None)[0]
+    found = Mixed(mean, np.repeat(first[:, None], 2, 1), np.maximum((answers - design @ mean).var(0), LEAST))
+    for _ in range(rounds):
+        found = _again(found, design, answers, people)
+    return found
+
+
+def _again(found: Mixed, design: Array, answers: Array, people: list[Array]) -> Mixed:
+    """One round: u of everybody given the model, then the model given them (both with their covariances)."""
+    mean, variance, noise = (np.empty_like(v) for v in (found.mean, found.variance, found.noise))
+    for k in range(2):
+        told = [found._of(design[rows], answers[rows], k) for rows in people]
+        theirs = np.zeros(len(design))
+        for rows, (u, _) in zip(people, told, strict=True):
+            theirs[rows] = design[rows] @ u
+        mean[:, k] = np.linalg.lstsq(design, answers[:, k] - theirs, rcond=None)[0]
+        variance[:, k] = np.mean([u**2 + np.diag(cov) for u, cov in told], axis=0) + LEAST
+        left = ((answers[:, k] - design @ mean[:, k] - theirs) ** 2).sum()
+        unsure = sum(np.sum((design[rows] @ cov) * design[rows]) for rows, (_, cov) in zip(people, told, strict=True))
+        noise[k] = (left + unsure) / len(design) + LEAST
+    return Mixed(mean, variance, noise)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class People:
+    """What a network's readings tell of gaze, over people.
+
+    model: of the terms. middle, spread: (7,) of the readings over people, the unit of every term.
+    """
+
+    model: Mixed
+    middle: Array
+    spread: Array
+
+    def terms(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
+        """(n, 36) the constant, the readings in their units, and their products."""
+        return _terms(_together(axis_deg, pupil_mm, slip_mm), self.middle, self.spread)
+
+    def person(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array, gaze_deg: Array) -> "Own":
+        """Calibrate a person.
+
+        Args:
+            axis_deg: (n, 2) angles of the optic axis as read. pupil_mm: (n, 2) on the sensor. slip_mm: (n, 3).
+            gaze_deg: (n, 2) where the person looked, across and down.
+
+        Raises:
+            TrainingError: fewer than 3 points.
+        """
+        if len(axis_deg) < 3:
+            raise TrainingError(f"a personal calibration from {len(axis_deg)} points, need 3 or more")
+        return Own(self, self.model.own(self.terms(axis_deg, pupil_mm, slip_mm), gaze_deg - axis_deg))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Own:
+    """A calibrated person. people: the prior. coefficients: (36, 2) of this person's terms, deg."""
+
+    people: People
+    coefficients: Array
+
+    def __call__(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
+        """(n, 2) gaze across and down, deg."""
+        return np.asarray(axis_deg + self.people.terms(axis_deg, pupil_mm, slip_mm) @ self.coefficients)
+
+
+def learn(axis_deg: Array, pupil_mm: Array, slip_mm: Array, gaze_deg: Array, person: Array) -> People:
+    """What readings of many people tell of gaze; arguments as of :meth:`People.person`, person: (n,) their numbers.
+
+    Raises:
+        TrainingError: too few people or frames.
+    """
+    together = _together(axis_deg, pupil_mm, slip_mm)
+    middle, spread = together.mean(0), np.maximum(together.std(0), 1e-9)
+    design = _terms(together, middle, spread)
+    first = np.full(design.shape[1], OTHERS_DEG**2)
+    first[0] = KAPPA_DEG**2
+    return People(mixed(design, gaze_deg - axis_deg, person, first=first), middle, spread)
+
+
+def _together(axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
+    return np.concatenate([axis_deg, pupil_mm, slip_mm], 1)
+
+
+def _terms(together: Array, middle: Array, spread: Array) -> Array:
+    x = (together - middle) / spread
+    one, other = np.triu_indices(x.shape[1])
+    return np.concatenate([np.ones((len(x), 1)), x, x[:, one] * x[:, other]], 1)
