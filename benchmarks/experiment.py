@@ -90,7 +90,7 @@ def rows() -> list[Row]:
 def _kept(name: str, points: str, seeds: dict[str, Any], all_lenses: dict[str, Any]) -> list[Row]:
     """Means over the seeds of one lens, and its ratio to the mid-range lens of the same seeds."""
     out = []
-    for quantity in QUANTITIES:
+    for quantity in (q for q in QUANTITIES if all(q in of for of in seeds.values())):
         case = f"{quantity}, {name}, {points} points"
         found = over_seeds(seeds, quantity)
         out.append(Row(case, f"{found.seeds} seeds", float("nan"), found.mean, f"truth: {found}"))

@@ -26,7 +26,7 @@ from codesign.budget.entry import NONE, Entry
 from codesign.budget.person import told
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Rendered, render
-from codesign.gaze import Own, PersonalGaze, angle_deg
+from codesign.gaze import Own, People, PersonalGaze, angle_deg
 from codesign.optics import Device, OpticsConfig, device, formed, image_difference
 from codesign.train import assess
 from metalens.ground.arrays import Array
@@ -59,7 +59,7 @@ class Reading:
         width = fwhm_nm or believed.fwhm_nm
         self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
         self.believed = gaze_experiment.ready(source, image="trained")
-        self.people = gaze_experiment.learnt(source, self.believed, config)
+        self._before: tuple[Imager | UniformImager, People | None] | None = None
         self.subjects: list[Rendered] = []
         trials = []
         for subject in range(config.subjects):
@@ -210,8 +210,9 @@ class Reading:
 
     def _taught(self, read: Read) -> dict[int, PersonalGaze] | dict[int, Own]:
         pupil, slip, axis = read
+        people = None if self._before is None else self._before[1]
         return gaze_experiment.taught(
-            pupil, slip, self.trial, self.config, rig=self.scenes.rig, axis_deg=axis, people=self.people
+            pupil, slip, self.trial, self.config, rig=self.scenes.rig, axis_deg=axis, people=people
         )
 
     @staticmethod
@@ -220,6 +221,9 @@ class Reading:
         return gaze_experiment.answered(people, pupil, slip, trial, axis_deg=axis)
 
     def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> Read:
+        """What is read of all frames; people who calibrated before did so through these optics, with noise."""
+        if self._before is None or self._before[0] is not optics:
+            self._before = optics, gaze_experiment.learnt(self.source, optics, self.config)
         return self._frames(self.subjects, optics, quiet=quiet)
 
     @torch.no_grad()

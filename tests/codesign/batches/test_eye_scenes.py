@@ -8,6 +8,7 @@ import torch
 
 from codesign.batches import pool
 from codesign.batches.scenes import TEST, TRAINING, EyeScenes, SceneConfig
+from codesign.network.cost import POINTS
 from metalens.ground.errors import ConfigError
 
 SMALL = SceneConfig(pixels=48, margin=8)
@@ -99,6 +100,7 @@ def test_poses_of_a_pool_are_those_of_the_renderer_whatever_the_view():
         torch.testing.assert_close(scaled, theirs.double(), rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(drawn.pose.axis, direct.pose.axis)
     torch.testing.assert_close(drawn.pose.points, direct.pose.points)
+    assert direct.pose.points.shape == (24, POINTS, 2)  # as many as networks seek
     labels = wide.rendered(0, 24).labels
     side = wide.camera.pixels
     x = (labels.pupil_px[:, 0] + 0.5) * 18.0 - 18.0 * side / 2  # um on the sensor, from the axis

@@ -8,7 +8,7 @@ import torch
 
 from codesign.network import blur, cost, supernet
 from codesign.network.architecture import Block, smallest
-from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, SLIP_GRID, lateral_strides
+from codesign.network.cost import MASK_CHANNELS, POINT_FEATURES, SLIP_CHANNELS, SLIP_GRID, lateral_strides
 from metalens.ground.errors import TrainingError
 
 
@@ -168,29 +168,33 @@ def test_a_mask_adds_its_strides_from_coarse_to_fine():
 
     total = laterals[0] + doubled(laterals[1] + doubled(laterals[2]))
     want = hardswish(folded(head.smooth, 1, MASK_CHANNELS, 3)(total))
-    logits, decoded = head([fine, middle, coarse])
+    logits, maps, decoded = head([fine, middle, coarse])
     assert torch.allclose(decoded, want, rtol=1e-9, atol=1e-9)
     weight, bias = head.mask.weight[0, :, 0, 0], head.mask.bias
     assert torch.allclose(logits, torch.einsum("c,ncyx->nyx", weight, want) + bias, rtol=1e-9, atol=1e-9)
+    weight, bias = head.points.weight[..., 0, 0], head.points.bias[:, None, None]
+    assert torch.allclose(maps, torch.einsum("pc,ncyx->npyx", weight, want) + bias, rtol=1e-9, atol=1e-9)
 
 
-def test_slip_is_read_from_both_features_and_its_uncertainty_shapes_neither():
+def test_slip_is_read_from_all_features_the_axis_without_depths_and_uncertainty_shapes_none():
     head = filled(supernet.CalibrationHead(5))
     head.spread.weight.data[0] *= 1e-4  # the first within its limits, the others beyond both
     draw = np.random.default_rng(8)
     features = torch.from_numpy(draw.normal(size=(2, 5, 2 * SLIP_GRID, SLIP_GRID)))
     depths = torch.from_numpy(draw.normal(size=(2, blur.SLIP_FEATURES)))
+    points = torch.from_numpy(draw.normal(size=(2, POINT_FEATURES)))
     features.requires_grad_()
-    slip, spread = head(features, depths)
+    slip, spread, axis = head(features, depths, points)
     reduced = hardswish(folded(head.reduce, 5, SLIP_CHANNELS)(features.detach()))
     grid = reduced.reshape(2, SLIP_CHANNELS, SLIP_GRID, 2, SLIP_GRID).mean(3).flatten(1)
 
     def linear(layer, x):
         return x @ layer.weight.T + layer.bias
 
-    joined = hardswish(
-        linear(head.joined, hardswish(torch.cat([linear(head.hidden, grid), linear(head.depths, depths)], 1)))
-    )
+    parts = [linear(head.hidden, grid), linear(head.points, points), linear(head.depths, depths)]
+    joined = hardswish(linear(head.joined, hardswish(torch.cat(parts, 1))))
+    turned = hardswish(linear(head.turned, hardswish(torch.cat(parts[:2], 1))))
+    assert torch.allclose(axis, linear(head.axis, turned), rtol=1e-9)
     assert torch.allclose(slip, linear(head.slip, joined), rtol=1e-9)
     assert torch.allclose(spread, linear(head.spread, joined).clamp(-4, 2), rtol=1e-9)
     assert ((spread > -4) & (spread < 2)).tolist() == [[True, False, False]] * 2
@@ -236,9 +240,13 @@ def test_slip_along_the_axis_is_that_of_the_features_and_that_of_the_depths():
     net.eval()
     with torch.no_grad():
         made = net(torch.randn(2, 1, 64, 64), replace(smallest(net.space), resolution=1.0))
-    (features,), (logits, decoded) = seen["perception"]
+    (features,), (logits, maps, decoded) = seen["perception"]
     (_, given), (depth, told, axial) = seen["blur"]
-    (last, depths), (slip, spread) = seen["calibration"]
+    (last, depths, points), (slip, spread, axis) = seen["calibration"]
+    middle, width = supernet.places(maps)
+    assert torch.equal(points, torch.cat([middle.flatten(1), width], 1))
+    assert torch.equal(made.points, middle)
+    assert made.axis is axis
     assert axial.abs().min() > 0
     assert torch.allclose(made.slip[:, :2], slip[:, :2])
     assert torch.allclose(made.slip[:, 2], slip[:, 2] + axial)
