@@ -48,6 +48,7 @@ SCENES = SceneConfig(pixels=128, margin=16, pool=4096)
 FREE = Schedule(0.02, 0.12, 0.8, clip=1.0)
 SWIFT = Schedule(0.05, 0.12, 0.8, clip=1.0)  # from focus 20 to 33 mm is 5 rad: all that 540 steps of FREE can go
 RUSH = Schedule(0.15, 0.06, 0.85, clip=1.0)
+DEPTH_ALONE = {"optics_weight": 0.0, "axis_weight": 0.0, "point_weight": 0.0}  # what is trained beside slip and mask
 SPACE = Space(widths=(0.25, 0.5), depths=(2, 3), expansions=(3, 4), kernels=(3, 5), resolution=(0.5, 1.0))
 
 
@@ -198,7 +199,7 @@ def _natural(scenes: EyeScenes, count: int) -> States:
 def train_one(work: Path, case: Case, lens: str, seed: int, *, kept_at: Path) -> Trainer:
     """The trainer at the end of its run, with the batch statistics of the final lens; goes on from ``kept_at``."""
     optics, moving = optics_of(lens, angle_deg=case.angle_deg)
-    settings = InnerConfig(steps=case.steps, batch=case.batch, seed=seed, optics=moving, optics_weight=0.0)
+    settings = InnerConfig(steps=case.steps, batch=case.batch, seed=seed, optics=moving, **DEPTH_ALONE)
     scenes: Scenes = (
         scenes_of(TRAINING, seed) if case.fresh else PoolScenes(pool_of(work), SCENES.margin, SCENES.scale, seed)
     )

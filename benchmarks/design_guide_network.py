@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.codesign_gaze import rendered
-from benchmarks.codesign_study import CASES, SPACE, architecture_of
+from benchmarks.codesign_study import CASES, DEPTH_ALONE, SPACE, architecture_of
 from codesign.batches import EyeScenes, SceneConfig
 from codesign.batches.scenes import TEST, TRAINING
 from codesign.evaluate.reader import ReaderConfig
@@ -51,7 +51,7 @@ def trained(optics: OpticsConfig, place: Tensor, config: ReaderConfig) -> Traine
     """The trainer at the end, its network with the batch statistics of its lens."""
     scenes = scenes_of(config, TRAINING)
     settings = InnerConfig(
-        steps=config.frames // CASE.batch, batch=CASE.batch, seed=config.seed, optics=Schedule(0.0), optics_weight=0.0
+        steps=config.frames // CASE.batch, batch=CASE.batch, seed=config.seed, optics=Schedule(0.0), **DEPTH_ALONE
     )
     made = inner.model(optics, pitch_um=config.pitch_um, seed=config.seed, space=SPACE)
     with torch.no_grad():

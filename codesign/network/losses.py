@@ -84,7 +84,7 @@ def reading(
 
 
 def pose(
-    found: Prediction, axis: Tensor, points: Tensor, *, axis_weight: float = 2.0, point_weight: float = 0.5
+    found: Prediction, axis: Tensor, points: Tensor, *, axis_weight: float = 0.5, point_weight: float = 0.2
 ) -> Tensor:
     """Landmarks that lie in the image, and the optic axis; 0 for a network that tells neither.
 

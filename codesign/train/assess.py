@@ -71,7 +71,7 @@ class Answers:
     slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of one that gives none.
     depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its spread; likewise.
     mask: (n, y, x) logits of the pupil on the network's own grid; likewise.
-    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise.
+    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise, and where training gave it no weight.
     """
 
     slip_mm: Tensor
@@ -96,7 +96,7 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
     shared = losses.overlap(mask, seen.mask, pixels=pixels)
     spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
     depth = [f.depth for f in found if f.depth is not None]
-    axis = [f.axis for f in found if f.axis is not None]
+    axis = [f.axis for f in found if f.axis is not None and inner.axis_weight]
     return Answers(
         slip,
         torch.cat([f.centre for f in found]),

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Batch, Flat, PoolScenes, Scenes, depth_um, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, blur, cost, losses, running, smallest, soap
+from codesign.batches import Batch, Flat, PoolScenes, Pose, Scenes, depth_um, irradiance, parallel, samples
+from codesign.network import Architecture, Baseline, Prediction, blur, cost, losses, running, smallest, soap
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train.ahead import Ahead
@@ -36,6 +36,8 @@ class InnerConfig:
     weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image, nor
         so coarse that least resolution leaves a network less than 16 pixels.
     slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of windows.
+    axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read from; 0 where slippage alone
+        counts: they cost a tenth of what is read along the axis.
     energy: encircled share that the optics loss keeps.
     budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their resolution to keep it
         (:func:`sandwich`); the hinge acts on those that cannot.
@@ -54,6 +56,8 @@ class InnerConfig:
     pitch: Schedule = field(default_factory=lambda: Schedule(0.0, 0.1, 0.8, clip=1.0))
     slip_weight: float = 2.0
     depth_weight: float = 0.5
+    axis_weight: float = 0.5
+    point_weight: float = 0.2
     optics_weight: float = 0.05
     budget_weight: float = 1.0
     energy: float = 0.4
@@ -258,9 +262,13 @@ class Trainer:
             answer = self.model.net(frames[finer[a]], a)
             loss = losses.task(answer, batch.mask, shift, scale, slip_weight=self.inner.slip_weight)
             loss = loss + losses.reading(answer, given.vergence, shift, scale, depth_weight=self.inner.depth_weight)
-            parts.append(loss if pose is None else loss + losses.pose(answer, pose.axis, pose.points))
+            parts.append(loss if pose is None else loss + self._pose(answer, pose))
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), macs
+
+    def _pose(self, answer: Prediction, pose: Pose) -> Tensor:
+        weights = {"axis_weight": self.inner.axis_weight, "point_weight": self.inner.point_weight}
+        return losses.pose(answer, pose.axis, pose.points, **weights)
 
     def _light(self, step: int, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
         """What images this step's frames, and the optics loss."""

@@ -70,6 +70,27 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
     assert plain.depth is None
 
 
+def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
+    class Turned(Typed):
+        def forward(self, frames, architecture):
+            found = super().forward(frames, architecture)
+            axis = torch.tensor([[0.3, -0.4, 1.2]]).expand(len(frames), 3)
+            return Prediction(found.mask_logits, found.centre, found.slip, axis=axis)
+
+    seen = Seen(torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2)
+    told = [
+        assess.predict(
+            Turned(torch.ones(3, 3), -torch.ones(3, 5, 5)),
+            None,
+            seen,
+            SimpleNamespace(slip_scale_mm=(1.0,) * 3, axis_weight=weight),
+        ).axis
+        for weight in (0.5, 0.0)
+    ]
+    assert torch.allclose(told[0], torch.tensor([[3.0, -4.0, 12.0]]).expand(3, 3) / 13)
+    assert told[1] is None
+
+
 @pytest.mark.parametrize(("frames", "used"), [(1, [1]), (2, [2]), (5, [2]), (8, [2, 2]), (10, [2, 2])])
 def test_batch_statistics_come_from_the_first_half_of_the_batches(monkeypatch, frames, used):
     told = []
