@@ -62,9 +62,20 @@ def test_a_batch_has_the_mask_without_its_margin_and_slippage_in_millimetres():
     frames = SimpleNamespace(
         radiance=torch.rand(2, 2, 9, 9), coverage=torch.rand(2, 2, 9, 9), depth_um=torch.rand(2, 2, 9, 9)
     )
-    labels = SimpleNamespace(slip_um=torch.tensor([[100.0, -250.0, 1900.0], [7.0, 0.0, -30.0]]))
+    labels = SimpleNamespace(
+        slip_um=torch.tensor([[100.0, -250.0, 1900.0], [7.0, 0.0, -30.0]]),
+        shift_um=torch.tensor([[400.0, -150.0, 1800.0], [8.0, 1.0, -40.0]]),
+        optic_axis=torch.tensor([[0.6, 0.0, -0.8], [0.0, 0.28, -0.96]]),
+        landmarks_px=torch.tensor([[[4.0, 4.0], [6.5, 1.0]], [[-1.0, 5.0], [9.0, 4.0]]]),
+        pupil_px=torch.tensor([[5.0, 3.0], [4.0, 6.0]]),
+    )
     pupil = torch.rand(2, 9, 9)
     made = scenes.as_batch(SimpleNamespace(frames=frames, pupil=pupil, labels=labels), 2)
     assert torch.equal(made.mask, pupil[:, 2:7, 2:7])
     assert made.slip_mm.numpy() == pytest.approx(np.array([[0.1, -0.25, 1.9], [0.007, 0.0, -0.03]]))
     assert made.frames.depth_um is frames.depth_um
+    assert made.pose.shift_mm.numpy() == pytest.approx(np.array([[0.4, -0.15, 1.8], [0.008, 0.001, -0.04]]))
+    assert torch.equal(made.pose.axis, labels.optic_axis)
+    # of the five pixels inside the margin, from the middle of pixel 4
+    assert made.pose.points[0].numpy() == pytest.approx(np.array([[0.0, 0.0], [0.5, -0.6], [0.2, -0.2]]), abs=1e-7)
+    assert made.pose.points[1].numpy() == pytest.approx(np.array([[-1.0, 0.2], [1.0, 0.0], [0.0, 0.4]]), abs=1e-7)

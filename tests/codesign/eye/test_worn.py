@@ -30,7 +30,7 @@ def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
     pupil[:, 26:34, left : left + 10] = 1
     one, three = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
     place = torch.tensor([[34.5, 29.5]], dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, place, place, one + 0.9, torch.zeros(1, 9, 2))
+    labels = Labels(three, three, three, three, three, three, place, place, one + 0.9, torch.zeros(1, 9, 2))
     return Rendered(Frames(light, cover, depth), pupil, labels)
 
 

@@ -31,7 +31,7 @@ def scene():
     pupil = torch.from_numpy(OPENING.copy())[None].repeat(2, 1, 1)
     two = torch.zeros(2, dtype=torch.float64)
     three, place = torch.zeros(2, 3, dtype=torch.float64), torch.tensor([PLACE] * 2, dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, place, place, two + 0.8, torch.zeros(2, 9, 2))
+    labels = Labels(three, three, three, three, three, three, place, place, two + 0.8, torch.zeros(2, 9, 2))
     return Rendered(Frames(light, cover, depth), pupil, labels)
 
 
@@ -225,7 +225,7 @@ def test_labels_follow_the_mask():
     was[1, 2, 2] = 1.0
     place = torch.tensor([[9.0, 8.0], [7.0, 6.0]], dtype=torch.float64)
     two, three = torch.tensor([0.8, 0.6], dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, place, place, two, torch.zeros(2, 9, 2))
+    labels = Labels(three, three, three, three, three, three, place, place, two, torch.zeros(2, 9, 2))
     got = wear._labels(labels, was, after)
     assert got.visible.tolist() == pytest.approx([0.8 * 1.5 / 9, 0.0])
     assert got.centroid_px[0].tolist() == pytest.approx([3.5 / 1.5, 2.5 / 1.5])

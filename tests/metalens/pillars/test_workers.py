@@ -186,5 +186,6 @@ def test_bars_of_a_shared_mesh_are_no_less_than_those_of_the_mesh_that_a_thin_di
     case = modal.case_of(cell, thin, light)
     made = modal.evaluate(case, mesh.plan, weak=rung.weak)
     ends = [one.factors.bound(made) for one in (own, mesh)]
-    assert at(thin).t_error == pytest.approx(max(ends), rel=1e-6)
+    first = max(ends)
+    assert at(thin).t_error == pytest.approx(first / (1 - first / 0.1), rel=1e-6)  # with the orders of a resonance
     assert ends[0] > 1.5 * ends[1]
