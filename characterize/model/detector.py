@@ -1,6 +1,5 @@
 """From the intensity in front of the sensor to expected electrons: source size, blur, pixel area, gain, background."""
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from scipy import fft, special
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
-_FEWER = 0.85  # of the samples that hold all light
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 
 
@@ -135,14 +133,6 @@ def oversampling(lens: Lens, pixel_um: float) -> int:
     """Samples along a pixel's side that are fine enough for the light of a lens."""
     sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
     return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
-
-
-def coarser(grid: Grid, lens: Lens) -> Grid:
-    """For derivatives and quick images: samples that hold the light but for the upper third of its band.
-
-    That folds onto itself; the light's own transfer is below a fifth there.
-    """
-    return dataclasses.replace(grid, oversample=oversampling(lens, _FEWER * grid.pixel_um))
 
 
 def pixel(fy: Array, fx: Array, pixel_um: float) -> Array:

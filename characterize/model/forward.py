@@ -44,8 +44,7 @@ WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
-_BLOCK = 20_000  # nodes whose phase is formed at once
-_FEW, _SMOOTHER = 2e-2, 10.0  # in a quick model: terms left out, what a slope may miss by ratio
+_FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,8 +128,8 @@ class ForwardModel:
 
     def quick(self) -> "ForwardModel":
         """The same model by few terms of every field and on fewer samples: for differences to images of this one."""
-        part = self.rough(_FEW)
-        part._missed, part.grid = _SMOOTHER * moments.MISSED, detector.coarser(self.grid, self.lens)
+        part, over = self.rough(_FEW), detector.oversampling(self.lens, _FEWER * self.grid.pixel_um)
+        part._missed, part.grid = _SMOOTHER * moments.MISSED, dataclasses.replace(self.grid, oversample=over)
         part.groups = [dataclasses.replace(group, reduced=group.reduced.quick()) for group in self.groups]
         return part
 
@@ -223,7 +222,7 @@ class ForwardModel:
         light = self.grid.sample(intensity, transfer)
         by = {"bias": lens[1], **dict(zip(ANSWERING, lens[2], strict=False)), "wave": lens[3]}
         factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
-        out = self._quick(x, (operators, coarse), group, bases, factors if isinstance(transfer, detector.Sums) else {})
+        out = self._quick((operators, coarse), group, transfer, bases, factors)
         conjugate, power, rough = field.conj(), np.vdot(lit, lit).real, max(self.cut, _SLOPE_TOLERANCE)
         for name in factors.keys() - out.keys():
             # the part of a change that is the light itself needs no sum, nor loses digits
@@ -244,19 +243,23 @@ class ForwardModel:
         return light, out
 
     def _quick(
-        self, x: Array, seen: tuple[Operators, Array], group: _Group, bases: Bases, factors: dict[str, Factor]
+        self,
+        seen: tuple[Operators, Array],
+        group: _Group,
+        blur: detector.Blur,
+        bases: Bases,
+        factors: dict[str, Factor],
     ) -> dict[str, Array]:
         """Derivatives that are had from those of the field: what smooth factors make of a point, on small pixels."""
         (operators, coarse), turned = seen, seen[0].turned
-        if turned is None or not factors or not moments.fine_enough(self.grid, group.reduced.radius_um):
+        small = bool(factors) and moments.fine_enough(self.grid, group.reduced.radius_um)
+        if turned is None or not isinstance(blur, detector.Sums) or not small:
             return {}
 
         def field(base: str, light: Array) -> Array:
             return coarse if base == LIT else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
 
-        grid = detector.coarser(self.grid, self.lens)
-        blur = grid.sums(x[PLACE["crosstalk_px"]] * grid.pixel_um, real_of(group.reduced.kind))[0]
-        return moments.rates(turned, grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
+        return moments.rates(turned, self.grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
 
     def _factors(self, x: Array, group: _Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
         """(name, what one unit does to the light on the nodes) of all parameters that change it."""
@@ -304,14 +307,12 @@ class ForwardModel:
         exit_path = sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
         lateral, out = [x[PLACE[f"source_{a}_um"]] for a in "xy"], np.empty((len(index), *here[0].shape))
-        block = max(1, _BLOCK // here[0].size)
-        for i in range(0, len(index), block):
-            z = depth[i : i + block, None, None]
+        for i, z in enumerate(depth):
             tangents = tx - lateral[0] / z, ty - lateral[1] / z
             path = source_path(*here, tangents, 1 / z) + exit_path
             if x[PLACE["glass_um"]] != 0:
-                path = path + extra_path(*here, tangents=tangents, depth_um=z, values=x)
-            out[i : i + block] = k * path - reduced.known[cut]
+                path = path + extra_path(*here, tangents=tangents, depth_um=float(z), values=x)
+            out[i] = k * path - reduced.known[cut]
         out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending[every], 1)
         uneven = x[[PLACE[name] for name in LIGHT]]
         light = -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1) if uneven.any() else 0.0
@@ -319,9 +320,8 @@ class ForwardModel:
 
     def _phase_slope(self, x: Array, group: _Group, name: str, cut: Cut) -> Array:
         """Derivative of i times :meth:`_phase` by a geometric parameter: central difference of a smooth function."""
-        way = (step := {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)) * (
-            np.arange(len(x)) == PLACE[name]
-        )
+        step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
+        way = step * (np.arange(len(x)) == PLACE[name])
         return 0.5j / step * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
 
     def _operators(self, x: Array, group: _Group) -> Operators:

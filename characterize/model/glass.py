@@ -8,11 +8,10 @@ from characterize.model.parameters import PLACE
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 
-Places = Array | float
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 
 
-def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[Places, Places], depth_um: Places, values: Array) -> Array:
+def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth_um: float, values: Array) -> Array:
     """(*shape) path to (x, y) on the lens with the plate less that without it, um, and less that at the lens centre.
 
     Along the plate's normal the source lies L away, across it rho. The path is the stationary value over the
@@ -23,7 +22,7 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[Places, Places], dep
     and three of Newton's steps from the straight ray leave less than 1e-9 um.
 
     Args:
-        tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z = ``depth_um``; all broadcast.
+        tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z = ``depth_um``.
         values: all parameters, of which glass_um and its tilts are used.
 
     Raises:

@@ -218,8 +218,8 @@ class Reduced:
             step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
-        def bent(degree: int, fine_um: tuple[Array, Array]) -> tuple[Array, Array]:
-            down, across = (turned(*one, degree) for one in zip(fine_um, (y, x), bands, strict=True))
+        def bent(degree: int) -> tuple[Array, Array]:
+            down, across = (turned(*one, degree) for one in zip(axes_um, (y, x), bands, strict=True))
             return down.astype(real_of(kind)), across.astype(real_of(kind))
 
         few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
@@ -233,7 +233,7 @@ class Reduced:
             parts[1],
             rest,
             moved,
-            Turned(kernel, (bands[0], bands[1]), bent) if few else None,
+            Turned(kernel, (bands[0], bands[1]), functools.cache(bent)) if few else None,
         )
 
     def _from(

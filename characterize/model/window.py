@@ -65,14 +65,14 @@ class Terms:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Turned:
-    """Coarse samples to derivatives of the field on even axes (y, x): :func:`turned` along each up to a degree, real.
+    """Coarse samples to derivatives of the field: :func:`turned` along (y, x) up to a degree, real.
 
     bands: (y, x) rad/um that directions are counted in; kernel: of which field.
     """
 
     kernel: Kernel
     bands: tuple[float, float]
-    ways: Callable[[int, tuple[Array, Array]], tuple[Array, Array]]
+    ways: Callable[[int], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
