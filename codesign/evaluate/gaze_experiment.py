@@ -15,14 +15,14 @@ import numpy as np
 import torch
 
 from codesign.adapt import Source, network
-from codesign.batches import EXPERIMENT, VALIDATION, EyeScenes, as_batch, irradiance
+from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.evaluate.shown import Trial as Trial
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
-from codesign.gaze import Own, People, PersonalGaze, angle_deg, bench, face_angles, personal, shared
+from codesign.gaze import Own, People, PersonalGaze, angle_deg, face_angles, personal, shared
 from codesign.network import recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, read_out
@@ -31,7 +31,7 @@ from metalens.ground.errors import ConfigError
 from metalens.image import Imager, UniformImager, low_snr
 
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
-BEFORE, EACH = 31, 40  # stream of the people who calibrated before, and their frames
+BEFORE, EACH = 100_000, 120  # first number of the people who calibrated before, and their frames
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,23 +210,30 @@ def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> Unif
 def learnt(source: Source, imager: UniformImager | Imager, config: ExperimentConfig) -> People | None:
     """What a network's readings tell of the gaze of people who calibrated before; None for one that tells no axis.
 
-    ``config.people`` of the validation's stream, whom neither training nor the experiment shows, each looking and
-    slipping in EACH ways within what training saw, at their own scale, through the run's lens, light and noise.
+    ``config.people`` whom neither training nor the experiment shows, before the same stimuli, on the same stage at
+    places of their own between its ends: EACH of their frames, drawn at random, through the run's lens, light and
+    noise.
     """
-    scenes = source.run.scenes(VALIDATION)
-    scenes = replace(scenes, settings=replace(scenes.settings, scale=0.0))
-    crowd = bench.people(scenes, config.people, EACH, seed=BEFORE)
-    found = []
+    scenes = source.run.scenes(EXPERIMENT)
+    found, looked = [], []
     for person in range(config.people):
-        states = crowd.states[slice(person * EACH, (person + 1) * EACH)]
-        made = render(states, rig=scenes.rig, camera=scenes.camera)
+        rng = np.random.default_rng([config.seed, BEFORE + person, POINTS])
+        axial, lateral = (
+            rng.uniform(min((0.0, *ends)), max((0.0, *ends)), len(ends))
+            for ends in (config.axial_mm, config.lateral_mm)
+        )
+        theirs = replace(config, axial_mm=tuple(axial), lateral_mm=tuple(lateral))
+        states, trial = states_of(theirs, BEFORE + person, scenes)
+        rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
+        made = render(states[torch.from_numpy(rows)], rig=scenes.rig, camera=scenes.camera)
         seen = through(source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db)
         found.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
+        looked.append(trial.stimulus_deg[rows])
     pupil_mm, slip_mm, axis_deg = read_from(found, source)
     if axis_deg is None:
         return None
-    looked = face_angles(crowd.labels.visual_axis.numpy(), scenes.rig.elevation_rad)
-    return shared.learn(axis_deg, pupil_mm, slip_mm, looked, np.arange(len(looked)) // EACH)
+    who = np.repeat(np.arange(config.people), [len(one) for one in looked])
+    return shared.learn(axis_deg, pupil_mm, slip_mm, np.concatenate(looked), who)
 
 
 def read_from(kept: Sequence[Answers], source: Source) -> tuple[Array, Array, Array | None]:
