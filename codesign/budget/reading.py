@@ -35,9 +35,8 @@ from metalens.lens import Layers
 
 THINNED = 320  # frames that small changes of the optics are judged on
 
-Read = tuple[
-    Array, Array, Array | None
-]  # pupil (n, 2) on the sensor and slippage (n, 3), mm; axis (n, 2), deg, if read
+# pupil (n, 2) on the sensor and slippage (n, 3), mm; angles (n, 2) of the optic axis, deg, where it is read
+Read = tuple[Array, Array, Array | None]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
