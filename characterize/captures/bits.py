@@ -24,7 +24,7 @@ def right_align(
         (counts, bits, note in words, counts of those beside).
 
     Raises:
-        CaptureError: the counts do not fit into the stated bits, shifted or not.
+        CaptureError: the counts lie neither in the lowest of the stated bits nor in the highest of 16.
     """
     every = (images, *beside)
     whole = [a for a in every if a.dtype.kind != "f" and a.min() >= 0]
@@ -40,14 +40,15 @@ def right_align(
 
 def _alignment(used: int, bits: int | None, item_bytes: int, where: str) -> tuple[int, int, str]:
     """(shift to undo, bits of the converter, note in words) of counts whose bits together are ``used``."""
-    shift = (used & -used).bit_length() - 1 if used else 0
+    shift = (used & -used).bit_length() - 1  # -1 where all is dark
     width = used.bit_length()
-    if bits is not None and width - shift > bits:
-        raise CaptureError(
-            f"{where}: counts use {width - shift} bits, the capture states {bits}; correct bits, or the bit shift"
-        )
     if bits is not None and width <= bits:
         return 0, bits, f"{bits} bits as stated"
+    if bits is not None and not 16 - bits <= shift < width <= 16:
+        raise CaptureError(
+            f"{where}: counts use {width - shift} bits above the lowest {shift}, the capture states {bits}; correct "
+            "bits, or the bit shift"
+        )
     if bits is not None:
         return 16 - bits, bits, f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
     if shift and width > 12 and item_bytes == 2:

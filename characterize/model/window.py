@@ -208,7 +208,7 @@ def _turned(first: float, last: float, count: int, places: tuple[float, ...], ba
     turn = band * t * (at_um[:, None] - coarse_um[index])[..., None]  # fine, taps, t
     waves = np.cos(turn), np.sin(turn)
     seen = np.stack([waves[a % 2] @ (share / 2 * t**a) for a in range(degree + 1)])
-    found = np.linalg.solve(apart + 1e-12 * np.eye(taps), seen.reshape(-1, taps).T).T.reshape(seen.shape)
+    found = np.linalg.solve(apart, seen.reshape(-1, taps).T).T.reshape(seen.shape)
     out = np.zeros((degree + 1, len(at_um), len(coarse_um)))
     for weights, row in zip(found, out, strict=True):
         np.put_along_axis(row, index, weights, 1)
@@ -261,7 +261,7 @@ def _weights(at_um: Array, coarse_um: Array, band: float, taps: int) -> tuple[Ar
     rms over it."""
     index, apart = _nearby(at_um, coarse_um, band, taps)
     seen = np.sinc(band / np.pi * (at_um[:, None] - coarse_um[index]))
-    found = np.linalg.solve(apart + 1e-14 * np.eye(taps), seen.T).T
+    found = np.linalg.solve(apart, seen.T).T
     missed = 1 - 2 * (found * seen).sum(1) + np.einsum("ni,ij,nj->n", found, apart, found)
     out = np.zeros((len(at_um), len(coarse_um)))
     np.put_along_axis(out, index, found, 1)

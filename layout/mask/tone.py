@@ -31,11 +31,12 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
         raise ProcessError(
             f"tone 'negative' with lattices of pitches {sorted(pitches)}: put them on masks of their own"
         )
-    square = _square(pitches.pop(), plan.grid)
+    pitch = pitches.pop()
+    square = _square(pitch, plan.grid)
     classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     clear = [box for lattice in plan.lattices for box in _empty(lattice, square)]
-    figures = _surroundings(plan, process, boxes) or [_rim(boxes, square[2] - square[0], process)]
+    figures = _surroundings(plan, process, boxes) or [_rim(boxes, pitch, process)]
     if clear:
         figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
     kept = [figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)]

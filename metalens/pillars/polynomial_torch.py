@@ -33,11 +33,7 @@ class _Polynomial(torch.autograd.Function):
         if diameter.device.type == "cpu":
             verb = polynomial.slope if order else polynomial.value
             return torch.from_numpy(verb(p, diameter.detach().numpy()))
-        polynomial.check(p, diameter)
-        x = diameter**p.power * p.scale + p.shift
-        if order:
-            return _horner(p.slope, x) * (p.inner_slope * diameter ** (p.power - 1))
-        return _horner(p, x).clamp_max(p.ceiling)
+        return _on_device(diameter, p, order)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -63,6 +59,15 @@ class _Polynomial(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], diameter: torch.Tensor, p: Curve, order: int) -> tuple[Any, Any]:
         return (slope if order else value)(p, diameter), in_dims[0]
+
+
+def _on_device(diameter: torch.Tensor, p: Curve, order: int) -> torch.Tensor:
+    """p(D) (order 0) or dp/dD (order 1) by torch's own operations, on whatever device."""
+    polynomial.check(p, diameter)
+    x = diameter**p.power * p.scale + p.shift
+    if order:
+        return _horner(p.slope, x) * (p.inner_slope * diameter ** (p.power - 1))
+    return _horner(p, x).clamp_max(p.ceiling)
 
 
 def _horner(p: Curve, x: torch.Tensor) -> torch.Tensor:

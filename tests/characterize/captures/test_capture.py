@@ -93,7 +93,7 @@ def test_imagej_spacing_gives_the_positions(tmp_path):
 
 
 def test_wrong_bit_shift_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="counts use 12 bits, the capture states 10"):
+    with pytest.raises(CaptureError, match="counts use 12 bits above the lowest 0, the capture states 10"):
         capture.load(folder(tmp_path, about="bits = 10\n"))
 
 

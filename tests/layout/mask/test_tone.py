@@ -127,3 +127,29 @@ def test_thin_marks_and_narrow_gaps_of_a_negative_mask_are_seen(arm, gap, broken
 def test_a_pillar_wider_than_its_square_is_refused():
     with pytest.raises(ProcessError, match=r"wider than the lattice square of 400"):
         tone.inverted(bare(diameter=412), Process(tone="negative"))
+
+
+def test_a_full_lattice_without_a_die_is_framed_by_one_pitch_and_has_nothing_to_clear():
+    """Three columns and two rows of 400 with the first site at 0: squares from -200 to 1000, and from -600 to 200."""
+    plan = bare()
+    negative = tone.inverted(plan.replace(figures=()), Process(tone="negative"))
+    (rim,) = negative.figures
+    assert rim.name == "RIM"
+    ((layer, shapes),) = rim.polygons.items()
+    assert layer == Process().layers.pillar
+    sides = sorted((*shape.min(0).tolist(), *shape.max(0).tolist()) for shape in shapes)
+    want = [(-600, -1000, 1400, -600), (-600, -600, -200, 200), (-600, 200, 1400, 600), (1000, -600, 1400, 200)]
+    assert sides == sorted(want)
+
+
+@pytest.mark.parametrize("way", [(-1, 0), (1, 0), (0, -1), (0, 1)])
+def test_a_pillar_beyond_any_side_of_its_square_is_refused(way):
+    """200 wide on 400: up to 100 to either side stays inside."""
+    plan, pillar = bare(), rectilinear.corners(np.array([-100, -100, 100, 100]))
+    for share, stands in ((100, True), (101, False)):
+        moved = dataclasses.replace(plan.classes[0], outline=pillar + np.array(way) * share)
+        if stands:
+            tone.inverted(plan.replace(classes=(moved,)), Process(tone="negative"))
+        else:
+            with pytest.raises(ProcessError, match="200 by 200 units"):
+                tone.inverted(plan.replace(classes=(moved,)), Process(tone="negative"))

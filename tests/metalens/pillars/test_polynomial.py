@@ -83,6 +83,21 @@ def test_ceiling_takes_off_rounding_alone():
     assert polynomial_torch.value(p, torch.tensor([0.1])) == 1.0
 
 
+@pytest.mark.parametrize("power", [1, 3])
+def test_operations_of_other_devices_give_the_same_numbers(power):
+    """As a device without the compiled loops computes them, here on the processor: series and slopes as written."""
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), power)
+    d = np.linspace(LOW, HIGH, 50)
+    for order in (0, 1):
+        got = polynomial_torch._on_device(torch.from_numpy(d), p, order).numpy()
+        want = np.imag(reference(d + 1e-30j, power)) / 1e-30 if order else reference(d, power)
+        assert got == pytest.approx(want, rel=1e-11)
+    level = polynomial.curve(np.array([1.0 + 1e-9]), (LOW, HIGH), 1, 1.0)
+    assert polynomial_torch._on_device(torch.tensor([0.1]), level, 0) == 1.0
+    with pytest.raises(DomainError):
+        polynomial_torch._on_device(torch.tensor([2 * HIGH]), p, 0)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_tensors_stay_on_their_device():
     p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 3)
