@@ -198,7 +198,8 @@ def _network_times(made: pool.Pool, member: Architecture) -> tuple[float, float]
     scale = torch.ones(3)
 
     def step() -> None:
-        losses.task(net(frames, member), batch.mask, batch.slip_mm, scale).backward()  # type: ignore[no-untyped-call]
+        loss = losses.task(net(frames, member), batch.mask, batch.slip_mm, scale, slip_weight=InnerConfig().slip_weight)
+        loss.backward()  # type: ignore[no-untyped-call]
 
     def look() -> None:
         with torch.no_grad():

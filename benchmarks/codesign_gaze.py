@@ -53,7 +53,10 @@ def gaze_of(work: Path, line: dict[str, Any], test: People, frames: Rendered) ->
     seen = assess.frames(trainer, frames, len(frames.batches))
     architecture = architecture_of(CASES[line["run"].split("/")[0]])
     answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
-    return {"run": line["run"], **asdict(gaze_test.gaze_errors(test, answers.centre, answers.slip_mm))}
+    return {
+        "run": line["run"],
+        **asdict(gaze_test.gaze_errors(test, gaze_test.read_of(test, answers.centre, answers.slip_mm))),
+    }
 
 
 def main() -> None:

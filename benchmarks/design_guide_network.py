@@ -76,4 +76,4 @@ def gaze_deg(trainer: Trainer, config: ReaderConfig) -> float:
     shown = replace(rendered(test), margin=config.margin)
     seen = assess.frames(trainer, shown, len(shown.batches))
     answers = assess.predict(trainer.model.net, architecture_of(CASE), seen, trainer.inner)
-    return gaze_test.gaze_errors(test, answers.centre, answers.slip_mm).personal_deg
+    return gaze_test.gaze_errors(test, gaze_test.read_of(test, answers.centre, answers.slip_mm)).personal_deg

@@ -11,15 +11,14 @@ from codesign.batches import EXPERIMENT, EyeScenes, SceneConfig
 from codesign.budget.entry import NONE, Entry
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Camera, Rig, render
-from codesign.gaze import angle_deg
-from metalens.ground.arrays import Array
+from codesign.gaze import Readings, Sphere, angle_deg
 
 LABELS = 64  # pixels of renderings whose labels alone are wanted
 WIDTH_UM = 1152.0  # of the sensor
 
 
-def told(config: ExperimentConfig, scenes: EyeScenes) -> tuple[Array, Array]:
-    """Pupil (n, 2) on the sensor and slippage (n, 3) of the experiment's frames as they are, mm."""
+def told(config: ExperimentConfig, scenes: EyeScenes) -> Readings:
+    """Pupil and slippage of the experiment's frames as they are."""
     pupil, slip = [], []
     pitch = scenes.camera.pitch_um * scenes.camera.pixels / LABELS
     for subject in range(config.subjects):
@@ -27,7 +26,7 @@ def told(config: ExperimentConfig, scenes: EyeScenes) -> tuple[Array, Array]:
         labels = render(states, rig=scenes.rig, camera=Camera(LABELS, pitch)).labels
         pupil.append((labels.pupil_px - (LABELS - 1) / 2) * (pitch * 1e-3))
         slip.append(labels.slip_um * 1e-3)
-    return torch.cat(pupil).double().numpy(), torch.cat(slip).double().numpy()
+    return Readings(torch.cat(pupil).double().numpy(), torch.cat(slip).double().numpy())
 
 
 def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
@@ -36,7 +35,8 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
     trial = gaze_experiment.joined([gaze_experiment.states_of(config, s, scenes)[1] for s in range(config.subjects)])
     answers = []
     for one in (replace(config, fixation_deg=0.0), config):
-        answer, judged = gaze_experiment.calibrated(*told(one, scenes), trial, one, rig=scenes.rig)
+        how = Sphere(scenes.rig, one.hidden, one.seed)
+        answer, judged = gaze_experiment.calibrated(told(one, scenes), trial, one, how)
         answers.append(answer)
     kept = judged & trial.group(AXIAL)
     alone, whole = (math.radians(float(np.mean(angle_deg(a, trial.stimulus_deg)[kept]))) for a in answers)

@@ -26,7 +26,7 @@ from codesign.budget.entry import NONE, Entry
 from codesign.budget.person import told
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Rendered, render
-from codesign.gaze import Own, People, PersonalGaze, angle_deg
+from codesign.gaze import Calibrator, Person, Readings, angle_deg
 from codesign.optics import Device, OpticsConfig, device, formed, image_difference
 from codesign.train import assess
 from metalens.ground.arrays import Array
@@ -35,15 +35,12 @@ from metalens.lens import Layers
 
 THINNED = 320  # frames that small changes of the optics are judged on
 
-# pupil (n, 2) on the sensor and slippage (n, 3), mm; angles (n, 2) of the optic axis, deg, where it is read
-Read = tuple[Array, Array, Array | None]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stand:
     """Persons calibrated on the device as it is, and the frames on which a change of the optics is judged."""
 
-    people: dict[int, PersonalGaze] | dict[int, Own]
+    people: dict[int, Person]
     frames: tuple[Rendered, ...]
     trial: gaze_experiment.Trial
 
@@ -58,7 +55,7 @@ class Reading:
         width = fwhm_nm or believed.fwhm_nm
         self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
         self.believed = gaze_experiment.ready(source, image="trained")
-        self._before: tuple[Imager | UniformImager, People | None] | None = None
+        self._before: tuple[Imager | UniformImager, Calibrator] | None = None
         self.subjects: list[Rendered] = []
         trials = []
         for subject in range(config.subjects):
@@ -101,26 +98,27 @@ class Reading:
         """Entries from the true pupil to the answered gaze, and what was measured at its end."""
         still = replace(self.config, fixation_deg=0.0)
         people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
-        yield self._grown(
-            "subject and calibration", (*told(still, self.scenes), None), f"true pupil and slippage; {people}"
-        )
-        true = (*told(self.config, self.scenes), None)
-        yield self._grown("fixation", true, f"scatter of {self.config.fixation_deg:g} deg about the stimulus")
+        said = f"true pupil and slippage; {people}"
+        sphere = gaze_experiment.sphere(self.source, self.config)
+        yield self._grown("subject and calibration", told(still, self.scenes), sphere, said)
+        true = told(self.config, self.scenes)
+        yield self._grown("fixation", true, sphere, f"scatter of {self.config.fixation_deg:g} deg about the stimulus")
         said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
-        read = self._read(self.believed, quiet=True)
-        yield self._grown("reader, pupil", (read[0], true[1], None), said)
-        yield self._grown("reader, slippage", read, said)
-        read = self._read(self.believed)
-        yield self._grown("sensor noise", read, "frames with the sensor's noise")
+        read, how = self._read(self.believed, quiet=True)
+        yield self._grown("reader, pupil", Readings(read.pupil_mm, true.slip_mm), sphere, said)
+        yield self._grown("reader, slippage", read, how, said)
+        read, how = self._read(self.believed)
+        yield self._grown("sensor noise", read, how, "frames with the sensor's noise")
         for link, optics, psf, said in self._unknown():
-            read = self._read(optics)
-            yield replace(self._grown(link, read, said), psf=psf)
-        self._settle(read)
+            read, how = self._read(optics)
+            yield replace(self._grown(link, read, how, said), psf=psf)
+        self._settle(read, how)
         yield from self._known()
 
-    def _grown(self, link: str, read: Read, method: str) -> Entry:
+    def _grown(self, link: str, read: Readings, how: Calibrator, method: str) -> Entry:
         """The entry of one more cause: what the error has more than before, in quadrature; 0 where it has less."""
-        before, self._error_rad = self._error_rad, self._off(angle_deg(self._answers(read), self.trial.stimulus_deg))
+        error = angle_deg(self._answers(read, how), self.trial.stimulus_deg)
+        before, self._error_rad = self._error_rad, self._off(error)
         gap = self._error_rad**2 - before**2
         return Entry(link, NONE, NONE, math.sqrt(max(gap, 0.0)), method)
 
@@ -173,14 +171,15 @@ class Reading:
         if stand is None:
             raise RuntimeError("changes are judged once the path is through")
         one, other = (
-            self._gaze(stand.people, self._frames(stand.frames, o, quiet=True), stand.trial) for o in (optics, base)
+            gaze_experiment.answered(stand.people, self._frames(stand.frames, o, quiet=True), stand.trial)
+            for o in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
-    def _settle(self, read: Read) -> None:
+    def _settle(self, read: Readings, how: Calibrator) -> None:
         """Keep the persons of the last state, what it measured, and a thin sample of the judged frames."""
-        people = self._taught(read)
-        error = angle_deg(self._gaze(people, read, self.trial), self.trial.stimulus_deg)
+        people = self._taught(read, how)
+        error = angle_deg(gaze_experiment.answered(people, read, self.trial), self.trial.stimulus_deg)
         judged = self._judged()
         for kind in self.measured_deg:
             self.measured_deg[kind] = float(error[judged & self.trial.group(kind)].mean())
@@ -203,32 +202,23 @@ class Reading:
     def _judged(self) -> Array:
         return ~np.isin(np.arange(len(self.trial.subject)), gaze_experiment.calibrating(self.trial, self.config))
 
-    def _answers(self, read: Read) -> Array:
+    def _answers(self, read: Readings, how: Calibrator) -> Array:
         """(n, 2) gaze, every person calibrated on what was read."""
-        return self._gaze(self._taught(read), read, self.trial)
+        return gaze_experiment.answered(self._taught(read, how), read, self.trial)
 
-    def _taught(self, read: Read) -> dict[int, PersonalGaze] | dict[int, Own]:
-        pupil, slip, axis = read
-        people = None if self._before is None else self._before[1]
-        return gaze_experiment.taught(
-            pupil, slip, self.trial, self.config, rig=self.scenes.rig, axis_deg=axis, people=people
-        )
+    def _taught(self, read: Readings, how: Calibrator) -> dict[int, Person]:
+        return gaze_experiment.taught(read, self.trial, self.config, how)
 
-    @staticmethod
-    def _gaze(people: dict[int, PersonalGaze] | dict[int, Own], read: Read, trial: gaze_experiment.Trial) -> Array:
-        pupil, slip, axis = read
-        return gaze_experiment.answered(people, pupil, slip, trial, axis_deg=axis)
-
-    def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> Read:
-        """What is read of all frames; people who calibrated before did so through these optics, with noise."""
+    def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> tuple[Readings, Calibrator]:
+        """What is read of all frames, and how people are calibrated whose frames come through these optics (noisy)."""
         if self._before is None or self._before[0] is not optics:
-            self._before = optics, gaze_experiment.learnt(self.source, optics, self.config)
-        return self._frames(self.subjects, optics, quiet=quiet)
+            self._before = optics, gaze_experiment.calibrator(self.source, optics, self.config)
+        return self._frames(self.subjects, optics, quiet=quiet), self._before[1]
 
     @torch.no_grad()
     def _frames(
         self, subjects: list[Rendered] | tuple[Rendered, ...], optics: Imager | UniformImager, *, quiet: bool = False
-    ) -> Read:
+    ) -> Readings:
         """What the network reads of frames through these optics; noise of the experiment's seeds."""
         found = []
         net, inner = network(self.source.run.trainer), self.source.settings.inner

@@ -7,7 +7,7 @@ own lens.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,9 +20,9 @@ from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.evaluate.shown import Trial as Trial
-from codesign.eye import POPULATION, Rendered, Rig, States, render
+from codesign.eye import POPULATION, Rendered, States, render
 from codesign.eye import population as eye
-from codesign.gaze import Own, People, PersonalGaze, angle_deg, face_angles, personal, shared
+from codesign.gaze import Calibrator, Person, Readings, Sphere, angle_deg, face_angles, shared
 from codesign.network import recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, read_out
@@ -153,7 +153,7 @@ def experiment(
     trials: list[Trial] = []
     answers: list[list[Answers]] = [[] for _ in sources]
     prepared = [ready(source, image=config.image) for source in sources]
-    before = [learnt(source, imager, config) for source, imager in zip(sources, prepared, strict=True)]
+    how = [calibrator(source, imager, config) for source, imager in zip(sources, prepared, strict=True)]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
@@ -168,8 +168,8 @@ def experiment(
     yield (
         config.subjects,
         [
-            _result(label, source, kept, whole, config, people)
-            for label, source, kept, people in zip(labels, sources, answers, before, strict=True)
+            _result(label, source, kept, whole, config, one)
+            for label, source, kept, one in zip(labels, sources, answers, how, strict=True)
         ],
     )
 
@@ -206,13 +206,18 @@ def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> Unif
     return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin)
 
 
-@torch.no_grad()
-def learnt(source: Source, imager: UniformImager | Imager, config: ExperimentConfig) -> People | None:
-    """What a network's readings tell of the gaze of people who calibrated before; None for one that tells no axis.
+def sphere(source: Source, config: ExperimentConfig) -> Sphere:
+    """Calibrates before a run's camera by pupil and slippage alone."""
+    return Sphere(source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed)
 
-    ``config.people`` whom neither training nor the experiment shows, before the same stimuli, on the same stage at
-    places of their own between its ends: EACH of their frames, drawn at random, through the run's lens, light and
-    noise.
+
+@torch.no_grad()
+def calibrator(source: Source, imager: UniformImager | Imager, config: ExperimentConfig) -> Calibrator:
+    """How people are calibrated whom a run's network reads: by what people have in common, if it tells the axis.
+
+    That is learned from ``config.people`` whom neither training nor the experiment shows, before the same stimuli, on
+    the same stage at places of their own between its ends: EACH of their frames, drawn at random, through the run's
+    lens, light and noise.
     """
     scenes = source.run.scenes(EXPERIMENT)
     found, looked = [], []
@@ -229,92 +234,52 @@ def learnt(source: Source, imager: UniformImager | Imager, config: ExperimentCon
         seen = through(source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db)
         found.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
         looked.append(trial.stimulus_deg[rows])
-    pupil_mm, slip_mm, axis_deg = read_from(found, source)
-    if axis_deg is None:
-        return None
+        if found[0].axis is None:
+            return sphere(source, config)
     who = np.repeat(np.arange(config.people), [len(one) for one in looked])
-    return shared.learn(axis_deg, pupil_mm, slip_mm, np.concatenate(looked), who)
+    return shared.learn(read_from(found, source), np.concatenate(looked), who)
 
 
-def read_from(kept: Sequence[Answers], source: Source) -> tuple[Array, Array, Array | None]:
-    """Pupil (n, 2) on the sensor and slippage (n, 3), mm, and angles (n, 2) of the optic axis, deg, if it is told."""
+def read_from(kept: Sequence[Answers], source: Source) -> Readings:
+    """A run's answers to frames one after the other, in the units that gaze is calibrated in."""
     centre, slip = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "slip_mm"))
     axes = [a.axis for a in kept if a.axis is not None]
     tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
     angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
-    return centre * source.run.window_um * 1e-3, slip, angles
+    return Readings(centre * source.run.window_um * 1e-3, slip, angles)
 
 
 def _result(
-    name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig, people: People | None
+    name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig, how: Calibrator
 ) -> Result:
-    pupil_mm, slip, axis_deg = read_from(kept, source)
-    rig = source.run.scenes(EXPERIMENT).rig
-    predicted, judged = calibrated(pupil_mm, slip, trial, config, rig=rig, axis_deg=axis_deg, people=people)
-    told, _ = calibrated(pupil_mm, trial.slip_mm, trial, config, rig=rig)
+    read = read_from(kept, source)
+    predicted, judged = calibrated(read, trial, config, how)
+    told, _ = calibrated(replace(read, slip_mm=trial.slip_mm), trial, config, sphere(source, config))
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
     mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
     centre, iou = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "iou"))
-    return Result(name, mmacs, trial, slip, centre, iou, error, predicted, told_error, reach)
+    return Result(name, mmacs, trial, read.slip_mm, centre, iou, error, predicted, told_error, reach)
 
 
-def calibrated(
-    pupil_mm: Array,
-    slip_mm: Array,
-    trial: Trial,
-    config: ExperimentConfig,
-    *,
-    rig: Rig,
-    axis_deg: Array | None = None,
-    people: People | None = None,
-) -> tuple[Array, Array]:
+def calibrated(read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator) -> tuple[Array, Array]:
     """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
-    own = taught(pupil_mm, slip_mm, trial, config, rig=rig, axis_deg=axis_deg, people=people)
-    judged = ~np.isin(np.arange(len(pupil_mm)), calibrating(trial, config))
-    return answered(own, pupil_mm, slip_mm, trial, axis_deg=axis_deg), judged
+    judged = ~np.isin(np.arange(len(read)), calibrating(trial, config))
+    return answered(taught(read, trial, config, how), read, trial), judged
 
 
-def taught(
-    pupil_mm: Array,
-    slip_mm: Array,
-    trial: Trial,
-    config: ExperimentConfig,
-    *,
-    rig: Rig,
-    axis_deg: Array | None = None,
-    people: People | None = None,
-) -> dict[int, PersonalGaze] | dict[int, Own]:
-    """Every subject's calibration by number, fitted to the stimuli of :func:`calibrating`.
-
-    By what people have in common where the axis is read and ``people`` tell it; by sphere and regressor otherwise.
-    """
+def taught(read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator) -> dict[int, Person]:
+    """Every subject's calibration by number, on the stimuli of :func:`calibrating`."""
     known = calibrating(trial, config)
     mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
-    looked = trial.stimulus_deg
-    if axis_deg is not None and people is not None:
-        return {s: people.person(axis_deg[r], pupil_mm[r], slip_mm[r], looked[r]) for s, r in mine.items()}
-    return {
-        s: personal.fit(pupil_mm[r], slip_mm[r], looked[r], rig=rig, hidden=config.hidden, seed=config.seed)
-        for s, r in mine.items()
-    }
+    return {s: how.person(read[rows], trial.stimulus_deg[rows]) for s, rows in mine.items()}
 
 
-def answered(
-    people: dict[int, PersonalGaze] | dict[int, Own],
-    pupil_mm: Array,
-    slip_mm: Array,
-    trial: Trial,
-    *,
-    axis_deg: Array | None = None,
-) -> Array:
+def answered(people: Mapping[int, Person], read: Readings, trial: Trial) -> Array:
     """(n, 2) gaze of frames, each by its subject's calibration."""
-    predicted = np.empty((len(pupil_mm), 2))
+    predicted = np.empty((len(read), 2))
     for subject in np.unique(trial.subject):
-        rows, person = np.flatnonzero(trial.subject == subject), people[int(subject)]
-        if isinstance(person, PersonalGaze):
-            predicted[rows] = person(pupil_mm[rows], slip_mm[rows])
-        elif axis_deg is not None:
-            predicted[rows] = person(axis_deg[rows], pupil_mm[rows], slip_mm[rows])
+        rows = np.flatnonzero(trial.subject == subject)
+        predicted[rows] = people[int(subject)](read[rows])
     return predicted
 
 

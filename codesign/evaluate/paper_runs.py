@@ -1,5 +1,6 @@
 """What finished runs say to Table 2 and Fig. 8b of the paper: gaze of other networks, cost of what is frozen."""
 
+import functools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,17 +11,18 @@ from typing import Any
 import torch
 
 from codesign.adapt import train as retraining
-from codesign.batches import TEST
+from codesign.batches import TEST, VALIDATION
 from codesign.evaluate.paper import Measured
-from codesign.gaze import GazeErrors
+from codesign.gaze import Readings
 from codesign.gaze import bench as gaze_test
 from codesign.network import Architecture, Baseline, recalibrate, smallest
-from codesign.train import Run, assess
+from codesign.train import Run, Seen, assess
 from codesign.train import run as runs
 from metalens.ground.errors import TrainingError
 
 TABLE_2 = {"nvgaze": "nvgaze", "popovic": "popovic_et_al", "de2gaze": "de2gaze"}  # our network: the claim's key
 PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
+BEFORE = 32  # other people of as many frames, whose gaze tells what an axis that is read means
 WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 
@@ -57,17 +59,32 @@ def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5)
     """
     settings = runs.load(folder / "run.toml")
     going = runs.resume(folder / "checkpoint.safetensors", settings)
-    test = gaze_test.people(going.scenes(TEST), people, each, seed=seed)
-    seen = assess.frames(going.trainer, test, math.ceil(people * each / settings.inner.batch))
+    shown = _shown(going, TEST, people, each, seed)
+    before = functools.cache(lambda: _shown(going, VALIDATION, BEFORE, each, seed + 1))
     known = assess.parts(assess.frames(going.trainer, going.trainer.scenes, min(8, settings.test_batches)))
     out = []
     for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
         architecture = _architecture(row, going, folder)
         recalibrate(going.trainer.model.net, architecture, known)
-        answers = assess.predict(going.trainer.model.net, architecture, seen, settings.inner)
-        found: GazeErrors = gaze_test.gaze_errors(test, answers.centre, answers.slip_mm)
+        read, how = _read(going, architecture, shown), None
+        if read.axis_deg is not None:
+            how = gaze_test.learnt(before()[0], _read(going, architecture, before()))
+        found = gaze_test.gaze_errors(shown[0], read, how=how)
         out.append({"mmacs": row["mmacs"], "people": people, "frames_each": each, "seed": seed, **asdict(found)})
     return out
+
+
+def _shown(going: Run, stream: int, people: int, each: int, seed: int) -> tuple[gaze_test.People, Seen]:
+    """People and their frames through a run's lens."""
+    test = gaze_test.people(going.scenes(stream), people, each, seed=seed)
+    return test, assess.frames(going.trainer, test, math.ceil(people * each / going.settings.inner.batch))
+
+
+def _read(going: Run, architecture: Architecture, shown: tuple[gaze_test.People, Seen]) -> Readings:
+    """What a network of a run reads of their frames."""
+    test, seen = shown
+    answers = assess.predict(going.trainer.model.net, architecture, seen, going.settings.inner)
+    return gaze_test.read_of(test, answers.centre, answers.slip_mm, answers.axis)
 
 
 def _architecture(row: Mapping[str, Any], going: Run, folder: Path) -> Architecture:

@@ -1,7 +1,8 @@
 """Gaze from a network's answers, three ways apart: population eye, the person's own eye, and personal calibration.
 
 With a population eye the error is that of anatomy, 3 degrees whatever the lens. So a test takes several frames of each
-of several people, calibrates on a fifth of them (the paper's 20 % of the points), and judges the rest.
+of several people, calibrates on a fifth of them (the paper's 20 % of the points), and judges the rest. Where the optic
+axis is read too, :func:`learnt` makes a calibrator of what other people's frames tell.
 """
 
 import math
@@ -14,10 +15,12 @@ from torch import Tensor
 from codesign.batches import EyeScenes, as_batch
 from codesign.eye import Labels, States, render
 from codesign.eye import population as eye
-from codesign.gaze import personal
+from codesign.gaze import shared
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
-from codesign.gaze.personal import angle_deg, face_angles
+from codesign.gaze.personal import Sphere, angle_deg
+from codesign.gaze.readings import Calibrator, Readings, face_angles
 from codesign.train import Batch
+from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
 
@@ -66,9 +69,9 @@ def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
 class GazeErrors:
     """Mean angles in degrees between found and true gaze, over the frames that no calibration saw.
 
-    population: optical axis, mean eye. anatomy: optical axis, the person's own eye. personal: visual axis after
-    :mod:`codesign.gaze.personal` on the person's calibration frames. The floors: the same with
-    true slippage and pupil, what is left to the solver and not to the network.
+    population: optical axis, mean eye. anatomy: optical axis, the person's own eye. personal: visual axis after a
+    calibration on the person's own frames. The floors: the same by the sphere (:mod:`codesign.gaze.personal`) with true
+    slippage and pupil, what is left to the solver and not to the network.
     """
 
     population_deg: float
@@ -79,11 +82,37 @@ class GazeErrors:
     personal_floor_deg: float
 
 
-def gaze_errors(test: People, centre: Tensor, slip_mm: Tensor, *, share: float = 0.2) -> GazeErrors:
-    """Gaze from pupil centres and slippages that a network found.
+def read_of(test: People, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None) -> Readings:
+    """What a network found in the frames, in the units that gaze is calibrated in.
 
     Args:
         centre: (n, 2) pupil centre, fraction of the frame from its middle. slip_mm: (n, 3) of the head.
+        axis: (n, 3) optic axis in the camera's frame; None of a network that tells none.
+    """
+    edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
+    angles = None if axis is None else face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
+    return Readings(centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles)
+
+
+def looked_deg(test: People) -> Array:
+    """(n, 2) angles of the visual axes, across and down in the frame of the face."""
+    return face_angles(test.labels.visual_axis.numpy(), test.scenes.rig.elevation_rad)
+
+
+def learnt(before: People, read: Readings) -> shared.People:
+    """What the frames of other people tell of gaze, by which a person is calibrated.
+
+    Raises:
+        TrainingError: too few people or frames, or readings without an axis.
+    """
+    return shared.learn(read, looked_deg(before), np.arange(len(read)) // before.each)
+
+
+def gaze_errors(test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2) -> GazeErrors:
+    """Gaze from what a network found in the frames.
+
+    Args:
+        how: people are calibrated; without it by pupil and slippage alone, as for the floor.
         share: part of each person's frames that calibrates.
 
     Raises:
@@ -92,23 +121,22 @@ def gaze_errors(test: People, centre: Tensor, slip_mm: Tensor, *, share: float =
     known = round(share * test.each)
     if not 3 <= known < test.each:
         raise TrainingError(f"{known} of {test.each} frames a person calibrate: need 3 or more, and some to judge")
-    edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
     camera = test.scenes.camera.pitch_um * test.scenes.camera.pixels / 32
-    true_mm = (test.labels.pupil_px - 15.5) * camera * 1e-3
-    true_slip = test.labels.slip_um * 1e-3
-    found = _angles(test, centre.double() * edge_mm, slip_mm.double(), known)
-    floor = _angles(test, true_mm, true_slip, known)
+    true = Readings(((test.labels.pupil_px - 15.5) * camera * 1e-3).numpy(), (test.labels.slip_um * 1e-3).numpy())
+    sphere = Sphere(test.scenes.rig)
+    found, floor = _angles(test, read, how or sphere, known), _angles(test, true, sphere, known)
     return GazeErrors(*(math.degrees(v) for v in (*found, *floor)))
 
 
-def _angles(test: People, pupil_mm: Tensor, slip_mm: Tensor, known: int) -> tuple[float, float, float]:
-    labels, rig = test.labels, test.scenes.rig
+def _angles(test: People, read: Readings, how: Calibrator, known: int) -> tuple[float, float, float]:
+    labels = test.labels
+    pupil_mm, slip_mm = torch.from_numpy(read.pupil_mm), torch.from_numpy(read.slip_mm)
     own = (labels.centre_um - labels.slip_um) * 1e-3
     radius = (labels.pupil_um - labels.centre_um).norm(dim=1).mean().item() * 1e-3
     early = (torch.arange(len(own)) % test.each) < known
     mean = _fitted(test, own.mean(0), radius, torch.nonzero(early)[:, 0], pupil_mm, slip_mm)
     crowd = optical_axis(pupil_mm, -slip_mm, mean).direction
-    looked = face_angles(labels.visual_axis.numpy(), rig.elevation_rad)
+    looked = looked_deg(test)
     errors: list[list[Tensor]] = [[], [], []]
     for person in range(test.people):
         rows = torch.arange(person * test.each, (person + 1) * test.each)
@@ -117,9 +145,9 @@ def _angles(test: People, pupil_mm: Tensor, slip_mm: Tensor, known: int) -> tupl
         geometry = _fitted(test, own[rows[0]], radius, first, pupil_mm, slip_mm)
         axis = optical_axis(pupil_mm[rest], -slip_mm[rest], geometry).direction
         errors[1].append(angle_rad(axis, labels.optic_axis[rest]))
-        taught = personal.fit(pupil_mm[first].numpy(), slip_mm[first].numpy(), looked[first], rig=rig)
-        found = taught(pupil_mm[rest].numpy(), slip_mm[rest].numpy())
-        errors[2].append(torch.from_numpy(np.radians(angle_deg(found, looked[rest]))))
+        mine, others = first.numpy(), rest.numpy()
+        found = how.person(read[mine], looked[mine])(read[others])
+        errors[2].append(torch.from_numpy(np.radians(angle_deg(found, looked[others]))))
     one, two, three = (float(torch.cat(e).mean()) for e in errors)
     return one, two, three
 

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from codesign.eye import Rig, face_axes
+from codesign.eye import Rig
 from codesign.eye import population as eye
 from codesign.gaze import regressor
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
+from codesign.gaze.readings import Readings, face_angles
 from codesign.gaze.regressor import Regressor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
@@ -50,12 +51,32 @@ class PersonalGaze:
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 
-    def __call__(self, pupil_mm: Array, slip_mm: Array) -> Array:
-        """(n, 2) gaze across and down, deg, of pupils (n, 2) on the sensor and slippages (n, 3) of the head."""
-        first = self.sphere(pupil_mm, slip_mm)
+    def __call__(self, read: Readings) -> Array:
+        """(n, 2) gaze across and down, deg, of pupil and slippage."""
+        first = self.sphere(read.pupil_mm, read.slip_mm)
         if self.rest is None:
             return first
-        return np.asarray(first + self.rest(np.concatenate([first, slip_mm], 1)))
+        return np.asarray(first + self.rest(np.concatenate([first, read.slip_mm], 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """Calibrates by pupil and slippage alone (:func:`fit`).
+
+    hidden: neurons of the regressor; 0 for none. seed: of its first weights.
+    """
+
+    rig: Rig
+    hidden: int = 10
+    seed: int = 0
+
+    def person(self, read: Readings, gaze_deg: Array) -> PersonalGaze:
+        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
+
+        Raises:
+            TrainingError: fewer than 3 points.
+        """
+        return fit(read.pupil_mm, read.slip_mm, gaze_deg, rig=self.rig, hidden=self.hidden, seed=self.seed)
 
 
 def mean_geometry(rig: Rig) -> EyeGeometry:
@@ -116,12 +137,6 @@ def _penalty(features: Array, missed: Array, gaze_deg: Array, *, hidden: int, se
         return total
 
     return min(PENALTIES, key=error)
-
-
-def face_angles(direction: Array, elevation_rad: float) -> Array:
-    """(n, 2) angles across and down, deg, in the frame of the face, of directions (n, 3) in the camera's."""
-    right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
-    return np.asarray(np.degrees(np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)))
 
 
 def angle_deg(one: Array, other: Array) -> Array:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from codesign.gaze.readings import Readings
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
@@ -98,23 +99,19 @@ class People:
     middle: Array
     spread: Array
 
-    def terms(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
+    def terms(self, read: Readings) -> Array:
         """(n, 36) the constant, the readings in their units, and their products."""
-        return _terms(_together(axis_deg, pupil_mm, slip_mm), self.middle, self.spread)
+        return _terms(_together(read), self.middle, self.spread)
 
-    def person(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array, gaze_deg: Array) -> "Own":
-        """Calibrate a person.
-
-        Args:
-            axis_deg: (n, 2) angles of the optic axis as read. pupil_mm: (n, 2) on the sensor. slip_mm: (n, 3).
-            gaze_deg: (n, 2) where the person looked, across and down.
+    def person(self, read: Readings, gaze_deg: Array) -> "Own":
+        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
 
         Raises:
-            TrainingError: fewer than 3 points.
+            TrainingError: fewer than 3 points, or readings without an axis.
         """
-        if len(axis_deg) < 3:
-            raise TrainingError(f"a personal calibration from {len(axis_deg)} points, need 3 or more")
-        return Own(self, self.model.own(self.terms(axis_deg, pupil_mm, slip_mm), gaze_deg - axis_deg))
+        if len(read) < 3:
+            raise TrainingError(f"a personal calibration from {len(read)} points, need 3 or more")
+        return Own(self, self.model.own(self.terms(read), gaze_deg - _axis(read)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -124,27 +121,36 @@ class Own:
     people: People
     coefficients: Array
 
-    def __call__(self, axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
+    def __call__(self, read: Readings) -> Array:
         """(n, 2) gaze across and down, deg."""
-        return np.asarray(axis_deg + self.people.terms(axis_deg, pupil_mm, slip_mm) @ self.coefficients)
+        return np.asarray(_axis(read) + self.people.terms(read) @ self.coefficients)
 
 
-def learn(axis_deg: Array, pupil_mm: Array, slip_mm: Array, gaze_deg: Array, person: Array) -> People:
-    """What readings of many people tell of gaze; arguments as of :meth:`People.person`, person: (n,) their numbers.
+def learn(read: Readings, gaze_deg: Array, person: Array) -> People:
+    """What readings of many people tell of gaze.
+
+    Args:
+        read: of n frames. gaze_deg: (n, 2) where was looked, across and down. person: (n,) whose frame it is.
 
     Raises:
-        TrainingError: too few people or frames.
+        TrainingError: too few people or frames, or readings without an axis.
     """
-    together = _together(axis_deg, pupil_mm, slip_mm)
+    together = _together(read)
     middle, spread = together.mean(0), np.maximum(together.std(0), 1e-9)
     design = _terms(together, middle, spread)
     first = np.full(design.shape[1], OTHERS_DEG**2)
     first[0] = KAPPA_DEG**2
-    return People(mixed(design, gaze_deg - axis_deg, person, first=first), middle, spread)
+    return People(mixed(design, gaze_deg - _axis(read), person, first=first), middle, spread)
 
 
-def _together(axis_deg: Array, pupil_mm: Array, slip_mm: Array) -> Array:
-    return np.concatenate([axis_deg, pupil_mm, slip_mm], 1)
+def _axis(read: Readings) -> Array:
+    if read.axis_deg is None:
+        raise TrainingError("the readings hold no optic axis, which gaze is told from here; calibrate by the sphere")
+    return read.axis_deg
+
+
+def _together(read: Readings) -> Array:
+    return np.concatenate([_axis(read), read.pupil_mm, read.slip_mm], 1)
 
 
 def _terms(together: Array, middle: Array, spread: Array) -> Array:

@@ -65,15 +65,13 @@ def spread(found: Prediction, truth: Tensor) -> Tensor:
     return (0.5 * miss**2 * torch.exp(-2 * found.slip_log_sd) + found.slip_log_sd).mean()
 
 
-def task(found: Prediction, mask: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, slip_weight: float = 2.0) -> Tensor:
+def task(found: Prediction, mask: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, slip_weight: float) -> Tensor:
     """L_task = L_seg + lambda_slip L_calib; a network without a mask is held to the pupil's centre in its place."""
     seen = segmentation(found.mask_logits, mask) if found.mask_logits.numel() else place(found.centre, mask)
     return seen + slip_weight * slip(found.slip, slip_mm, scale_mm)
 
 
-def reading(
-    found: Prediction, vergence: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, depth_weight: float = 0.5
-) -> Tensor:
+def reading(found: Prediction, vergence: Tensor, slip_mm: Tensor, scale_mm: Tensor, *, depth_weight: float) -> Tensor:
     """lambda_depth L_depth + the uncertainty's own loss: what a network that reads depth is trained on beside the task.
 
     Args:
@@ -83,9 +81,7 @@ def reading(
     return told + SPREAD_WEIGHT * spread(found, slip_mm / scale_mm)
 
 
-def pose(
-    found: Prediction, axis: Tensor, points: Tensor, *, axis_weight: float = 0.5, point_weight: float = 0.2
-) -> Tensor:
+def pose(found: Prediction, axis: Tensor, points: Tensor, *, axis_weight: float, point_weight: float) -> Tensor:
     """Landmarks that lie in the image, and the optic axis; 0 for a network that tells neither.
 
     Args:

@@ -91,7 +91,7 @@ def made_reading(monkeypatch, judged, axial):
     self.trial = SimpleNamespace(stimulus_deg=None, group=lambda kind: axial if kind == AXIAL else ~axial)
     self._error_rad = 0.0
     monkeypatch.setattr(self, "_judged", lambda: judged)
-    monkeypatch.setattr(self, "_answers", lambda read: read)
+    monkeypatch.setattr(self, "_answers", lambda read, how: read)
     return self
 
 
@@ -99,24 +99,26 @@ def test_one_more_cause_adds_what_the_error_has_more_in_quadrature(monkeypatch):
     """Mean errors of 3, then 5, then 4.6 degrees of the judged frames that slip along the axis: 3, 4 and nothing."""
     judged, axial = np.array([True, True, True, False]), np.array([True, True, False, True])
     self = made_reading(monkeypatch, judged, axial)
-    found = [self._grown("link", np.array([low, high, 80.0, 70.0]), "") for low, high in ((2, 4), (3, 7), (4.6, 4.6))]
+    found = [
+        self._grown("link", np.array([low, high, 80.0, 70.0]), None, "") for low, high in ((2, 4), (3, 7), (4.6, 4.6))
+    ]
     assert [math.degrees(entry.gaze_rad) for entry in found] == pytest.approx([3, 4, 0])
-    again = self._grown("link", np.array([5.8, 5.8, 0.0, 0.0]), "")  # over the state before, not over the largest
+    again = self._grown("link", np.array([5.8, 5.8, 0.0, 0.0]), None, "")  # over the state before, not over the largest
     assert math.degrees(again.gaze_rad) == pytest.approx(math.sqrt(5.8**2 - 4.6**2))
 
 
 def test_fixation_is_what_is_left_of_the_whole_error(monkeypatch):
     """Subject and calibration 0.5 degrees, with fixation 1.3: 1.2; only frames judged under axial slippage count."""
-    config = ExperimentConfig(subjects=2, fixation_deg=0.9)
+    config = ExperimentConfig(subjects=2, fixation_deg=0.9, hidden=7, seed=3)
     axial = np.array([True, True, False])
     trial = SimpleNamespace(group=lambda kind: axial, stimulus_deg=None)
     monkeypatch.setattr(person.gaze_experiment, "states_of", lambda *_: (None, None))
     monkeypatch.setattr(person.gaze_experiment, "joined", lambda _: trial)
-    monkeypatch.setattr(person, "told", lambda one, scenes: (one.fixation_deg, None))
+    monkeypatch.setattr(person, "told", lambda one, scenes: one.fixation_deg)
     monkeypatch.setattr(person, "angle_deg", lambda one, other: one)
 
-    def calibrated(fixation, _, trial, one, *, rig):
-        assert fixation == one.fixation_deg
+    def calibrated(fixation, trial, one, how):
+        assert (fixation, how.hidden, how.seed) == (one.fixation_deg, 7, 3)
         return np.array([1.3 if fixation else 0.5, 40.0, 50.0])[:, None], np.array([True, False, True])
 
     monkeypatch.setattr(person.gaze_experiment, "calibrated", calibrated)

@@ -20,6 +20,7 @@ from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.gaze import personal, regressor, shared
+from codesign.gaze.readings import Readings
 from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
 from tests.referees.seen_pupil import pupil_of
@@ -103,7 +104,7 @@ def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_muc
     direction = torch.from_numpy(personal.direction(np.radians(trial.stimulus_deg)) @ axes)
     pupil = pupil_of(direction, torch.from_numpy(-trial.slip_mm), person.mean).numpy()
     for slip, low, high in ((trial.slip_mm, 0.0, 0.5), (0 * trial.slip_mm, 1.5, 20.0)):
-        predicted, judged = experiment.calibrated(pupil, slip, trial, config, rig=rig)
+        predicted, judged = experiment.calibrated(Readings(pupil, slip), trial, config, personal.Sphere(rig))
         error = personal.angle_deg(predicted, trial.stimulus_deg)[judged]
         assert low <= error.mean() < high
     assert judged.mean() == pytest.approx(39 / 49)
@@ -195,7 +196,7 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
 def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and pupil are told nothing."""
     rng, config = np.random.default_rng(3), ExperimentConfig(subjects=2)
-    trial, rig = _trial(config, 2), Rig()
+    trial = _trial(config, 2)
 
     def misread(gaze, slip, kappa):
         return gaze + kappa + 0.1 * slip[:, [0]] * slip[:, [2]] + 0.1 * slip[:, [2]] ** 2
@@ -203,21 +204,21 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     person = np.repeat(np.arange(12), 20)
     gaze, slip = rng.uniform(-17, 17, (240, 2)), rng.uniform(-5, 5, (240, 3))
     pupil = rng.normal(0, 0.3, (240, 2))
-    people = shared.learn(misread(gaze, slip, rng.normal(5, 2, (12, 2))[person]), pupil, slip, gaze, person)
+    theirs = Readings(pupil, slip, misread(gaze, slip, rng.normal(5, 2, (12, 2))[person]))
+    people = shared.learn(theirs, gaze, person)
     axis = misread(trial.stimulus_deg, trial.slip_mm, np.array([[3.0, -1.0], [7.0, 4.0]])[trial.subject])
-    blind = np.zeros((len(axis), 2))
-    given = {"rig": rig, "axis_deg": axis, "people": people}
-    predicted, judged = experiment.calibrated(blind, trial.slip_mm, trial, config, **given)
+    read = Readings(np.zeros((len(axis), 2)), trial.slip_mm, axis)
+    predicted, judged = experiment.calibrated(read, trial, config, people)
     assert personal.angle_deg(predicted, trial.stimulus_deg)[judged].mean() < 0.05
-    alone = experiment.taught(blind, trial.slip_mm, trial, replace(config, hidden=0), rig=rig, axis_deg=axis)
-    assert isinstance(alone[0], personal.PersonalGaze)
+    alone, _ = experiment.calibrated(read, trial, config, personal.Sphere(Rig(), hidden=0))
+    assert personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5  # the pupil tells nothing here
 
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
     source = retraining.load(folder / "run")
     config, imager = replace(SMALL, people=2), experiment.ready(source)
     found, again, dim = (
-        experiment.learnt(source, imager, c) for c in (config, config, replace(config, snr_db=3.0))
+        experiment.calibrator(source, imager, c) for c in (config, config, replace(config, snr_db=3.0))
     )  # fmt: skip
     assert found.model.mean.shape == (36, 2)
     assert np.isfinite(found.model.mean).all()

@@ -12,6 +12,7 @@ from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
 from codesign.eye.population import Rig
 from codesign.gaze import bench, personal
 from codesign.gaze.axis import EyeGeometry, optical_axis
+from codesign.gaze.readings import Readings
 from metalens.ground.errors import TrainingError
 from tests.referees.seen_pupil import pupil_of
 
@@ -60,38 +61,39 @@ def test_places_go_to_mm_by_the_frame_s_edge_and_the_labels_pixel(monkeypatch):
     test, pupil, slip = group()
     asked = []
 
-    def angles(test, pupil_mm, slip_mm, known):
-        asked.append((pupil_mm, slip_mm, known))
+    def angles(test, read, how, known):
+        asked.append((read.pupil_mm, read.slip_mm, known))
         return tuple(math.radians(v) for v in ((1.0, 2.0, 3.0) if len(asked) == 1 else (0.4, 0.5, 0.6)))
 
     monkeypatch.setattr(bench, "_angles", angles)
     centre = torch.linspace(-0.2, 0.3, 36).reshape(18, 2)
-    got = bench.gaze_errors(test, centre, (slip + 0.25).float(), share=0.3)
+    read = bench.read_of(test, centre, (slip + 0.25).float())
+    got = bench.gaze_errors(test, read, share=0.3)
     (found, off, known), (true, real, again) = asked
     assert (known, again) == (3, 3)  # 0.3 of 9 frames: 2.7
-    assert found.numpy() == pytest.approx(centre.double().numpy() * 53 * 17e-3, rel=1e-6)
-    assert off.numpy() == pytest.approx(slip.numpy() + 0.25, rel=1e-6)
-    assert true.numpy() == pytest.approx(pupil.numpy(), rel=1e-9)
-    assert real.numpy() == pytest.approx(slip.numpy(), rel=1e-9)
+    assert found == pytest.approx(centre.double().numpy() * 53 * 17e-3, rel=1e-6)
+    assert off == pytest.approx(slip.numpy() + 0.25, rel=1e-6)
+    assert true == pytest.approx(pupil.numpy(), rel=1e-9)
+    assert real == pytest.approx(slip.numpy(), rel=1e-9)
     assert [got.population_deg, got.anatomy_deg, got.personal_deg] == pytest.approx([1.0, 2.0, 3.0])
     assert [got.population_floor_deg, got.anatomy_floor_deg, got.personal_floor_deg] == pytest.approx([0.4, 0.5, 0.6])
     with pytest.raises(TrainingError, match="2 of 9"):
-        bench.gaze_errors(test, centre, slip, share=0.25)
+        bench.gaze_errors(test, read, share=0.25)
     with pytest.raises(TrainingError, match="9 of 9"):
-        bench.gaze_errors(test, centre, slip, share=1.0)
+        bench.gaze_errors(test, read, share=1.0)
 
 
-def test_angles_are_means_over_the_frames_that_no_calibration_saw(monkeypatch):
+def test_angles_are_means_over_the_frames_that_no_calibration_saw():
     test, pupil, slip = group()
     labels, later = test.labels, (np.arange(2 * EACH) % EACH) >= KNOWN
     fits = []
 
-    def fit(pupil_mm, slip_mm, gaze_deg, *, rig):
-        fits.append((pupil_mm, slip_mm, gaze_deg, rig))
-        return lambda p, s: np.tile([4.0, -1.5], (len(p), 1))
+    def calibrated(read, gaze_deg):
+        fits.append((read.pupil_mm, read.slip_mm, gaze_deg))
+        return lambda later: np.tile([4.0, -1.5], (len(later), 1))
 
-    monkeypatch.setattr(personal, "fit", fit)
-    crowd, own, taught = (math.degrees(v) for v in bench._angles(test, pupil, slip, KNOWN))
+    read, how = Readings(pupil.numpy(), slip.numpy()), SimpleNamespace(person=calibrated)
+    crowd, own, taught = (math.degrees(v) for v in bench._angles(test, read, how, KNOWN))
     assert own < 1e-6  # a sphere of the person's centre and of 1.00 of the mean radius gives every gaze
     # the mean eye, of the radius between 0.9 and 1.15 of the mean one that suits the calibrating frames best
     mean = tuple(CENTRES.mean(0))
@@ -106,11 +108,10 @@ def test_angles_are_means_over_the_frames_that_no_calibration_saw(monkeypatch):
     told = personal.direction(np.radians(np.tile([4.0, -1.5], (2 * EACH, 1))))
     off = degrees_between(told, personal.direction(np.radians(looked)))
     assert taught == pytest.approx(off[later].mean(), rel=1e-6)
-    for person, (p, s, g, rig) in enumerate(fits):
+    for person, (p, s, g) in enumerate(fits):
         rows = slice(person * EACH, person * EACH + KNOWN)
         assert (np.array_equal(p, pupil[rows].numpy()), np.array_equal(s, slip[rows].numpy())) == (True, True)
         assert g == pytest.approx(looked[rows])
-        assert rig is test.scenes.rig
 
 
 def noisy():
@@ -172,7 +173,7 @@ def test_a_sphere_s_gaze_is_turned_by_its_angles_and_rolled():
     got = personal.PersonalGaze(mean, rig.elevation_rad, own, None)
     assert got.sphere(pupil, slip) == pytest.approx(want, rel=1e-12)
     rest = personal.PersonalGaze(mean, rig.elevation_rad, own, lambda f: 0.1 * f[:, [2, 4]] + 0.01 * f[:, :2])
-    assert rest(pupil, slip) == pytest.approx(want + 0.1 * slip[:, [0, 2]] + 0.01 * want, rel=1e-12)
+    assert rest(Readings(pupil, slip)) == pytest.approx(want + 0.1 * slip[:, [0, 2]] + 0.01 * want, rel=1e-12)
 
 
 def test_the_penalty_is_the_one_that_foretells_points_left_out(monkeypatch):

@@ -1,9 +1,13 @@
 """Gaze tests: with true slippage and one's own eye little is left, with the population's eye anatomy rules."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
+from codesign.gaze import bench
 from codesign.gaze.bench import gaze_errors, people
 from metalens.ground.errors import TrainingError
 
@@ -18,7 +22,7 @@ def group():
 def _truth(group):
     edge = 64 * 18.0
     camera = SCENES.camera.pitch_um * SCENES.camera.pixels / 32
-    return (group.labels.pupil_px - 15.5) * camera / edge, group.labels.slip_um * 1e-3
+    return bench.read_of(group, (group.labels.pupil_px - 15.5) * camera / edge, group.labels.slip_um * 1e-3)
 
 
 def test_each_person_has_one_eye_and_many_gazes(group):
@@ -29,7 +33,7 @@ def test_each_person_has_one_eye_and_many_gazes(group):
 
 
 def test_with_true_answers_anatomy_rules_until_it_is_known(group):
-    found = gaze_errors(group, *_truth(group))
+    found = gaze_errors(group, _truth(group))
     assert found.population_deg == pytest.approx(found.population_floor_deg, abs=1e-6)
     assert found.anatomy_floor_deg < 0.8  # refraction that no sphere follows
     assert 1.2 < found.population_floor_deg < 6.0
@@ -38,11 +42,11 @@ def test_with_true_answers_anatomy_rules_until_it_is_known(group):
 
 def test_wrong_slippage_turns_the_gaze_as_geometry_says(group):
     """1 mm of lateral error moves the pupil by 1 mm on a sphere of 9.5 mm: 6 degrees, less for the slanted view."""
-    centre, slip = _truth(group)
-    off = slip + torch.tensor([1.0, 0.0, 0.0])
-    assert 4.0 < gaze_errors(group, centre, off).anatomy_deg < 9.0
+    true = _truth(group)
+    off = replace(true, slip_mm=np.add(true.slip_mm, (1.0, 0.0, 0.0)))
+    assert 4.0 < gaze_errors(group, off).anatomy_deg < 9.0
 
 
 def test_too_few_frames_to_calibrate_are_refused(group):
     with pytest.raises(TrainingError, match="2 of 60 frames a person calibrate"):
-        gaze_errors(group, *_truth(group), share=0.03)
+        gaze_errors(group, _truth(group), share=0.03)

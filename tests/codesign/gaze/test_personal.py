@@ -10,6 +10,7 @@ from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.gaze import personal
 from codesign.gaze.axis import EyeGeometry
+from codesign.gaze.readings import Readings
 from metalens.ground.errors import TrainingError
 from tests.referees.seen_pupil import pupil_of
 
@@ -51,7 +52,7 @@ def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
     pupil, slip, gaze = _person(SLIPS)
     known = _known(gaze, 4)
     person = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG)
-    error = personal.angle_deg(person(pupil[~known], slip[~known]), gaze[~known])
+    error = personal.angle_deg(person(Readings(pupil[~known], slip[~known])), gaze[~known])
     alone = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG, hidden=0)
     assert known.sum() == 49
     assert error.mean() < 0.15
@@ -66,7 +67,7 @@ def test_noisy_slippage_makes_the_regressor_careful():
     read = slip + 0.3 * rng.standard_normal(slip.shape)
     known = _known(gaze, 3)
     person = personal.fit(pupil[known], read[known], gaze[known], rig=RIG)
-    assert personal.angle_deg(person(pupil[~known], read[~known]), gaze[~known]).mean() < 4.0
+    assert personal.angle_deg(person(Readings(pupil[~known], read[~known])), gaze[~known]).mean() < 4.0
 
 
 def test_angles_between_directions():

@@ -1,9 +1,12 @@
 """What people share: variances in closed form, shrunk offsets, a person found from fewer points than terms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from codesign.gaze import shared
+from codesign.gaze.readings import Readings
 from metalens.ground.errors import TrainingError
 
 
@@ -88,7 +91,8 @@ def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatc
     slip[:, 1] = 0.25
     asked = []
     monkeypatch.setattr(shared, "mixed", lambda *given, first: asked.append((*given, first)) or shared.Mixed(*given))
-    people = shared.learn(axis, pupil, slip, axis + 7.0, np.arange(80) % 4)
+    read = Readings(pupil, slip, axis)
+    people = shared.learn(read, axis + 7.0, np.arange(80) % 4)
     ((design, answers, person, first),) = asked
     assert first.tolist() == [25.0] + [1.0] * 35
     assert answers == pytest.approx(np.full((80, 2), 7.0))
@@ -98,7 +102,7 @@ def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatc
     products = [unit[i] * unit[j] for i in range(7) for j in range(i, 7)]
     want = np.stack([np.ones(80), *unit, *products], 1)
     assert design == pytest.approx(want, abs=1e-9)
-    assert people.terms(axis[:5], pupil[:5], slip[:5]) == pytest.approx(want[:5], abs=1e-9)
+    assert people.terms(read[:5]) == pytest.approx(want[:5], abs=1e-9)
 
 
 def _read(rng, people, each, common):
@@ -109,7 +113,7 @@ def _read(rng, people, each, common):
     gain = rng.normal(1.0, 0.05, people)[person]
     axis = gain[:, None] * gaze + kappa + common * np.stack([slip[:, 0] * slip[:, 2], slip[:, 2] ** 2], 1)
     pupil = 0.03 * gaze + 0.1 * slip[:, :2] + 0.01 * rng.normal(0, 1, gaze.shape)
-    return axis + 0.2 * rng.normal(0, 1, gaze.shape), pupil, slip, gaze, person
+    return Readings(pupil, slip, axis + 0.2 * rng.normal(0, 1, gaze.shape)), gaze, person
 
 
 def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
@@ -117,11 +121,12 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
     are noise, 0.25 in the mean angle; ten points leave sqrt(1 + 4 / 10) of that, and twice that is the bar."""
     rng = np.random.default_rng(1)
     people = shared.learn(*_read(rng, 32, 40, 0.2))
-    axis, pupil, slip, gaze, _ = _read(rng, 1, 210, 0.2)
-    own = people.person(axis[:10], pupil[:10], slip[:10], gaze[:10])
-    error = np.linalg.norm(own(axis[10:], pupil[10:], slip[10:]) - gaze[10:], axis=1).mean()
+    read, gaze, _ = _read(rng, 1, 210, 0.2)
+    own = people.person(read[:10], gaze[:10])
+    error = np.linalg.norm(own(read[10:]) - gaze[10:], axis=1).mean()
     assert error < 2 * 0.25 * np.sqrt(1.4)
-    raw = axis[10:] - gaze[10:] - (axis[:10] - gaze[:10]).mean(0)
+    off = read.axis_deg - gaze
+    raw = off[10:] - off[:10].mean(0)
     assert np.linalg.norm(raw, axis=1).mean() > 2.0  # 0.2 deg/mm² of products up to 25 mm²
 
 
@@ -132,6 +137,9 @@ def test_too_few_people_frames_or_points_are_refused():
     with pytest.raises(TrainingError, match="36 frames of 4 people tell not how people differ in 36 terms"):
         shared.learn(*_read(rng, 4, 9, 0.0))
     people = shared.learn(*_read(rng, 6, 20, 0.0))
-    axis, pupil, slip, gaze, _ = _read(rng, 1, 2, 0.0)
+    read, gaze, _ = _read(rng, 1, 2, 0.0)
     with pytest.raises(TrainingError, match="2 points"):
-        people.person(axis, pupil, slip, gaze)
+        people.person(read, gaze)
+    blind = replace(_read(rng, 1, 12, 0.0)[0], axis_deg=None)
+    with pytest.raises(TrainingError, match="no optic axis"):
+        people.person(blind, np.zeros((12, 2)))

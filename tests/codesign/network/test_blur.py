@@ -121,14 +121,15 @@ def test_the_uncertainty_moves_nothing_but_itself():
     slip = torch.tensor([[0.4, -0.2, 1.1]], requires_grad=True)
     spread = torch.tensor([[-0.3, 0.1, 0.4]], requires_grad=True)
     found = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip, None, spread)
-    value = losses.reading(found, torch.zeros(1, 7, 7), torch.tensor([[0.3, 0.9, -2.0]]), torch.tensor([0.5, 0.7, 3.0]))
+    given = torch.zeros(1, 7, 7), torch.tensor([[0.3, 0.9, -2.0]]), torch.tensor([0.5, 0.7, 3.0])
+    value = losses.reading(found, *given, depth_weight=0.5)
     value.backward()
     assert slip.grad is None or not bool(slip.grad.any())
     miss = slip.detach() - torch.tensor([[0.6, 0.9 / 0.7, -2.0 / 3.0]])
     want = losses.SPREAD_WEIGHT / 3 * (1 - miss**2 * torch.exp(-2 * spread.detach()))
     assert torch.allclose(spread.grad, want, rtol=1e-5)
     plain = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip)
-    assert float(losses.reading(plain, torch.zeros(1, 7, 7), slip.detach(), torch.ones(3))) == 0
+    assert float(losses.reading(plain, torch.zeros(1, 7, 7), slip.detach(), torch.ones(3), depth_weight=0.5)) == 0
 
 
 def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():

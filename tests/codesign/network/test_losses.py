@@ -87,7 +87,7 @@ def test_task_adds_mask_and_twice_the_slip():
     fine = torch.nn.functional.interpolate(logits[:, None], scale_factor=2, mode="bilinear", align_corners=False)[:, 0]
     bce = torch.nn.functional.binary_cross_entropy_with_logits(fine, mask)
     want = losses.dice(fine, mask) + bce + 2 * losses.slip(slip, truth, scale)
-    assert float(losses.task(found, mask, truth, scale)) == pytest.approx(float(want), rel=1e-6)
+    assert float(losses.task(found, mask, truth, scale, slip_weight=2.0)) == pytest.approx(float(want), rel=1e-6)
 
 
 def test_dice_of_a_half_covered_mask_in_closed_form():
@@ -121,6 +121,6 @@ def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
     got = losses.pose(found, axis, points, axis_weight=0.7, point_weight=3.0)
     assert float(got) == pytest.approx(0.7 * looked + 3.0 * seen, rel=1e-5)
     nothing = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3))
-    assert float(losses.pose(nothing, axis, points)) == 0
-    away = losses.pose(found, axis, points + 2, axis_weight=0.0)
+    assert float(losses.pose(nothing, axis, points, axis_weight=0.7, point_weight=3.0)) == 0
+    away = losses.pose(found, axis, points + 2, axis_weight=0.0, point_weight=3.0)
     assert float(away) == 0  # no landmark in the image: finite

@@ -42,11 +42,11 @@ def test_the_depth_of_windows_is_half_of_their_likelihood_and_the_spread_a_tenth
     assert float(losses.depth(torch.from_numpy(told), torch.from_numpy(truth))) == pytest.approx(depth, rel=1e-12)
     given = torch.from_numpy(truth), torch.from_numpy(TRUTH * SCALE), torch.from_numpy(SCALE)
     spread = likelihood(SLIP - TRUTH, SPREADS)
-    got = losses.reading(found(depth=torch.from_numpy(told)), *given)
+    got = losses.reading(found(depth=torch.from_numpy(told)), *given, depth_weight=0.5)
     assert float(got) == pytest.approx(0.5 * depth + 0.1 * spread, rel=1e-12)
     got = losses.reading(found(depth=torch.from_numpy(told)), *given, depth_weight=1.7)
     assert float(got) == pytest.approx(1.7 * depth + 0.1 * spread, rel=1e-12)
-    assert float(losses.reading(found(), *given)) == pytest.approx(0.1 * spread, rel=1e-12)
+    assert float(losses.reading(found(), *given, depth_weight=0.5)) == pytest.approx(0.1 * spread, rel=1e-12)
 
 
 def test_slippage_is_squared_to_three_tenths_of_its_scale_and_linear_beyond():
@@ -71,7 +71,7 @@ def test_a_task_is_its_mask_and_twice_its_slippage():
     off = np.abs(SLIP - TRUTH)
     slip = np.where(off < 0.3, off**2 / 0.6, off - 0.15).mean()
     given = torch.from_numpy(mask), torch.from_numpy(TRUTH * SCALE), torch.from_numpy(SCALE)
-    got = losses.task(found(mask_logits=torch.from_numpy(logits)), *given)
+    got = losses.task(found(mask_logits=torch.from_numpy(logits)), *given, slip_weight=2.0)
     assert float(got) == pytest.approx(seen(logits, mask) + 2 * slip, rel=1e-9)
     fine = RNG.uniform(0, 1, (4, 15, 12))
     y, x = np.meshgrid((np.arange(15) + 0.5) / 3 - 0.5, (np.arange(12) + 0.5) / 2 - 0.5, indexing="ij")

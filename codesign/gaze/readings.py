@@ -1,0 +1,48 @@
+"""What a network reads of frames, in the units that gaze is calibrated in, and what calibrates a person with it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from codesign.eye import face_axes
+from metalens.ground.arrays import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Readings:
+    """Of n frames.
+
+    pupil_mm: (n, 2) pupil on the sensor, upright image, from the lens axis. slip_mm: (n, 3) displacement of the head.
+    axis_deg: (n, 2) angles of the optic axis across and down in the frame of the face; None where no axis is read.
+    """
+
+    pupil_mm: Array
+    slip_mm: Array
+    axis_deg: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.pupil_mm)
+
+    def __getitem__(self, rows: Array | slice) -> "Readings":
+        return Readings(self.pupil_mm[rows], self.slip_mm[rows], None if self.axis_deg is None else self.axis_deg[rows])
+
+
+class Person(Protocol):
+    """A calibrated person."""
+
+    def __call__(self, read: Readings) -> Array:
+        """(n, 2) gaze across and down, deg."""
+
+
+class Calibrator(Protocol):
+    """A way to calibrate people."""
+
+    def person(self, read: Readings, gaze_deg: Array) -> Person:
+        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down."""
+
+
+def face_angles(direction: Array, elevation_rad: float) -> Array:
+    """(n, 2) angles across and down, deg, in the frame of the face, of directions (n, 3) in the camera's."""
+    right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
+    return np.asarray(np.degrees(np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)))
