@@ -12,7 +12,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.threads import split
 from metalens.propagate.geometry import Case, check_aperture
-from metalens.propagate.layered import add_rays, media_arrays
+from metalens.propagate.layered import add_rays, media_arrays, product
 from metalens.propagate.paths import from_source
 from metalens.propagate.sincos import turns64
 
@@ -67,7 +67,7 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
     if case.behind is not None:
         y_far, x_far = (np.abs(points[:, i]).max() + half for i, half in zip((1, 0), case.half_size_um, strict=True))
         films = media_arrays(case.behind, case.wavenumber, float(np.hypot(y_far, x_far)))
-        kernel, numbers = add_rays, (case.wavenumber, case.area_um2, *films)
+        kernel, numbers = add_rays, (case.area_um2, (case.wavenumber, *films))
 
     def work(a: int, b: int) -> None:
         kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])
@@ -100,11 +100,7 @@ def _accumulate(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-
                 h_re[j] = scale * (c / r + k * s)
                 h_im[j] = scale * (s / r - k * c)
             for z in range(depths):
-                sum_re, sum_im = 0.0, 0.0
-                for j in range(columns):
-                    sum_re += re[z, i, j] * h_re[j] - im[z, i, j] * h_im[j]
-                    sum_im += re[z, i, j] * h_im[j] + im[z, i, j] * h_re[j]
-                out[z, p] += complex(sum_re, sum_im)
+                out[z, p] += product(re[z, i], im[z, i], h_re, h_im)
 
 
 def transfer(case: Case, count: tuple[int, int], *, band_limited: bool) -> Array:

@@ -299,7 +299,7 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
     total: Any = sum_nodes
     if case.behind is not None:
         k = case.wavenumber
-        total, numbers = sum_rays, (k, *case.centre_um, *media_arrays(case.behind, k, case.reach_um))
+        total, numbers = sum_rays, (*case.centre_um, (k, *media_arrays(case.behind, k, case.reach_um)))
     split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
     return np.asarray(out * case.area_um2).reshape(len(light), len(depths), -1)
 

@@ -5,7 +5,10 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.lens import Media, saddle
+from metalens.lens.media import NEWTON as STEPS
 from metalens.propagate.sincos import turns64
+
+SETTLED = 1e-9  # a step of Newton's method, relative, after which its square is left
 
 
 def media_arrays(media: Media, wavenumber: float, reach_um: float) -> tuple[Array, Array, Array, Array]:
@@ -16,98 +19,132 @@ def media_arrays(media: Media, wavenumber: float, reach_um: float) -> tuple[Arra
     return np.array([n * n for n, _ in layers]), np.array([t for _, t in layers], float), np.array(media.order), series
 
 
-@numba.njit(inline="always")
-def ray(reach2, n2, t):  # type: ignore[no-untyped-def]
-    """w = p² of the ray of this reach², Newton's method as in :func:`metalens.lens.media.square`."""
-    s = 0.0
-    for _ in range(14):
-        w = n2[0] * s / (1 + s)
-        g, h = 0.0, 0.0
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
+def product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
+    """Σ ab of complex rows given by their parts."""
+    real, imaginary = 0.0, 0.0
+    for j in range(a_re.size):
+        real += a_re[j] * b_re[j] - a_im[j] * b_im[j]
+        imaginary += a_re[j] * b_im[j] + a_im[j] * b_re[j]
+    return complex(real, imaginary)
+
+
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
+    """w = p² to ``work[0]`` of the rays of a row of reach², by Newton's method as in
+    :func:`metalens.lens.media.square` from tan² ``s`` in the rarest medium, which is put right.
+
+    Reach² is concave in s: a step from beyond a ray falls short of it, at worst below none (0)."""
+    w, g, h = work[0], work[1], work[2]
+    for _ in range(STEPS):
+        for j in range(s.size):
+            w[j], g[j], h[j] = n2[0] * s[j] / (1 + s[j]), 0.0, 0.0
         for i in range(n2.size):
-            near = 1 / np.sqrt(n2[i] - w)
-            g += t[i] * near
-            h += t[i] * near * near * near
-        step = (reach2 - w * g * g) * (1 + s) ** 2 / ((g * g + w * g * h) * n2[0])
-        s += step
-        if abs(step) <= 1e-15 * s:
+            for j in range(s.size):
+                near = 1 / np.sqrt(n2[i] - w[j])
+                g[j] += t[i] * near
+                h[j] += t[i] * near * near * near
+        worst = 0.0
+        for j in range(s.size):
+            step = (reach2[j] - w[j] * g[j] * g[j]) * (1 + s[j]) ** 2 / ((g[j] * g[j] + w[j] * g[j] * h[j]) * n2[0])
+            s[j] = max(s[j] + step, 0.0)
+            worst = max(worst, abs(step) - SETTLED * s[j])
+        if worst <= 0:
             break
-    return n2[0] * s / (1 + s)
+    for j in range(s.size):
+        w[j] = n2[0] * s[j] / (1 + s[j])
 
 
-@numba.njit(inline="always")
-def length(w, n2, t):  # type: ignore[no-untyped-def]
-    """Optical path of the ray."""
-    total = 0.0
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
+    """Optical paths of a row of rays."""
+    far[:] = 0.0
     for i in range(n2.size):
-        total += n2[i] * t[i] / np.sqrt(n2[i] - w)
-    return total
+        for j in range(w.size):
+            far[j] += n2[i] * t[i] / np.sqrt(n2[i] - w[j])
 
 
-@numba.njit(inline="always")
-def level(w, n2, t, order):  # type: ignore[no-untyped-def]
-    """√(passed / spread) of the ray."""
-    g, along = 0.0, 0.0
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def levels(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
+    """√(passed / spread) of a row of rays."""
+    g, along, in_s, in_p = out, work[1], work[2], work[3]
+    g[:], along[:], in_s[:], in_p[:] = 0.0, 0.0, 1.0, 1.0
     for i in range(n2.size):
-        near = 1 / np.sqrt(n2[i] - w)
-        g += t[i] * near
-        along += t[i] * n2[i] * near * near * near
-    in_s, in_p = 1.0, 1.0
+        for j in range(w.size):
+            near = 1 / np.sqrt(n2[i] - w[j])
+            g[j] += t[i] * near
+            along[j] += t[i] * n2[i] * near * near * near
     for i in range(order.size - 1):
         a, b = order[i], order[i + 1]
-        ca, cb = np.sqrt(1 - w / (a * a)), np.sqrt(1 - w / (b * b))
-        in_s *= 1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2
-        in_p *= 1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2
-    return np.sqrt((in_s + in_p) / 2 / (g * along))
+        for j in range(w.size):
+            ca, cb = np.sqrt(1 - w[j] / (a * a)), np.sqrt(1 - w[j] / (b * b))
+            in_s[j] *= 1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2
+            in_p[j] *= 1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2
+    for j in range(w.size):
+        out[j] = np.sqrt((in_s[j] + in_p[j]) / 2 / (g[j] * along[j]))
 
 
-@numba.njit(inline="always")
-def beside(w, far, k, n2, series):  # type: ignore[no-untyped-def]
-    """-i(1 + iC/(kL)) of the ray, its optical path being ``far``."""
-    u = (np.sqrt(n2[0] - w) - series[0, 0]) / series[0, 1]
-    ahead, aside = 0.0, 0.0
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def beside(w, n2, series, work):  # type: ignore[no-untyped-def]
+    """Real and imaginary part of C of a row of rays, to ``work[1]`` and ``work[2]``."""
+    real, imaginary, u = work[1], work[2], work[3]
+    real[:], imaginary[:] = 0.0, 0.0
+    for j in range(w.size):
+        u[j] = (np.sqrt(n2[0] - w[j]) - series[0, 0]) / series[0, 1]
     for i in range(series.shape[0] - 1, 0, -1):
-        ahead, aside = ahead * u + series[i, 0], aside * u + series[i, 1]
-    return complex(ahead / (k * far), aside / (k * far) - 1)
+        for j in range(w.size):
+            real[j], imaginary[j] = real[j] * u[j] + series[i, 0], imaginary[j] * u[j] + series[i, 1]
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def _film_row(reach2, less, numbers, s, work, re, im):  # type: ignore[no-untyped-def]
+    """Kernel of :mod:`metalens.propagate.paths` through films to one point, along a row of reach²; its paths less
+    ``less``."""
+    k, n2, t, order, series = numbers
+    w, level, far = work[0], work[4], work[5]
+    rays(reach2, n2, t, s, work)
+    lengths(w, n2, t, far)
+    levels(w, n2, t, order, level, work)
+    beside(w, n2, series, work)
+    for j in range(w.size):
+        turn = (far[j] - less[j]) * (k / (2 * np.pi))
+        cosine, sine = turns64(turn - np.rint(turn))
+        near = k / (2 * np.pi) * level[j]
+        ahead, aside = near * work[1, j] / (k * far[j]), near * (work[2, j] / (k * far[j]) - 1)
+        re[j], im[j] = ahead * cosine - aside * sine, ahead * sine + aside * cosine
+
+
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def add_rays(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-def]
     """Add the light of a block of pillar rows (depth, row, column) to ``out`` (depth, point)."""
-    k, area, n2, t, order, series = numbers
+    area, films = numbers
+    nothing, work = np.zeros(x.size), np.empty((6, x.size))
+    s, reach2, h_re, h_im = np.zeros(x.size), np.empty(x.size), np.empty(x.size), np.empty(x.size)
     for p in range(points.shape[0]):
         for i in range(y.size):
-            down = (points[p, 1] - y[i]) ** 2
-            for j in range(x.size):
-                w = ray((points[p, 0] - x[j]) ** 2 + down, n2, t)
-                far = length(w, n2, t)
-                turn = far * (k / (2 * np.pi))
-                c, s = turns64(turn - np.rint(turn))
-                scale = k / (2 * np.pi) * area * level(w, n2, t, order)
-                h = scale * complex(c, s) * beside(w, far, k, n2, series)
-                for z in range(re.shape[0]):
-                    out[z, p] += complex(re[z, i, j], im[z, i, j]) * h
+            reach2[:] = (points[p, 0] - x) ** 2 + (points[p, 1] - y[i]) ** 2
+            _film_row(reach2, nothing, films, s, work, h_re, h_im)
+            for z in range(re.shape[0]):
+                out[z, p] += area * product(re[z, i], im[z, i], h_re, h_im)
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def sum_rays(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-def]
     """Add light (row, depth, column) on lens nodes, its path to the window's centre taken off, to ``out`` (depth,
     point) at window offsets (point, [X, Y])."""
-    k, cx, cy, n2, t, order, series = numbers
-    middle = np.empty(x.size)
+    cx, cy, films = numbers
+    middle, work = np.empty((e.size, x.size)), np.empty((6, x.size))
+    s, reach2, h_re, h_im = np.zeros(x.size), np.empty(x.size), np.empty(x.size), np.empty(x.size)
     for i in range(e.size):
-        for j in range(x.size):
-            middle[j] = length(ray((cx - x[j]) ** 2 + (cy - e[i]) ** 2, n2, t), n2, t)
-        for p in range(points.shape[0]):
-            down = (cy + points[p, 1] - e[i]) ** 2
-            for j in range(x.size):
-                w = ray((cx + points[p, 0] - x[j]) ** 2 + down, n2, t)
-                far = length(w, n2, t)
-                turn = (far - middle[j]) * (k / (2 * np.pi))
-                c, s = turns64(turn - np.rint(turn))
-                scale = k / (2 * np.pi) * level(w, n2, t, order)
-                h = scale * complex(c, s) * beside(w, far, k, n2, series)
-                for z in range(re.shape[1]):
-                    out[z, p] += complex(re[i, z, j], im[i, z, j]) * h
+        reach2[:] = (cx - x) ** 2 + (cy - e[i]) ** 2
+        rays(reach2, films[1], films[2], s, work)
+        lengths(work[0], films[1], films[2], middle[i])
+    for p in range(points.shape[0]):
+        for i in range(e.size):
+            reach2[:] = (cx + points[p, 0] - x) ** 2 + (cy + points[p, 1] - e[i]) ** 2
+            _film_row(reach2, middle[i], films, s, work, h_re, h_im)
+            for z in range(re.shape[1]):
+                out[z, p] += product(re[i, z], im[i, z], h_re, h_im)
 
 
 @numba.njit(inline="always")
@@ -156,8 +193,4 @@ def sum_nodes(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-de
         for i in range(e.size):
             _kernel_row(points[p, 0], points[p, 1], numbers[4] - e[i], x, numbers, h_re, h_im)
             for z in range(re.shape[1]):
-                total_re, total_im = 0.0, 0.0
-                for j in range(x.size):
-                    total_re += re[i, z, j] * h_re[j] - im[i, z, j] * h_im[j]
-                    total_im += re[i, z, j] * h_im[j] + im[i, z, j] * h_re[j]
-                out[z, p] += complex(total_re, total_im)
+                out[z, p] += product(re[i, z], im[i, z], h_re, h_im)

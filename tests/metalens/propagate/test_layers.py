@@ -16,6 +16,7 @@ from metalens.cell import Film, Index
 from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, Media, media
 from metalens.propagate import Case
+from metalens.propagate.layered import rays
 from metalens.propagate.paths import amplitude, chief_path, cosines, from_source, slopes, to_sensor
 from tests.referees import films as referee
 
@@ -235,3 +236,17 @@ def test_chief_ray_and_its_path_obey_snell():
     length = sum(n * t / np.cos(a) for n, t, a in zip((1.31, 1.52, 2.1), thick, angles, strict=True))
     assert chief_path(case) == pytest.approx(length, rel=1e-12)
     assert isinstance(case, Case)
+
+
+def test_rays_of_a_row_are_found_from_any_others() -> None:
+    """Through 20 nm of air, where reach² is bent most, from rays straight ahead, from these, and from grazing ones."""
+    layers = Media((1.0, 1.45, 2.02), (0.02, 480.0, 30.0)).layers
+    squared, thick = np.array([n * n for n, _ in layers]), np.array([t for _, t in layers])
+    reach2 = np.array([0.0, 1e-9, 3.1, 470.3**2, 441.0**2, 0.07, 505.6**2])
+    want = np.array([media.square(layers, one) for one in reach2])
+    work = np.empty((6, reach2.size))
+    s = np.zeros(reach2.size)
+    for start in (0.0 * s, want[::-1] / (1 - want[::-1]), np.full(reach2.size, 1e7)):
+        s[:] = start
+        rays(reach2, squared, thick, s, work)
+        assert work[0] == pytest.approx(want, rel=1e-13, abs=1e-15)
