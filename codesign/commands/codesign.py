@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from codesign.batches import parallel
+from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
 from codesign.network import Baseline, Subnet
 from codesign.optics import formed
@@ -33,7 +34,6 @@ from metalens import design, lens, library
 from metalens.ground import config, report, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
-from metalens.image import sensor as camera
 
 CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
@@ -114,12 +114,10 @@ def _image(going: Run) -> dict[str, Any]:
 
 def _export(folder: Path, going: Run, ends: list[End]) -> None:
     """Every budget's network as ONNX."""
-    pitch = float(going.trainer.model.pitch_um.detach())
-    size = camera.pixel_count(going.settings.scenes.pixels, going.settings.optics.sample_um, pitch)
     for end, state in zip(ends, going.searches, strict=False):
         if not isinstance(end.model.net, Baseline):
-            cut = Subnet(end.model.net, best(state.history).architecture)
-            cut.export_onnx(folder / f"subnet_{end.row['budget_mmacs']:g}.onnx", size=size)
+            path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
+            onnx_file.write(path, going, end.model.net, best(state.history).architecture)
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:

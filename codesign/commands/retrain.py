@@ -11,6 +11,7 @@ from codesign.adapt import Lenses, RetrainConfig, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.sure import judge
+from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
@@ -87,6 +88,9 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
     if sure.usable:
         correction.write(folder, plan)
     _keep(folder, options.output, (source, trained["retrained"]), story)
+    if options.export:
+        net = retraining.network(trained["retrained"])
+        onnx_file.write(folder / "subnet_retrained.onnx", source.run, net, source.architecture)
     return story
 
 

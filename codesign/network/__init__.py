@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.network import blur as blur
     from codesign.network import cost as cost
+    from codesign.network import exported as exported
     from codesign.network import losses as losses
     from codesign.network import running as running
     from codesign.network import soap as soap
@@ -40,6 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "blur": "",
         "check": "architecture",
         "cost": "",
+        "exported": "",
         "largest": "architecture",
         "losses": "",
         "make": "baselines",

@@ -1,20 +1,16 @@
-"""One architecture cut out of a supernet, to be exported: it holds only the weights that it uses."""
+"""One architecture cut out of a supernet, to be kept: it holds only the weights that it uses."""
 
-import warnings
-from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from codesign.network.architecture import Architecture, Block, blocks, stem_channels
 from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, lateral_strides
 from codesign.network.supernet import ElasticBlock, Supernet, modules_of
-from metalens.ground.store import replacing
 
 
 class Subnet(nn.Module):
-    """One architecture cut out of a supernet, for export: ``forward(frames) -> (mask_logits, centre, slip)``.
+    """One architecture cut out of a supernet: ``forward(frames) -> (mask_logits, centre, slip)``.
 
     It holds only the weights that it uses; outputs equal those of the recalibrated supernet.
     """
@@ -30,20 +26,6 @@ class Subnet(nn.Module):
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         found = self.net(frames, self.architecture)
         return found.mask_logits, found.centre, found.slip
-
-    def export_onnx(self, path: str | Path, *, size: int) -> None:
-        """Write an ONNX file (opset 17) for square frames of ``size`` pixels: frames -> mask_logits, centre, slip.
-
-        Raises:
-            OSError: the target cannot be written.
-        """
-        names = ["mask_logits", "centre", "slip"]
-        example = torch.zeros(1, 1, size, size)
-        with replacing(path) as part, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # sizes are fixed on purpose; the exporter's own age is no news here
-            torch.onnx.export(
-                self, (example,), str(part), dynamo=False, input_names=["frames"], output_names=names, opset_version=17
-            )
 
 
 def _trim(net: Supernet, architecture: Architecture) -> None:

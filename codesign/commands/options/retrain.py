@@ -24,6 +24,7 @@ class Options(Common):
         process: PROCESS.toml that the mask was drawn with; its bias table is the one to be corrected.
         settings: how to train on.
         resume: go on from the folder's checkpoints, bit for bit.
+        export: write the retrained network as ONNX too, as ``metalens codesign --export`` does.
         insist: use a fit that failed its own checks.
     """
 
@@ -34,4 +35,5 @@ class Options(Common):
     process: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[RetrainConfig] = field(default_factory=RetrainConfig)
     resume: bool = False
+    export: bool = False
     insist: bool = False

@@ -58,20 +58,6 @@ def test_torchscript_export_gives_equal_outputs(net):
             assert torch.allclose(a, b, atol=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("resolution", [1.0, 0.6])
-def test_onnx_export_gives_equal_outputs(net, tmp_path, resolution):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
-    recalibrate(net, chosen, [_frames(size=100)])
-    cut = Subnet(net, chosen)
-    cut.export_onnx(tmp_path / "n.onnx", size=100)
-    found = onnxruntime.InferenceSession(tmp_path / "n.onnx").run(None, {"frames": _frames(1, 100).numpy()})
-    with torch.no_grad():
-        for a, b in zip(cut(_frames(1, 100)), found, strict=True):
-            assert np.abs(a.numpy() - b).max() < 1e-4  # float32 through 40 layers in another order
-
-
 def test_recalibration_gives_the_mean_of_the_batches_whatever_came_before(net):
     chosen = arch.largest(SPACE)
     batches = [_frames(4), 2 * _frames(4) + 1]

@@ -1,0 +1,32 @@
+"""A run's network as ONNX, with the scale of the run: lengths on its sensor, slippage in mm, angles of the face."""
+
+from pathlib import Path
+
+from codesign.batches import EXPERIMENT
+from codesign.network import Architecture, Supernet, exported
+from codesign.network.subnet import Subnet
+from codesign.train import Run
+from metalens.image import sensor as camera
+
+
+def scale_of(run: Run) -> exported.Scale:
+    """What a run's networks answer in."""
+    inner = run.settings.inner
+    return exported.Scale(
+        frame_mm=run.window_um * 1e-3,
+        slip_mm=inner.slip_scale_mm,
+        elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
+        axis=inner.axis_weight > 0,
+        points=inner.point_weight > 0,
+    )
+
+
+def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> None:
+    """Write a network of a run, cut to its architecture, for frames of the run's sensor.
+
+    Raises:
+        OSError: the target cannot be written.
+    """
+    settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
+    size = camera.pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
+    exported.write(path, Subnet(net, architecture), scale_of(run), size=size, pitch_um=pitch)

@@ -1,0 +1,53 @@
+"""A device that holds the exported graph and a person's few points answers the gaze of the virtual experiment."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from codesign.adapt import train as retraining
+from codesign.commands import onnx_file
+from codesign.evaluate import gaze_experiment as experiment
+from codesign.evaluate.shown import ExperimentConfig
+from codesign.eye import render
+from codesign.gaze import Readings, angle_deg
+
+CONFIG = ExperimentConfig(subjects=2, people=3, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,))
+
+
+def test_gaze_from_the_graph_is_that_of_the_experiment(tmp_path):
+    """Frames as the sensor gives them, through onnxruntime, calibrated by what three other people tell.
+
+    The graph's readings differ by 1e-4 mm and degrees, rounding; squares of them in units of their spread, which an
+    untrained network makes small, raise that a hundred times in the gaze.
+    """
+    onnxruntime = pytest.importorskip("onnxruntime")
+    m.finished_run(tmp_path / "run")
+    source = retraining.load(tmp_path / "run")
+    *_, (_, (found,)) = experiment.experiment([source], CONFIG)
+    onnx_file.write(tmp_path / "n.onnx", source.run, retraining.network(source.run.trainer), source.architecture)
+    session = onnxruntime.InferenceSession(tmp_path / "n.onnx")
+    imager, scenes = experiment.ready(source), source.run.scenes(experiment.EXPERIMENT)
+    trials, read = [], []
+    for subject in range(CONFIG.subjects):
+        states, trial = experiment.states_of(CONFIG, subject, scenes)
+        made = render(states, rig=scenes.rig, camera=scenes.camera)
+        seen = experiment.through(source, made, imager, seed=experiment.NOISE + subject)
+        levels = (300 + 41 * seen.frames.detach()).numpy()
+        names = [value.name for value in session.get_outputs()]
+        read.append(dict(zip(names, session.run(None, {"frames": levels}), strict=True)))
+        trials.append(trial)
+    told = Readings(*(np.concatenate([r[n] for r in read]).astype(float) for n in Readings.__slots__))
+    whole = experiment.joined(trials)
+    assert np.abs(told.slip_mm - found.slip_mm).max() < 1e-3
+    how = experiment.calibrator(source, imager, CONFIG)
+    gaze, judged = experiment.calibrated(told, whole, CONFIG, how)
+    assert angle_deg(gaze, found.predicted_deg).max() < 0.05
+    assert np.array_equal(judged, np.isfinite(found.gaze_deg))
+    without, _ = experiment.calibrated(replace(told, axis_deg=told.axis_deg[::-1]), whole, CONFIG, how)
+    assert angle_deg(without, found.predicted_deg).max() > 0.5  # the axis is what it is told by

@@ -1,0 +1,80 @@
+"""An exported graph against the network it was made of: the same numbers in the units that it says, for any batch."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.network import architecture as arch
+from codesign.network import exported
+from codesign.network.subnet import Subnet
+from codesign.network.supernet import Supernet, recalibrate
+
+SPACE = arch.Space()
+SCALE = exported.Scale(frame_mm=1.87, slip_mm=(1.4, 0.9, 2.3), elevation_rad=0.6)
+
+
+@pytest.fixture(scope="module")
+def net():
+    torch.manual_seed(0)
+    return Supernet(SPACE)
+
+
+def _frames(count, size, seed=1):
+    return torch.randn(count, 1, size, size, generator=torch.Generator().manual_seed(seed))
+
+
+def _angles_deg(axis, elevation):
+    """By the camera's place below the face: its z points to the face, which is turned about x by the elevation."""
+    x, y, z = axis.T / np.linalg.norm(axis, axis=1)
+    down = np.cos(elevation) * y - np.sin(elevation) * z
+    out = -np.sin(elevation) * y - np.cos(elevation) * z
+    return np.degrees(np.stack([np.arctan2(x, out), np.arcsin(down)], 1))
+
+
+@pytest.mark.parametrize(("resolution", "size"), [(1.0, 61), (0.6, 100)])
+def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(net, tmp_path, resolution, size):
+    """Levels of a sensor, 512 with a spread of 90, in place of standardised frames; batches of one and three."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
+    recalibrate(net, chosen, [_frames(4, size)])
+    exported.write(tmp_path / "n.onnx", Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
+    session = onnxruntime.InferenceSession(tmp_path / "n.onnx")
+    for count in (1, 3):
+        plain = _frames(count, size, seed=count)
+        plain = (plain - plain.mean((2, 3), keepdim=True)) / plain.std((2, 3), keepdim=True)
+        found = session.run(None, {"frames": (512 + 90 * plain).numpy()})
+        with torch.no_grad():
+            want = net(plain, chosen)
+        unit = np.array(SCALE.slip_mm)
+        told = {
+            "mask_logits": want.mask_logits.numpy(),
+            "pupil_mm": 1.87 * want.centre.numpy(),
+            "slip_mm": want.slip.numpy() * unit,
+            "slip_sd_mm": np.exp(want.slip_log_sd.numpy()) * unit,
+            "points_mm": 1.87 * want.points.numpy(),
+            "axis_deg": _angles_deg(want.axis.double().numpy(), 0.6),
+        }
+        assert [value.name for value in session.get_outputs()] == list(told)
+        for value, (name, expected) in zip(found, told.items(), strict=True):
+            # float32 through 40 layers in another order; an axis of untrained weights is 0.1 long: ten times in degrees
+            assert np.abs(value - expected).max() < (3e-3 if name == "axis_deg" else 3e-4), name
+    assert session.get_outputs()[5].shape == ["batch", 2]
+
+
+def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(net, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    chosen = arch.smallest(SPACE)
+    bare = dataclasses.replace(SCALE, axis=False, points=False)
+    for name, scale in (("a", SCALE), ("b", bare)):
+        exported.write(tmp_path / name, Subnet(net, chosen), scale, size=64, pitch_um=30.0)
+    whole, cut = (onnx.load(tmp_path / name) for name in "ab")
+    onnx.checker.check_model(whole, full_check=True)
+    assert [v.name for v in cut.graph.output] == ["mask_logits", "pupil_mm", "slip_mm", "slip_sd_mm"]
+    assert {v.name: v.doc_string[-2:] for v in whole.graph.output if v.name.endswith("_mm")} == dict.fromkeys(
+        ["pupil_mm", "slip_mm", "slip_sd_mm"], "mm"
+    ) | {"points_mm": "mm"}
+    assert whole.graph.output[5].doc_string.endswith("deg")
+    about = {p.key: float(p.value) for p in whole.metadata_props}
+    assert about == {"pixels": 64, "pitch_um": 30.0, "frame_mm": 1.87, "elevation_rad": 0.6}
