@@ -21,7 +21,7 @@ demo: setup
 test: setup
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not peers'
 
-# The numeric tests under the arithmetic of other processors; -all: the whole default suite under each of them.
+# The numeric tests under the arithmetic of other processors, and compiled loops as they are written; -all: the whole default suite under each of them.
 test-arithmetic: setup
 	$(BIN)/python tests/arithmetic.py
 

@@ -3,7 +3,8 @@
 A tolerance that holds on one processor only shows here. Each row of ``ARITHMETIC`` is a processor that this one can
 play by the documented switches of the libraries: OPENBLAS_CORETYPE (numpy's and scipy's kernels), ATEN_CPU_CAPABILITY,
 MKL_CBWR and ONEDNN_MAX_CPU_ISA (torch), NPY_DISABLE_CPU_FEATURES (numpy's loops), NUMBA_CPU_NAME and
-NUMBA_CPU_FEATURES (compiled loops, with a cache of their own), and the number of threads.
+NUMBA_CPU_FEATURES (compiled loops, with a cache of their own), and the number of threads. ``interpreted`` runs the
+loops as they are written (NUMBA_DISABLE_JIT): a place beyond an array is an error there, as is a number that overflows.
 """
 
 import os
@@ -34,6 +35,7 @@ ARITHMETIC = {
     "avx2": (AVX2, ("AVX512", "X86_V4"), 1),
     "old-2": (OLD, ("AVX", "FMA", "X86_V3", "X86_V4", "F16C"), 2),
     "own-2": ({}, (), 2),
+    "interpreted": ({"NUMBA_DISABLE_JIT": "1"}, (), 1),
 }
 # Where sums are long or ill-conditioned, and quick: eigenvalues, Fourier sums, windows, fits, compiled loops.
 QUICK = (
@@ -52,6 +54,27 @@ QUICK = (
     "tests/layout/study/test_focus.py",
     "tests/codesign/gaze",
     "tests/codesign/optics",
+)
+# Small tests of compiled loops, 80 s of one processor. Sums modulo 2⁶⁴ (layout/files/digest) stay with machine code.
+INTERPRETED = (
+    "tests/characterize/model/test_gather.py",
+    "tests/codesign/batches/test_flat.py",
+    "tests/codesign/eye/test_shading.py",
+    "tests/codesign/optics/test_built.py",
+    "tests/layout/certify/test_background.py",
+    "tests/layout/certify/test_neighbours.py",
+    "tests/layout/certify/test_survey_numbers.py",
+    *(f"tests/layout/dose/test_{name}.py" for name in ("assign_numbers", "constants_of_doses", "dose", "exposure")),
+    *(f"tests/layout/dose/test_{name}.py" for name in ("exposure_core", "nodes", "pieces", "rects", "sampled_sites")),
+    "tests/layout/files/test_gdsii_numbers.py",
+    "tests/layout/oasis",
+    *(f"tests/layout/rules/test_{name}.py" for name in ("apart", "check_foreign", "drc", "facing_edges", "near")),
+    "tests/metalens/field/test_compiled_weights.py",
+    "tests/metalens/field/test_shared_rays.py",
+    "tests/metalens/image/test_scene_truths.py",
+    "tests/metalens/image/test_sheet_weights.py",
+    *(f"tests/metalens/propagate/test_{name}.py" for name in ("estimate_parts", "grid_truths", "operator_parts")),
+    *(f"tests/metalens/propagate/test_{name}.py" for name in ("propagate_exact", "pupil_error", "sincos_truths")),
 )
 ALL = tuple(f"tests/{folder}" for folder in ("metalens", "characterize", "layout", "codesign"))
 
@@ -75,12 +98,12 @@ def environment(name: str) -> dict[str, str]:
 
 def main(words: list[str]) -> int:
     """Run pytest once per arithmetic; the worst of their exit codes."""
-    names = [w for w in words if w in ARITHMETIC] or (list(ARITHMETIC) if "all" in words else ["old"])
-    folders = ALL if words else QUICK
+    names = [w for w in words if w in ARITHMETIC] or (list(ARITHMETIC) if "all" in words else ["old", "interpreted"])
     worst = 0
     for name in names:
         sys.stdout.write(f"arithmetic {name}\n")
         sys.stdout.flush()
+        folders = INTERPRETED if name == "interpreted" else ALL if words else QUICK
         workers = "auto" if ARITHMETIC[name][2] == 1 else "1"
         command = [sys.executable, "-m", "pytest", "-n", workers, "--dist", "loadfile", "-m", "not slow and not peers"]
         done = subprocess.run([*command, *folders], cwd=ROOT, env=environment(name), check=False)

@@ -83,11 +83,9 @@ def _log_mean(radii: Array, gaps: Array, range_um: float) -> Array:
 
 @compiled
 def _mean(log_mean: Array, one: float, two: float, gap: float, square: float) -> float:
-    """Trilinear in steps of radius, radius and gap, less the ``square`` of the gap; 0 beyond the last gap."""
+    """Trilinear in steps of radius, radius and gap, less the ``square`` of the gap; straight on beyond the table."""
     i, j = min(max(int(one), 0), log_mean.shape[0] - 2), min(max(int(two), 0), log_mean.shape[1] - 2)
-    k = int(gap)
-    if k >= log_mean.shape[2] - 1:
-        return 0.0
+    k = min(int(gap), log_mean.shape[2] - 2)
     a, b, c = one - i, two - j, gap - k
     low = (1 - a) * ((1 - b) * log_mean[i, j, k] + b * log_mean[i, j + 1, k]) + a * (
         (1 - b) * log_mean[i + 1, j, k] + b * log_mean[i + 1, j + 1, k]

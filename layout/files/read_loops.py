@@ -48,7 +48,7 @@ def _srefs(data: Array, at: int, size: int, out: Array, slots: Array, first: Arr
             return n, names
         key = 0
         for i in range(p + 8, q):
-            key = (key * 131 + data[i]) & 0x7FFFFFFF
+            key = (key * 131 + int(data[i])) & 0x7FFFFFFF
         slot = (key ^ key >> 15) & mask
         while slots[slot] >= 0:
             other, same = first[slots[slot]], True
@@ -74,7 +74,7 @@ def _srefs(data: Array, at: int, size: int, out: Array, slots: Array, first: Arr
 def _big_endian(data: Array, at: int) -> int:
     value = 0
     for i in range(4):
-        value = value << 8 | (data[at + i] + 0)  # 64 bits wide
+        value = value << 8 | (int(data[at + i]) + 0)  # 64 bits wide, compiled or not
     return value - (1 << 32) if value >= 1 << 31 else value
 
 
@@ -83,7 +83,7 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
     """A variable-length integer of at most 6 bytes and the position after it; -1 where it is cut or longer."""
     value, shift = 0, 0
     while at < end and shift < 42:
-        byte = data[at] + 0  # 64 bits wide
+        byte = int(data[at]) + 0  # 64 bits wide, compiled or not
         value |= (byte & 127) << shift
         at += 1
         if byte < 128:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from layout.solid.tile import Tile, check_count
 from metalens.ground import store
 from metalens.ground.errors import ProcessError
@@ -46,9 +48,10 @@ def write_step(path: str | Path, pillars: Tile) -> None:
     check_count(pillars, "STEP")
     from build123d import Solid
 
-    half_x, half_y = (float(abs(v - v.mean()).max()) + pillars.pitch_um / 2 for v in (pillars.x_um, pillars.y_um))
-    corner = (float(pillars.x_um.mean()) - half_x, float(pillars.y_um.mean()) - half_y, -1.0)
-    pieces = [Piece("substrate", Solid.make_box(2 * half_x, 2 * half_y, 1.0).wrapped, (0.75, 0.85, 0.95), [corner])]
+    x, y, half = pillars.x_um, pillars.y_um, pillars.pitch_um / 2
+    slab = Solid.make_box(float(np.ptp(x)) + 2 * half, float(np.ptp(y)) + 2 * half, 1.0).wrapped
+    corner = (float(x.min()) - half, float(y.min()) - half, -1.0)
+    pieces = [Piece("substrate", slab, (0.75, 0.85, 0.95), [corner])]
     for kind, name in enumerate(pillars.names):
         here = pillars.kind == kind
         places = [(x, y, 0.0) for x, y in zip(pillars.x_um[here].tolist(), pillars.y_um[here].tolist(), strict=True)]

@@ -13,52 +13,48 @@ from numba.extending import overload
 from metalens.propagate.sincos import turns
 
 EXACT = {"contract", "arcp", "nsz", "afn"}  # order of sums is kept: the phase is reduced in two steps
+_PER_RAD = 1 / (2 * np.pi)
+_SCALE, _FIRST = np.float32(_PER_RAD), np.float32(6.28125)  # few bits, so that its multiples are exact
+_SECOND = np.float32(2 * np.pi - 6.28125)
 
 
 def whole_turns_off(phase: Any, like: Any) -> Any:
-    """Phase in turns less its whole turns, in the precision of ``like``; for compiled code only."""
-    raise NotImplementedError("whole_turns_off is compiled code")
+    """Phase in turns less its whole turns, in the precision of ``like``; compiled loops choose while compiled."""
+    return (_single if like.dtype == np.float32 else _double)(phase, like)  # type: ignore[no-untyped-call]
+
+
+def _double(phase, like):  # type: ignore[no-untyped-def]
+    t = phase * _PER_RAD
+    return t - np.rint(t)
+
+
+def _single(phase, like):  # type: ignore[no-untyped-def]
+    r = np.rint(phase * _SCALE)
+    return ((phase - r * _FIRST) - r * _SECOND) * _SCALE
 
 
 @overload(whole_turns_off, inline="always")
 def _whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
-    per_rad = 1 / (2 * np.pi)
-    if like.dtype != numba.float32:
-
-        def double(phase, like):  # type: ignore[no-untyped-def]
-            t = phase * per_rad
-            return t - np.rint(t)
-
-        return double
-    scale, first = np.float32(per_rad), np.float32(6.28125)  # few bits, so that its multiples are exact
-    second = np.float32(2 * np.pi - 6.28125)
-
-    def single(phase, like):  # type: ignore[no-untyped-def]
-        r = np.rint(phase * scale)
-        return ((phase - r * first) - r * second) * scale
-
-    return single
+    return _single if like.dtype == numba.float32 else _double
 
 
 def carried(table: Any, u: Any, j: Any, like: Any) -> Any:
-    """Carrier of column j at row position u of a block; for compiled code only."""
-    raise NotImplementedError("carried is compiled code")
+    """Carrier of column j at row position u of a block; compiled loops choose while compiled."""
+    return (_short if like.dtype == np.float32 else _long)(table, u, j, like)  # type: ignore[no-untyped-call]
+
+
+def _short(table, u, j, like):  # type: ignore[no-untyped-def]
+    return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * table[4, j])))
+
+
+def _long(table, u, j, like):  # type: ignore[no-untyped-def]
+    t = table[4, j] + u * (table[5, j] + u * (table[6, j] + u * (table[7, j] + u * table[8, j])))
+    return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * t)))
 
 
 @overload(carried, inline="always")
 def _carried(table, u, j, like):  # type: ignore[no-untyped-def]
-    if like.dtype == numba.float32:
-
-        def short(table, u, j, like):  # type: ignore[no-untyped-def]
-            return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * table[4, j])))
-
-        return short
-
-    def long(table, u, j, like):  # type: ignore[no-untyped-def]
-        t = table[4, j] + u * (table[5, j] + u * (table[6, j] + u * (table[7, j] + u * table[8, j])))
-        return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * t)))
-
-    return long
+    return _short if like.dtype == numba.float32 else _long
 
 
 @numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)

@@ -55,8 +55,8 @@ def turns32(t):  # type: ignore[no-untyped-def]
 
 
 def turns(t: Any, like: Any) -> Any:
-    """(cos 2πt, sin 2πt) in the precision of the array ``like``; for compiled code only."""
-    raise NotImplementedError("turns is compiled code")
+    """(cos 2πt, sin 2πt) in the precision of the array ``like``; compiled loops choose while they are compiled."""
+    return turns32(t) if like.dtype == np.float32 else turns64(t)
 
 
 @overload(turns, inline="always")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
+from layout.certify import neighbours
 from layout.certify.neighbours import Pairs, reach_um
 
 
@@ -65,3 +66,53 @@ def test_the_rim_of_a_disc_by_another_is_the_mean_of_an_integral():
     got = pairs((x[:1], y[:1], mass[:1], radius[:1]), (x, y, mass, radius))
     assert got[0] == pytest.approx(0.8 * want, rel=2e-3)  # what is interpolated is nearly straight in the gap
     assert reach_um(a, 0.2) == pytest.approx(0.2 + 6 * a)  # exp(-36) is nothing
+
+
+def test_a_table_holds_its_radii_and_gaps_up_to_where_discs_are_gaussians():
+    """Twelve radii, 46 gaps of six ranges; beyond 1.5 of the widest diameter, 0.45, there is none."""
+    radius = np.array([0.09, 0.15, 0.04])
+    narrow, wide = Pairs.of(radius, 0.449), Pairs.of(radius, 0.451)
+    assert narrow.log_mean.shape == (12, 12, 46)
+    assert narrow.least_um == 0.04
+    assert narrow.step_um == pytest.approx(0.01)
+    assert narrow.gap_um == pytest.approx(6 * 0.449 / 45)
+    assert narrow.reach_um == pytest.approx(0.3 + 6 * 0.449)
+    assert wide.log_mean.size == 0
+    assert wide.reach_um == pytest.approx(4 * 0.451)
+
+
+@pytest.mark.parametrize(("a", "step"), [(0.2, 7), (0.041, 20), (0.25, 35)])
+def test_discs_of_one_size_see_each_other_too(a, step):
+    """The exact mean over the rim of the second, by chi-square, at gaps of the table: up to 4.7 ranges, 1.2 um."""
+    turn, r, gap = 2 * np.pi * (np.arange(96) + 0.5) / 96, 0.1, 6 * a / 45 * step
+    apart = 2 * r + gap
+    square = apart**2 + r**2 - 2 * apart * r * np.cos(turn)
+    want = special.chndtr(2 * (r / a) ** 2, 2.0, 2 * square / a**2).mean()
+    both = np.array([1.0, 1.0]), np.array([2.0, 2.0 + apart]), np.full(2, 0.7 * np.pi * r**2), np.full(2, r)
+    pairs = Pairs.of(both[3], a)
+    assert pairs.step_um == pytest.approx(1e-6 * r / 11, rel=1e-6)
+    assert pairs(both, both) == pytest.approx([0.7 * want] * 2, rel=1e-5)  # radii 1e-6 of one apart
+
+
+def test_what_lies_beyond_four_widths_of_a_gaussian_is_nothing():
+    """exp(-16), of the Gaussian's own width: of the range, half of the other's and once the own radius, squared."""
+    out_of = 4 * math.sqrt(0.5**2 + 0.1**2 / 2 + 0.07**2)
+    for apart, want in ((out_of * 0.999, math.exp(-16 * 0.999**2) * 0.01 / (out_of / 4) ** 2), (out_of * 1.001, 0)):
+        x, y = np.array([5.0, 5.0 - 0.28 * apart]), np.array([1.0, 1.0 + 0.96 * apart])
+        radius = np.array([0.07, 0.1])
+        every = x, y, np.pi * radius**2, radius
+        got = Pairs.of(radius, 0.5)(tuple(v[:1] for v in every), every)
+        assert got[0] == pytest.approx(want, rel=1e-6, abs=1e-17)  # beside the pillar's own, taken off: 0.02
+
+
+def test_between_nodes_a_table_is_straight_along_every_axis_and_at_its_ends():
+    """A function linear in all three at once, read where it is known: at nodes, between them, on the last of each."""
+    i, j, k = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")
+    table = 0.3 * i - 0.2 * j * k + 0.1 * i * j * k - 0.05
+    mean = getattr(neighbours._mean, "py_func", neighbours._mean)  # as written: a place beyond the table is an error
+    for one, two, gap in ((0.0, 0.0, 0.0), (0.4, 2.7, 3.2), (1.6, 1.1, 0.8), (2.0, 3.0, 4.0), (-1e-12, 3.0, 4.0)):
+        want = 0.3 * one - 0.2 * two * gap + 0.1 * one * two * gap - 0.05 - 0.7
+        assert mean(table, one, two, gap, 0.7) == pytest.approx(math.exp(want), rel=1e-9)
+    uneven = np.random.default_rng(2).normal(size=(3, 4, 5))
+    for place in ((0, 3, 4), (2, 1, 2), (1, 2, 0)):
+        assert mean(uneven, *map(float, place), 0.0) == pytest.approx(math.exp(uneven[place]), rel=1e-12)

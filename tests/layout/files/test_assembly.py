@@ -42,6 +42,18 @@ def sort_key(row):
     return child, turn.angle_deg, turn.mirrored, turn.scale, x, y
 
 
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize(("child", "turn"), [(0, 1), (0, 0), (1, 2)])
+def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(suffix, child, turn, tmp_path):
+    """Three of one kind alone: as the first cell unturned, by its second turn, or of a later cell."""
+    write, read = WRITERS[suffix]
+    placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
+    cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in placed.children}
+    write(Assembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}), tmp_path / f"a{suffix}")
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    assert sorted(listed(found), key=sort_key) == sorted(listed(placed), key=sort_key)
+
+
 @given(
     seed=st.integers(0, 10_000),
     shape=st.tuples(st.integers(1, 6), st.integers(1, 5)),

@@ -165,6 +165,11 @@ def test_step_of_a_tile_shares_its_pillars_and_keeps_labels_places_and_sizes(tmp
     found = build123d.import_step(path)
     assert found.label.replace("_", " ") == "metalens tile"
     assert len(found.children) == len(pillars.kind) + 1
+    slab = found.children[0].bounding_box()  # half a pitch wider than the sites on every side, 1 um thick
+    half = pillars.pitch_um / 2
+    low = pillars.x_um.min() - half, pillars.y_um.min() - half, -1.0
+    high = pillars.x_um.max() + half, pillars.y_um.max() + half, 0.0
+    assert pytest.approx([v * 1e-3 for v in (*low, *high)], abs=1e-9) == [*slab.min, *slab.max]
     order = np.argsort(pillars.kind, kind="stable")
     sites = zip(pillars.kind[order], pillars.x_um[order], pillars.y_um[order], strict=True)
     for part, (kind, x, y) in zip(found.children[1:], sites, strict=True):

@@ -1,6 +1,7 @@
 """Cones of rays that arrive in another medium than air: sines and obliquities as a sensor under glass sees them."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -81,3 +82,22 @@ def test_rays_to_the_window_have_the_directions_of_the_last_medium(behind):
         p = snell(pairs, far)
         want = [*(away / far * p / last), math.sqrt(1 - (p / last) ** 2)]
         assert got[:, i, j] == pytest.approx(want, rel=1e-9)
+
+
+def test_light_behind_a_face_is_parted_into_s_and_p_by_what_passes():
+    """Fresnel's powers of both: their shares of the sum, times the light; halves in one medium. Waves about the ray add
+    1/(kL), 2e-3, of which a few percent are not common to both."""
+    case = Case((30, 41), 0.37, 0.85, 62.0, (0.0, 0.0), (1 / 400,), (14.0, -8.5), 0.6, (3, 3))
+    y, x = np.array([-41.0, 3.0]), np.array([-27.0, 0.5, 30.0])
+    signs, alone = vector.s_and_p(case)(y, x)
+    assert signs.tolist() == [1, 1]
+    assert alone.shape == (2, 1, 2, 3)
+    assert alone == pytest.approx(np.full((2, 1, 2, 3), math.sqrt(0.5)))
+    films = replace(case, behind=Media((GEL, GLASS), (40.0, 22.0)))
+    _, both = vector.s_and_p(films)(y, x)
+    for i, j in np.ndindex(2, 3):
+        p = snell([(GEL, 40.0), (GLASS, 22.0)], math.hypot(14.0 - x[j], -8.5 - y[i]))
+        one, two = math.asin(p / GEL), math.asin(p / GLASS)
+        ahead = math.sin(2 * one) * math.sin(2 * two) / math.sin(one + two) ** 2
+        powers = np.array([ahead, ahead / math.cos(one - two) ** 2])
+        assert np.abs(both[:, 0, i, j]) ** 2 == pytest.approx(powers / powers.sum(), abs=2e-4)
