@@ -176,7 +176,7 @@ def texture_information(psf: Tensor, *, step_um: float, spectrum: Tensor, noise:
         (depths - 1,) between the depths.
     """
     power = torch.log(torch.fft.rfft2(psf).abs() ** 2 * spectrum + noise)
-    weight = torch.full(power.shape[-1:], 2.0, dtype=power.dtype)
+    weight = power.new_full(power.shape[-1:], 2.0)
     weight[0] = 1
     if psf.shape[-1] % 2 == 0:
         weight[-1] = 1

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from codesign.network import largest
 from codesign.train import placement, run
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
@@ -27,6 +28,14 @@ def test_without_a_gpu_the_processor_is_taken():
 def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
     with pytest.raises(ConfigError, match="--device cpu"):
         placement.device_of("cuda")
+
+
+def test_a_network_computes_where_its_parameters_are():
+    """A device without numbers stands for a GPU: nothing of an answer may be formed on the processor."""
+    net = _going().trainer.model.net.eval().to("meta")
+    answer = net(torch.empty(2, 1, 64, 64, device="meta"), largest(net.space))
+    parts = [getattr(answer, name) for name in answer.__slots__]
+    assert {part.device.type for part in parts if part is not None} == {"meta"}
 
 
 def test_frames_and_gradients_pass_through_an_attended_network():

@@ -237,3 +237,18 @@ def test_no_pixel_is_lost_to_rounding_of_the_count(samples, sample_um, pixel_um)
     light = (pixel_um / sample_um) ** 2
     got = fisher.pixel_information(near, 2 * near, **setting)
     assert float(got) == pytest.approx((whole * light / 0.3) ** 2, rel=1e-9)
+
+
+def test_information_is_formed_on_the_device_of_the_image():
+    """A device without numbers stands for any that is not the processor: nothing may be brought from there."""
+    near, far = torch.empty(2, 30, 24, device="meta"), torch.empty(2, 30, 24, device="meta")
+    setting = dict(step_um=5.0, sample_um=1.0, pixel_um=3.0)
+    found = [
+        fisher.axial_information(near, far, **setting),
+        fisher.encircled_energy(near, 1.0, radius_um=5.0),
+        fisher.information(near, far),
+        fisher.span_angle(torch.empty(2, 2, device="meta")),
+        fisher.texture_information(near, step_um=5.0, spectrum=torch.empty(30, 13, device="meta"), noise=0.1),
+        fisher.without_nuisance(torch.empty(3, 3, device="meta"), 1),
+    ]
+    assert {one.device.type for one in found} == {"meta"}
