@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, special
+from scipy import ndimage, optimize, special
 
 from characterize.captures import Capture, clean
 from characterize.measure import metrics
@@ -19,6 +19,7 @@ from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
 
 _FINE = 15  # samples a pixel side under the ideal spot
+_CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6  # to a pixel from its second and first neighbours
 _CORE = 5  # pixels on each side of the brightest one, over which the ideal spot is laid on a frame's
 Field = tuple[float, float]  # angle along x and y, degrees
 
@@ -84,7 +85,7 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
     frames = clean(capture)
     step = capture.pixel_um
     light = np.stack([_above(f, u) for f, u in zip(frames.electrons, frames.usable, strict=True)])
-    notes = list(frames.corrections)
+    notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
         notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
     rows = []
@@ -149,14 +150,41 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
 
 
 def _above(electrons: Array, usable: Array) -> Array:
-    """The frame above the median of its border; 0 where it is masked."""
+    """The frame above the median of its border; masked pixels by :func:`_filled`."""
     rim = _rim(electrons)
-    light = electrons - np.median(rim)
-    light = np.where(usable, light, 0.0)
+    light = _filled(electrons - np.median(rim), usable)
     noise = 1.4826 * float(np.median(np.abs(rim - np.median(rim))))
     if light.max() < 5 * max(noise, 1e-9):
         raise CaptureError("a frame holds no spot above five times its background's noise; expose longer, or crop")
     return np.asarray(light)
+
+
+def _filled(light: Array, usable: Array) -> Array:
+    """Masked pixels by the cubic through two pixels on either side, (4 (f₁ + f₋₁) - f₂ - f₋₂) / 6.
+
+    Mean of that along rows and along columns where all four are usable, else mean of the usable ones of the eight
+    neighbours (0 without any). A hole in the core of a spot would narrow it.
+    """
+    known, some = np.where(usable, light, 0.0), usable.astype(float)
+    cubic, lines = np.zeros_like(known), np.zeros_like(known)
+    for axis in (0, 1):
+        whole = ndimage.correlate1d(some, [1, 1, 0, 1, 1], axis, mode="constant") > 3.5
+        cubic += whole * ndimage.correlate1d(known, _CUBIC, axis, mode="constant")
+        lines += whole
+    near, count = (ndimage.correlate(part, np.ones((3, 3)), mode="constant") for part in (known, some))
+    filled = np.where(lines > 0, cubic / np.maximum(lines, 1), near / np.maximum(count, 1))
+    return np.where(usable, light, filled)
+
+
+def _masked_words(light: Array, usable: Array) -> list[str]:
+    """What masked pixels in the core of a spot, above a tenth of its peak, mean for its numbers."""
+    inside = (~usable & (light > 0.1 * light.max((1, 2), keepdims=True))).sum((1, 2))
+    if not inside.any():
+        return []
+    return [
+        f"masked pixels lie within {int((inside > 0).sum())} spots ({int(inside.max())} at most): filled from their "
+        "neighbours, so that Strehl ratio, widths and MTF there are less sure"
+    ]
 
 
 def _rim(image: Array) -> Array:

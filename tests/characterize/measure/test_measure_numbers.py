@@ -109,8 +109,46 @@ def test_light_is_counted_above_the_median_of_the_rim():
     usable[2, 3] = False
     light = frames._above(frame, usable)
     assert light[3, 4] == 30
-    assert light[2, 3] == 0
     assert light[0, 0] == -4
+
+
+def test_masked_pixels_are_filled_from_those_around_them():
+    """Exact for cubics along rows or columns; where a second neighbour is masked too, by those that touch."""
+    y, x = np.mgrid[:9, :11] - 4.0
+    light = 70 + 3 * x**3 - 2 * y**3 + x * y + 5 * x
+    usable = np.ones(light.shape, bool)
+    usable[4, 6] = usable[0, 3] = False
+    broken = np.where(usable, light, 4000.0)
+    assert frames._filled(broken, usable) == pytest.approx(light, abs=1e-9)
+    usable[2, 6] = usable[4, 7] = False  # neither the column nor the row of (4, 6) is whole
+    ring = [light[i, j] for i in (3, 4, 5) for j in (5, 6, 7) if usable[i, j]]
+    assert len(ring) == 7
+    assert frames._filled(np.where(usable, light, 4000.0), usable)[4, 6] == pytest.approx(np.mean(ring))
+
+
+@pytest.mark.parametrize("beside", [0, 1])
+def test_a_hot_pixel_in_its_core_leaves_a_spot_its_width(beside):
+    """A Gaussian of 1.6 x 1.9 pixels; the cubic misses 6 % of a pixel at its top, which holds 5 % of the light."""
+    y, x = np.mgrid[:41, :47] - np.array([20.2, 23.4])[:, None, None]
+    spot = 30000 * np.exp(-(x**2) / (2 * 1.6**2) - y**2 / (2 * 1.9**2))
+    counts = np.rint(np.stack([0.7 * spot, spot, 0.4 * spot]) + 300)
+    dark = np.full((3, 41, 47), 300.0)
+    plain, broken = (
+        frames.measure(
+            Capture(
+                counts + hot, np.array([1.0, 2.0, 3.0]), np.zeros((3, 2)), np.full(3, np.nan), ("a", "b", "c"), 16,
+                pixel_um=1.3, dark=dark + hot, about={"gain_e": 1.4},
+            )
+        )
+        for hot in (0.0, np.where((np.arange(41)[:, None] == 20) & (np.arange(47) == 23 + beside), 9000.0, 0.0))
+    )  # fmt: skip
+    for before, after in zip(plain.frames, broken.frames, strict=True):
+        assert after.spot.fwhm_um == pytest.approx(before.spot.fwhm_um, rel=0.05)
+        assert after.spot.ee80_um == pytest.approx(before.spot.ee80_um, rel=0.01)
+        assert after.spot.d4sigma_um == pytest.approx(before.spot.d4sigma_um, rel=0.01)
+        assert after.mtf50_x_per_um == pytest.approx(before.mtf50_x_per_um, rel=0.02)
+    assert any("within 3 spots (1 at most)" in note for note in broken.notes)
+    assert not any("spots" in note for note in plain.notes)
 
 
 @pytest.mark.parametrize(("top", "seen"), [(5.2, True), (4.8, False)])
