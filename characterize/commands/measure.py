@@ -126,11 +126,14 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))
     laid: overlay.Overlay | None = None
     table: overlay.Table = []
+    scale = 1.0
     if options.design is not None:
-        laid = overlay.overlay(found, lenses.load_plain(options.design).diameters)
-        table = overlay.bias_table(laid) if laid.clearly else []  # elsewhere, other diameters were drawn
+        design = lenses.load_plain(options.design).diameters
+        laid, scale = overlay.overlay(found, design), overlay.scale(found, pixel, design)
+        sure = laid.clearly and abs(scale - 1) < overlay.SCALE  # elsewhere, other diameters were drawn
+        table = overlay.bias_table(laid) if sure else []
         found = overlay.numbered(found, laid)
-    values = _summary(found, laid, table, pixel)
+    values = _summary(found, laid, table, pixel) | ({"pitch_over_design": scale} if laid is not None else {})
     store.write_text(folder / "pillars.csv", _table(_pillars(found, laid)))
     store.write_text(folder / "measure.json", _json(values))
     if table:
@@ -138,7 +141,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
     good = bool(np.isfinite(found.diameter_nm).any())
-    return values, _words(found, laid, table, options.output), good
+    return values, "\n".join([_words(found, laid, table, options.output), *_scale_words(scale, pixel)]), good
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
@@ -209,6 +212,16 @@ def _words(found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Ta
         lines.append(f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}")
         lines += [f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)" for d, b, s, n in table]
     return "\n".join(lines)
+
+
+def _scale_words(scale: float, pixel_nm: float) -> list[str]:
+    """What to do where the picture's lattice is not as wide as the mask's."""
+    if abs(scale - 1) < overlay.SCALE:
+        return []
+    return [
+        f"  the lattice is {scale - 1:+.2%} off the mask's, and so are all diameters: no bias table; if the mask was "
+        f"written true to scale, measure again with --pixel-nm {pixel_nm / scale:.5g}"
+    ]
 
 
 def _plain(row: frames.Frame) -> dict[str, object]:

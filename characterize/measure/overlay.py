@@ -15,6 +15,7 @@ Table = list[tuple[float, float, float, int]]  # drawn nm, made less drawn nm, i
 _CLEAR = 0.7  # scatter of the best place over that of the next best: below, the place is sure
 _LEAST = 12  # pillars
 OUTLIER = 4.0  # robust sigma
+SCALE = 0.005  # of the lattice against the mask's: 1 nm on a pillar of 200
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,6 +69,19 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
     ordered = np.sort(scatter[np.isfinite(scatter)])
     sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
     return Overlay(designed, error, row - int(first[0]), column - int(first[1]), bool(sure), outlier)
+
+
+def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
+    """Lattice constant in the picture over that of the mask: by how much the stated pixel is too large.
+
+    Of the plane places (row, column) = origin + J (j, i) through the good pillars, sqrt |det J|, so that a scan
+    stretched along one axis counts half. Masks are written true to scale to a few parts in a million, pixels of
+    microscopes are known to some per cent. Accuracy: 4e-4 for five pillars a side.
+    """
+    good = np.isfinite(found.diameter_nm)
+    sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
+    turn = np.linalg.lstsq(sites, np.column_stack([found.row[good], found.column[good]]), rcond=None)[0][:2]
+    return float(np.sqrt(abs(np.linalg.det(turn))) * pixel_nm / (design.pitch_um * 1e3))
 
 
 def bias_table(laid: Overlay, *, knots: int = 7) -> Table:

@@ -109,3 +109,26 @@ def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats)
     assert told["place_is_clear"] != repeats
     assert bool(told["bias_nm"]) != repeats
     assert (tmp_path / "out" / "bias.toml").is_file() != repeats
+
+
+def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, capsys):
+    """A pixel stated 1.7 % too large makes pillars of 220 nm 3.7 nm too wide; the mask's lattice tells by how much."""
+    mask = np.random.default_rng(4).uniform(160, 280, (7, 7))
+    cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
+    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    drawn = DiameterMap(mask * 1e-3, cell.pitch_um)
+    lenses.save(tmp_path / "lens.h5", Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
+    image = np.clip((test_sem.render(mask[1:6, 2:7]) + 0.5) * 2e4, 0, 65535).astype(np.uint16)  # pixels of 4 nm
+    tifffile.imwrite(tmp_path / "sem.tif", image)
+    arguments = ["measure", str(tmp_path / "sem.tif"), "--design", str(tmp_path / "lens.h5"), "--pixel-nm"]
+    assert main([*arguments, "4.068", "-o", str(tmp_path / "out")]) == 0
+    told = json.loads((tmp_path / "out" / "measure.json").read_text())
+    assert told["place_is_clear"]
+    assert told["pitch_over_design"] == pytest.approx(1.017, abs=5e-4)  # 0.1 pixels at either end of 4 x 100
+    assert told["bias_nm"] == []
+    assert not (tmp_path / "out" / "bias.toml").exists()
+    better = capsys.readouterr().out.split("--pixel-nm ")[1].split()[0]
+    assert main([*arguments, better, "-o", str(tmp_path / "again"), "--quiet"]) == 0
+    told = json.loads((tmp_path / "again" / "measure.json").read_text())
+    assert max(abs(bias) for _, bias, *_ in told["bias_nm"]) < 1.5
+    assert (tmp_path / "again" / "bias.toml").is_file()
