@@ -141,7 +141,10 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
     good = bool(np.isfinite(found.diameter_nm).any())
-    return values, "\n".join([_words(found, laid, table, options.output), *_scale_words(scale, pixel)]), good
+    lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
+    if table and not options.edge_bias_nm:
+        lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
+    return values, "\n".join(lines), good
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:

@@ -74,6 +74,7 @@ def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Ite
         # resonances are left out of it
         yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True)
     light = image - background(x, task.model.setting)
+    yield Change("vibration or blur along one direction", _along_one(light))
     if len(image) > 2:
         yield from _of_frames(light, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
@@ -191,6 +192,15 @@ def _each(change: Array) -> Array:
     out = np.zeros((len(change), *change.shape))
     out[np.arange(len(change)), np.arange(len(change))] = change
     return out
+
+
+def _along_one(light: Array) -> Array:
+    """(2, n, y, x): a blur s² wider along x than along y, and along one diagonal than the other, is s²/2 of these.
+
+    Second differences of the light, xx - yy and 2 xy: the blur that parameters describe is round.
+    """
+    xx, yy = (ndimage.correlate1d(light, [1.0, -2.0, 1.0], axis, mode="nearest") for axis in (2, 1))
+    return np.stack([xx - yy, 2 * np.gradient(np.gradient(light, axis=1), axis=2)])
 
 
 def _curvature(light: Array) -> Array:

@@ -12,7 +12,7 @@ from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange
 from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
-from characterize.inference.missing import Looked, Unstated
+from characterize.inference.missing import Lean, Looked, Unstated
 from characterize.inference.prepare import check_depths, check_enough, data_of, merged, quick_enough, setting_of, stated
 from characterize.inference.search import Task, with_values
 from characterize.model import (
@@ -90,6 +90,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     task = dataclasses.replace(task, model=quick_enough(model, task.data, search.starts(task, biases_nm=(0.0,))[0]))
     task, ends = _ends(task, frames.gain, cautions)
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
+    leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):
         rest = residual.attempt(task.model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
         if rest is not None:
@@ -99,12 +100,12 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
                 f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
                 f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
             )
-    _refuse(_problems(task, ends[0], frames.gain), options)
+    _refuse(_problems(task, ends[0], frames.gain), options, leans)
     posterior = explore.explore(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
     result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
-    _refuse(result.problems, options)
+    _refuse(result.problems, options, leans)
     return result
 
 
@@ -114,9 +115,10 @@ def _reach_um(known: dict[str, Known], lens: Lens) -> float:
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
-def _refuse(problems: Sequence[str], options: Options) -> None:
+def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> None:
+    """Refuse by the problems, with what the residuals lean to: where to look on the bench."""
     if problems and not options.insist:
-        raise FitRefused("fit refused: " + "; ".join(problems))
+        raise FitRefused("fit refused: " + "; ".join([*problems, *missing.words(leans)]))
 
 
 def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solution]]:

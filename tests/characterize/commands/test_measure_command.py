@@ -128,7 +128,10 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
     assert told["bias_nm"] == []
     assert not (tmp_path / "out" / "bias.toml").exists()
     better = capsys.readouterr().out.split("--pixel-nm ")[1].split()[0]
-    assert main([*arguments, better, "-o", str(tmp_path / "again"), "--quiet"]) == 0
+    assert main([*arguments, better, "-o", str(tmp_path / "again")]) == 0
+    assert "what the microscope adds" in capsys.readouterr().out
+    assert main([*arguments, better, "--edge-bias-nm", "0.3", "-o", str(tmp_path / "told")]) == 0
+    assert "what the microscope adds" not in capsys.readouterr().out
     told = json.loads((tmp_path / "again" / "measure.json").read_text())
     assert max(abs(bias) for _, bias, *_ in told["bias_nm"]) < 1.5
     assert (tmp_path / "again" / "bias.toml").is_file()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
@@ -181,6 +182,13 @@ def test_steep_background_and_vibration_are_found():
     steep = {"background_x_e": 1500.0, "background_e": 1600.0}
     assert right(fit(b.capture(b.electrons(**steep))), **steep)
     assert right(fit(b.capture(b.electrons(crosstalk_px=1.0))), crosstalk_px=1.0)
+
+
+@pytest.mark.slow
+def test_vibration_along_one_direction_is_refused_by_name():
+    shaken = ndimage.gaussian_filter(b.electrons(), (0, 0.2, 0.9), mode="nearest")
+    with pytest.raises(FitError, match=r"residuals lean towards .*vibration or blur along one direction"):
+        fit(b.capture(shaken))
 
 
 @pytest.mark.slow

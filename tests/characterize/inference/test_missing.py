@@ -13,11 +13,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.captures import clean
-from characterize.inference import causes
+from characterize.inference import causes, estimate
+from characterize.inference.estimate import Options
 from characterize.inference.missing import CHANCE, Fitted, Lean, Looked, look, untold, words
 from characterize.inference.prepare import data_of
 from characterize.inference.search import Task, refine
 from characterize.model import PLACE, ForwardModel, Setting, vector
+from metalens.ground.errors import FitError
 from metalens.made import Bends, maps
 
 rng = np.random.default_rng(20)
@@ -169,9 +171,10 @@ def shifted(light):
 
 FAULTS = {
     "a ghost": lambda light: light + 0.05 * shifted(light),
-    "vibration": lambda light: np.stack(
+    "vibration or blur in single": lambda light: np.stack(
         [ndimage.gaussian_filter(frame, 0.7 * (i % 2)) for i, frame in enumerate(light)]
     ),
+    "vibration or blur along one": lambda light: ndimage.gaussian_filter(light, (0, 0.2, 0.6), mode="nearest"),
     "a lamp": lambda light: light * (1 + 0.06 * np.array([0, 1, -1, 1, -1]))[:, None, None],
 }
 
@@ -198,6 +201,34 @@ def test_faults_of_a_bench_are_named(cause):
     told = [one.cause for one in found if one.chance < CHANCE] or found[:2]
     assert any(str(one).startswith(cause) for one in told[:2]), told
     assert words(found)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0, 45.0, 110.0])
+def test_blur_along_one_direction_changes_light_by_its_second_derivatives(turn_deg):
+    """A Gaussian of 3 pixels whose variance is s² more along a direction and s² less across it, to first order in s²;
+    central differences of such a Gaussian err by (3 to 5) / (6 x 9), along each axis."""
+    y, x = np.mgrid[:31, :35] - np.array([14.6, 17.3])[:, None, None]
+    s2, turn = 0.3, np.radians(turn_deg)
+    a, o = s2 * np.cos(2 * turn), s2 * np.sin(2 * turn)
+
+    def spot(sign):
+        inverse = np.linalg.inv([[9 + sign * a, sign * o], [sign * o, 9 - sign * a]])
+        q = inverse[0, 0] * x**2 + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y**2
+        return np.exp(-q / 2) * np.sqrt(np.linalg.det(inverse))
+
+    want = (spot(1) - spot(-1)) / 2
+    along, diagonal = causes._along_one(spot(0)[None])[:, 0]
+    assert np.abs(a / 2 * along + o / 2 * diagonal - want).max() < 0.1 * np.abs(want).max()
+
+
+def test_a_refusal_names_what_the_residuals_lean_to():
+    leans = [Lean("a ghost", 90.0, 1, 1e-9), Lean("a lamp", 40.0, 4, 1e-6), Lean("a drift", 2.0, 1, 0.2)]
+    with pytest.raises(FitError, match=r"refused: a bad fit; residuals lean towards a ghost.*; a lamp.* explain"):
+        estimate._refuse(["a bad fit"], Options(), leans)
+    with pytest.raises(FitError, match=r"refused: a bad fit$"):
+        estimate._refuse(["a bad fit"], Options(), leans[2:])
+    estimate._refuse([], Options(), leans)
+    estimate._refuse(["a bad fit"], Options(insist=True), leans)
 
 
 def test_a_clean_bench_is_called_clean_and_glass_is_declared():
