@@ -24,5 +24,7 @@ class RetrainConfig:
     budget_mmacs: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.draws, self.judge, self.test_batches) < 1 or not self.rate > 0:
-            raise ConfigError(f"{self}: need steps, draws, judge and test_batches of 1 or more, and a rate above 0")
+        if min(self.steps, self.draws, self.judge, self.test_batches) < 1 or self.seed < 0 or not self.rate > 0:
+            raise ConfigError(
+                f"{self}: need steps, draws, judge and test_batches of 1 or more, a seed of 0 or more, a rate above 0"
+            )

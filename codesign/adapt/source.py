@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import AsBuilt
-from codesign.network import Architecture, check
+from codesign.network import Architecture, Baseline, check, smallest
 from codesign.train import Run, RunConfig
 from codesign.train import run as runs
 from metalens.ground import manifest, reading
@@ -38,10 +38,14 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     """
     names = ("run.toml", "checkpoint.safetensors", "lens.h5", "result.json")
     missing = [name for name in names if not (folder / name).is_file()]
-    if missing:
-        what = "no run folder" if len(missing) == len(names) else "a half-written run"
+    if len(missing) == len(names):
         raise TrainingError(
-            f"{folder} is {what}: {', '.join(missing)} missing; finish it with "
+            f"{folder} is no run folder: {', '.join(missing)} missing; give the folder that "
+            "`metalens codesign RUN.toml -o FOLDER` wrote"
+        )
+    if missing:
+        raise TrainingError(
+            f"{folder} is a half-written run: {', '.join(missing)} missing; finish it with "
             f"`metalens codesign RUN.toml -o {folder} --resume`"
         )
     with reading.steady(folder):
@@ -51,7 +55,7 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
         rows = rows_of(folder)
     found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
     if not found:
-        have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
+        have = ", ".join("none" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:g}" for r in rows)
         raise TrainingError(f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}")
     return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
 
@@ -77,15 +81,17 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def architecture_of(entry: dict[str, Any], run: Run, folder: Path) -> Architecture:
-    """The architecture in a row of result.json.
+def architecture_of(entry: dict[str, Any] | None, run: Run, folder: Path) -> Architecture:
+    """The architecture in a row of result.json; the only one of a baseline network, whose row names none.
 
     Raises:
         TrainingError: of another version, or outside the run's space.
     """
-    values: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k not in ("error", "macs")
-    }
+    net = run.trainer.model.net
+    if isinstance(net, Baseline):
+        return smallest(net.space)
+    named = (entry or {}).items()
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in named if k not in ("error", "macs")}
     try:
         return check(run.settings.space, Architecture(**values))
     except TypeError as error:

@@ -68,6 +68,12 @@ class SceneConfig:
                 f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
                 "margin below them, and a scale below 0.5"
             )
+        nearest = 1e-3 * Rig().distance_um
+        if min(self.slip_mm) < 0 or self.slip_mm[2] >= nearest or not all(0 <= turn < 60 for turn in self.gaze_deg):
+            raise ConfigError(
+                f"slip_mm = {self.slip_mm}, gaze_deg = {self.gaze_deg}: need largest slippages of 0 or more, along z "
+                f"below the {nearest:g} mm that the eye stands before the lens, and angles of 0 to 60, as eyes turn"
+            )
         if self.pool < 0 or not self.depth_sd_mm >= 0 or not 0 <= self.variety <= 4:
             raise ConfigError(
                 f"pool = {self.pool}, depth_sd_mm = {self.depth_sd_mm}, variety = {self.variety}: need the first two 0 "

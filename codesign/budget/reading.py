@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign.adapt import Source, network
+from codesign.adapt import Source
 from codesign.batches import EXPERIMENT
 from codesign.budget.entry import NONE, Entry
 from codesign.budget.person import told
@@ -221,7 +221,7 @@ class Reading:
     ) -> Readings:
         """What the network reads of frames through these optics; noise of the experiment's seeds."""
         found = []
-        net, inner = network(self.source.run.trainer), self.source.settings.inner
+        net, inner = self.source.run.trainer.model.net, self.source.settings.inner
         for subject, made in enumerate(subjects):
             seen = gaze_experiment.through(
                 self.source, made, optics, seed=gaze_experiment.NOISE + subject, snr_db=self.config.snr_db, quiet=quiet

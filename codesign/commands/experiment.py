@@ -66,8 +66,9 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
     for result, means in zip(results, per, strict=True):
         row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs, **_beyond(result)}
         for quantity, values in means.items():
-            row[quantity] = float(values.mean())
-            if len(values) > 1:
+            known = bool(np.isfinite(values).all())  # a network without a mask has no overlap
+            row[quantity] = float(values.mean()) if known else None
+            if known and len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap(values))
         rows.append(row)
     ratios = []
@@ -131,9 +132,10 @@ def table(values: dict[str, Any]) -> str:
     head = f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}{'axial/mm':>10}{'IoU':>7}"
     lines = [head]
     for r in values["runs"]:
+        iou = "      -" if r["iou"] is None else f"{r['iou']:7.3f}"
         lines.append(
             f"{r['name']:<16}{r['mmacs']:7.2f}{r['gaze_axial_deg']:12.2f}{r['gaze_lateral_deg']:12.2f}"
-            f"{r['slip_mm']:8.3f}{r['slip_axial_mm']:10.3f}{r['iou']:7.3f}"
+            f"{r['slip_mm']:8.3f}{r['slip_axial_mm']:10.3f}{iou}"
         )
     for r in values["ratios"]:
         low, high = r["interval"]

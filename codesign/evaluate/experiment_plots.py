@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from codesign.adapt import Source, network
+from codesign.adapt import Source
 from codesign.batches import EXPERIMENT
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Result, ready, states_of, through
 from codesign.evaluate.shown import ExperimentConfig
@@ -18,7 +18,7 @@ COLOURS = ("#e9812b", "#1f6feb", "#2a9d8f", "#6d597a")
 @torch.no_grad()
 def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> bytes:
     """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is (green) and as it is read (red)."""
-    scenes, net = source.run.scenes(EXPERIMENT), network(source.run.trainer)
+    scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
     prepared, slips = ready(source), config.slips_mm
     points = len(config.stimuli_deg)
     count = min(subjects, config.subjects)
@@ -34,7 +34,7 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
             ax = axes[subject, column]
             ax.imshow(seen.frames[column, 0].numpy(), cmap="gray", extent=(0, 1, 1, 0))
             for mask, level, colour in ((seen.mask[column], 0.5, "#39d353"), (logits[column], 0.0, "#ff4d4d")):
-                if float(mask.min()) < level < float(mask.max()):
+                if mask.numel() and float(mask.min()) < level < float(mask.max()):  # some networks give no mask
                     n = mask.shape[-1]
                     place = (np.arange(n) + 0.5) / n
                     ax.contour(place, place, mask.numpy(), [level], colors=colour, linewidths=1)

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from codesign.adapt import Source, network
+from codesign.adapt import Source
 from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
@@ -84,14 +84,25 @@ class Result:
         return out
 
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
-        """(subjects,) means of (n,) values, of which nan are left out."""
+        """(subjects,) means of (n,) values, of which nan are left out; nan where none is left."""
         keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        return np.array([values[keep & (self.trial.subject == s)].mean() for s in np.unique(self.trial.subject)])
+        mine = (values[keep & (self.trial.subject == s)] for s in np.unique(self.trial.subject))
+        return np.array([one.mean() if len(one) else math.nan for one in mine])
 
 
 def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tuple[States, Trial]:
-    """All frames of one subject: slippage states outermost, stimuli within."""
+    """All frames of one subject: slippage states outermost, stimuli within.
+
+    Raises:
+        ConfigError: slippage that takes the eye to the lens.
+    """
     stimuli, slips = config.stimuli_deg, config.slips_mm
+    nearest = 1e-3 * scenes.rig.distance_um + slips[:, 2].min()
+    if not nearest > 0:
+        raise ConfigError(
+            f"axial_mm {config.axial_mm}: the eye stands {1e-3 * scenes.rig.distance_um:g} mm before the lens; "
+            "let it slip less towards it"
+        )
     n = len(stimuli) * len(slips)
     rng = np.random.default_rng([config.seed, subject, LOOKS])
     person = eye.draw(1, (config.seed, PEOPLE, subject), motion=replace(scenes.settings.motion, scale=0.0))
@@ -160,7 +171,7 @@ def experiment(
         trials.append(trial)
         for kept, source, imager in zip(answers, sources, prepared, strict=True):
             seen = through(source, made, imager, seed=NOISE + subject, snr_db=config.snr_db)
-            kept.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
+            kept.append(_answers(source, seen))
         if subject + 1 < config.subjects:
             yield subject + 1, []
     whole = joined(trials)
@@ -172,6 +183,10 @@ def experiment(
             for label, source, kept, one in zip(labels, sources, answers, how, strict=True)
         ],
     )
+
+
+def _answers(source: Source, seen: Seen) -> Answers:
+    return assess.predict(source.run.trainer.model.net, source.architecture, seen, source.settings.inner)
 
 
 def joined(trials: Sequence[Trial]) -> Trial:
@@ -199,7 +214,7 @@ def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> Unif
     """
     trainer = source.run.trainer
     measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
-    recalibrate(network(trainer), source.architecture, assess.parts(measured))
+    recalibrate(trainer.model.net, source.architecture, assess.parts(measured))
     settings, scenes = trainer.optics, source.settings.scenes
     seen = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
@@ -232,7 +247,7 @@ def calibrator(source: Source, imager: UniformImager | Imager, config: Experimen
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
         made = render(states[torch.from_numpy(rows)], rig=scenes.rig, camera=scenes.camera)
         seen = through(source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db)
-        found.append(assess.predict(network(source.run.trainer), source.architecture, seen, source.settings.inner))
+        found.append(_answers(source, seen))
         looked.append(trial.stimulus_deg[rows])
         if found[0].axis is None:
             return sphere(source, config)

@@ -120,7 +120,8 @@ def of_experiment(path: Path) -> dict[str, Measured]:
             ("iou", "iou"),
         ):
             low, high = run.get(f"{name}_interval", (math.nan, math.nan))
-            found[f"{key}/{run['name']}"] = Measured(run[name], low, high, words)
+            if run[name] is not None:  # a network without a mask has no overlap
+                found[f"{key}/{run['name']}"] = Measured(run[name], low, high, words)
     for entry in told["ratios"]:
         if entry["against"] != "hyperbolic":
             continue

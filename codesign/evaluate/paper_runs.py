@@ -15,7 +15,7 @@ from codesign.batches import TEST, VALIDATION
 from codesign.evaluate.paper import Measured
 from codesign.gaze import Readings
 from codesign.gaze import bench as gaze_test
-from codesign.network import Architecture, Baseline, recalibrate, smallest
+from codesign.network import Architecture, recalibrate
 from codesign.train import Run, Seen, assess
 from codesign.train import run as runs
 from metalens.ground.errors import TrainingError
@@ -64,7 +64,7 @@ def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5)
     known = assess.parts(assess.frames(going.trainer, going.trainer.scenes, min(8, settings.test_batches)))
     out = []
     for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
-        architecture = _architecture(row, going, folder)
+        architecture = retraining.architecture_of(row["architecture"], going, folder)
         recalibrate(going.trainer.model.net, architecture, known)
         read, how = _read(going, architecture, shown), None
         if read.axis_deg is not None:
@@ -85,13 +85,6 @@ def _read(going: Run, architecture: Architecture, shown: tuple[gaze_test.People,
     test, seen = shown
     answers = assess.predict(going.trainer.model.net, architecture, seen, going.settings.inner)
     return gaze_test.read_of(test, answers.centre, answers.slip_mm, answers.axis)
-
-
-def _architecture(row: Mapping[str, Any], going: Run, folder: Path) -> Architecture:
-    net = going.trainer.model.net
-    if isinstance(net, Baseline):
-        return smallest(net.space)
-    return retraining.architecture_of(row["architecture"], going, folder)
 
 
 def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:

@@ -72,6 +72,13 @@ class ExperimentConfig:
             )
         if self.people < 2:
             raise ConfigError(f"people {self.people}: need two or more, to tell how people differ")
+        if min(self.hidden, self.seed, self.fixation_deg, self.pupil_sd) < 0:
+            raise ConfigError(
+                f"hidden {self.hidden}, seed {self.seed}, fixation_deg {self.fixation_deg:g}, pupil_sd "
+                f"{self.pupil_sd:g}: need 0 or more"
+            )
+        if not all(0 < field < 120 for field in self.field_deg):
+            raise ConfigError(f"field_deg {self.field_deg}: need two angles above 0 and below 120, as eyes turn")
 
     @property
     def stimuli_deg(self) -> Array:

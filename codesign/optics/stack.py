@@ -86,7 +86,8 @@ class OpticsConfig:
         low, high = self.depths_mm
         if not (0 < low < high and self.depth_count >= 2):
             raise ConfigError(
-                f"depths_mm = {self.depths_mm}, depth_count = {self.depth_count}: need 0 < least < largest"
+                f"depths_mm = {self.depths_mm}, depth_count = {self.depth_count}: need 0 < least < largest and a count "
+                "of 2 or more"
             )
         if min(self.aperture_mm, self.sensor_distance_mm, self.wavelength_nm, self.focus_mm, self.sample_um) <= 0:
             raise ConfigError("aperture, sensor distance, wavelength, focus and sample must all be above 0")

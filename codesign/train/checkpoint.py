@@ -94,7 +94,10 @@ def _about(metadata: dict[str, str]) -> dict[str, Any]:
 def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
     if metadata.get("kind") != "checkpoint" or metadata.get("version") != VERSION:
         found = metadata.get("kind", "no kind"), metadata.get("version", "no version")
-        raise TrainingError(f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}")
+        raise TrainingError(
+            f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}; train again, or go on "
+            "with the release that wrote it"
+        )
     changed = difference(metadata["settings"], config.dumps(settings))
     if changed:
         raise TrainingError(f"{path} belongs to other settings; start a new run or undo the change:\n{changed}")

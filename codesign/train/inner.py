@@ -68,10 +68,10 @@ class InnerConfig:
     patience: int = 20
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1 or self.subnets < 0:
+        if min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1 or min(self.slip_scale_mm) <= 0:
             raise ConfigError(
                 f"steps {self.steps}, batch {self.batch}, patience {self.patience}, refresh {self.refresh}, draws "
-                f"{self.draws}: need 1 or more"
+                f"{self.draws}: need 1 or more; slip_scale_mm {self.slip_scale_mm}: need all above 0"
             )
 
 

@@ -169,7 +169,7 @@ def test_half_written_runs_are_named(folder, tmp_path, name, message):
 
 
 def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder, tmp_path):
-    with pytest.raises(TrainingError, match="is no run folder"):
+    with pytest.raises(TrainingError, match=r"is no run folder: .* give the folder that `metalens codesign"):
         retraining.load(tmp_path)
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -178,6 +178,15 @@ def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder,
         retraining.load(tmp_path)
     with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are 2"):
         retraining.load(folder, budget_mmacs=7.0)
+
+
+def test_a_run_of_another_network_is_read_and_not_retrained(tmp_path):
+    source = retraining.load(m.finished_baseline(tmp_path / "run"))
+    assert source.architecture.resolution == 1.0
+    with pytest.raises(TrainingError, match="trained a NVGaze; only elastic networks are retrained"):
+        retraining.network(source.run.trainer)
+    with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are none"):
+        retraining.load(tmp_path / "run", budget_mmacs=7.0)
 
 
 def test_a_fit_of_another_lens_or_a_refused_one_is_refused():

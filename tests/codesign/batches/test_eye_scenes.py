@@ -55,6 +55,11 @@ def test_scale_ambiguity_moves_depth_but_not_the_pinhole_image():
 def test_impossible_settings_are_refused():
     with pytest.raises(ConfigError, match="scale"):
         SceneConfig(scale=0.6)
+    for slip_mm in ((-2.0, 1.5, 3.5), (2.0, 1.5, 21.0)):
+        with pytest.raises(ConfigError, match=r"slip_mm = .* the 21 mm that the eye stands before the lens"):
+            SceneConfig(slip_mm=slip_mm)
+    with pytest.raises(ConfigError, match=r"gaze_deg = \(18.0, 60.0\)"):
+        SceneConfig(gaze_deg=(18.0, 60.0))
 
 
 def test_variety_widens_looks_and_nothing_else():

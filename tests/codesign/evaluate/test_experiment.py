@@ -13,7 +13,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
 from codesign.adapt import train as retraining
+from codesign.batches import EyeScenes, SceneConfig
 from codesign.commands import experiment as command
+from codesign.evaluate import experiment_plots
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
 from codesign.evaluate.shown import ExperimentConfig
@@ -126,6 +128,36 @@ def test_impossible_experiments_are_refused(change):
         replace(SMALL, **change)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("hidden", -2), ("seed", -1), ("fixation_deg", -0.1), ("pupil_sd", -1.0), ("field_deg", (35.0, -25.0)),
+     ("field_deg", (400.0, 25.0))],
+)  # fmt: skip
+def test_settings_below_what_they_can_be_are_named(name, value):
+    with pytest.raises(ConfigError, match=name):
+        replace(SMALL, **{name: value})
+
+
+def test_an_eye_that_would_slip_into_the_lens_is_refused():
+    scenes = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
+    with pytest.raises(ConfigError, match=r"axial_mm \(-21.0,\): the eye stands 21 mm before the lens"):
+        experiment.states_of(replace(SMALL, axial_mm=(-21.0,)), 0, scenes)
+
+
+def test_a_network_of_others_reads_the_experiment_by_sphere_and_has_no_overlap(tmp_path):
+    source = retraining.load(m.finished_baseline(tmp_path / "run"))
+    config = replace(SMALL, subjects=2, hidden=0, axial_mm=(2.5,), lateral_mm=())
+    *_, (_, (found,)) = experiment.experiment([source], config)
+    assert isinstance(experiment.calibrator(source, experiment.ready(source), config), personal.Sphere)
+    told = command.summary([found], config)
+    (row,) = told["runs"]
+    assert row["iou"] is None
+    assert "iou_interval" not in row
+    assert row["slip_mm"] == pytest.approx(np.abs(found.slip_mm - found.trial.slip_mm).mean(), rel=1e-9)
+    assert command.table(told).splitlines()[1].split()[-1] == "-"
+    assert experiment_plots.samples(source, config, subjects=1).startswith(b"\x89PNG")
+
+
 def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     run, out = str(folder / "run"), folder / "out"
     words = [
@@ -142,6 +174,8 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
         "3",
         "--share",
         "0.3",
+        "--people",
+        "3",
     ]
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

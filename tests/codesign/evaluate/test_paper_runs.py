@@ -35,17 +35,6 @@ def _result(path, **entries):
     return path
 
 
-def _other_network(path):
-    """A finished run of somebody else's network on the scenes of the small one."""
-    path.mkdir()
-    (path / "run.toml").write_text(m.TINY.replace('preset = "smoke"', 'preset = "smoke"\nnetwork = "nvgaze"'))
-    made = runs.start(runs.load(path / "run.toml"))
-    runs.save(path / "checkpoint.safetensors", made)
-    row = {"budget_mmacs": None, "mmacs": 1.5, "architecture": {}}
-    (path / "result.json").write_text(json.dumps({"rows": [row], "network": "nvgaze", "frozen": []}))
-    return path
-
-
 def test_compute_of_a_frozen_part_is_that_at_its_own_best_error():
     ours = [{"mmacs": 2.0, "axial_slip_mm": 0.9}, {"mmacs": 6.0, "axial_slip_mm": 0.5}]
     fixed = [{"mmacs": 4.0, "axial_slip_mm": 1.2}, {"mmacs": 14.0, "axial_slip_mm": 0.9}]
@@ -86,7 +75,7 @@ def test_networks_of_the_table_have_their_claims():
 
 
 def test_gaze_of_both_kinds_of_network_stands_in_the_table(folder, tmp_path, monkeypatch):
-    other, page = _other_network(tmp_path / "nvgaze"), tmp_path / "page"
+    other, page = m.finished_baseline(tmp_path / "nvgaze"), tmp_path / "page"
     monkeypatch.setattr(paper_runs, "gaze", functools.partial(paper_runs.gaze, people=3, each=20))
     monkeypatch.setattr(command_paper, "_measure", lambda options, at: command_paper._measure_gaze(options, at / GAZE))
     arguments = ["evaluate", "paper", str(folder), "--others", str(other), "-o", str(page), "--quiet"]

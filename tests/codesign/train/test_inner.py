@@ -187,6 +187,8 @@ def test_impossible_schedules_are_refused():
         Schedule(0.1, 0.8, 0.2)
     with pytest.raises(ConfigError, match="need 1 or more"):
         InnerConfig(steps=0)
+    with pytest.raises(ConfigError, match="slip_scale_mm"):
+        InnerConfig(slip_scale_mm=(1.4, 0.0, 2.3))
 
 
 class Hard(Discs):
