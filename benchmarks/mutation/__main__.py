@@ -232,11 +232,13 @@ def _say(done: int, total: int, row: dict[str, object]) -> None:
 
 
 def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) -> int:
-    """The result as JSON and as a table; with --again the judged ones replace their old lines."""
+    """The result as JSON and as a table; with --again the judged ones replace their old lines, and open ones of source
+    that is no longer there go."""
     if asked.again:
         kept = json.loads(asked.result.read_text(encoding="utf-8"))
         judged = {_identity(row): row for row in rows}
-        rows, words = [judged.get(_identity(row), row) for row in kept["mutants"]], kept["command"]
+        stay = [r for r in kept["mutants"] if _identity(r) in judged or r["outcome"] != "survived" or _reason(r)]
+        rows, words = [judged.get(_identity(row), row) for row in stay], kept["command"]
     else:
         words = f"python -m benchmarks.mutation {words}".strip()
     for row in rows:

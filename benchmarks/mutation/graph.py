@@ -41,7 +41,7 @@ class Graph:
             own = self.root / "tests" / folder == test.parent
             named = re.search(rf"(^|_){stem}(_|$)", test.stem) is not None
             near = self._reach[test][module]
-            spoken = len(re.findall(rf"\b{stem}\b", test.read_text(encoding="utf-8"))) if near == 1 else 0
+            spoken = len(re.findall(rf"(?:\b|_){stem}\b", test.read_text(encoding="utf-8"))) if near == 1 else 0
             spent = seconds.get(self._name(test), 1.0)
             truths = _TRUTHS.search(test.stem) is not None
             kind = (0 if truths else 1) if named else 2 if truths and near == 1 else 3
