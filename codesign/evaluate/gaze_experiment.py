@@ -20,7 +20,7 @@ from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.evaluate.shown import Trial as Trial
-from codesign.eye import POPULATION, Rendered, States, render
+from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
 from codesign.gaze import Calibrator, Person, Readings, Sphere, angle_deg, face_angles, shared
 from codesign.network import recalibrate
@@ -31,6 +31,7 @@ from metalens.ground.errors import ConfigError
 from metalens.image import Imager, UniformImager, low_snr
 
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
+TURNS = 4  # corrections of where an eye looks, each twenty times as fine as the one before
 BEFORE, EACH = 100_000, 120  # first number of the people who calibrated before, and their frames
 
 
@@ -108,20 +109,33 @@ def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tupl
     person = eye.draw(1, (config.seed, PEOPLE, subject), motion=replace(scenes.settings.motion, scale=0.0))
     base = person[torch.zeros(n, dtype=torch.int64)]
     state, stimulus = (g.ravel() for g in np.meshgrid(np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"))
-    kappa = torch.stack([base.trait("kappa_x_rad"), base.trait("kappa_y_rad")], 1)
-    looks = np.radians(stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2)))
+    looks = stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2))
     traits = base.traits.clone()
     radius = list(POPULATION).index("pupil_radius_um")
     traits[:, radius] *= torch.from_numpy(np.clip(1 + config.pupil_sd * rng.standard_normal(n), 0.7, 1.3))
     states = replace(
         base,
         traits=traits,
-        gaze_rad=torch.from_numpy(looks) + kappa,  # the visual axis lies nasal of and above the optic axis
         torsion_rad=torch.zeros(n, dtype=torch.float64),
         slip_um=torch.from_numpy(slips[state] * 1e3),
         aperture=torch.from_numpy(np.clip(1 + 0.05 * rng.standard_normal(n), 0.8, 1.15)),
     )
-    return states, Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
+    trial = Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
+    return turned_to(states, looks, scenes.rig), trial
+
+
+def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
+    """States whose visual axes point along angles (n, 2) across and down, in the frame of the face: to 1e-5 degrees.
+
+    The visual axis lies nasal of and above the optic axis, by which eyes are turned; what that leaves is corrected.
+    """
+    kappa = torch.stack([states.trait("kappa_x_rad"), states.trait("kappa_y_rad")], 1)
+    straight = torch.zeros_like(states.mount_rad)
+    found = replace(states, gaze_rad=torch.from_numpy(np.radians(looks_deg)) + kappa, mount_rad=straight)
+    for _ in range(TURNS):
+        miss = looks_deg - face_angles(eye.directions(found, rig)[1].numpy(), rig.elevation_rad)
+        found = replace(found, gaze_rad=found.gaze_rad + torch.from_numpy(np.radians(miss)))
+    return replace(found, mount_rad=states.mount_rad)
 
 
 def through(

@@ -47,6 +47,8 @@ class End:
 def finished(run: Run) -> list[End]:
     """The ends of :func:`finish`, a budget each.
 
+    ``mmacs``: that run for a frame. A search holds its budget to the smooth count, beside which it may lie where the
+    pitch does not divide the image, or a network's resolution the pixels.
     ``effective_pitch_um``: distance of the cells that the network sees: of pixels binned to its resolution.
     ``axial_coverage_90``: share of test frames within the network's calibrated 90 % interval, whose mean half width is
     ``axial_interval_mm``. ``window_depth_mm``: mean error of the depth of the windows.
@@ -66,7 +68,7 @@ def finished(run: Run) -> list[End]:
         trainer = _tuned(run, best.architecture, i)
         net, architecture = trainer.model.net, best.architecture
         recalibrate(net, architecture, assess.parts(measured))
-        row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": best.macs / 1e6}
+        row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": run.counted(architecture) / 1e6}
         row["effective_pitch_um"] = float(run.trainer.model.pitch_um.detach()) / architecture.resolution
         reach = widths(assess.predict(net, architecture, apart, settings.inner), apart)
         plain = assess.predict(net, architecture, tests[""], settings.inner)

@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 
 from codesign.batches import VALIDATION, EyeScenes, Pool, PoolScenes, SceneConfig, fill, parallel
@@ -21,6 +22,7 @@ from codesign.train.words import Part
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
 from metalens.image import Sensor
+from metalens.image.sensor import pixel_count
 
 Preset = Literal["smoke", "laptop", "paper"]
 
@@ -122,6 +124,13 @@ class Run:
         pitch = self.trainer.model.pitch_um.detach()
         cost.input_size(self.window_um, float(pitch), architecture.resolution)
         return float(network_macs(self.trainer.model.net, architecture, self.window_um, pitch))
+
+    def counted(self, architecture: Architecture) -> int:
+        """Multiply-accumulates that run for a frame of whole pixels; :meth:`macs` goes smoothly with the pitch."""
+        settings, pitch = self.settings, float(self.trainer.model.pitch_um.detach())
+        pixels = pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
+        sizes = np.array([round(pixels * architecture.resolution)])
+        return int(self.trainer.model.net.counts(architecture, sizes)[0])
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""

@@ -1,6 +1,7 @@
 """A whole run at the smallest size: presets, stop and resume bit for bit, search within budgets, refusals by name."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -9,8 +10,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from codesign.commands import codesign as command_codesign
+from codesign.network.architecture import smallest
 from codesign.train import run
 from codesign.train.finish import finish, finished
 from metalens.ground.errors import ConfigError, TrainingError
@@ -139,6 +142,19 @@ def test_bad_configs_are_refused_by_name(tmp_path, change, message):
 def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
     with pytest.raises(TrainingError, match="below the smallest network"):
         run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+
+
+def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
+    """A pitch that does not divide the image and a resolution that does not divide the pixels, by torch's counter."""
+    pitch = 1.07 * settings.run.pitch_um
+    going = run.start(replace(settings, run=replace(settings.run, pitch_um=pitch)))
+    net = going.trainer.model.net.eval()
+    chosen = replace(smallest(settings.space), resolution=0.87)
+    pixels = math.ceil(settings.scenes.pixels * settings.optics.sample_um / pitch)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        net(torch.zeros(1, 1, pixels, pixels), chosen)
+    assert going.counted(chosen) == counter.get_total_flops() // 2
+    assert going.macs(chosen) != pytest.approx(going.counted(chosen), rel=1e-4)
 
 
 def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
