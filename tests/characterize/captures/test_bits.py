@@ -51,6 +51,11 @@ def test_counts_in_the_highest_bits_are_shifted_back_with_all_beside_them(bits):
         assert beside[1] == pytest.approx(np.array([[5.25, 1.5, 2.0]]))
 
 
+def test_even_counts_are_shifted_back_by_no_more_than_was_stated():
+    even = frames(4095) & 0xFFE
+    assert right_align(even << 4, 12, "a.tif")[0].tolist() == even.tolist()
+
+
 def test_frames_that_hide_a_shift_are_told_by_the_dark_frame_beside_them():
     """Even counts of 16 bits would be taken for 15 shifted ones; one odd count of the dark frame shows they are not."""
     even = frames(32_767) << 1
@@ -78,6 +83,7 @@ def test_real_and_negative_counts_are_taken_as_they_are(given):
         assert bits == told
         assert note == "counts are real numbers: taken as they are"
         assert beside[0] is dark
+    assert right_align(given, None, "a.tif")[1] == 16
 
 
 def test_stated_bits_hold_the_counts_at_one_end_or_the_other():

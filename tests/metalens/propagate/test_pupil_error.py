@@ -10,7 +10,15 @@ from metalens.propagate import Case, estimate
 from metalens.propagate.estimate import Sample
 
 CASE = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400, 1 / 900, 1 / 2500), (14.0, -8.5), 0.6, (3, 4))
-BESIDE = replace(CASE, samples=(2, 2), centre_um=(15.5, -8.1))  # with the first, sixteen pixels: all are looked at
+CASES = [  # sixteen pixels: all are looked at
+    replace(CASE, samples=samples, centre_um=centre)
+    for samples, centre in (
+        ((2, 3), (14.0, -8.5)),
+        ((1, 4), (15.5, -8.1)),
+        ((4, 1), (12.1, -7.7)),
+        ((2, 1), (14.7, -9.9)),
+    )
+]
 SIGNS = np.array([1.0, -1.0, 0.5])
 
 
@@ -71,14 +79,13 @@ def by_sums(windows, seen, depths):
 
 @pytest.mark.parametrize("orders", [(5, 6), (14, 15)])
 def test_every_pixel_is_seen_with_factors_of_its_own(orders):
-    """Two windows of two wavelengths, of three depths the outer two; factors of degree 2 are exact on twelve nodes."""
-    green = replace(CASE, wavelength_um=0.53), replace(BESIDE, wavelength_um=0.53)
+    """Four windows of two wavelengths, of three depths the outer two; factors of degree 2 are exact on twelve nodes."""
     windows = [
-        [sample(CASE, orders, 0.7, 1), sample(green[0], orders, 0.4, 2)],
-        [sample(BESIDE, orders, 0.7, 3), sample(green[1], orders, 0.4, 4)],
+        [sample(case, orders, 0.7, 2 * n), sample(replace(case, wavelength_um=0.53), orders, 0.4, 2 * n + 1)]
+        for n, case in enumerate(CASES)
     ]
     rng = np.random.default_rng(5)
-    seen = [rng.uniform(0.5, 2.0, (3, 3, 4)), rng.uniform(0.5, 2.0, (3, 2, 2))]
+    seen = [rng.uniform(0.5, 2.0, (3, *case.samples)) for case in CASES]
     got = estimate.pupil_error(windows, seen, factors)
     assert got == pytest.approx(by_sums(windows, seen, np.array([0, 2])), rel=1e-8)
 
@@ -90,8 +97,10 @@ def one_map(case):
 
 
 def test_a_scalar_is_held_as_its_square_and_many_nodes_are_judged_at_one_depth(monkeypatch):
-    alone = [[sample(replace(CASE, samples=(2, 4)), (5, 6), 0.7, 6, held=False)]]  # eight pixels, all looked at
-    seen = [np.random.default_rng(7).uniform(0.5, 2.0, (3, 2, 4))]
+    one, other = replace(CASE, samples=(2, 3)), replace(CASE, samples=(1, 2))  # eight pixels, all looked at
+    alone = [[sample(one, (5, 6), 0.7, 6, held=False)], [sample(other, (4, 5), 0.7, 7, held=False)]]
+    rng = np.random.default_rng(7)
+    seen = [rng.uniform(0.5, 2.0, (3, 2, 3)), rng.uniform(0.5, 2.0, (3, 1, 2))]
     for depths, work in (([0, 2], 30 * 8 * 8), ([0], 30 * 8 * 8 - 1)):
         monkeypatch.setattr(estimate, "WORK", work)
         got = estimate.pupil_error(alone, seen, one_map)
@@ -110,3 +119,18 @@ def test_of_few_pixels_half_of_the_plain_part_is_left(monkeypatch):
     plain = ((0.1 * np.take_along_axis(share, points, 1)) ** 2 / chance).mean(1).sum()
     assert got == pytest.approx(1.7 * np.sqrt(0.5 * plain / (share**2).sum()), rel=1e-9)
     assert energy == pytest.approx(light[[0, 2]].sum((1, 2)))
+
+
+def test_factors_are_formed_on_twelve_nodes_where_the_lens_has_more():
+    """Shares of a node are Lagrange's: places are given back, and a polynomial of degree 11 at each of them."""
+    few = np.array([-3.0, 1.0, 2.5])
+    for places in (few, np.full(20, 4.0)):
+        nodes, shares = estimate._coarse(places)
+        assert nodes is places
+        assert np.array_equal(shares, np.eye(len(places)))
+    places = np.linspace(-7.0, 31.0, 40)
+    nodes, shares = estimate._coarse(places)
+    assert nodes.shape == (12,)
+    assert shares.shape == (12, 40)
+    series = np.polynomial.Polynomial(np.random.default_rng(3).normal(size=12), domain=(-7, 31))
+    assert series(nodes) @ shares == pytest.approx(series(places), abs=1e-9)

@@ -1,0 +1,135 @@
+"""Causes that a fit leaves out: what each does to images linear in everything, and how much of it is likely."""
+
+import math
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from characterize.inference import causes
+from characterize.model import MODES, PLACE, Known, prior_rad, vector
+from metalens.made import Bends, named
+
+SHAPE = (4, 5, 7)
+RNG = np.random.default_rng(41)
+SLOPES = RNG.normal(size=(len(PLACE), *SHAPE))
+LIGHT, LEANING, MOVED = RNG.uniform(3, 9, SHAPE), RNG.normal(size=SHAPE), RNG.normal(size=(MODES + 3, *SHAPE))
+LENS = SimpleNamespace(
+    wavelength_um=0.87,
+    diameters=SimpleNamespace(radius_um=300.0),
+    sensor_distance_um=1100.0,
+    source_distance_um=5200.0,
+    cell=SimpleNamespace(sidewall_rad=0.0),
+)
+
+
+@dataclass
+class Sensor:
+    pixel_um: float = 3.0
+    rows: int = 5
+    columns: int = 7
+
+
+@dataclass
+class Model:
+    """Images that are linear in parameters, in the wall's angle, in smooth phases and in the pixel."""
+
+    wall_rad: float = 0.0
+    moved: tuple[float, ...] = ()
+    setting: Sensor = field(default_factory=Sensor)
+    grid: Sensor = field(default_factory=Sensor)
+    lens: SimpleNamespace = field(default_factory=lambda: LENS)
+    modes: tuple[int, ...] = ()
+
+    def images(self, x, names=()):
+        light = LIGHT + np.tensordot(x, SLOPES, 1) + self.wall_rad * LEANING
+        light = light + np.tensordot(np.array(self.moved), MOVED[: len(self.moved)], 1)
+        slopes = [MOVED[int(n[9:])] if n.startswith("residual_") else SLOPES[PLACE[n]] for n in names]
+        return light * (1 + 5 * (self.setting.pixel_um / 3 - 1)) * self.grid.pixel_um / self.setting.pixel_um, slopes
+
+    def with_walls(self, rad):
+        return replace(self, wall_rad=rad)
+
+    def with_residual(self, amounts, shape):
+        return replace(self, moved=tuple(amounts))
+
+
+def found(names=("bias_nm",), known=None, unfitted=None):
+    x = vector({"bias_nm": 2.0, "background_e": 1.5, "index": 0.004})
+    task = SimpleNamespace(model=Model(), names=names, known=known or {}, unfitted=unfitted or {})
+    image = task.model.images(x)[0]
+    slopes = {name: SLOPES[PLACE[name]] for name in ("stage_zero_um", *named(Bends))}
+    return {one.cause: one for one in causes.changes(task, x, image, slopes)}, image
+
+
+def test_every_cause_changes_the_images_by_its_amount_and_is_as_likely_as_its_size():
+    """Sizes that nobody stated: a source of 5 um, a spectrum of 1 nm (both squared), saddles of 10 nm, a wall of 2
+    degrees, an index of 0.02, tilts of 1 degree, a plate of 100 um and its tilts of 5 degrees."""
+    every, _ = found()
+    known = {
+        "a source of finite size": ("pinhole_um", 6, (5 / 6) ** 2),
+        "a spectrum of finite width": ("bandwidth_nm", 2, 1 / 4),
+        "a tilt of the lens about y": ("tilt_x_deg", 0.3, 1 / 0.3),
+        "a tilt of the lens about x": ("tilt_y_deg", 0.3, 1 / 0.3),
+        "a saddle of the diameters": ("bias_a_nm", 3, 10 / 3),
+        "an oblique saddle of the diameters": ("bias_o_nm", 3, 10 / 3),
+        "a tilted side wall": ("sidewall_deg", 0.5, 2 / 0.5),
+        "another refractive index": ("index", 0.01, 0.02 / 0.01),
+        "a plate of glass in the beam": ("glass_um", 100, 1.0),
+        "a tilt of 100 um of glass about y": ("glass_tilt_x_deg", 5, 1.0),
+        "a tilt of 100 um of glass about x": ("glass_tilt_y_deg", 5, 1.0),
+    }
+    for cause, (name, amount, sigma) in known.items():
+        one = every[cause]
+        assert one.images == pytest.approx(amount * SLOPES[None, PLACE[name]], abs=1e-9), cause
+        assert one.amount == amount
+        assert one.sigma == pytest.approx(sigma), cause
+        assert one.frees == (() if "of glass" in cause and "tilt" in cause else (name,))
+        assert one.of_mask == (name in ("bias_a_nm", "bias_o_nm", "sidewall_deg", "index"))
+
+
+def test_walls_pixels_and_uneven_light_have_units_of_their_own():
+    every, image = found()
+    leaning = every["a side wall that leans about half height"]
+    assert leaning.images == pytest.approx(math.radians(1.5) * LEANING[None])
+    assert (leaning.amount, leaning.sigma) == (pytest.approx(2.25), pytest.approx((2 / 1.5) ** 2))
+    assert leaning.roughly
+    assert leaning.of_mask
+    pitch = every["a wrong pixel pitch"]  # 1 % of it, of which 1 % is likely
+    assert pitch.images == pytest.approx(0.05 * image[None], rel=1e-9)
+    assert (pitch.amount, pitch.sigma) == (1.0, 1.0)
+    uneven = every["uneven illumination"]
+    assert uneven.images == pytest.approx(0.2 * SLOPES[[PLACE[n] for n in ("light_x", "light_y", "light_r")]])
+    assert uneven.amount == 0.2
+    assert uneven.sigma == pytest.approx([1.0, 1.0, 1.0])
+    assert uneven.frees == ("light_x", "light_y", "light_r")
+    some, _ = found(names=("light_y",), known={"light_r": Known("light_r", 0.0, 0.05)})
+    assert some["uneven illumination"].sigma == pytest.approx([1.0, 0.25])
+
+
+def test_write_fields_are_as_far_out_of_place_as_stated_and_smooth_phases_as_their_prior():
+    """32 fields, 1 um each: 60 nm where nobody says, what is stated in nm."""
+    for unfitted, sigma in ({}, 0.06), ({"stitching_nm": 11.0}, 0.011):
+        every, _ = found(unfitted=unfitted)
+        fields = every["write fields out of place"]
+        assert fields.images.shape == (32, *SHAPE)
+        assert fields.sigma == pytest.approx(sigma)
+        assert fields.roughly
+        assert not fields.sought
+    shapes = np.concatenate([MOVED, SLOPES[[PLACE[n] for n in named(Bends)]]])
+    assert fields.images == pytest.approx(np.tensordot(causes.write_fields(LENS), shapes, 1), abs=1e-9)
+    smooth = every["a smooth phase that no parameter describes"]
+    assert smooth.images == pytest.approx(MOVED[:MODES] * prior_rad()[:, None, None, None])
+    half = every["a write field off along y"]
+    assert half.images == pytest.approx(0.05 * MOVED[None, 0])
+    assert half.amount == pytest.approx(50.0)
+
+
+def test_what_is_fitted_or_stated_exactly_is_no_cause():
+    every, _ = found(names=("bias_nm", "tilt_x_deg", "glass_um", "light_x", "light_y", "light_r"))
+    assert "a tilt of the lens about y" not in every
+    assert "a plate of glass in the beam" not in every
+    assert "uneven illumination" not in every
+    none, _ = found(known={"glass_um": Known("glass_um", 0.0)})
+    assert not [cause for cause in none if "of glass about" in cause]

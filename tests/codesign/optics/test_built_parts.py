@@ -1,0 +1,103 @@
+"""Parts of a made lens's PSFs by hand: pillars gathered to cells, cells on nodes, harmonics on samples, waves."""
+
+import dataclasses
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import made_lens as m
+
+from characterize.model.parameters import NAMES, vector
+from codesign.optics import built
+from metalens.image import Pupil, coordinates
+
+GATHER = getattr(built._gather, "py_func", built._gather)  # as written: a place beyond the table is an error
+
+
+def test_cells_hold_the_mean_of_their_pillars_with_the_bias_where_each_stands():
+    """5 x 7 pillars in blocks of 3; bias 0.01 + 0.004 u - 0.002 v + 0.003 uv + 0.005 u² of a table by place."""
+    rng = np.random.default_rng(4)
+    diameter = rng.uniform(0.1, 0.3, (5, 7)).astype(np.float32)
+    diameter[1, 2], diameter[3:, 3:6] = 0, 0  # one pillar is missing, and all of a cell
+    carrier = np.exp(2j * np.pi * rng.random((5, 7))).astype(np.complex64)
+    u, v = np.linspace(-0.9, 0.8, 7), np.linspace(-0.5, 1.0, 5)
+    bias = np.array([[0.01, -0.002, 0.0], [0.004, 0.003, 0.0], [0.005, 0.0, 0.0]])
+    low, step = 0.05, 1e-3
+    table = np.exp(1j * np.arange(400) / 50).astype(np.complex64)
+    got = GATHER(diameter, carrier, table, low, step, u, v, bias, 3)
+    assert got.shape == (2, 3)
+    for row, column in np.ndindex(2, 3):
+        terms = []
+        for i, j in np.ndindex(5, 7):
+            if (i // 3, j // 3) == (row, column) and diameter[i, j] > 0:
+                x, y = u[j], v[i]
+                wide = diameter[i, j] + 0.01 + 0.004 * x - 0.002 * y + 0.003 * x * y + 0.005 * x * x
+                terms.append(table[round((wide - low) / step)] * carrier[i, j])
+        want = np.mean(terms) if terms else 0.0
+        assert got[row, column] == pytest.approx(want, abs=1e-6)
+    assert got[1, 1] == 0
+
+
+def test_empty_cells_take_the_nearest_filled_one():
+    cells = np.array([[0, 0, 2 + 1j, 0], [0, 3j, 0, 0], [0, 0, 0, 5.0]])
+    filled = built._filled(cells)
+    assert filled[cells != 0].tolist() == cells[cells != 0].tolist()
+    assert filled[2, 0] == 3j
+    assert filled[0, 3] == 2 + 1j
+    assert filled[1, 3] == 5.0
+
+
+def test_a_lens_keeps_what_is_made_and_leaves_its_bench():
+    x = np.arange(1.0, len(NAMES) + 1)
+    kept = built.of_lens(x)
+    for name, before, after in zip(NAMES, x, kept, strict=True):
+        assert after == (before if name in built.OF_LENS else vector()[NAMES.index(name)])
+    assert "distance_um" in built.OF_LENS
+
+
+def test_harmonics_of_a_period_are_integrated_over_samples_up_to_half_their_rate():
+    """Waves of the period come out as their mean over each sample, those beyond half a wave a sample not at all, the
+    last in part."""
+    lens = built.MadeLens(m.small(), m.OPTICS)
+    pupil = Pupil(60.2, 300.0, 0.85, 64)
+    period, sample = pupil.period_um, 3.0
+    edge = period / (2 * sample)
+    harmonics, columns = lens._samples(pupil)
+    assert harmonics == math.floor(edge + 0.5) + 1
+    place = (np.arange(11) - 5) * sample
+    for at, order in enumerate(range(-harmonics + 1, harmonics)):
+        f, share = order / period, min(1.0, max(0.0, edge - abs(order) + 0.5))
+        ends = [np.exp(2j * np.pi * f * (place + side * sample / 2)) for side in (1, -1)]
+        mean = (ends[0] - ends[1]) / (2j * np.pi * f * sample) if order else np.ones(11)
+        assert columns[:, at].numpy() == pytest.approx(share * mean, abs=2e-6)
+
+
+@pytest.mark.parametrize(("sample_um", "nodes"), [(3.0, 64), (30.0, 202)])
+def test_nodes_hold_the_window_twice_and_sixty_four_at_least(sample_um, nodes):
+    """15 samples (four are spare) by the direction cosine of the rim, 0.18995 at half a pitch beyond the last pillar,
+    over the wavelength: 100.6 to either side."""
+    lens = built.MadeLens(m.small(), dataclasses.replace(m.OPTICS, sample_um=sample_um))
+    pupil = lens._pupil(310.0)
+    assert pupil.radius_um == lens.design.diameters.radius_um + 0.2
+    assert pupil.edge == pytest.approx(0.18995, abs=1e-5)
+    assert pupil.nodes == nodes
+    assert pupil.sensor_distance_um == 310.0
+
+
+def test_a_wave_of_another_distance_is_the_design_s_defocused():
+    """exp(ik (√(r² + d'²) - d' - √(r² + d²) + d)) within the rim, nothing beyond."""
+    lens = built.MadeLens(m.small(), m.OPTICS)
+    plain, moved = lens.wave(), lens.wave(vector({"distance_um": 7.0}))
+    x, y = (c.numpy() for c in coordinates(lens._pupil(300.0)))
+    r = np.hypot(x, y)
+    inside = np.abs(plain) > 0
+    assert np.array_equal(inside, np.abs(moved) > 0)
+    assert (r[inside] < 62).all()
+    assert inside.sum() == pytest.approx(math.pi / 4 * inside.size, rel=0.05)  # nodes across the aperture
+    paths = np.hypot(r, 307.0) - 307.0 - np.hypot(r, 300.0) + 300.0
+    turned = plain[inside] * np.exp(2j * np.pi / 0.85 * paths[inside])
+    assert moved[inside] == pytest.approx(turned, abs=1e-6)
