@@ -302,7 +302,7 @@ def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> 
     low, high = record.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(
-            f"{record.name} at {wavelength_um} um: its source holds from {low} to {high} um ({record.source}); "
+            f"{record.name} at {wavelength_um} um: its source holds from {low:.6g} to {high:.6g} um ({record.source}); "
             f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:

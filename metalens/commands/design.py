@@ -136,12 +136,11 @@ def run(options: Options) -> int:
         raise ConfigError("along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it")
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
-    wanted = made.wanted
-    values = words.values(made.quality, made.check, made.unlike)
-    text = words.text(_head(wanted, target, made.quality), wanted.layers, made.quality, made.check, made.unlike)
+    values, head = words.values(made.quality, made.check, made.unlike), _head(made.wanted, target, made.quality)
+    text = words.text(head + made.held, made.wanted.layers, made.quality, made.check, made.unlike)
     if made.conversion is not None:
-        values["circular"] = {"hand": wanted.hand, **asdict(made.conversion)}
-        text = f"{text}\n{words.converted(made.conversion, made.quality, wanted.hand)}"
+        values["circular"] = {"hand": made.wanted.hand, **asdict(made.conversion)}
+        text = f"{text}\n{words.converted(made.conversion, made.quality, made.wanted.hand)}"
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     options.console.result(values, text)
@@ -232,7 +231,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(wanted, quality, check, judged, conversion, found)
+    return Outcome(wanted, quality, check, judged, conversion, found, words.held(made))
 
 
 def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
@@ -249,7 +248,7 @@ def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; judged: of a free form; conversion: of
-    circular light; unlike: what neighbours leave of the efficiency."""
+    circular light; unlike: what neighbours leave of the efficiency; held: which light it is for, where that matters."""
 
     wanted: Design
     quality: Quality
@@ -257,6 +256,7 @@ class Outcome:
     judged: "_Judged | None"
     conversion: Conversion | None
     unlike: design.Unlike | None
+    held: str
 
 
 def _filled(layers: Layers, cell: Cell) -> Layers:

@@ -105,6 +105,16 @@ def _films(layers: Layers) -> list[str]:
     return found
 
 
+def held(made: Lens) -> str:
+    """Which light a lens is for, in words: a line, where its pillars of one size answer x and y apart."""
+    if not made.one_light:
+        return ""
+    return (
+        f"\n  all of it for {made.one_light}: {made.cell.described} answers x and y apart, and the library\n"
+        "  holds no more (of rectangles and ellipses lengths_um in [sweep] makes one for both)"
+    )
+
+
 def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> str:
     """Lines about a lens below a head; layers: films that its phase is corrected for."""
     lines = [

@@ -121,6 +121,7 @@ def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failur
         "seconds": seconds,
         "max_error": float(made.t_error.max()),
         "median_error": float(np.median(made.t_error)),
+        "polarizations": list(made.polarization),
         "failures": failures,
     }
     if made.turned is not None:
@@ -161,6 +162,8 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
         ]
     if made.turned is not None:
         lines += _turned_lines(made.turned)
+    elif made.polarization == ("x",) and not made.cell.alike:
+        lines.append("  all of it for light along x: these pillars answer light along y otherwise")
     return "\n".join(lines + [f"  FAILED: {failure}" for failure in failures])
 
 

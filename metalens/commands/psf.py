@@ -195,8 +195,10 @@ def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
 
 def _of_design(path: Path, settings: Settings, made: lens.Lens) -> psf.PsfStack:
     """PSFs of a lens file, for the polarisation that is asked for."""
-    if settings.light != "both" and made.pairs is None:
-        raise ConfigError(f"{path}: light = {settings.light!r} is for pillars of two sizes; these treat x and y alike")
+    if settings.light != "both" and made.pairs is None and made.one_light != f"light along {settings.light}":
+        known = f"know {made.one_light} alone" if made.one_light else "treat x and y alike"
+        known = "are turned, for circular light" if made.hand else known
+        raise ConfigError(f"{path}: light = {settings.light!r} is for pillars of two sizes; these {known}")
     provenance = _provenance(path, settings)
     if made.pairs is None:
         return _from_lens(made, settings, provenance)

@@ -69,7 +69,7 @@ class PillarWave:
     Light that single pillars scatter out of their cell's mean is lost to the image; it lands far outside the window.
 
     Raises:
-        SceneError: another lattice than a square one, or turned pillars.
+        SceneError: another lattice than a square one, turned pillars, or pillars that answer x and y apart.
     """
 
     def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
@@ -77,6 +77,11 @@ class PillarWave:
             raise SceneError(
                 f"pillars on a {lens.diameters.lattice.kind} lattice{', turned one by one' if lens.hand else ''}: the "
                 "image of the whole field knows square lattices of pillars that are not turned (metalens.psf takes any)"
+            )
+        if lens.one_light:
+            raise SceneError(
+                f"pillars ({lens.cell.described}) that answer x and y apart, of which the lens knows {lens.one_light} "
+                "alone: the image is of unpolarised light (metalens psf says of which light it is)"
             )
         self.lens = lens
         self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)

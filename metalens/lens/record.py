@@ -84,6 +84,13 @@ class Lens:
         """Σ thickness / index from the pillars to the sensor: samples at x um show directions of tangent x over it."""
         return self.layers.after(self.sensor_distance_um, self.wavelength_um).reduced_um
 
+    @property
+    def one_light(self) -> str:
+        """Which light the proxy is of, in words, where pillars of one size answer x and y apart; empty for others."""
+        if self.hand or self.pairs is not None or self.cell.alike:
+            return ""
+        return "the mean of both polarisations" if self.proxy.max_angle_rad > 0 else "light along x"
+
     def seen(self, light: Literal["x", "y"]) -> "Lens":
         """The lens for light polarised along x or y, where it focuses that."""
         if self.pairs is None or self.light == light:

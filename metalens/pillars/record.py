@@ -175,8 +175,9 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
         CellError, MaterialError: as :func:`check`.
     """
     films = [film.material for film in (*cell.under, *cell.over)]
+    layered = [m for layer in cell.layers for m in (layer.material, layer.between, layer.coat) if m is not None]
     for wavelength in sweep.wavelengths_um:
-        for material in (cell.pillar, cell.between, *films):
+        for material in (cell.pillar, cell.between, *films, *layered):
             index(material, wavelength)
         for side in ("substrate", "cover"):
             n = index(getattr(cell, side), wavelength)

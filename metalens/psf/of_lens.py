@@ -68,8 +68,9 @@ def from_lens(
 
     The proxy is asked at the angle of every direction where its library has angles, else at normal incidence, which
     ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the proxy holds the mean of both
-    polarisations, at normal incidence they are alike. The lens' films and cover are gone through, and the factor of its
-    own unlike neighbours where it holds their rows (``lens.neighbours``).
+    polarisations, at normal incidence they are alike. Where pillars of one size answer x and y apart, the PSFs are
+    those of the light that the proxy is of (``lens.one_light``), which ``reason`` says. The lens' films and cover are
+    gone through, and the factor of its own unlike neighbours where it holds their rows (``lens.neighbours``).
 
     Args:
         spectrum: wavelengths and weights, or a diode or measured curves, which get as few wavelengths as the tolerance
@@ -81,8 +82,9 @@ def from_lens(
             numbers.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``vector`` for a lens
-            of turned pillars (``auto`` takes the scalar there; its error is in the budget).
+        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``flux`` or ``vector``
+            for turned pillars, those of two sizes and those that answer x and y apart (``auto`` takes the scalar there;
+            its error is in the budget).
     """
     how: dict[str, Any] = {"tolerance": tolerance, "polarisation": polarisation, "own": left_out or _known(lens)}
     how["provenance"] = provenance or Provenance()
@@ -208,13 +210,15 @@ def _of_nodes(
         )
         judged = dataclasses.replace(nodes, error=_spectral(lens, view, angle, parts[-1], nodes))
         budgets.append(_budget(lens, angle, parts[-1], judged, counted, own))
-    return _told(_joined(parts, provenance), worst(budgets), tolerance, own)
+    held = f"of {lens.one_light}: these pillars answer x and y apart" if lens.one_light else ""
+    return _told(_joined(parts, provenance), worst(budgets), tolerance, held, own)
 
 
-def _told(stack: PsfStack, found: Budget, tolerance: float, own: LeftOut) -> PsfStack:
+def _told(stack: PsfStack, found: Budget, tolerance: float, held: str, own: LeftOut) -> PsfStack:
     """With the budget of all directions, and in words what it is of; the stack's own tolerance is that of the sums."""
     above = [ABOVE] if found.computed > tolerance and stack.converged else []
-    words = "; ".join([stack.reason, *above, *([AT_NORMAL] if found.angle else []), own.words])
+    told = [stack.reason, *above, held, AT_NORMAL if found.angle else "", own.words]
+    words = "; ".join(filter(None, told))
     return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
 
 
@@ -253,9 +257,10 @@ def _budget(
 
 def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> Polarisation:
     """``auto`` decided."""
-    if lens.hand or lens.pairs is not None:
+    if lens.hand or lens.pairs is not None or lens.one_light:
         if polarisation in ("flux", "vector"):
-            own = "is for circular light" if lens.hand else "has pillars of two sizes"
+            sized = "has pillars of two sizes" if lens.pairs is not None else f"knows {lens.one_light} alone"
+            own = "is for circular light" if lens.hand else sized
             raise PropagationError(
                 f"polarisation = {polarisation!r} is for pillars that treat x and y alike; this lens {own}: take "
                 "'scalar'"

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from metalens.cell import Cell, Film, Index
+from metalens.cell.shapes.straight import Rectangle
 from metalens.design import Focus, profiles
 from metalens.field import Grid, Layers, Optics, PillarWave, Window, imager, psfs
 from metalens.field.patches import relative
+from metalens.ground.errors import SceneError
 from metalens.image import integrate
 from metalens.lens import DiameterMap, Lens, Neighbours
 from metalens.pillars import Proxy
@@ -141,3 +143,14 @@ def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
     assert float(relative(got, want / want.sum())) < 3e-2
     bare = imager(glazed, grid, tolerance=0.1, layers=Layers()).stack[middle[0], middle[1], 0].double()
     assert float(relative(bare, want / want.sum())) > 0.1
+
+
+def test_pillars_that_answer_x_and_y_apart_are_no_unpolarised_image(lens):
+    """A rectangle's proxy is of light along x (or the mean at angles): the image of both polarisations is refused."""
+    oblong = replace(lens, cell=replace(lens.cell, shape=Rectangle(ratio=0.6)))
+    with pytest.raises(SceneError, match="the lens knows light along x alone"):
+        PillarWave(oblong)
+    angled = replace(oblong, proxy=replace(PROXY, max_angle_rad=0.3))
+    with pytest.raises(SceneError, match="the mean of both polarisations"):
+        PillarWave(angled)
+    PillarWave(replace(lens, cell=replace(lens.cell, shape=Rectangle(ratio=1.0))))

@@ -12,7 +12,7 @@ import pytest
 
 from metalens import library, modal, rcwa
 from metalens.cell.light import Light
-from metalens.cell.record import Cell, Film, Index
+from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError, DomainError, MaterialError, StoreError
@@ -173,6 +173,15 @@ def test_impossible_diameters_and_wavelengths_are_refused():
             library.check(DEFAULT_CELL, Sweep(diameters_um=span))
     with pytest.raises(MaterialError):
         library.check(Cell(0.2, 0.7, "a-Si"), Sweep(wavelengths_um=(30.0,)))
+
+
+@pytest.mark.parametrize("part", [{"material": "Si"}, {"between": "Si"}, {"coat": "Si", "coat_um": 0.01}])
+def test_materials_of_layers_are_asked_for_before_anything_is_solved(part):
+    """The shipped table of silicon ends below 30 um; plain numbers elsewhere hold at any wavelength."""
+    air = Index(1.0)
+    cell = Cell(5.0, 4.0, Index(3.0), air, air, air, shape=Square(), layers=(Layer(3.0), Layer(1.0, **part)))
+    with pytest.raises(MaterialError, match="Si at 30"):
+        library.check(cell, Sweep(wavelengths_um=(30.0,), diameters_um=(1.0, 3.0)))
 
 
 def test_workers_pass_refusals_on():

@@ -26,6 +26,7 @@ def lens(knows_angles=0.0):
         proxy=SimpleNamespace(max_angle_rad=knows_angles),
         hand="",
         pairs=None,
+        one_light="",
     )
 
 
