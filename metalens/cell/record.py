@@ -170,6 +170,11 @@ class Cell:
             low, high = (middle, high) if self.gap_um(middle) > gap_um else (low, middle)
         return round(low, 4)
 
+    def size_um(self, width_um: float) -> float:
+        """The size of the shape whose least width across is this."""
+        unit = self.pitch_um / 2
+        return width_um if self.round else width_um * unit / self.outline(unit).narrowest_um
+
     def gap_um(self, size_um: float, *, grow_um: float = 0.0) -> float:
         """Least distance between neighbouring pillars of this size; 0 where they touch."""
         return self.outline(size_um, grow_um=grow_um).gap_um(self.lattice.steps_um(self.pitch_um))

@@ -169,8 +169,7 @@ def printable(
     Raises:
         LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
     """
-    across = cell.outline(cell.pitch_um / 2).narrowest_um / (cell.pitch_um / 2)  # width of a pillar over its size
-    thinnest, widest = limits.min_diameter_nm * 1e-3 / across, cell.widest_um(limits.min_gap_nm * 1e-3)
+    thinnest, widest = cell.size_um(limits.min_diameter_nm * 1e-3), cell.widest_um(limits.min_gap_nm * 1e-3)
     low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
     if low >= high:
         raise LensError(

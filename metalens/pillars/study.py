@@ -28,8 +28,8 @@ class Study:
     pitches_um, heights_um, wavelengths_um: every combination.
     pillar: material of the pillars, on the substrate and under the cover of :class:`metalens.cell.Cell`.
     cell: any cell in its place: substrate, cover, shape, lattice, films, wall and material of every pillar; its pitch
-        and height are those compared, and "diameter" is the size of its shape.
-    min_diameter_um, min_gap_um: what can be printed.
+        and height are those compared, and "diameter" is the size of its shape. Light is along x, at normal incidence.
+    min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and between two.
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t.
@@ -139,11 +139,11 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
     Raises:
         CellError: there is none.
     """
-    low, high = study.min_diameter_um, cell.widest_um(study.min_gap_um)
+    low, high = cell.size_um(study.min_diameter_um), cell.widest_um(study.min_gap_um)
     if low >= high:
         raise CellError(
             f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "
-            f"{high:g} um, below min_diameter_um = {low:g}"
+            f"{high:g} um, min_diameter_um = {study.min_diameter_um:g} takes {low:.4g} um"
         )
     return low, high
 

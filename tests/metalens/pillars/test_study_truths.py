@@ -1,5 +1,6 @@
 """Verdicts on a cell from curves that are typed in: the stretch of most phase, its light, its ends, its error."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index
+from metalens.cell.shapes import Ellipse, Rectangle
+from metalens.ground.errors import CellError
 from metalens.pillars import converted, study
 
 CELL = Cell(0.36, 0.6, Index(3.2), Index(1.45), Index(1.0), Index(1.0))
@@ -93,3 +96,15 @@ def test_the_best_size_converts_most_at_its_worst_wavelength_with_sure_bars():
     assert converted.best_size_um(some) == 0.12
     some.t_error[:] = 0.5
     assert converted.best_size_um(some) == 0.15  # no bar is sure: the most of all
+
+
+@pytest.mark.parametrize(("shape", "least"), [(Rectangle(0.4), 0.2), (Rectangle(2.5), 0.08), (Ellipse(0.5), 0.16)])
+def test_what_can_be_printed_is_the_least_width_of_a_shape_not_its_size(shape, least):
+    """80 nm is the short side: of a rectangle of 0.4 the size along x is 200 nm; of 2.5 it is the size itself."""
+    limits = study.Study(pitches_um=(0.4,), min_diameter_um=0.08, min_gap_um=0.07)
+    cell = dataclasses.replace(CELL, pitch_um=0.4, shape=shape)
+    low, high = study._span(limits, cell)
+    assert low == pytest.approx(least, rel=2e-3)  # an ellipse is measured on a polygon of its area
+    assert high == pytest.approx(0.33 / max(1.0, shape.ratio), abs=2e-4)
+    with pytest.raises(CellError, match=r"min_diameter_um = 0\.3 takes"):
+        study._span(dataclasses.replace(limits, min_diameter_um=0.3, min_gap_um=0.09), cell)
