@@ -103,8 +103,10 @@ def _amount(seen: Array, wave: Array) -> complex:
 def _refined(seen: Array, wave: Array) -> Array:
     """The wave at the top of its peak."""
     step = 0.3 / max(seen.shape)
+    simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
+    ends = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": np.inf}  # whatever the unit of the picture
     found = optimize.minimize(
-        lambda k: -abs(_amount(seen, wave + k * step)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-3}
+        lambda k: -abs(_amount(seen, wave + k * step)), simplex[0], method="Nelder-Mead", options=ends
     )
     return np.asarray(wave + found.x * step)
 

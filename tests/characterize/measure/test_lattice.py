@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from characterize.measure import lattice as lattices
 from characterize.measure import overlay, sem
 from metalens.ground.errors import CaptureError
 from metalens.lens import DiameterMap
@@ -94,3 +95,15 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
         assert abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL  # edges of a blurred rim: as above
         assert 0 < sigma < 1.5
         assert count > 6
+
+
+@pytest.mark.parametrize("level", [4000.0, 1e-9])
+@pytest.mark.parametrize("wave", [(0.0613, 0.1187), (0.117, -0.0342)])
+def test_a_wave_is_refined_to_a_thousandth_of_a_fringe(wave, level):
+    """Under a Hann window, from a quarter of a fringe away, whatever the unit of the picture. Steps end at 1e-3 of 0.3
+    fringes; the wave's own mirror image moves the peak by less."""
+    y, x = np.arange(90), np.arange(120)
+    hann = np.outer(np.sin(np.pi * (y + 0.5) / 90) ** 2, np.sin(np.pi * (x + 0.5) / 120) ** 2)
+    seen = level * hann * np.cos(2 * np.pi * (wave[0] * y[:, None] + wave[1] * x) + 0.7)
+    found = lattices._refined(seen, np.array([wave[0] + 0.25 / 120, wave[1] - 0.2 / 120]))
+    assert found * 120 == pytest.approx(np.array(wave) * 120, abs=2e-3)

@@ -36,6 +36,13 @@ def test_the_degree_is_that_of_the_polynomial():
     assert error < 1e-12  # rounding of a fit to 20 points
 
 
+def test_degrees_up_to_fourteen_are_tried():
+    x = np.cos(np.pi * (np.arange(31) + 0.5) / 31)
+    degree, error = pillar_slopes._degree(x, np.cos(14 * np.arccos(x))[None], 1e-9)
+    assert degree == 14
+    assert error < 1e-11
+
+
 def test_a_degree_that_is_never_enough_comes_with_its_error():
     """|x| by polynomials of degree n is missed by 0.28 / n (Bernstein), of which the held-out points see a part."""
     x = np.cos(np.pi * (np.arange(301) + 0.5) / 301)

@@ -102,3 +102,20 @@ def test_an_edge_is_as_steep_as_the_error_functions_of_all_its_ranges():
     rise = sum(w * math.erf(0.35e-3 / a) / 2 for a, w in zip(alphas, weights, strict=True))
     # an error function is straight to (x / range)^2 / 3, 5e-5 here
     assert assign.straight_edge_error(PointExposure(alphas, weights)) == pytest.approx(rise / CLEARS, rel=1e-4)
+
+
+def test_the_span_of_doses_is_that_of_every_pillar_with_the_closest_tolerance():
+    """Beside those of a block before: doses, and the share that a pillar's dose may be off by its own goal."""
+    own, goal, soft = np.array([9.0, 0.31, 0.44]), np.array([9.0, 1.0, 0.93]), np.array([9.0, 0.05, 0.011])
+    block, field = np.array([[1, 0, 2], [2, 1, 0]]), np.array([[0.1, 0.9, 0.2], [0.31, 0.17, 0.05]])
+    lit = [(1, 0.1), (2, 0.2), (2, 0.31), (1, 0.17)]
+    doses = [(goal[k] - f) / own[k] for k, f in lit]
+    shares = [(goal[k] - f) / goal[k] / min(0.03, soft[k] * d / goal[k]) for (k, f), d in zip(lit, doses, strict=True)]
+    span = getattr(assign._span, "py_func", assign._span)
+    for before, want in (
+        ((np.inf, 0.0, 0.0), (min(doses), max(doses), max(shares))),
+        ((0.7, 5.0, 900.0), (0.7, 5.0, 900.0)),
+    ):
+        found = np.array(before)
+        span(block, field, own, goal, soft, 0.03, found)
+        assert found == pytest.approx(want, rel=1e-12)

@@ -54,6 +54,22 @@ def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(su
     assert sorted(listed(found), key=sort_key) == sorted(listed(placed), key=sort_key)
 
 
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_path):
+    """Beyond the eight quarter turns 300 angles, more than a byte numbers."""
+    write, read = WRITERS[suffix]
+    turns = (*QUARTERS, *(Turn(0.5 + n / 4) for n in range(300)))
+    x = 7 * np.arange(308, dtype=np.int32)
+    placed = Placed(("A",), np.zeros(308, np.int32), x, x[::-1].copy(), np.arange(308, dtype=np.int32), turns)
+    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP", placed=placed)}
+    write(Assembly("TOP", cells, {}), tmp_path / f"a{suffix}")
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    for got, want in zip(sorted(listed(found), key=sort_key), sorted(listed(placed), key=sort_key), strict=True):
+        assert got[2:] == want[2:]
+        assert got[1].mirrored == want[1].mirrored
+        assert got[1].angle_deg == pytest.approx(want[1].angle_deg, abs=1e-9)
+
+
 @given(
     seed=st.integers(0, 10_000),
     shape=st.tuples(st.integers(1, 6), st.integers(1, 5)),

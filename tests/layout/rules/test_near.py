@@ -76,3 +76,23 @@ def test_shapes_that_lie_on_each_other_are_refused_by_number(monkeypatch):
     monkeypatch.setattr(near, "_AT_ONCE", 40)
     with pytest.raises(MaskFileError, match="more than 40 shapes lie on one"):
         near.pairs(many, 5.0)
+
+
+def test_pairs_beside_some_kinds_have_one_of_them_each():
+    some = discs(8, 90, 500, [9.0, 12.0, 40.0, 130.0])
+    beside = np.array([False, True, False, True])
+    one, two = near.pairs(some, 25.0, beside=beside)
+    pairs = [tuple(sorted(pair)) for pair in zip(one.tolist(), two.tolist(), strict=True)]
+    wanted = {(i, j) for i, j in every(some, 25.0) if beside[some.kind[i]] or beside[some.kind[j]]}
+    assert len(pairs) == len(set(pairs))
+    assert set(pairs) == wanted < every(some, 25.0)
+
+
+def test_as_many_pairs_as_are_allowed_are_found(monkeypatch):
+    some = discs(8, 90, 500, [9.0, 12.0, 40.0, 130.0])
+    count = len(every(some, 25.0))
+    monkeypatch.setattr(near, "MOST_PAIRS", count)
+    assert len(found(some, 25.0)) == count
+    monkeypatch.setattr(near, "MOST_PAIRS", count - 1)
+    with pytest.raises(MaskFileError, match="pairs of shapes"):
+        near.pairs(some, 25.0)

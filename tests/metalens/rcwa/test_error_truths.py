@@ -1,5 +1,6 @@
 """Error bars of coupled waves from typed truncations: how far the last ones lie apart, and what is added."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -207,3 +208,26 @@ def test_shifts_are_solved_at_chebyshev_s_diameters_between_foot_and_top():
     want = [0.2 + half * math.cos(math.pi * (n + 0.5) / 4) for n in range(4)]
     assert anchored.node_diameters(leaning, 0.2) == pytest.approx(want, rel=1e-12)
     assert anchored.node_diameters(CELL, 0.2) == (0.2,)
+
+
+@pytest.mark.parametrize(
+    ("gap_um", "times", "wall_rad", "cut"),
+    [(0.0019, 1 + 5 * (1 - 0.0019 / 0.008), 0.0, 0.0), (0.05, 1.0, 0.0, 0.0), (0.05, 1.0, 0.02, 3e-3)],
+)
+def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(monkeypatch, gap_um, times, wall_rad, cut):
+    """Truncations off by 0.1 / reach², trusted less where pillars all but touch, and what is left of a wall."""
+    cell = dataclasses.replace(CELL, sidewall_rad=wall_rad)
+
+    def truncated(this, reach, stages):
+        assert stages == (5 if wall_rad else 0)
+        t = np.diag([0.6 + 0.1 / reach**2, 0.5j])
+        return any_shape.Jones(("x", "y"), t, 0.2 * t, math.nan, np.ones(2), 0, False, "")
+
+    monkeypatch.setattr(any_shape, "_truncated", truncated)
+    monkeypatch.setattr(any_shape.wall, "enough", lambda both, tolerance: (5, 3e-3))
+    found = any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1e-9)
+    lag = len(np.unique(found.earlier[:, 0, 0]))
+    want = times * (5.4 * 0.1 * (1 / (9 - lag) ** 2 - 1 / 81) + 1e-13) + cut
+    assert found.t_error == pytest.approx(want, rel=1e-3)  # the gap between polygons is 3 pm wider
+    assert not found.converged
+    assert any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1.001 * want).converged
