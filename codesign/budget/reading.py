@@ -100,25 +100,34 @@ class Reading:
         people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
         said = f"true pupil and slippage; {people}"
         sphere = gaze_experiment.sphere(self.source, self.config)
-        yield self._grown("subject and calibration", told(still, self.scenes), sphere, said)
+        yield self._grown("subject and calibration", self._error(told(still, self.scenes), sphere), said)
         true = told(self.config, self.scenes)
-        yield self._grown("fixation", true, sphere, f"scatter of {self.config.fixation_deg:g} deg about the stimulus")
-        said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
-        read, how = self._read(self.believed, quiet=True)
-        yield self._grown("reader, pupil", Readings(read.pupil_mm, true.slip_mm), sphere, said)
-        yield self._grown("reader, slippage", read, how, said)
+        said = f"scatter of {self.config.fixation_deg:g} deg about the stimulus"
+        yield self._grown("fixation", self._error(true, sphere), said)
+        yield from self._reader(true, sphere)
         read, how = self._read(self.believed)
-        yield self._grown("sensor noise", read, how, "frames with the sensor's noise")
+        yield self._grown("sensor noise", self._error(read, how), "frames with the sensor's noise")
         for link, optics, psf, said in self._unknown():
             read, how = self._read(optics)
-            yield replace(self._grown(link, read, how, said), psf=psf)
+            yield replace(self._grown(link, self._error(read, how), said), psf=psf)
         self._settle(read, how)
         yield from self._known()
 
-    def _grown(self, link: str, read: Readings, how: Calibrator, method: str) -> Entry:
+    def _reader(self, true: Readings, sphere: Calibrator) -> Iterator[Entry]:
+        """The pupil as read with the true slippage, then all that is read.
+
+        Who reads an axis needs the pupil less than the sphere does: alone it costs at most what all together costs.
+        """
+        said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
+        read, how = self._read(self.believed, quiet=True)
+        together = self._error(read, how)
+        alone = self._error(Readings(read.pupil_mm, true.slip_mm), sphere)
+        yield self._grown("reader, pupil", min(alone, together), said)
+        yield self._grown("reader, slippage", together, said)
+
+    def _grown(self, link: str, error_rad: float, method: str) -> Entry:
         """The entry of one more cause: what the error has more than before, in quadrature; 0 where it has less."""
-        error = angle_deg(self._answers(read, how), self.trial.stimulus_deg)
-        before, self._error_rad = self._error_rad, self._off(error)
+        before, self._error_rad = self._error_rad, error_rad
         gap = self._error_rad**2 - before**2
         return Entry(link, NONE, NONE, math.sqrt(max(gap, 0.0)), method)
 
@@ -202,9 +211,10 @@ class Reading:
     def _judged(self) -> Array:
         return ~np.isin(np.arange(len(self.trial.subject)), gaze_experiment.calibrating(self.trial, self.config))
 
-    def _answers(self, read: Readings, how: Calibrator) -> Array:
-        """(n, 2) gaze, every person calibrated on what was read."""
-        return gaze_experiment.answered(self._taught(read, how), read, self.trial)
+    def _error(self, read: Readings, how: Calibrator) -> float:
+        """Mean error of the answers under axial slippage, rad, every person calibrated on what was read."""
+        answers = gaze_experiment.answered(self._taught(read, how), read, self.trial)
+        return self._off(angle_deg(answers, self.trial.stimulus_deg))
 
     def _taught(self, read: Readings, how: Calibrator) -> dict[int, Person]:
         return gaze_experiment.taught(read, self.trial, self.config, how)

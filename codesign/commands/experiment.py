@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import bootstrap
+from codesign.adapt import Source, bootstrap
 from codesign.adapt import train as retraining
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
+from codesign.gaze import People, people_file
 from codesign.optics import formed
+from metalens.ground import config as settings
 from metalens.ground import reading, report, store
 from metalens.ground.errors import ConfigError
 
@@ -41,8 +43,17 @@ def run(options: Options) -> int:
             "errors.png": experiment_plots.errors(results),
         }
         _write(draft.path, values, pictures)
+        for number, (result, source) in enumerate(zip(results, sources, strict=True), 1):
+            if isinstance(result.how, People):
+                people_file.save(draft.path / f"people_{number}.h5", result.how, provenance=_made(source, config))
     options.console.result(values, f"{table(values)}\nopen {folder / PAGE}")
     return 0
+
+
+def _made(source: Source, config: ExperimentConfig) -> store.Provenance:
+    """By which run, shown what."""
+    seed = source.settings.inner.seed
+    return store.Provenance(config=f"{settings.dumps(source.settings)}\n{settings.dumps(config)}", seed=seed)
 
 
 def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:

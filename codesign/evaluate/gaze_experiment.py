@@ -42,7 +42,7 @@ class Result:
     slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
     calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
     and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
-    slippage along x, y, z that the run's training saw.
+    slippage along x, y, z that the run's training saw. how: subjects were calibrated.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Result:
     predicted_deg: Array
     told_deg: Array
     reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    how: Calibrator | None = None
 
     @property
     def within(self) -> Array:
@@ -287,7 +288,7 @@ def _result(
     error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
     mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
     centre, iou = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "iou"))
-    return Result(name, mmacs, trial, read.slip_mm, centre, iou, error, predicted, told_error, reach)
+    return Result(name, mmacs, trial, read.slip_mm, centre, iou, error, predicted, told_error, reach, how)
 
 
 def calibrated(read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator) -> tuple[Array, Array]:

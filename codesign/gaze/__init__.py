@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from codesign.gaze import bench as bench
+    from codesign.gaze import people_file as people_file
     from codesign.gaze import personal as personal
     from codesign.gaze import shared as shared
     from codesign.gaze.bench import GazeErrors as GazeErrors
@@ -33,6 +34,7 @@ __getattr__, __dir__, __all__ = attach(
         "angle_deg": "personal",
         "bench": "",
         "face_angles": "readings",
+        "people_file": "",
         "personal": "",
         "shared": "",
     },

@@ -12,6 +12,8 @@ from characterize.inference import asbuilt
 from codesign.budget.links import Entry
 from codesign.commands import budget as command_budget
 from codesign.eye import dataset
+from codesign.gaze import people_file
+from codesign.gaze.shared import Mixed, People
 from metalens import lens, library, psf
 from metalens.cell.record import Cell, Index
 from metalens.ground import store
@@ -61,12 +63,19 @@ def _budget_rows():
     return [Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"), Entry("all links", 0.1, math.nan, 1e-3, "sum")]
 
 
+def _people():
+    rng = np.random.default_rng(0)
+    model = Mixed(rng.normal(0, 1, (36, 2)), rng.uniform(0.1, 2, (36, 2)), rng.uniform(0.1, 1, 2))
+    return People(model, rng.normal(0, 3, 7), rng.uniform(0.5, 5, 7))
+
+
 KINDS = {
     "lens": (lambda p: lens.save(p, _lens()), lens.load),
     "library": (lambda p: library.save(p, _library()), library.load),
     "psf": (lambda p: psf.save(p, _psf()), psf.load),
     "asbuilt": (lambda p: asbuilt.save(p, _asbuilt()), asbuilt.load),
     "budget": (lambda p: command_budget.save(p, _budget_rows(), store.Provenance()), command_budget.load),
+    "people": (lambda p: people_file.save(p, _people()), people_file.load),
 }
 
 

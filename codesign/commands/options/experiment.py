@@ -17,7 +17,8 @@ class Options(Common):
 
     Attributes:
         runs: folders of finished runs of one geometry; the first is compared with each of the others.
-        output: folder for experiment.json, samples.png, ambiguity.png, errors.png and report.html.
+        output: folder for experiment.json, samples.png, ambiguity.png, errors.png, report.html and, of every run that
+            tells the optic axis, people_1.h5 ...: what calibrates a wearer of that device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.
         settings: subjects, stimuli, slippage states, calibration.
     """

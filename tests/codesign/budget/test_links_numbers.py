@@ -91,7 +91,8 @@ def made_reading(monkeypatch, judged, axial):
     self.trial = SimpleNamespace(stimulus_deg=None, group=lambda kind: axial if kind == AXIAL else ~axial)
     self._error_rad = 0.0
     monkeypatch.setattr(self, "_judged", lambda: judged)
-    monkeypatch.setattr(self, "_answers", lambda read, how: read)
+    monkeypatch.setattr(self, "_taught", lambda read, how: how)
+    monkeypatch.setattr(reading.gaze_experiment, "answered", lambda people, read, trial: read)
     return self
 
 
@@ -99,12 +100,27 @@ def test_one_more_cause_adds_what_the_error_has_more_in_quadrature(monkeypatch):
     """Mean errors of 3, then 5, then 4.6 degrees of the judged frames that slip along the axis: 3, 4 and nothing."""
     judged, axial = np.array([True, True, True, False]), np.array([True, True, False, True])
     self = made_reading(monkeypatch, judged, axial)
-    found = [
-        self._grown("link", np.array([low, high, 80.0, 70.0]), None, "") for low, high in ((2, 4), (3, 7), (4.6, 4.6))
-    ]
+    errors = [self._error(np.array([low, high, 80.0, 70.0]), None) for low, high in ((2, 4), (3, 7), (4.6, 4.6))]
+    found = [self._grown("link", error, "") for error in errors]
     assert [math.degrees(entry.gaze_rad) for entry in found] == pytest.approx([3, 4, 0])
-    again = self._grown("link", np.array([5.8, 5.8, 0.0, 0.0]), None, "")  # over the state before, not over the largest
+    again = self._grown(
+        "link", self._error(np.array([5.8, 5.8, 0.0, 0.0]), None), ""
+    )  # over the state before, not over the largest
     assert math.degrees(again.gaze_rad) == pytest.approx(math.sqrt(5.8**2 - 4.6**2))
+
+
+@pytest.mark.parametrize(("alone", "shares"), [(20.0, (12.0, 0.0)), (4.0, (math.sqrt(7.0), math.sqrt(137.0)))])
+def test_a_pupil_alone_costs_at_most_what_all_that_is_read_does(monkeypatch, alone, shares):
+    """3 degrees before, sqrt(153) by all that is read: a pupil that leads beyond by the sphere costs 12, not more."""
+    self = made_reading(monkeypatch, np.array([True]), np.array([True]))
+    self.source = SimpleNamespace(row={"mmacs": 2.0})
+    self.believed, self._error_rad = "optics", math.radians(3.0)
+    monkeypatch.setattr(self, "_read", lambda optics, quiet: (SimpleNamespace(pupil_mm="pupil"), "people"))
+    by = {"people": math.radians(math.sqrt(153.0)), "sphere": math.radians(alone)}
+    monkeypatch.setattr(self, "_error", lambda read, how: by[how])
+    found = list(self._reader(SimpleNamespace(slip_mm="slip"), "sphere"))
+    assert [entry.link for entry in found] == ["reader, pupil", "reader, slippage"]
+    assert [math.degrees(entry.gaze_rad) for entry in found] == pytest.approx(shares, abs=1e-6)
 
 
 def test_fixation_is_what_is_left_of_the_whole_error(monkeypatch):

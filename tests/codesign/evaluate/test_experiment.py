@@ -21,7 +21,7 @@ from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
-from codesign.gaze import personal, regressor, shared
+from codesign.gaze import people_file, personal, regressor, shared
 from codesign.gaze.readings import Readings
 from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
@@ -187,6 +187,8 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert first["beyond_training_mm"] == [[-5, 0, 0], [-2.5, 0, 0], [0, 0, -5], [0, 0, 5]]
     assert "(0, 0, 5) mm lie outside of what it saw" in (out / "report.html").read_text()
     assert {p.name for p in out.iterdir()} >= {"experiment.json", "samples.png", "ambiguity.png", "errors.png"}
+    one, two = (people_file.load(out / f"people_{n}.h5") for n in (1, 2))
+    assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
     assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2

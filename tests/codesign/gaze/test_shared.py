@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from codesign.gaze import shared
+from codesign.gaze import people_file, shared
 from codesign.gaze.readings import Readings
-from metalens.ground.errors import TrainingError
+from metalens.ground.errors import StoreError, TrainingError
 
 
 def test_variances_of_a_balanced_layout_are_those_of_the_analysis_of_variance():
@@ -128,6 +128,18 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
     off = read.axis_deg - gaze
     raw = off[10:] - off[:10].mean(0)
     assert np.linalg.norm(raw, axis=1).mean() > 2.0  # 0.2 deg/mm² of products up to 25 mm²
+
+
+def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_path):
+    people = shared.learn(*_read(np.random.default_rng(6), 5, 20, 0.1))
+    people_file.save(tmp_path / "p.h5", people)
+    again = people_file.load(tmp_path / "p.h5")
+    read, gaze, _ = _read(np.random.default_rng(7), 1, 8, 0.1)
+    assert np.array_equal(again.person(read[:5], gaze[:5])(read), people.person(read[:5], gaze[:5])(read))
+    for odd in (replace(people, spread=0 * people.spread), replace(people, middle=people.middle[:3])):
+        people_file.save(tmp_path / "odd.h5", odd)
+        with pytest.raises(StoreError, match=r"(spread|middle) of a shape or value that no people have"):
+            people_file.load(tmp_path / "odd.h5")
 
 
 def test_too_few_people_frames_or_points_are_refused():
