@@ -93,6 +93,47 @@ def test_a_network_without_a_mask_is_held_to_the_centroid():
         each.append(np.where(off < 0.3, off**2 / 0.6, off - 0.15).mean())
     got = losses.place(torch.from_numpy(centre), torch.from_numpy(mask))
     assert float(got) == pytest.approx(np.mean(each), rel=1e-9)
+    given = torch.from_numpy(mask), torch.from_numpy(TRUTH * SCALE), torch.from_numpy(SCALE)
+    whole = found(mask_logits=torch.zeros(4, 0, 0), centre=torch.from_numpy(centre))
+    slip = float(losses.slip(whole.slip, *given[1:]))
+    assert float(losses.task(whole, *given, slip_weight=2.0)) == pytest.approx(np.mean(each) + 2 * slip, rel=1e-9)
+    dim = torch.from_numpy(mask * 0.45 / mask.sum((1, 2)).clip(1e-9)[:, None, None])  # less than half a pixel each
+    assert float(losses.place(torch.from_numpy(centre), dim)) == 0
+
+
+def test_masks_are_averaged_over_cells_and_interpolated_between_them():
+    """Blocks of 2 x 3; on 6 x 6 pixels logits and a coarse mask are straight between the middles of cells."""
+    mask, like = torch.from_numpy(RNG.uniform(0, 1, (2, 6, 9))), torch.from_numpy(RNG.normal(size=(2, 3, 3)))
+    blocks = mask.numpy().reshape(2, 3, 2, 3, 3).mean((2, 4))
+    assert losses.resized(mask, like).numpy() == pytest.approx(blocks)
+    assert losses.resized(mask, torch.zeros(2, 6, 9)) is mask
+    logits, seen = losses.at_pixels(like, mask[:, :2, :3], 6)
+    three = mask[:, :2, :3].numpy()
+    two = np.stack([three[..., :2].mean(-1), three[..., 1:].mean(-1)], -1)  # as many columns as rows, of 1.5 cells
+    for got, given in ((logits, like.numpy()), (seen, two)):
+        n = given.shape[-1]
+        y, x = np.meshgrid(*[(np.arange(6) + 0.5) * n / 6 - 0.5] * 2, indexing="ij")
+        want = np.stack([map_coordinates(one, [y, x], order=1, mode="nearest") for one in given])
+        assert got.numpy() == pytest.approx(want, rel=1e-6)
+
+
+def test_masks_overlap_by_what_both_hold():
+    """Threshold 0 of logits and a half of coverage: 2 of 4 pixels, none of 3, nothing at all, and no mask."""
+    logits = torch.tensor([[[3.0, 0.1, 2.0], [-1, -2, -0.1]], [[1.0, 1, -1], [-1, -1, -1]], [[-1.0] * 3] * 2])
+    mask = torch.tensor([[[0.9, 0.51, 0.4], [0.6, 0.2, 0.1]], [[0.1, 0.0, 0.8], [0.3, 0.3, 0.3]], [[0.5] * 3] * 2])
+    assert losses.overlap(logits, mask).tolist() == pytest.approx([2 / 4, 0.0, 1.0])
+    told = losses.overlap(torch.zeros(3, 0, 0), mask)
+    assert told.shape == (3,)
+    assert torch.isnan(told).all()
+
+
+def test_a_pose_needs_both_and_one_landmark_counts_whole():
+    axis, points = torch.zeros(1, 3), torch.tensor([[[0.1, 0.2], [0.7, 0.0]]])
+    told = points + torch.tensor([0.1, 0.0])
+    one = losses.pose(found(points=told, axis=axis), axis, points, axis_weight=1.0, point_weight=3.0)
+    assert float(one) == pytest.approx(3.0 * (2.0 - 0.05) / 2, rel=1e-6)  # the second lies outside
+    for part in ({"points": told, "axis": None}, {"points": None, "axis": axis}):
+        assert float(losses.pose(found(**part), axis, points, axis_weight=1.0, point_weight=3.0)) == 0
 
 
 @pytest.mark.parametrize("size", [64, 61])
