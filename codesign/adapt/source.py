@@ -36,6 +36,7 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     Raises:
         TrainingError: no run folder, half written, unfinished, of another version, or without such a budget.
     """
+    _no_retraining(folder)
     names = ("run.toml", "checkpoint.safetensors", "lens.h5", "result.json")
     missing = [name for name in names if not (folder / name).is_file()]
     if len(missing) == len(names):
@@ -60,12 +61,22 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
 
 
+def _no_retraining(folder: Path) -> None:
+    """Refuse a folder of `metalens retrain`, which holds a network and not the run that it belongs to."""
+    if (folder / "retrain.toml").is_file():
+        raise TrainingError(
+            f"{folder} holds a retraining, no run: its network was trained on for one made lens; give the folder that "
+            "`metalens codesign RUN.toml -o FOLDER` wrote"
+        )
+
+
 def rows_of(folder: Path) -> list[dict[str, Any]]:
     """Rows of result.json, least budget first.
 
     Raises:
         TrainingError: the file is missing, cut short or of another version.
     """
+    _no_retraining(folder)
     manifest.check(folder)
     path = folder / "result.json"
     if not path.is_file():

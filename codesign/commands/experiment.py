@@ -29,6 +29,8 @@ def run(options: Options) -> int:
     names = options.names or distinct(options.runs)
     if len(names) != len(options.runs):
         raise ConfigError(f"{len(names)} names for {len(options.runs)} runs; give one a run")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"names {', '.join(names)}: two are alike; give every run one of its own")
     folder, config = options.output, options.settings
     sources = [retraining.load(path) for path in options.runs]
     with options.claim_folder(folder) as draft:

@@ -45,6 +45,7 @@ Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
 def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 0."""
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
+    retraining.network(source.run.trainer)  # refused now, not after the lenses were imaged
     result = asbuilt.load(options.asbuilt)
     design = lens.load_plain(options.run_dir / "lens.h5")
     retraining.check_lens(design, result, insist=options.insist)

@@ -180,6 +180,14 @@ def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder,
         retraining.load(folder, budget_mmacs=7.0)
 
 
+@pytest.mark.parametrize("take_up", [retraining.load, retraining.rows_of])
+def test_a_retraining_is_no_run_and_said_to_be_none(folder, tmp_path, take_up):
+    for name in ("retrain.toml", "result.json"):
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(TrainingError, match=r"holds a retraining, no run: .* give the folder that `metalens codesign"):
+        take_up(tmp_path)
+
+
 def test_a_run_of_another_network_is_read_and_not_retrained(tmp_path):
     source = retraining.load(m.finished_baseline(tmp_path / "run"))
     assert source.architecture.resolution == 1.0

@@ -191,6 +191,8 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
+    assert main([*words[:4], "-o", str(folder / "twins"), "--names", "a", "a"]) == 2
+    assert "names a, a: two are alike" in capsys.readouterr().err
     assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
     assert "is no run folder" in capsys.readouterr().err
 
