@@ -59,6 +59,7 @@ QUICK = (
 INTERPRETED = (
     "tests/characterize/model/test_gather.py",
     "tests/codesign/batches/test_flat.py",
+    "tests/codesign/eye/test_renderer.py::test_frames_that_do_not_fill_the_tiles_agree_with_the_twin",
     "tests/codesign/eye/test_shading.py",
     "tests/codesign/optics/test_built.py",
     "tests/layout/certify/test_background.py",
@@ -73,8 +74,9 @@ INTERPRETED = (
     "tests/metalens/field/test_shared_rays.py",
     "tests/metalens/image/test_scene_truths.py",
     "tests/metalens/image/test_sheet_weights.py",
-    *(f"tests/metalens/propagate/test_{name}.py" for name in ("estimate_parts", "grid_truths", "operator_parts")),
-    *(f"tests/metalens/propagate/test_{name}.py" for name in ("propagate_exact", "pupil_error", "sincos_truths")),
+    *(f"tests/metalens/propagate/test_{name}.py" for name in ("estimate_parts", "gathered_light", "grid_truths")),
+    *(f"tests/metalens/propagate/test_{name}.py" for name in ("operator_parts", "propagate_exact", "pupil_error")),
+    "tests/metalens/propagate/test_sincos_truths.py",
 )
 ALL = tuple(f"tests/{folder}" for folder in ("metalens", "characterize", "layout", "codesign"))
 

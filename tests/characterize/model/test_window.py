@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from characterize.model import window
 from characterize.model.kernel import Kernel
 from characterize.model.window import Operators, Terms, ways
 
@@ -80,3 +81,14 @@ def test_rates_are_the_differences_of_both_factors():
         want = (ends[0] - ends[1]) / step
         found = operators.rates(light, name)[0] * (y[1].carrier[:, None] * x[1].carrier)
         assert np.abs(found - want).max() < 1e-4 * np.abs(want).max()
+
+
+@pytest.mark.parametrize(("kind", "of"), [(np.float32, np.complex64), (np.float64, np.complex128)])
+def test_real_weights_of_complex_values_are_their_product(kind, of):
+    rng = np.random.default_rng(12)
+    weights = rng.normal(size=(5, 7)).astype(kind)
+    values = (rng.normal(size=(7, 8)) + 1j * rng.normal(size=(7, 8))).astype(of)
+    for some in (values, values[:, ::2]):  # also where they do not lie side by side
+        got = window.weighted(weights, some)
+        assert got.dtype == of
+        assert got == pytest.approx(weights.astype(float) @ some, abs=1e-5 if kind is np.float32 else 1e-13)
