@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from layout.shapes import polygon
+from layout.shapes import polygon, rectilinear
 
 
 def dense_error(points, radius):
@@ -156,3 +156,18 @@ def test_trial_moves_are_small_steps_of_one_or_two_coordinates_or_all_of_few(cou
         assert np.array_equal(found[:, -1], found[:, -2])  # it stays on the diagonal
         found = found[:, :-1]
     assert set(map(tuple, found.tolist())) == want
+
+
+def test_boxes_around_a_slanted_shape_are_as_wide_as_it_is_in_their_slice():
+    """A triangle that leans; its x at any height by the lines between its corners, its middle corner within a slice."""
+    corners = np.array([[-41_000, 7_000], [3_000, 31_500], [-12_500, 62_000]])
+    boxes = rectilinear.covering(corners)
+    assert len(boxes) == 11
+    assert (boxes[0, 1], boxes[-1, 3]) == (7_000, 62_000)
+    sides = list(zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    for left, bottom, right, top in boxes.tolist():
+        x = [float(c[0]) for c in corners if bottom <= c[1] <= top]
+        for (x0, y0), (x1, y1) in sides:
+            x += [x0 + (y - y0) * (x1 - x0) / (y1 - y0) for y in (bottom, top) if min(y0, y1) <= y <= max(y0, y1)]
+        assert left == pytest.approx(min(x), abs=2)  # outwards to whole units, and a unit of the slice's height
+        assert right == pytest.approx(max(x), abs=2)

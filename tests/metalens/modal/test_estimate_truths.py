@@ -139,3 +139,18 @@ def test_an_order_counts_as_at_its_cutoff_by_one_over_the_distance(apart, want):
     """The least order (pi - 1.1)², ``apart`` of the cutoff beyond it or short of it; the next is far."""
     cutoff = (math.pi - 1.1) ** 2 / (1 + apart)
     assert match.nearness(cutoff, 1.1) == pytest.approx(want, abs=1e-9)
+
+
+@pytest.mark.parametrize(("cutoff", "bloch"), [(17.0, 0.4), (120.0, -1.3), (3.1, 1.5), (61.0, 0.0)])
+def test_the_wavenumbers_of_the_lattice_are_all_up_to_twice_the_cutoff(cutoff, bloch):
+    found = np.sort(match.lattice(cutoff, bloch))
+    every = [(bloch + math.pi * m) ** 2 + (math.pi * n) ** 2 for m in range(-40, 41) for n in range(41)]
+    want = sorted(v for v in every if v <= 2 * cutoff)
+    assert found[: len(want)] == pytest.approx(want, rel=1e-12)
+
+
+def test_the_zero_order_keeps_the_wavenumber_of_the_mesh():
+    """Its (k0 sin)² is what both sides share: it is no order that begins to propagate."""
+    zero = 1.3**2
+    assert match.near_cutoff(np.array([0.9999 * zero]), 1.05 * zero, 1.3).tolist() == [0.9999 * zero]
+    assert match.nearness(1.05 * zero, 1.3) == 0  # the next, (pi - 1.3)², is 1.9 times as far
