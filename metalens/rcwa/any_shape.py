@@ -9,6 +9,7 @@ import numpy as np
 
 from metalens.cell import Cell, Light, Response, check_tolerance
 from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern, wall
 from metalens.rcwa.conditions import direction
@@ -29,7 +30,8 @@ _COARSE = 3  # orders that suffice to see what the collocation of a tilted wall 
 class Jones:
     """Zero-order response of one cell to both polarisations, power-normalised, exp(-iwt), incidence from the substrate.
 
-    basis: ("x", "y") at normal incidence, ("s", "p") else: s across the plane of incidence, p in it.
+    basis: ("x", "y") at normal incidence, ("s", "p") else, for an azimuth φ from +x to +y: s is a field along
+        (-sin φ, cos φ), p one in the plane of incidence whose part along the layers lies along (cos φ, sin φ).
     t, r: (2, 2); column: polarisation that comes, row: that leaves. (For r, p is taken along the same tangential
         direction as that of the light that comes.)
     t_error: estimate of the largest |t - exact| and |r - exact|, not below the true error.
@@ -74,7 +76,8 @@ def jones(
         converge slowly: 1e-2 is usual.
 
     Raises:
-        CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order.
+        CellError: pillars that touch or lose their outline, an impossible angle or tolerance, no zero order,
+            less than one harmonic.
         MaterialError: a wavelength outside the range of a material.
     """
     check_tolerance(tolerance)
@@ -113,7 +116,13 @@ class Ladder:
 
 
 def ladder(this: Problem, harmonics: int | None) -> Ladder:
-    """Of one cell and light; harmonics: the largest truncation, in place of the one that takes about a second."""
+    """Of one cell and light; harmonics: the largest truncation, in place of the one that takes about a second.
+
+    Raises:
+        CellError: less than one harmonic.
+    """
+    if harmonics is not None and harmonics < 1:
+        raise CellError(f"harmonics = {harmonics}: need at least 1")
     cell, size_um = this.cell, this.size_um
     gap = cell.gap_um(size_um)
     before = int(compared(min(gap, cell.outline(size_um).narrowest_um) / cell.pitch_um))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell import Cell, Film, Index, Lattice, Layer
+from metalens.cell import Cell, Film, Index, Lattice, Layer, Light
 from metalens.cell.orders import check_subwavelength
 from metalens.cell.shapes import Circle, Ellipse, Polygon, Rectangle, RegularPolygon
 from metalens.ground.errors import CellError
@@ -111,6 +111,19 @@ def test_solve_gives_the_diagonal_and_refuses_what_touches():
         assert rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t == got.t[place, place]
     with pytest.raises(CellError, match="touches its neighbour"):
         rcwa.solve(cell, 0.36, WAVE)
+
+
+@pytest.mark.parametrize("harmonics", [0, -2])
+def test_no_harmonics_at_all_are_refused_by_every_verb(harmonics):
+    cell = Cell(0.35, **ABOUT, shape=Rectangle(0.5))
+    about = {"harmonics": harmonics}
+    for verb in (
+        lambda: rcwa.jones(cell, 0.25, WAVE, **about),
+        lambda: rcwa.solve(cell, 0.25, WAVE, **about),
+        lambda: rcwa.near_field(cell, 0.25, Light(WAVE), x_um=[0.0], y_um=[0.0], z_um=[0.1], **about),
+    ):
+        with pytest.raises(CellError, match=f"harmonics = {harmonics}: need at least 1"):
+            verb()
 
 
 def test_orders_of_the_hexagonal_lattice():
