@@ -14,12 +14,14 @@ from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern, wall
 from metalens.rcwa.conditions import direction
 from metalens.rcwa.orders import mirrors
+from metalens.rcwa.orders.mirrors import Operation
 from metalens.rcwa.problem import Problem, classes, problem, tangent, waves_of
 from metalens.rcwa.solver import MOST_COMPARED, compared, crowding, safety
 from metalens.rcwa.stack import respond
 
 _FIRST = 3  # orders of the first truncation
 _LAST = {4: 15, 2: 10, 1: 9}  # by the number of operations: about a second a solve
+_TILTED = {4: 10, 2: 7, 1: 6}  # of tilted walls, whose collocation costs some hundred times as much: some seconds
 _COMPARED = 4
 SAFETY = 7.0  # the most that :func:`metalens.rcwa.solver.safety` gives
 _ROUNDING = 1e-13
@@ -82,7 +84,7 @@ def jones(
     """
     check_tolerance(tolerance)
     this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
-    climb = ladder(this, harmonics)
+    climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
     stages, cut = 0, 0.0
     if cell.sidewall_rad:
         coarse = min(climb.reaches[-1], _COARSE)
@@ -115,8 +117,9 @@ class Ladder:
     crowded: float
 
 
-def ladder(this: Problem, harmonics: int | None) -> Ladder:
-    """Of one cell and light; harmonics: the largest truncation, in place of the one that takes about a second.
+def ladder(this: Problem, harmonics: int | None, *, collocated: bool = False) -> Ladder:
+    """Of one cell and light; harmonics: the largest truncation, in place of the one that takes about a second
+    (or some, of walls that are collocated).
 
     Raises:
         CellError: less than one harmonic.
@@ -126,7 +129,7 @@ def ladder(this: Problem, harmonics: int | None) -> Ladder:
     cell, size_um = this.cell, this.size_um
     gap = cell.gap_um(size_um)
     before = int(compared(min(gap, cell.outline(size_um).narrowest_um) / cell.pitch_um))
-    last = _LAST[min(len(operations) for operations in this.classes)] if harmonics is None else harmonics
+    last = _last(this.classes, collocated) if harmonics is None else harmonics
     first = _FIRST + _COMPARED - before if harmonics is None else max(1, harmonics - before)
     return Ladder(range(first, last + 1), before, float(crowding(gap, cell.pitch_um)))
 
@@ -171,8 +174,13 @@ def co_polarised(cell: Cell, size_um: float, light: Light, *, tolerance: float, 
 
 
 def most_harmonics(cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimuth_rad: float = 0.0) -> int:
-    """Largest truncation that :func:`jones` takes by itself: less for a cell without mirrors."""
-    return _LAST[min(len(found) for found in classes(cell, size_um, tangent(1.0, angle_rad, azimuth_rad)))]
+    """Largest truncation that :func:`jones` takes by itself: less without mirrors, and where walls are tilted."""
+    return _last(classes(cell, size_um, tangent(1.0, angle_rad, azimuth_rad)), bool(cell.sidewall_rad))
+
+
+def _last(found: tuple[tuple[Operation, ...], ...], collocated: bool) -> int:
+    """Largest truncation for the sets of operations of a cell."""
+    return (_TILTED if collocated else _LAST)[min(len(operations) for operations in found)]
 
 
 def _truncated(this: Problem, reach: int, stages: int) -> Jones:
