@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from characterize.model import solving, thinplate
-from metalens.made import Answers, of_kind
+from metalens.made import Answers, Bends, maps, of_kind
 
 RNG = np.random.default_rng(29)
 
@@ -43,3 +43,15 @@ def test_bending_energy_is_the_mean_of_squared_second_derivatives():
     shapes = np.stack([u**2 + 3 * u * v - 2 * v**2, u**2, u * v])
     want = np.array([[4 + 18 + 16, 4, 6], [4, 4, 0], [6, 0, 2]])
     assert thinplate._bending(shapes, inside, t[1] - t[0]) == pytest.approx(want, rel=1e-9, abs=1e-9)
+
+
+def test_modes_leave_out_what_parameters_already_do():
+    """On the places where they are made they are at right angles to piston, tilts, defocus and every aberration."""
+    t = np.linspace(-1, 1, thinplate._GRID)
+    u, v = np.meshgrid(t, t)
+    inside = np.hypot(u, v) <= 1
+    modes = thinplate.basis(u, v)[:, inside]
+    u, v = u[inside], v[inside]
+    for shape in (np.ones_like(u), u, v, u**2 + v**2, *maps(Bends, u, v)):
+        assert np.abs(modes @ shape).max() < 1e-6 * len(u)
+    assert (modes @ modes.T) / len(u) == pytest.approx(np.eye(len(modes)), abs=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Lattice, Layer
-from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
+from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square, straight
 from metalens.ground import config
 from metalens.ground.errors import CellError, ConfigError
 
@@ -106,3 +106,15 @@ def test_bias_that_eats_the_outline_is_refused():
         Cross(0.2).outline(0.1, grow_um=-0.03)
     with pytest.raises(CellError, match="nothing is left"):
         Circle().outline(0.1, grow_um=-0.1)
+
+
+def test_edges_cross_where_both_hold_the_same_point():
+    """Random edges anywhere: the point that lies on both lines, by solving for its shares along them."""
+    rng, met = np.random.default_rng(14), 0
+    for _ in range(300):
+        a, b, c, d = rng.uniform(-1, 1, (4, 2)) + rng.uniform(-3, 3, 2)
+        along, across = np.linalg.solve(np.stack([b - a, c - d], 1), c - a)
+        want = 0 <= along <= 1 and 0 <= across <= 1
+        assert straight._cross(a, b, c, d) == want
+        met += want
+    assert 40 < met < 260
