@@ -46,6 +46,10 @@ class Budgets:
     def __post_init__(self) -> None:
         if not self.pitch_um > 0 or not self.budgets_mmacs or min(self.budgets_mmacs) <= 0:
             raise ConfigError(f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0")
+        if len({f"{budget:g}" for budget in self.budgets_mmacs}) < len(self.budgets_mmacs):
+            raise ConfigError(
+                f"budgets_mmacs = {self.budgets_mmacs}: two are alike, and so would be their files' names"
+            )
         if self.finetune_steps < 0:
             raise ConfigError(f"finetune_steps = {self.finetune_steps}: need 0 or more")
 

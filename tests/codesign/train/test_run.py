@@ -126,6 +126,7 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
         ("[run]\npitch_um = 500.0", "pixels of a"),
         ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
         ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
+        ("[run]\nbudgets_mmacs = [4.0, 2.0, 4]", "two are alike"),
         ("[scenes]\npool = 3", "need a pool of a batch or more"),
         ("[run]\nfrozen = ['lens']", "frozen"),
         ("network = 'resnet'", "network"),
