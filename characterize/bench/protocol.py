@@ -12,14 +12,15 @@ from typing import Literal
 
 import numpy as np
 
-from characterize.inference import invert, posterior
-from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, vector
+from characterize.inference import Data, Task, Unstated, invert, missing, posterior
+from characterize.model import NAMES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Known, Setting, vector
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
 from metalens.made import Sensitivity
 
 REACH = posterior.REACH
+_LEAST_PLACES = 4  # depths and angles, from which on a fit is tested on frames left out; one frame is refused
 _DEFOCUS_WAVES = 0.5  # at the rim: below, images are those of the focus, in which even errors act in second order
 
 
@@ -27,7 +28,7 @@ _DEFOCUS_WAVES = 0.5  # at the rim: below, images are those of the focus, in whi
 class Wanted:
     """An interval that the session is to give: half of the 95 % interval of a parameter, in its unit.
 
-    name: of the parameter. within: half of its 95 % interval.
+    name: of the parameter. within: half of its 95 % interval, with what the session cannot tell.
     """
 
     name: str
@@ -49,8 +50,9 @@ class Protocol:
     frames: how many may be taken. criterion: D (determinant) or A (mean variance).
     peak_e: electrons in the brightest pixel of all candidates at exposure 1. full_well_e, read_noise_e: of the sensor.
     pixel_um, pixels: of the sensor and of the window about the image.
-    free, known: as in the metrology of ``metalens fit``.
-    wanted: intervals (name, within): no more frames are taken than they need, and what falls short is said.
+    free, known: as in the metrology of ``metalens fit``; what ``capture.toml`` will state, with sigma = 0, too.
+    wanted: intervals (name, within): no more frames are taken than they need (of four depths and angles at least), and
+    what falls short is said.
     """
 
     depths_um: tuple[float, float]
@@ -83,7 +85,8 @@ class Protocol:
 class Plan:
     """Frames to take, in the order of what each adds.
 
-    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,) expected standard errors with them.
+    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,) expected standard errors with them,
+    within the model. untold: (p,) standard deviation of what causes that nobody states may add.
     even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and the first angle.
     gain: (n,) criterion after each frame, relative to the last (1 at the end).
     warnings: what these frames will not tell, in words.
@@ -95,6 +98,7 @@ class Plan:
     names: tuple[str, ...]
     sigma: Array
     even_sigma: Array
+    untold: Array
     gain: Array
     warnings: tuple[str, ...] = ()
 
@@ -109,46 +113,107 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     """
     names, prior = _parameters(protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
-    chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names)
-    chosen = chosen[: _needed(information, prior, chosen, names, protocol.wanted)]
+    place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
+    chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names, place=place)
+    unstated = _unstated(lens, protocol, response, candidates[chosen])
+    wanted = _left(names, unstated.sigma, protocol.wanted)
+    chosen = chosen[: _needed(information, prior, chosen, names, wanted, least=_least(candidates[chosen]))]
     even = _even(candidates, protocol, len(chosen))
     values = [score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names) for i in range(len(chosen))]
     covariances = [invert(prior + information[pick].sum(0)) for pick in (chosen, even)]
     sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
     depth, angle, exposure = candidates[chosen].T
-    words = (*_short(names, sigma, protocol.wanted, len(chosen)), *_blind(lens, protocol, depth))
-    return Plan(depth, angle, exposure, names, sigma, even_sigma, np.array(values) / values[-1], words)
+    words = (
+        *_short(names, sigma, unstated, protocol.wanted, len(chosen)),
+        *_few(candidates[chosen]),
+        *_blind(lens, protocol, depth),
+    )
+    gain = np.array(values) / values[-1]
+    return Plan(depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, words)
+
+
+def _unstated(lens: Lens, protocol: Protocol, response: Sensitivity, frames: Array) -> Unstated:
+    """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as asked for, will reckon with."""
+    known = {k.name: k for k in protocol.known}
+    unfitted = {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
+    angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
+    setting = Setting(frames[:, 0], angles, frames[:, 2], protocol.pixel_um, protocol.pixels, protocol.pixels)
+    model = ForwardModel(lens, setting, response)
+    x = vector({name: k.value for name, k in known.items()})
+    brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
+    x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
+    image = model.images(x)[0]
+    full, ones = image >= protocol.full_well_e, np.ones_like(image)
+    data = Data(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
+    free = tuple(name for name in protocol.free if name not in known or known[name].sigma > 0)
+    return missing.expected(Task(model, data, x, known, None, free, unfitted))
+
+
+def _left(names: tuple[str, ...], untold: Array, wanted: Sequence[Wanted]) -> list[Wanted]:
+    """What the model's own errors may take of the wanted intervals; all where what cannot be told takes more."""
+    left = []
+    for one in wanted:
+        beside = REACH * float(untold[names.index(one.name)]) if one.name in names else 0.0
+        rest = one.within**2 - beside**2
+        left.append(Wanted(one.name, math.sqrt(rest)) if rest > 0 else one)
+    return left
+
+
+def _least(frames: Array) -> int:
+    """How many of (n, 3) frames, in their order, lie at ``_LEAST_PLACES`` depths and angles; all where none do."""
+    places = [len({tuple(place) for place in frames[: n + 1, :2].tolist()}) for n in range(len(frames))]
+    return next((n + 1 for n, count in enumerate(places) if count >= _LEAST_PLACES), len(frames))
 
 
 def _needed(
-    information: Array, prior: Array, chosen: list[int], names: tuple[str, ...], wanted: Sequence[Wanted]
+    information: Array, prior: Array, chosen: list[int], names: tuple[str, ...], wanted: Sequence[Wanted], *, least: int
 ) -> int:
     """How many of the chosen frames, in their order, give all intervals that are wanted; all of them where none do."""
     places = [(names.index(w.name), w.within) for w in wanted if w.name in names]
     if not places:
         return len(chosen)
-    for count in range(1, len(chosen)):
+    for count in range(least, len(chosen)):
         sigma = np.sqrt(np.diag(invert(prior + information[chosen[:count]].sum(0))))
         if all(REACH * sigma[i] <= within for i, within in places):
             return count
     return len(chosen)
 
 
-def _short(names: tuple[str, ...], sigma: Array, wanted: Sequence[Wanted], count: int) -> list[str]:
-    """Intervals that are wanted and not reached, with the light that they would take."""
+def _short(names: tuple[str, ...], sigma: Array, unstated: Unstated, wanted: Sequence[Wanted], count: int) -> list[str]:
+    """Intervals that are wanted and not reached, with the light that they would take, or what must be stated."""
     words = []
     for one in wanted:
         if one.name not in names:
             words.append(f"{one.name} is held, not fitted: no frame changes its interval")
             continue
-        reach = REACH * float(sigma[names.index(one.name)])
-        if reach > one.within * (1 + 1e-9):
-            more = (reach / one.within) ** 2
+        i = names.index(one.name)
+        own, untold = REACH * float(sigma[i]), REACH * float(unstated.sigma[i])
+        told = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
+        if untold >= one.within:
+            most = [unstated.causes[k] for k in np.argsort(-unstated.by_cause[:, i])[:3]]
             words.append(
-                f"{one.name} will be known to +- {reach:.2g}, wanted +- {one.within:.2g}: {more:.1f} times the light "
+                f"{told}: within the model it is +- {own:.2g}, more frames do not help; state what else there is or is "
+                f"not, first of all {', '.join(most)} (capture.toml, [[known]])"
+            )
+        elif math.hypot(own, untold) > one.within * (1 + 1e-9):
+            more = own**2 / (one.within**2 - untold**2)
+            words.append(
+                f"{told}: {more:.1f} times the light "
                 f"({math.ceil(count * more)} such frames), other depths or angles, or an independent measurement"
             )
     return words
+
+
+def _few(frames: Array) -> list[str]:
+    """That (n, 3) frames lie at too few depths and angles for a fit to test itself, or for one at all."""
+    places = len({tuple(place) for place in frames[:, :2].tolist()})
+    if places >= _LEAST_PLACES:
+        return []
+    fate = "is refused" if places == 1 else "cannot be tested on frames left out"
+    return [
+        f"frames at {places} of the depths and angles: a fit of fewer than {2 if places == 1 else 4} {fate}; "
+        "allow more frames"
+    ]
 
 
 def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
@@ -183,7 +248,7 @@ def candidate_information(
     angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
     setting = Setting(pairs[:, 0], angles, np.ones(len(pairs)), protocol.pixel_um, protocol.pixels, protocol.pixels)
     model = ForwardModel(lens, setting, response)
-    x = vector({k.name: k.value for k in protocol.known})
+    x = vector({k.name: k.value for k in protocol.known if k.name in PLACE})
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
     images, slopes = model.images(x, names)
     if slopes is None:
@@ -197,22 +262,39 @@ def candidate_information(
     return np.concatenate(rows), np.concatenate(information)
 
 
-def choose(information: Array, prior: Array, count: int, *, criterion: str, names: tuple[str, ...]) -> list[int]:
-    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as long as they help."""
+def choose(
+    information: Array, prior: Array, count: int, *, criterion: str, names: tuple[str, ...], place: Array | None = None
+) -> list[int]:
+    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as long as they help.
+
+    place: (c,) equal for candidates of one depth and angle; ``_LEAST_PLACES`` of them are kept, where there are so
+    many. An optimum has hardly more places than its model needs, and nothing to test that model with.
+    """
     chosen: list[int] = []
     total = prior.copy()
+    where = np.arange(len(information)) if place is None else place
+    least = 0 if place is None else min(_LEAST_PLACES, count, len(set(where.tolist())))
 
-    def best(base: Array) -> int:
-        return int(np.argmax([score(base + one, criterion, names) for one in information]))
+    def best(base: Array, others: list[int]) -> int:
+        taken = np.unique(where[others])
+        new = ~np.isin(where, taken) if len(taken) < least else np.ones(len(where), bool)
+        return int(
+            np.argmax(
+                [
+                    score(base + one, criterion, names) if some else -np.inf
+                    for one, some in zip(information, new, strict=True)
+                ]
+            )
+        )
 
     for _ in range(count):
-        chosen.append(best(total))
+        chosen.append(best(total, chosen))
         total = total + information[chosen[-1]]
     for _ in range(10):
         before = list(chosen)
         for i, old in enumerate(before):
             base = total - information[old]
-            chosen[i] = best(base)
+            chosen[i] = best(base, chosen[:i] + chosen[i + 1 :])
             total = base + information[chosen[i]]
         if chosen == before:
             break
@@ -230,7 +312,7 @@ def _parameters(protocol: Protocol) -> tuple[tuple[str, ...], Array]:
     """Names of what will be fitted, and what is known of it beforehand as (p, p) information."""
     known = {k.name: k for k in protocol.known}
     held = {k.name for k in protocol.known if k.sigma == 0}
-    wanted = {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)
+    wanted = {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)  # the unfitted are in no NAMES
     names = tuple(name for name in NAMES if name in wanted - held)
     sigma = [known[n].sigma if n in known else PARAMETERS[PLACE[n]].sigma for n in names]
     return names, np.diag([s**-2.0 for s in sigma])

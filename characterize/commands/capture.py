@@ -36,9 +36,13 @@ def _plan(options: Options, path: Path) -> int:
     values |= {"sigma": dict(zip(found.names, found.sigma.tolist(), strict=True))}
     values |= {"warnings": list(found.warnings)}
     values |= {"even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))}
+    values |= {"untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))}
     told = [f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}" for z, angle, time in rows]
-    table = zip(found.names, found.sigma, found.even_sigma, strict=True)
-    told += [f"  {n:<24} +- {s:.2g}  (evenly spread: {even:.2g})" for n, s, even in table]
+    whole = np.hypot(found.sigma, found.untold)
+    told.append("  half of a 95 % interval, with what cannot be told; within the model; so with frames evenly spread")
+    columns = (protocol.REACH * part for part in (whole, found.sigma, found.even_sigma))
+    table = zip(found.names, *columns, strict=True)
+    told += [f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}" for n, total, own, even in table]
     told += [f"  note: {words}" for words in found.warnings]
     options.console.result(values, "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]))
     return 0

@@ -20,6 +20,7 @@ from scipy import stats
 from characterize.inference import causes
 from characterize.inference.leastsquares import Solution
 from characterize.inference.search import Task
+from characterize.model import PLACE
 from metalens.ground.arrays import Array
 
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
@@ -125,6 +126,15 @@ def look(task: Task, mode: Solution) -> Looked:
     found.append(_ghost(task, x, image, root, fit))
     told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
     return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
+
+
+def expected(task: Task) -> Unstated:
+    """What a fit of frames to come will reckon with: at the task's start, of frames that are as expected there."""
+    image, slopes = task.model.images(task.start, task.names)
+    p, value = len(task.names), task.start[[PLACE[name] for name in task.names]]
+    none = np.zeros_like(image)
+    mode = Solution(value, np.eye(p), np.eye(p), image, none, 1.0, 0.0, True, "", 0, np.zeros(p), np.asarray(slopes))
+    return look(task, mode).reckoned()
 
 
 def words(found: list[Lean]) -> list[str]:

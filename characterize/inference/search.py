@@ -29,6 +29,7 @@ _WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is foll
 class Task:
     """What is searched: the model and its data, all start values, what is known, how the frames lie, what is free.
 
+    found: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes (``characterize.model.UNFITTED``).
     left_out: (n, y, x) images and (p, n, y, x) slopes that are added to those of the model; see :func:`anchored`.
     """
@@ -37,7 +38,7 @@ class Task:
     data: Data
     start: Array
     known: dict[str, Known]
-    found: Arrangement
+    found: Arrangement | None
     free: tuple[str, ...] = ()
     unfitted: dict[str, float] = field(default_factory=dict)
     left_out: tuple[Array, Array] | None = None
@@ -247,6 +248,8 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
     """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
     model, data, found = task.model, task.data, task.found
+    if found is None:
+        raise FitError("a search begins where the frames lie; arrange them first")
     pixel = model.setting.pixel_um
     level = float(np.median(data.electrons[data.usable]))
     base = with_values(

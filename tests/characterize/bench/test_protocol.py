@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import bench_lens as b
 
 from characterize.bench import protocol
 from characterize.bench.protocol import Protocol, Wanted
+from characterize.inference import missing
 from metalens import lens as lenses
 from metalens.cli import main
 from metalens.ground.errors import FitError
@@ -39,6 +41,23 @@ def test_choice_is_the_best_of_all(candidates, criterion):
     found = protocol.choose(candidates, prior, 3, criterion=criterion, names=NAMES)
     best = max(itertools.combinations_with_replacement(range(7), 3), key=value)
     assert value(found) > 0.98 * value(best)  # exchanges may end in a local optimum
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_frames_lie_at_four_places_where_there_are_so_many(count):
+    """One place tells ten times as much as each other: all frames would be there, but for the test of the model."""
+    random = np.random.default_rng(3)
+    slopes = random.standard_normal((8, 3, 5)) * [[1.0], [0.5], [20.0]]
+    slopes[2:4] *= 3.3
+    information, place = slopes @ slopes.transpose(0, 2, 1), np.arange(8) // 2
+    prior, more = np.eye(3) * 1e-3, {"criterion": "A", "names": NAMES}
+    assert set(place[protocol.choose(information, prior, count, **more)]) == {1}
+    found = protocol.choose(information, prior, count, place=place, **more)
+    assert len(found) == count
+    assert len(set(place[found])) == min(count, 4)
+    assert (place[found] == 1).sum() == count - min(count, 4) + 1
+    two = protocol.choose(information[:4], prior, count, place=place[:4], **more)
+    assert set(place[two]) == {0, 1}  # there are no more
 
 
 def test_plan_beats_frames_spread_evenly():
@@ -70,7 +89,9 @@ def test_protocol_on_the_command_line(tmp_path, capsys):
     values = json.loads(capsys.readouterr().out)
     assert len(values["frames"]) == 2
     assert values["sigma"]["bias_nm"] > 0
-    assert "in focus" in values["warnings"][0]  # 0.23 waves
+    assert any("in focus" in words for words in values["warnings"])  # 0.23 waves
+    assert any("fewer than 4 cannot be tested" in words for words in values["warnings"])
+    assert values["untold_sigma"]["bias_nm"] > 0.5  # glass, walls, write fields, that nobody stated
     lines = (tmp_path / "stage.csv").read_text().splitlines()
     assert lines[0] == "file,depth_um,angle_deg,exposure_s"
     assert len(lines) == 3
@@ -88,9 +109,37 @@ def test_no_more_frames_are_taken_than_the_wanted_intervals_need():
     prior, chosen = np.zeros((1, 1)), [0] * 10
     for within, frames in ((1.95997 / 2, 4), (1.95995 / 2, 5), (1.9, 2), (0.1, 10)):
         wanted = (Wanted("bias_nm", within),)
-        assert protocol._needed(same, prior, chosen, ("bias_nm",), wanted) == frames
-    words = protocol._short(("bias_nm",), np.array([0.5]), (Wanted("bias_nm", 0.49),), 4)
+        assert protocol._needed(same, prior, chosen, ("bias_nm",), wanted, least=1) == frames
+        assert protocol._needed(same, prior, chosen, ("bias_nm",), wanted, least=3) == max(frames, 3)
+    words = protocol._short(("bias_nm",), np.array([0.5]), missing.Unstated.none(1), (Wanted("bias_nm", 0.49),), 4)
     assert "4.0 times the light (16 such frames)" in words[0]
+
+
+def test_what_cannot_be_told_is_part_of_a_wanted_interval():
+    """Shifts of 0.36: 95 % within 0.707. What is wanted beyond that is left to the frames, root of 1 - 0.5 = 0.7."""
+    stated = missing.Unstated(("a plate", "a wall"), np.array([[0.2], [0.3]]), np.array([[0.13]]), np.zeros((1, 1)))
+    (left,) = protocol._left(("bias_nm",), stated.sigma, (Wanted("bias_nm", 1.0),))
+    assert left.within == pytest.approx(math.sqrt(1 - 1.959964**2 * 0.13), rel=1e-5)
+    (over,) = protocol._left(("bias_nm",), stated.sigma, (Wanted("bias_nm", 0.7),))
+    assert over.within == 0.7
+    (words,) = protocol._short(("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 0.7),), 4)
+    assert "known to +- 1.2, wanted +- 0.7: within the model it is +- 0.98, more frames do not help" in words
+    assert "first of all a wall, a plate" in words
+    (words,) = protocol._short(("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 1.0),), 4)
+    assert "1.9 times the light (8 such frames)" in words  # 0.96 / 0.5006
+    assert not protocol._short(("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 1.22),), 4)
+
+
+def test_a_plan_has_frames_enough_for_a_fit_that_tests_itself():
+    """Four depths or angles; the same place again is none."""
+    frames = np.array(
+        [[5.0, 0.0, 1.0], [5.0, 0.0, 2.0], [6.0, 0.0, 1.0], [6.0, 3.0, 1.0], [5.0, 0.0, 1.0], [7.0, 0, 1]]
+    )
+    assert protocol._least(frames) == 6
+    assert protocol._least(frames[:4]) == 4
+    assert protocol._few(frames) == []
+    assert "3 of the depths and angles: a fit of fewer than 4 cannot be tested" in protocol._few(frames[:4])[0]
+    assert "fewer than 2 is refused" in protocol._few(frames[:2])[0]
 
 
 def test_a_plan_in_focus_or_on_one_side_of_it_is_warned_of():
@@ -148,6 +197,7 @@ def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
     names, prior = ("bias_nm", "distance_um"), np.diag([0.5**-2, 30.0**-2])
     monkeypatch.setattr(protocol, "_parameters", lambda wanted: (names, prior))
     monkeypatch.setattr(protocol, "candidate_information", lambda *words: (rows, information))
+    monkeypatch.setattr(protocol, "_unstated", lambda *words: missing.Unstated.none(2))
     made = protocol.plan(b.lens(), Protocol((400.0, 900.0), frames=3), None)
     chosen = [int(np.flatnonzero(rows[:, 0] == d)[0]) for d in made.depth_um]
     for sigma, pick in ((made.sigma, chosen), (made.even_sigma, [0, 2, 5])):
