@@ -86,6 +86,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     cautions = [*frames.corrections, *_arranged_words(found)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
+    model = model.about(search.window_um(found, setting.pixel_um))
     task = Task(model, _rearranged(data, found), start, known, found, options.free, unfitted)
     task = dataclasses.replace(task, model=quick_enough(model, task.data, search.starts(task, biases_nm=(0.0,))[0]))
     task, ends = _ends(task, frames.gain, cautions)

@@ -245,20 +245,27 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
+def window_um(found: Arrangement, pixel_um: float) -> tuple[float, float]:
+    """(x, y) of the window's middle from the chief ray, as the light lies in the frames."""
+    x, y = (float(np.clip(-shift * pixel_um, -50, 50)) for shift in found.shift_px[::-1])
+    return x, y
+
+
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
     """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
     pixel = model.setting.pixel_um
+    place = window_um(found, pixel)
     level = float(np.median(data.electrons[data.usable]))
     base = with_values(
         task.start,
         {
             "stage_zero_um": found.stage_zero_um,
             "distance_um": found.distance_um,
-            "decentre_x_um": float(np.clip(-found.shift_px[1] * pixel, -50, 50)),
-            "decentre_y_um": float(np.clip(-found.shift_px[0] * pixel, -50, 50)),
+            "decentre_x_um": place[0],
+            "decentre_y_um": place[1],
             "background_e": level,
         },
     )

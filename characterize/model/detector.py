@@ -33,7 +33,7 @@ class Grid:
     """Fine samples under the pixels of a window, with a margin that keeps blur from wrapping around.
 
     rows, columns: pixels of the window. oversample: fine samples per pixel side.
-    margin: pixels on each side.
+    margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief ray.
     """
 
     rows: int
@@ -41,6 +41,7 @@ class Grid:
     pixel_um: float
     oversample: int = 1
     margin: int = 2
+    middle_um: tuple[float, float] = (0.0, 0.0)
 
     @property
     def fine_um(self) -> float:
@@ -48,8 +49,13 @@ class Grid:
         return self.pixel_um / self.oversample
 
     def axes_um(self) -> tuple[Array, Array]:
-        """(y, x) of the fine samples, 0 at pixel (rows // 2, columns // 2)."""
-        return self._axis(self.rows), self._axis(self.columns)
+        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows // 2, columns // 2)."""
+        return self._axis(self.rows) + self.middle_um[1], self._axis(self.columns) + self.middle_um[0]
+
+    def ends_um(self) -> tuple[Array, Array]:
+        """(y, x) of the first and last pixels from the chief ray."""
+        ends = [(np.array([0, n - 1]) - n // 2) * self.pixel_um for n in (self.rows, self.columns)]
+        return ends[0] + self.middle_um[1], ends[1] + self.middle_um[0]
 
     def _axis(self, pixels: int) -> Array:
         fine = np.arange((pixels + 2 * self.margin) * self.oversample)

@@ -26,24 +26,14 @@ from metalens.lens import Lens
 from metalens.made import Answers, Bends, Sensitivity, Widens, maps, named, of_kind
 
 GEOMETRY = (
-    "distance_um",
-    "wavelength_nm",
-    "decentre_x_um",
-    "decentre_y_um",
-    "tilt_x_deg",
-    "tilt_y_deg",
-    "source_x_um",
-    "source_y_um",
-    "stage_zero_um",
-    "stage_scale",
-    "glass_um",
-    "glass_tilt_x_deg",
-    "glass_tilt_y_deg",
-)
+    "distance_um", "wavelength_nm", "decentre_x_um", "decentre_y_um", "tilt_x_deg", "tilt_y_deg", "source_x_um",
+    "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
+)  # fmt: skip
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM = 0.01
+_NEAR_UM = 5.0  # off the chief ray, within which windows need no more directions than those of the middle
 _FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
 
 
@@ -100,6 +90,7 @@ class ForwardModel:
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
         bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
         window = (max(setting.rows, setting.columns) + setting.margin) * setting.pixel_um + 20.0  # margin: half is seen
+        window += 2 * max(0.0, *(abs(v) - _NEAR_UM for v in self.grid.middle_um))
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
@@ -118,6 +109,17 @@ class ForwardModel:
         places = [np.flatnonzero(np.isin(frames, group.index)) for group in self.groups]
         pairs = [(group, place) for group, place in zip(self.groups, places, strict=True) if len(place)]
         part.groups = [dataclasses.replace(group, index=place) for group, place in pairs]
+        return part
+
+    def about(self, middle_um: tuple[float, float]) -> "ForwardModel":
+        """The same model with the window's middle held at (x, y) from the chief ray.
+
+        Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5 sin² / d is missed at X off it.
+        """
+        part = copy.copy(self)
+        part.grid = dataclasses.replace(self.grid, middle_um=(float(middle_um[0]), float(middle_um[1])))
+        if max(abs(v) for v in middle_um) > _NEAR_UM:  # more directions beside those of the nominal window
+            part._kept, part.groups = {}, [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)]
         return part
 
     def rough(self, tolerance: float) -> "ForwardModel":
@@ -303,7 +305,8 @@ class ForwardModel:
         d = nominal.distance_um + x[PLACE["distance_um"]]
         lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
         tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
-        centre = d * tx + x[PLACE["decentre_x_um"]], d * ty + x[PLACE["decentre_y_um"]]
+        held = self.grid.middle_um
+        centre = d * tx + x[PLACE["decentre_x_um"]] - held[0], d * ty + x[PLACE["decentre_y_um"]] - held[1]
         exit_path = sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
         lateral, out = [x[PLACE[f"source_{a}_um"]] for a in "xy"], np.empty((len(index), *here[0].shape))
@@ -336,13 +339,12 @@ class ForwardModel:
     def _growth(self, x: Array, group: _Group) -> dict[str, Array]:
         """(frames,) relative growth of the source's image with the parameters that change its magnification."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
-        distance = self.lens.sensor_distance_um + x[PLACE["distance_um"]]
-        return {"distance_um": np.full(len(depth), 1 / distance), "stage_zero_um": -1 / depth}
+        distance = np.full(len(depth), self.lens.sensor_distance_um + x[PLACE["distance_um"]])
+        return {"distance_um": 1 / distance, "stage_zero_um": -1 / depth}
 
     def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[detector.Blur, dict[str, detector.Blur]]:
         """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
-        blur, source = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]]
-        how = {"sized": "pinhole_um" in names, "kind": real_of(group.reduced.kind)}
-        return detector.transfers(self.grid, blur, source * shrink, shrink, **how)
+        blur, sizes, kind = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]] * shrink, real_of(group.reduced.kind)
+        return detector.transfers(self.grid, blur, sizes, shrink, sized="pinhole_um" in names, kind=kind)

@@ -192,8 +192,7 @@ def _tables(
     cut = np.ix_(some, some)
     keep = lens[2][cut]
     p, q = (part[cut][keep] for part in lens[:2])
-    ends = [(np.array([0, n - 1]) - n // 2) * grid.pixel_um for n in (grid.rows, grid.columns)]
-    Y, X = (legendre.mapped(_PLACES, *end) for end in ends)
+    Y, X = (legendre.mapped(_PLACES, *end) for end in grid.ends_um())
     to_y, to_x = (legendre.interpolation(_PLACES, np.linspace(-1, 1, n)) for n in (grid.rows, grid.columns))
     places = [(float(a), float(b)) for a, b in itertools.product(Y, X)]
     seen = np.stack([_directions(turned, p, q, place) for place in places])
