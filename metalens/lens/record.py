@@ -89,7 +89,8 @@ class Lens:
         """Which light the proxy is of, in words, where pillars of one size answer x and y apart; empty for others."""
         if self.hand or self.pairs is not None or self.cell.alike:
             return ""
-        return "the mean of both polarisations" if self.proxy.max_angle_rad > 0 else "light along x"
+        angled = self.proxy.max_angle_rad > 0
+        return "the mean of both polarisations, tilted along x" if angled else "light along x"
 
     def seen(self, light: Literal["x", "y"]) -> "Lens":
         """The lens for light polarised along x or y, where it focuses that."""

@@ -46,6 +46,14 @@ def test_pillars_alike_for_both_take_both(shape):
     assert design_words.held(made) == ""
 
 
+def test_at_angles_the_library_holds_the_mean_of_both_in_one_plane_of_incidence():
+    """Rectangles answer light that is tilted along y otherwise than along x, where their rows were solved."""
+    alike = {name: getattr(PROXY, name)[None] for name in ("phase_coefficients", "transmission_coefficients")}
+    made = replace(lens(Rectangle(ratio=0.6)), proxy=replace(PROXY, max_angle_rad=0.3, **alike))
+    found = from_lens(made, VIEW, tolerance=1e-3)
+    assert "of the mean of both polarisations, tilted along x" in found.reason
+
+
 def test_round_pillars_of_unlike_periods_are_of_one_light_too():
     assert replace(lens(Circle()), cell=Cell(0.4, lattice=Lattice("rectangular", 1.2))).one_light == "light along x"
 
