@@ -28,12 +28,12 @@ _SHORT = 0.15  # of the way from the mode, that such a step may go: on a flat ta
 _NEAR = 0.6  # sigma of a step from which on slopes must hold
 _STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell, in all, while these are said to hold
 _FAR = 1.25  # times the goal: a step at most
-_TURNS = 14
+_TURNS, _MOST_TURNS = 20, 40  # where steps go to and fro, and where they still go on
 _HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
 _BELOW = 0.5  # of -2 ln L, by which a place is a better mode
 _BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
 _UNSURE = 0.5  # of what is still to go, by a straight model that does not hold yet
-_WORTH = 0.1  # sigma by which a begin must reach beyond what is found
+_WORTH, _SPARE = 0.1, 0.05  # sigma by which a begin must reach beyond what is found, and must promise to on its way
 POINTS = 61  # of the curve of a walk
 _MODE = -1  # the first mode among stops of a walk; then -2 ...
 Begin = tuple[int, Array | None, float]
@@ -44,13 +44,17 @@ Wanted = tuple[int, int, Begin | None]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Profile:
-    """One parameter: 95 % interval, and the rise of -2 ln L at ``value`` (points,) with the rest fitted."""
+    """One parameter: 95 % interval, and the rise of -2 ln L at ``value`` (points,) with the rest fitted.
+
+    found: whether its low and its high end were; one that was not is the farthest place inside that was met.
+    """
 
     low: float
     high: float
     value: Array
     rise: Array
     parabolic: bool
+    found: tuple[bool, bool] = (True, True)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,7 +62,8 @@ class End:
     """Of a profile.
 
     place: of the parameter. seen: (value, rise) of the profile on the way. met: (places (p,), rise) on the way, no more
-    than that of the end. lower: a place below the mode, if one was met. steps: images that were asked for.
+    than that of the end. lower: a place below the mode, if one was met. steps: images that were asked for. done: found,
+    or given up, in time; else ``place`` is the farthest that was met.
     """
 
     place: float
@@ -66,6 +71,7 @@ class End:
     met: list[tuple[Array, float]]
     lower: Array | None = None
     steps: int = 0
+    done: bool = True
 
 
 def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
@@ -75,7 +81,7 @@ def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
     if max(one.steps for one in sides) < 2:  # straight
         points = [(mode + s * sigma, s * s) for s in (-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5)]
     value, rise = np.array(sorted(points)).T
-    return Profile(low, high, value, rise, plain(low, high, mode, goal * sigma))
+    return Profile(low, high, value, rise, plain(low, high, mode, goal * sigma), (sides[0].done, sides[1].done))
 
 
 def plain(low: float, high: float, middle: float, reach: float) -> bool:
@@ -96,40 +102,47 @@ def end(
 ) -> End:
     """The farthest to one side where the misfit has risen by no more than ``goal`` squared.
 
+    Where it is not found in time, the farthest place with less that was met.
+
     begin: (p,) a place with less, instead of the valley's. most: by how much the parameter goes in a step.
     beyond: times ``sign``, what is reached already. What promises less is given up: though what is still to go by the
         straight model were half as much again, or half of it where it goes back.
     """
     here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
     lowest = valley.least - valley.above
-    far, missed, back, steps = _FAR * goal, 0.0, False, 0
-    seen, met = dict[float, float](), list[tuple[Array, float]]()
-    for _ in range(_TURNS):
+    far, missed, back, turn, steps, done, onward = _FAR * goal, 0.0, False, 0, 0, False, True
+    seen, met, first = dict[float, float](), list[tuple[Array, float]](), here.x
+    while turn < (_MOST_TURNS if onward else _TURNS):
+        turn += 1
         step, least, size = _outwards(here, i, sign, lowest + goal**2, valley.prior, (far, most))
         if steps:
             seen[float(here.x[i])] = max(least - lowest, 0.0)
-        close = size < _CLOSE and abs(step[i]) <= min(_SHORT * abs(here.x[i] + step[i] - valley.mode[i]), 0.999 * most)
-        off_level = close and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2
-        held = missed < _STRAIGHT and not off_level
-        if held and steps and close:
+        close = size < _CLOSE and _short(step[i], here.x[i] + step[i] - valley.mode[i], most)
+        held = missed <= _STRAIGHT and not (close and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2)
+        again = not held and (size < _NEAR or back)
+        given_up = not again and _at_most(sign * here.x[i], sign * step[i] * max(1.0, size / far)) < beyond
+        if done := steps > 0 and ((held and close) or given_up):
             break
-        if not held and (size < _NEAR or back):  # again, with slopes that hold here
+        if again:  # with slopes that hold here
             here, missed = Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)), 0.0
             continue
-        if steps and _at_most(sign * here.x[i], sign * step[i] * max(1.0, size / far)) < beyond:
-            break
         there, off = _moved(valley, here, step)
         steps, rise = steps + 1, there.misfit - lowest
         if rise < -_BELOW:
-            return End(float(there.x[i]), [(float(there.x[i]), 0.0)], met, there.x, steps)
+            return End(float(there.x[i]), [(float(there.x[i]), 0.0)], met, there.x, steps, done=False)
         met += [(there.x, rise)] if rise < goal**2 else []
         back = rise > (goal + _HIGH) ** 2 and (off > size / 2 or there.misfit > here.misfit > lowest + goal**2)
-        if back:
-            far = min(size, far) / 2
-        else:
-            here, missed, far = there, missed + off, min(_FAR * goal, 2 * far)
-    place = float(np.clip(here.x[i] + step[i], valley.prior.low[i], valley.prior.high[i]))
-    return End(place, list(seen.items())[-3:], met, None, steps)
+        onward = sign * step[i] > 0 and not back
+        here, missed = (here, missed) if back else (there, missed + off)
+        far = min(size, far) / 2 if back else min(_FAR * goal, 2 * far)
+    at = here.x + step if done else max([first, *(x for x, _ in met)], key=lambda x: sign * x[i])
+    place = float(np.clip(at[i], valley.prior.low[i], valley.prior.high[i]))
+    return End(place, list(seen.items())[-3:], met, None, steps, done)
+
+
+def _short(step: float, way: float, most: float) -> bool:
+    """Whether a last step of a parameter is, beside its way from the mode, and no more was asked for."""
+    return abs(step) <= min(_SHORT * abs(way), 0.999 * most)
 
 
 def _at_most(place: float, way: float) -> float:
@@ -260,7 +273,8 @@ class Search:
         return [one.lower for some in ends for _, one in some if one.lower is not None]
 
     def beyond(self) -> list[Wanted]:
-        """Ends that a place with less misfit lies beyond, with the farthest of these; each place is tried once."""
+        """Ends that a place with less misfit lies beyond, or that were not found in time, with the farthest such place;
+        each is tried once."""
         out: list[Wanted] = []
         for (i, sign), one in self._found.items():
             if not self._met:
@@ -268,7 +282,8 @@ class Search:
             k, begin, x = max(self._met, key=lambda place: sign * place[2][i])
             room = _BEYOND * abs(self._found[i, 1].place - self._found[i, -1].place)
             tried = self._tried.get((i, sign), -math.inf)
-            if sign * x[i] > max(sign * one.place + room, tried):
+            least = max(sign * one.place, tried) + room if one.done else max(sign * one.place - room, tried + room)
+            if sign * x[i] > least:
                 self._tried[i, sign] = sign * float(x[i])
                 out.append((i, sign, (k, begin, sign * float(x[i]))))
         return out
@@ -286,7 +301,8 @@ class Search:
         least, most = max(seen[0][:, 0].max(), near.min()), min(seen[1][:, 0].min(), near.max())
         inner = inner[(inner[:, 0] >= least) & (inner[:, 0] <= most)]
         value, rise = np.array(sorted(np.concatenate([*seen, inner]).tolist())).T
-        return Profile(low, high, value, rise, plain(low, high, middle, math.sqrt(self._level) * sigma))
+        parabolic = plain(low, high, middle, math.sqrt(self._level) * sigma)
+        return Profile(low, high, value, rise, parabolic, (sides[0].done, sides[1].done))
 
     def _begins(self, i: int, sign: int) -> list[Begin]:
         """Stops of the walk from where a parameter goes farthest, and modes, the farthest first.
@@ -314,6 +330,7 @@ class Search:
         most = 2 * goal * sigma
         for k, begin, reach in begins:
             if reach > far + _WORTH * sigma:
-                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most, beyond=far)))
+                worth = far + _SPARE * sigma
+                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most, beyond=worth)))
                 far = max(far, sign * out[-1][1].place)
         return out

@@ -116,13 +116,16 @@ def _joined(
     profiles: dict[str, Profile],
     walks: Mapping[str, Walk],
 ) -> Posterior:
-    best, names = modes[0], task.names
+    best, names, profiles = modes[0], task.names, dict(profiles)
     spread = max(1.0, best.chi2_per_dof)
     calibration = valleys[0].calibration()
     sigma = valleys[0].sigma * np.sqrt(spread)
     low, high, parabolic = _intervals(task, modes, valleys, profiles, walks)
     wider = np.sqrt(1 + np.maximum(np.diag(calibration), 0.0) / sigma**2)
-    profiles = profiles | {names[one.index]: _whole(one, best, low, high) for one in walks.values()}
+    for one in walks.values():
+        known = profiles.get(names[one.index])
+        whole = _whole(one, best, low, high)
+        profiles |= {names[one.index]: dataclasses.replace(whole, found=known.found) if known else whole}
     low = np.maximum(best.value + wider * (low - best.value), task.prior.low)
     high = np.minimum(best.value + wider * (high - best.value), task.prior.high)
     profiles = {name: _widened(one, best.value, wider, names.index(name)) for name, one in profiles.items()}
@@ -215,8 +218,13 @@ def _covariance(draws: Array, valley: Valley, sigma: Array) -> Array:
 
 
 def words(task: Task, found: Posterior) -> list[str]:
-    """Bent and double posteriors, in words."""
-    out = []
+    """Bent and double posteriors, and ends that were not found, in words."""
+    out = [
+        f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, perhaps beyond"
+        for name, one in found.profiles.items()
+        for which, place, there in zip(("lower", "upper"), (one.low, one.high), one.found, strict=True)
+        if not there
+    ]
     for name, flat in zip(task.names, found.parabolic, strict=True):
         if not flat:
             i = task.names.index(name)

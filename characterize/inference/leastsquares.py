@@ -17,6 +17,7 @@ from characterize.inference.constrained import Ball
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 
+_TELLING = 0.03  # sigma of a step from which on images tell slopes: they are rounded by a thousandth of one or two
 Model = Callable[[Array, bool], tuple[Array, Array | None]]
 """(parameters, with Jacobian) -> (images (n, y, x), Jacobian (p, n, y, x) or None)."""
 
@@ -212,11 +213,15 @@ def _secant(
 ) -> _State:
     """The problem after a step, with the least change of the Jacobian that explains how the images changed.
 
-    J + (dI - J s) sᵀC / (sᵀC s), where C, the curvature, is the natural measure of a step.
+    J + (dI - J s) sᵀC / (sᵀC s), where C, the curvature, is the natural measure of a step. After one of less than
+    ``_TELLING`` sigma the Jacobian stays: how images are rounded (float32), over so short a way, would be taken for
+    slopes, and all that a fit ends in, covariance and a quick model put right by its slopes, with it.
     """
-    measure = state.curvature @ step
-    missed = (image - state.image) - np.tensordot(step, state.jacobian, 1)
-    jacobian = state.jacobian + np.multiply.outer(measure / max(float(step @ measure), 1e-300), missed)
+    jacobian = state.jacobian
+    if moved >= _TELLING:
+        measure = state.curvature @ step
+        missed = (image - state.image) - np.tensordot(step, jacobian, 1)
+        jacobian = jacobian + np.multiply.outer(measure / max(float(step @ measure), 1e-300), missed)
     return _state(data, (state.x + step, image, jacobian), prior, settings, travel=state.travel + moved)
 
 

@@ -50,9 +50,9 @@ def test_ends_of_a_bent_valley_are_those_of_what_is_straight_in_the_data(top):
         assert rise == pytest.approx(want, abs=0.05 * max(want, 0.4))  # descents end within 0.02
 
 
-@pytest.mark.parametrize("slope", [0.63, 0.35, 0.28])
+@pytest.mark.parametrize("slope", [0.63, 0.35, 0.28, 0.245])
 def test_ends_on_a_flat_tail_are_not_where_a_quarter_of_a_sigma_is_left(slope):
-    """slope ln(1 + x) has risen by 1.96 sigma at exp(1.96 sigma / slope) - 1: 7 to 53 sigma out, where the last quarter
+    """slope ln(1 + x) has risen by 1.96 sigma at exp(1.96 sigma / slope) - 1: 7 to 94 sigma out, where the last quarter
     of a sigma is a fifth to half of the way. Of a last step, 0.15 of it at most, the bend misses half the square, 1 %;
     slopes brought up to date by images as much again."""
     across, beside = np.linalg.qr(SHAPES.reshape(2, -1).T)[0].T.reshape(SHAPES.shape)
@@ -67,6 +67,35 @@ def test_ends_on_a_flat_tail_are_not_where_a_quarter_of_a_sigma_is_left(slope):
     valley = Valley(flat, seen(flat(mode, False)[0]), mode, prior)
     found = ends.end(valley, 0, 1, REACH, most=2 * REACH * float(valley.sigma[0]))  # no farther a step than a search
     assert found.place == pytest.approx(want, rel=0.03)
+
+
+@pytest.mark.parametrize(("share", "sign"), [(0.03, 1), (0.04, -1)])
+def test_without_an_end_in_time_it_is_the_farthest_place_that_was_tried(share, sign):
+    """A straight valley, whose end is 1.96 sigma off, in steps of a share of a sigma: 40 of them are tried."""
+    truth = np.array([1.5, 0.6])
+
+    def straight(x, jacobian):
+        return np.tensordot(x, SHAPES, 1), SHAPES if jacobian else None
+
+    valley = Valley(straight, seen(straight(truth, False)[0]), truth, Prior.none(np.zeros(2)))
+    sigma = float(valley.sigma[0])
+    for begin, way in ((None, 0.0), (truth + sign * 0.3 * valley.along(0), 0.3)):
+        found = ends.end(valley, 0, sign, REACH, begin=begin, most=share * sigma)
+        assert (found.place - truth[0]) / sigma == pytest.approx(sign * min(way + 40 * share, REACH), rel=1e-6)
+    whole = ends.end(valley, 0, sign, REACH, most=0.5 * sigma)
+    assert (whole.place - truth[0]) / sigma == pytest.approx(sign * REACH, rel=1e-6)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_steps_to_and_fro_give_the_farthest_place_that_holds(sign):
+    """Slopes of no use: the image of any other place is far off, so that only the mode holds."""
+    truth = np.array([1.5, 0.6])
+
+    def torn(x, jacobian):
+        return np.tensordot(truth, SHAPES, 1) + 40 * (x[0] != truth[0]), SHAPES if jacobian else None
+
+    valley = Valley(torn, seen(torn(truth, False)[0]), truth, Prior.none(np.zeros(2)))
+    assert ends.end(valley, 0, sign, REACH).place == truth[0]
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

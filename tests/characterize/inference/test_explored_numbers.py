@@ -22,7 +22,7 @@ def test_a_profile_is_stretched_about_its_own_mode():
     assert not wide.parabolic
 
 
-def test_a_second_lens_is_told_by_the_three_parameters_that_differ_most_in_sigma():
+def test_a_second_lens_is_told_by_the_three_parameters_that_differ_most_in_sigma_and_ends_that_were_not_found():
     """Of steps -8, 3, -0.1 and 0.06 with errors 4, 0.5, 0.1 and 0.02: 2, 6, 1 and 3 sigma."""
     best = SimpleNamespace(
         value=np.array([2.0, -7.0, 0.3, 0.02]), covariance=np.diag([4.0, 0.5, 0.1, 0.02]) ** 2, merit=812.0
@@ -31,8 +31,18 @@ def test_a_second_lens_is_told_by_the_three_parameters_that_differ_most_in_sigma
     found = SimpleNamespace(
         best=best, modes=(best, other), share=np.array([0.78, 0.22]), parabolic=np.array([True, False, True, True]),
         low=np.array([0.0, -9.25, 0.0, 0.0]), high=np.array([9.0, 1.5, 1.0, 1.0]),
+        profiles={
+            name: Profile(low, high, np.zeros(1), np.zeros(1), parabolic=False, found=found)
+            for name, low, high, found in (
+                ("bias_nm", 0.0, 9.0, (True, True)),
+                ("height_nm", -9.25, 1.5, (False, True)),
+                ("index", 0.0, 1.0, (True, False)),
+            )
+        },
     )  # fmt: skip
-    bent, second = explore.words(SimpleNamespace(names=NAMES), found)
+    low, high, bent, second = explore.words(SimpleNamespace(names=NAMES), found)
+    assert low == "the lower end of height_nm was not found: 95 % reach to -9.25 at least, perhaps beyond"
+    assert high == "the upper end of index was not found: 95 % reach to 1 at least, perhaps beyond"
     assert bent.startswith("height_nm is bent: 95 % within -9.25 to 1.5 about -7, ")
     assert second.startswith("a second lens explains the frames nearly as well (misfit +2.5, probability 22%): ")
     assert ": height_nm -4 for -7, index 0.08 for 0.02, bias_nm -6 for 2; frames" in second

@@ -85,3 +85,49 @@ def test_parameters_of_unlike_units_are_inverted_alike():
     matrix = np.array([[3.0, 0.8, -0.1], [0.8, 2.0, 0.3], [-0.1, 0.3, 1.4]])
     units = np.array([1e-7, 3.0, 4e8])
     assert invert(matrix / np.outer(units, units)) / np.outer(units, units) == pytest.approx(np.linalg.inv(matrix))
+
+
+@pytest.mark.parametrize("away", [3e-3, 1e-2, 0.028])
+def test_a_step_too_short_to_show_in_rounded_images_changes_no_slopes(away):
+    """A straight model whose images come in single precision: bright pixels of 3e5, known to their root, round by up to
+    3e-5 sigma each, 5e-4 in all of 25 x 20. Over a step of ``away`` sigma these would be slopes of 5e-4 / ``away``
+    sigma a sigma along it. A fit that begins so close ends with the slopes that it was given.
+    """
+    rng = np.random.default_rng(15)
+    shapes = rng.uniform(0.7, 1.3, (2, 1, 25, 20)) * [[[[3e5]]], [[[1.0]]]] * [[[[1.0]]], [[[2e4]]]]
+    truth, sigma = np.array([1.0, -0.37]), 550.0
+    image = np.tensordot(truth, shapes, 1)
+    everywhere = np.ones(image.shape, bool)
+    data = Data(image, everywhere, ~everywhere, np.full(image.shape, sigma**2), np.full(image.shape, 1e15))
+
+    def rounded(x, slopes):
+        return np.tensordot(x, shapes, 1).astype(np.float32).astype(float), shapes if slopes else None
+
+    scaled = shapes.reshape(2, -1) / sigma
+    size, turn = np.linalg.eigh(scaled @ scaled.T)
+    begin = truth + away * turn @ (np.array([0.8, -0.6]) / np.sqrt(size))
+    found = fit(rounded, data, begin, settings=Settings(secant=True, step_tolerance=1e-4))
+    assert found.slopes == pytest.approx(shapes, rel=1e-12)
+    assert found.converged
+
+
+def test_longer_steps_bring_slopes_up_to_date():
+    """e^x of a picture from 0.3 sigma off, with slopes of where it is sought: after one step they are the secant."""
+    shape = np.random.default_rng(2).uniform(0.5, 1.5, (1, 6, 5))
+    sigma = 0.01 * float(np.linalg.norm(shape)) * np.exp(0.4) / 1.2  # of a parameter: 0.012
+    everywhere = np.ones(shape.shape, bool)
+    data = Data(
+        np.exp(0.4) * shape, everywhere, ~everywhere, np.full(shape.shape, sigma**2), np.full(shape.shape, 1e15)
+    )
+    asked = []
+
+    def model(x, slopes):
+        asked.append(float(x[0]))
+        return np.exp(x[0]) * shape, np.exp(x)[:, None, None, None] * shape if slopes else None
+
+    settings = Settings(secant=True, near=np.inf, finish=False, iterations=1)
+    found = fit(model, data, np.array([0.39]), settings=settings)
+    (begin, end) = asked
+    want = (np.exp(end) - np.exp(begin)) / (end - begin)
+    assert end - begin > 0.1 * 0.012
+    assert found.slopes[0] == pytest.approx(want * shape, rel=1e-9)

@@ -115,6 +115,27 @@ def test_a_place_beyond_an_end_is_asked_once_and_the_farther_end_stays(monkeypat
     assert (search._found[1, 1].place, search._found[0, -1].place) == (3.6, -0.7)
 
 
+def test_an_end_that_was_not_found_is_asked_again_from_a_place_as_far_and_told(monkeypatch):
+    """2.8 falls 0.2 short of 3, of an interval of 11 no more than a fiftieth: from there once, and from no place that
+    is not a fiftieth farther again."""
+    told = Told(four() | {(1, 1): End(3.0, [], [(np.array([0.0, 2.8]), 3.0)], steps=3, done=False)})
+    told.by[0, -1].met.clear()
+    monkeypatch.setattr(ends, "end", told)
+    search = Search(None, MODE, None, [valley()])
+    search.ends(WANTED)
+    (again,) = search.beyond()
+    assert again[:2] == (1, 1)
+    assert again[2][1].tolist() == [0.0, 2.8]
+    assert search.beyond() == []
+    told.by[1, 1] = End(2.9, [], [(np.array([0.0, 2.95]), 3.0)], steps=3)
+    search.ends([again])
+    assert search.beyond() == []
+    assert search.profile(1).found == (True, False)  # what is known reaches to 3, and was not the end
+    told.by[1, 1] = End(3.1, [], [], steps=3)
+    search.ends([again])
+    assert search.profile(1).found == (True, True)
+
+
 def test_places_below_the_mode_are_told(monkeypatch):
     lower = np.array([0.1, -2.0])
     monkeypatch.setattr(ends, "end", Told(four() | {(1, 1): End(3.0, [], [], lower, 2)}))
