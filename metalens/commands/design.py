@@ -12,9 +12,10 @@ import tyro
 from metalens import design, lens, library
 from metalens.cell import Cell
 from metalens.commands import design_words as words
-from metalens.commands import paired
+from metalens.commands import paired, several
 from metalens.commands.common import Common, Output
 from metalens.commands.paired import Target
+from metalens.commands.several import Beside
 from metalens.design import (
     Conversion,
     Cubic,
@@ -26,8 +27,6 @@ from metalens.design import (
     PhaseOf,
     Quality,
     check_focus,
-    focuses,
-    meeting_um,
 )
 from metalens.design.free_form import Asked, Fisher
 from metalens.ground import config, reading, store, transaction
@@ -66,6 +65,8 @@ class Design:
         library is one over two sizes; without it the same as light along x.
     hand: of the circular light that comes, where the library is for circular light: right (x + iy) or left. The phase
         is then made by the turn of pillars of one size.
+    wavelengths: [[wavelengths]] with wavelength_nm, weight and distances: light beside the design's own that the same
+        pillars are to serve, by least squares over wavelengths (an achromatic lens where distances are left out).
     """
 
     profile: Profile = "hyperbolic"
@@ -83,6 +84,7 @@ class Design:
     layers: Layers = field(default_factory=Layers)
     hand: Literal["right", "left"] = "right"
     along_y: Target | None = None
+    wavelengths: tuple[Beside, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.aperture_mm <= 10:
@@ -91,6 +93,7 @@ class Design:
             raise ConfigError("profile 'map' needs a table [map] with file and pitch_um")
         if self.library is not None and self.cell is not None:
             raise ConfigError("library and cell are both given; a library holds its cell: give one of them")
+        several.check(self.wavelengths, self.profile)
         check_gaps(self.layers, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
 
     @property
@@ -136,15 +139,17 @@ def run(options: Options) -> int:
         raise ConfigError("along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it")
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
-    values, head = words.values(made.quality, made.check, made.unlike), _head(made.wanted, target, made.quality)
-    text = words.text(head + made.held, made.wanted.layers, made.quality, made.check, made.unlike)
+    head, layers = _head(made.wanted, target, made.quality) + made.held, made.wanted.layers
+    values = words.values(made.quality, made.check, made.unlike) | several.numbers(made.beside)
+    text = words.text(head, layers, made.quality, made.check, made.unlike, several=bool(made.beside))
+    text += several.lines(made.beside, layers)
     if made.conversion is not None:
         values["circular"] = {"hand": made.wanted.hand, **asdict(made.conversion)}
         text = f"{text}\n{words.converted(made.conversion, made.quality, made.wanted.hand)}"
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     options.console.result(values, text)
-    return 0 if made.check is None or made.check.passed else 1
+    return 0 if all(one is None or one.passed for one in (made.check, *(b.check for b in made.beside))) else 1
 
 
 def _head(wanted: Design, target: Path, quality: Quality) -> str:
@@ -158,6 +163,8 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
     """A lens of pillars of two sizes, for light along x and along y."""
     if options.own_cell:
         raise ConfigError("own_cell: rows of pillars of two sizes are not solved; leave --own-cell out")
+    if wanted.wavelengths:
+        raise ConfigError("wavelengths: need a library of pillars of one size; this one is over two (lengths_um)")
     with options.claim(options.output, beside=(".png",), inputs=read) as draft:
         path = options.config.parent / (wanted.library or "")
         made_of, inputs = axes.load(path), {file.name: reading.sha256(file) for file in (path, options.config)}
@@ -166,7 +173,7 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         if options.process is not None:
             wanted = replace(wanted, limits=_printable(options.process, made_of.cell, wanted.limits))
             inputs[options.process.name] = reading.sha256(options.process)
-        wanted = replace(wanted, layers=_filled(wanted.layers, made_of.cell))
+        wanted = replace(wanted, layers=wanted.layers.covered_by(made_of.cell.cover))
         radius_um = wanted.aperture_mm * 500
         phase, focus, _ = _phase(wanted, options, radius_um)
         if wanted.along_y is None:
@@ -209,7 +216,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         wanted = replace(wanted, limits=_printable(options.process, cell, wanted.limits))
         inputs[options.process.name] = reading.sha256(options.process)
     inputs[options.config.name] = reading.sha256(options.config)
-    wanted = replace(wanted, layers=_filled(wanted.layers, cell))
+    wanted = replace(wanted, layers=wanted.layers.covered_by(cell.cover))
     own = _located(wanted, options.config)
     if wanted.profile == "map" and own is not None and own.file.is_file():
         inputs[own.file.name] = reading.sha256(own.file)
@@ -218,37 +225,34 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     about: dict[str, Any] = {"aperture_um": 2 * radius_um, "limits": wanted.limits, "profile": wanted.profile}
     about["provenance"] = store.Provenance(config=config.dumps(wanted), inputs=inputs)
     conversion: Conversion | None = None
-    if made_of.turned is not None:
+    others: list[Quality] = []
+    if wanted.wavelengths:
+        each = several.each(wanted, made_of)
+        lights = [design.Wanted(*_phase(one, options, radius_um)[:2], weight) for one, weight in each]
+        made, (quality, *others) = design.make_several(lights, cell=cell, proxy=proxy, **about)
+    elif made_of.turned is not None:
         made, quality, conversion = design.make_turned(phase, focus, library=made_of, hand=wanted.hand, **about)
     else:
         partial = options.accept_partial_turn
         made, quality = design.make(phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about)
-    meets = wanted.profile != "map" or _meets(phase, focus, radius_um, cell, options.console)
+    meets = wanted.profile != "map" or words.meets(phase, focus, radius_um, cell, options.console)
     quality = replace(quality, focuses=meets)
     made, found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
-    check = check_focus(made) if _checkable(wanted, options, quality) else None
+    checked = _checkable(wanted, options, quality)
+    check = check_focus(made, expected=quality.strehl if others else 1.0) if checked else None
+    beside = several.judged(made, wanted.wavelengths, others, check=checked)
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(wanted, quality, check, judged, conversion, found, words.held(made))
-
-
-def _meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
-    """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
-    if focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
-        return True
-    elsewhere = meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
-    if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
-        told = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {focus.sensor_distance_um / 1e3:g} mm"
-        console.say(f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}")
-    return False
+    return Outcome(wanted, quality, check, judged, conversion, found, words.held(made), beside)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; judged: of a free form; conversion: of
-    circular light; unlike: what neighbours leave of the efficiency; held: which light it is for, where that matters."""
+    circular light; unlike: what neighbours leave of the efficiency; held: which light it is for, where that matters;
+    beside: of the other wavelengths."""
 
     wanted: Design
     quality: Quality
@@ -257,17 +261,7 @@ class Outcome:
     conversion: Conversion | None
     unlike: design.Unlike | None
     held: str
-
-
-def _filled(layers: Layers, cell: Cell) -> Layers:
-    """The films with the cell's cover between them.
-
-    Raises:
-        ConfigError: another cover is given.
-    """
-    if layers.cover not in (None, cell.cover):
-        raise ConfigError(f"layers.cover = {layers.cover!r}, but the cell has {cell.cover!r}: leave layers.cover out")
-    return replace(layers, cover=cell.cover)
+    beside: tuple[several.Judged, ...]
 
 
 def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
@@ -333,7 +327,8 @@ def _pillars(wanted: Design, where: Path, console: Console) -> tuple[PillarLibra
         path = where.parent / wanted.library
         return library.load(path), {path.name: reading.sha256(path)}
     cell = wanted.cell or library.DEFAULT_CELL
-    return library.sweep(cell, wavelengths_um=(wanted.focus.wavelength_um,), console=console), {}
+    waves = wanted.focus.wavelength_um, *(1e-3 * one.wavelength_nm for one in wanted.wavelengths)
+    return library.sweep(cell, wavelengths_um=tuple(sorted(waves)), console=console), {}
 
 
 def _printable(path: Path, cell: Cell, limits: Limits) -> Limits:

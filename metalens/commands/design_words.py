@@ -4,9 +4,22 @@ import math
 from dataclasses import asdict, replace
 
 from metalens import design
-from metalens.design import Conversion, FocusCheck, Quality, Unlike
+from metalens.cell import Cell
+from metalens.design import Conversion, Focus, FocusCheck, PhaseOf, Quality, Unlike
+from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens
+
+
+def meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
+    """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
+    if design.focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
+        return True
+    elsewhere = design.meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
+    if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
+        told = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {focus.sensor_distance_um / 1e3:g} mm"
+        console.say(f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}")
+    return False
 
 
 def neighbours(
@@ -115,8 +128,17 @@ def held(made: Lens) -> str:
     )
 
 
-def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> str:
-    """Lines about a lens below a head; layers: films that its phase is corrected for."""
+def text(
+    head: str,
+    layers: Layers,
+    quality: Quality,
+    check: FocusCheck | None,
+    unlike: Unlike | None = None,
+    *,
+    several: bool = False,
+) -> str:
+    """Lines about a lens below a head; layers: films that its phase is corrected for; several: whether its pillars are
+    a compromise between wavelengths."""
     lines = [
         head,
         *_cone(quality),
@@ -132,10 +154,15 @@ def text(head: str, layers: Layers, quality: Quality, check: FocusCheck | None, 
             f"{quality.sampled_aperture:.3f} without aliases): there light leaves in other directions too; take a "
             "smaller pitch"
         )
-    if quality.turns < 1:
+    if several or quality.turns < 1:
+        why = (
+            "the compromise between wavelengths is"
+            if several
+            else "the nearest stands in for the phases that none has,"
+        )
         lines.append(
-            f"  the pillars cover {quality.turns:.3f} of a turn: the nearest stands in for the phases that none has, "
-            f"{quality.rms_phase_error_rad:.2g} rad rms off, which costs {1 - quality.strehl:.1%} of the peak"
+            f"  the pillars cover {quality.turns:.3f} of a turn: {why} {quality.rms_phase_error_rad:.2g} rad rms off, "
+            f"which costs {1 - quality.strehl:.1%} of the peak"
         )
     if check is not None:
         lines.append(f"  exact diffraction sum: {check.text}")

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from metalens.design.profiles import Focus as Focus
     from metalens.design.profiles import PhaseMap as PhaseMap
     from metalens.design.profiles import hyperbolic as hyperbolic
+    from metalens.design.several import Wanted as Wanted
+    from metalens.design.several import make_several as make_several
     from metalens.design.sites import PhaseOf as PhaseOf
     from metalens.design.turned import Conversion as Conversion
     from metalens.design.turned import make_turned as make_turned
@@ -45,6 +47,7 @@ __getattr__, __dir__, __all__ = attach(
         "Quality": "of_phase",
         "Split": "paired",
         "Unlike": "own_cell",
+        "Wanted": "several",
         "check_focus": "focus_check",
         "focuses": "focusing",
         "meeting_um": "focusing",
@@ -52,6 +55,7 @@ __getattr__, __dir__, __all__ = attach(
         "left_out": "own_cell",
         "make": "of_phase",
         "make_paired": "paired",
+        "make_several": "several",
         "make_turned": "turned",
         "neighbours": "",
         "phase_of": "of_phase",

@@ -2,10 +2,10 @@
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from metalens.cell import Film, Index, Material, index
-from metalens.ground.errors import PropagationError
+from metalens.ground.errors import ConfigError, PropagationError
 from metalens.lens.media import Media
 
 MOST_ABSORBED = 0.02
@@ -38,6 +38,16 @@ class Layers:
     def films(self) -> tuple[Film, ...]:
         """All films that have a thickness."""
         return tuple(film for film in (*self.front, *self.behind) if film.thickness_um > 0)
+
+    def covered_by(self, cover: Material) -> "Layers":
+        """These films with the cover of a cell between them.
+
+        Raises:
+            ConfigError: they name another cover.
+        """
+        if self.cover not in (None, cover):
+            raise ConfigError(f"layers.cover = {self.cover!r}, but the cell has {cover!r}: leave layers.cover out")
+        return replace(self, cover=cover)
 
     def after(self, distance_um: float, wavelength_um: float) -> Media:
         """Media from pillars to sensor, the cover first.
