@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from characterize.captures.electrons import Gain as Gain
     from characterize.captures.electrons import clean as clean
     from characterize.captures.electrons import merge_brackets as merge_brackets
+    from characterize.captures.turns import MIRRORED as MIRRORED
+    from characterize.captures.turns import TURNS as TURNS
+    from characterize.captures.turns import between as between
+    from characterize.captures.turns import turn as turn
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -18,8 +22,12 @@ __getattr__, __dir__, __all__ = attach(
         "Capture": "capture",
         "Frames": "electrons",
         "Gain": "electrons",
+        "MIRRORED": "turns",
+        "TURNS": "turns",
+        "between": "turns",
         "capture": "",
         "clean": "electrons",
         "merge_brackets": "electrons",
+        "turn": "turns",
     },
 )

@@ -1,23 +1,27 @@
 """Before the fit: how the frames lie. Orientation, order and stage zero, judged against the nominal lens."""
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft, optimize
 
+from characterize.captures import MIRRORED, TURNS, between, turn
 from characterize.inference.leastsquares import Data
 from characterize.model import PLACE, ForwardModel, Setting, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
-TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
 _ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
+Way = tuple[bool, int]  # reordered, orientation
+Shift = tuple[float, float]
 _TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
+_NEAR = 0.02  # of the likeness: by ten times less errors of a made lens were seen to exchange two orientations
+_TOLD = 40.0  # chi-square between orientations from which on fits may tell them apart
 _SURE = 0.9  # likeness from which on the nominal lens explains the frames
 _ZEROS = 17
 _DISTANCES = 17  # of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at NA 0.25
-MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,6 +34,7 @@ class Arrangement:
     order_seen: whether the nominal images differ enough with depth to tell.
     orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the stated one beyond doubt.
     alike: turns (1 to 7) under which the nominal images do not change: these cannot be told from the chosen one.
+    others: the same in other ways about as much alike: as a lens is made, any may be the one; fits tell.
     """
 
     stage_zero_um: float
@@ -42,6 +47,7 @@ class Arrangement:
     orientation: int
     clearly: bool
     alike: tuple[int, ...]
+    others: tuple["Arrangement", ...] = ()
 
     @property
     def words(self) -> str:
@@ -57,12 +63,6 @@ def few_frames(setting: Setting) -> Array:
         by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
         chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
     return np.unique(chosen)
-
-
-def turn(frames: Array, orientation: int) -> Array:
-    """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation mod 4) times."""
-    turned = frames[..., ::-1] if orientation >= 4 else frames
-    return np.rot90(turned, orientation % 4, axes=(-2, -1))
 
 
 def arrange(
@@ -115,21 +115,63 @@ class _Frames:
         return _Frames(model, rough, self.light[index], self.noise[index], self.clipped[index], _reversed(model))
 
     def scanned(self, start: Array, zeros: Array, distances_um: Array | None = None) -> tuple[Array, float]:
-        """Parameters at the best stage zero (and distance) for frames as stated or end to end; likeness there."""
+        """Parameters at the best stage zero (and distance) of the way that the frames lie; likeness there.
+
+        Each way has its own best: images that twist with depth are mirrored ones at another depth.
+        """
         distances = start[PLACE["distance_um"], None] if distances_um is None else distances_um
         places = np.repeat(start[None], len(distances) * len(zeros), 0)
         places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
             part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
         )
-        scores = threads.each(self._score, places)
-        best = int(np.argmax(np.nan_to_num(scores, nan=-math.inf)))
-        return places[best], scores[best]
+        turned = [_Spectra.of(turn(self.light, k), self.noise) for k in self.orientations()]
+        scores = np.nan_to_num(threads.each(lambda x: self._scores(x, turned), places), nan=-math.inf)
+        stated, back = scores.max(0)
+        orientation, back_first = _way(stated, back)
+        place = int(np.argmax(scores[:, int(back_first), orientation]))
+        return places[place], float(scores[place, int(back_first), orientation]) - _TWIN * back_first
 
-    def _score(self, x: Array) -> float:
-        """Likeness at some parameters, of frames as stated or, by ``_TWIN`` less, end to end."""
-        expected = _expected(self.rough, x, self.clipped)
-        stated = _mean_likeness(self.light, expected, self.noise)
-        return max(stated, _mean_likeness(self.light[self.back], expected, self.noise[self.back]) - _TWIN)
+    def orientations(self) -> range:
+        """Those that keep the shape of the frames."""
+        return range(0, 8, 1 if self.light.shape[1] == self.light.shape[2] else 2)
+
+    def _scores(self, x: Array, turned: list["_Spectra"]) -> Array:
+        """(2, orientations) likeness at some parameters: of frames as stated, and end to end."""
+        expected = _Spectra.of(_expected(self.rough, x, self.clipped), 0 * self.noise)
+        orders = np.arange(len(self.light)), self.back
+        return np.array([[frames.alike(expected, index) for frames in turned] for index in orders])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Spectra:
+    """Frames as :func:`_likeness` correlates them: spectra (n, u, v) of twice the side, norms (n,) freed of noise."""
+
+    spectrum: Array
+    norm: Array
+    sides: tuple[int, int]
+
+    @classmethod
+    def of(cls, frames: Array, noise: Array) -> "_Spectra":
+        """Of frames with noise of some norm, (n,)."""
+        power = (frames**2).sum((1, 2))
+        norm = np.sqrt(np.maximum(power - noise**2, 0.1 * power))
+        sides = 2 * frames.shape[1], 2 * frames.shape[2]
+        return cls(fft.rfft2(frames, sides), norm, sides)
+
+    def alike(self, expected: "_Spectra", index: Array) -> float:
+        """Mean likeness of the frames, taken in some order, to those expected."""
+        cross = fft.irfft2(self.spectrum[index] * np.conj(expected.spectrum), self.sides).max((1, 2))
+        norm = self.norm[index] * expected.norm
+        return float(np.minimum(np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0).mean())
+
+
+def _way(stated: Array, back: Array) -> tuple[int, bool]:
+    """Place of the orientation, and whether frames lie end to end, by their likeness: the least that explains them."""
+    orientation, clearly = _plainest_turn(stated)
+    orientation = orientation if clearly else 0
+    if back[0] <= stated[0] + _TWIN or back.max() < stated[orientation]:
+        return orientation, False
+    return (int(back.argmax()) if back.max() > back[0] + _TWIN else 0), True
 
 
 def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
@@ -137,26 +179,52 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
     order, reordered, seen = _order(light, expected, noise, frames.model)
+    orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
+    alike, shifts = _ways(frames, expected, orders)
     orientation, clearly = _orientation(light, expected, noise)
     if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
         reordered, clearly = _plainest(light, expected, noise, order, orientation)
-    laid = turn(light, orientation) if clearly else light
-    found = _compare(laid[order] if reordered else laid, expected, noise)
-    possible = [k for k in range(1, 8) if k % 2 == 0 or expected.shape[1] == expected.shape[2]]
-    turned = {k: _mean_likeness(turn(expected, k), expected, 0 * noise) for k in possible}
-    shift = np.median([s for _, s in found], axis=0)
-    return Arrangement(
+    chosen = reordered, orientation if clearly else 0
+    apart = {k: _apart(k, expected, light, noise) for k in frames.orientations()}
+    found = Arrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
-        shift_px=(float(shift[0]), float(shift[1])),
+        shift_px=shifts[chosen],
         likeness=likeness,
         order=order,
         reordered=reordered,
         order_seen=seen,
-        orientation=orientation,
+        orientation=chosen[1],
         clearly=clearly,
-        alike=tuple(k for k, value in turned.items() if value >= 0.997),
+        alike=tuple(k for k in apart if k and apart[k] < _TOLD),
     )
+    told = [way for way in alike if way[0] == reordered and apart[between(chosen[1], way[1])] >= _TOLD]
+    twin = sorted((way for way in alike if way[0] != reordered), key=lambda way: -alike[way])[:1]
+    others = [
+        replace(found, reordered=way[0], orientation=way[1], clearly=way[1] > 0, shift_px=shifts[way])
+        for way in [*told, *twin]
+        if alike[way] > alike[chosen] - _NEAR
+    ]
+    return replace(found, others=tuple(others))
+
+
+def _ways(frames: _Frames, expected: Array, orders: dict[bool, Array]) -> tuple[dict[Way, float], dict[Way, Shift]]:
+    """Mean likeness and shift (y, x) of the frames, by whether they are reordered and by orientation."""
+    alike, shifts = {}, {}
+    for way in itertools.product(orders, frames.orientations()):
+        index = orders[way[0]]
+        found = _compare(turn(frames.light[index], way[1]), expected, frames.noise[index])
+        alike[way] = float(np.mean([score for score, _ in found]))
+        y, x = np.median([shift for _, shift in found], axis=0).tolist()
+        shifts[way] = y, x
+    return alike, shifts
+
+
+def _apart(k: int, expected: Array, light: Array, noise: Array) -> float:
+    """Chi-square between the nominal images, as bright as the light, and these turned about the chief ray."""
+    odd = expected[:, 1 - expected.shape[1] % 2 :, 1 - expected.shape[2] % 2 :]  # pixel n // 2 is its middle
+    unlike = ((turn(odd, k) - odd) ** 2).sum((1, 2)) * _brightness(light, expected, noise) ** 2
+    return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
 def _reversed(model: ForwardModel) -> Array:
@@ -186,10 +254,7 @@ def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
 def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
     """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
     n = len(light)
-    power = float((light**2).sum())
-    seen = max(power - float((noise**2).sum()), 0.1 * power)
-    # by their power: the sum of frames less a plane may be 0, or below
-    bright = expected * math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
+    bright = expected * _brightness(light, expected, noise)
     apart = np.full((n, n), np.inf)
     unlike = np.full((n, n), np.inf)
     for group in model.groups:
@@ -203,6 +268,13 @@ def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> 
     neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
     distinct = bool(n > 1 and np.median(neighbours) > 0.2)
     return columns, bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct), distinct
+
+
+def _brightness(light: Array, expected: Array, noise: Array) -> float:
+    """Of the light over that expected, by their power: the sum of frames less a plane may be 0, or below."""
+    power = float((light**2).sum())
+    seen = max(power - float((noise**2).sum()), 0.1 * power)
+    return math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
 
 
 def _distance(a: Array, b: Array) -> float:
@@ -220,15 +292,16 @@ def _plainest(light: Array, expected: Array, noise: Array, order: Array, orienta
 
 
 def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool]:
-    scores = []
-    square = light.shape[1] == light.shape[2]
-    for orientation in range(8):
-        if orientation % 2 and not square:
-            scores.append(-1.0)
-            continue
-        scores.append(_mean_likeness(turn(light, orientation), expected, noise))
-    best = int(np.flatnonzero(np.array(scores) > max(scores) - 2e-3)[0])  # of equals the plainest turn
-    return best, best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02
+    scores = np.full(8, -1.0)
+    for k in range(0, 8, 1 if light.shape[1] == light.shape[2] else 2):
+        scores[k] = _mean_likeness(turn(light, k), expected, noise)
+    return _plainest_turn(scores)
+
+
+def _plainest_turn(scores: Array) -> tuple[int, bool]:
+    """Of equal likenesses the plainest turn; whether it beats the first, that of frames as stated, beyond doubt."""
+    best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
+    return best, bool(best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02)
 
 
 def _bare(x: Array) -> Array:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import Capture, Gain, clean
+from characterize.captures import MIRRORED, TURNS, Capture, Gain, clean
 from characterize.inference import explore, knowable, missing, residual, search, verdict
-from characterize.inference.arrange import MIRRORED, TURNS, Arrangement, arrange, rearranged
+from characterize.inference.arrange import Arrangement, arrange, rearranged
 from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Data, Solution
@@ -83,12 +83,14 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
     found = arrange(model, data, scan_um=scan, start=start, reach_um=_reach_um(known, lens))
     _check_likeness(found, lens)
-    cautions = [*frames.corrections, *_arranged_words(found)]
+    whole = Task(model, data, start, known, found, options.free, unfitted)
+    task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
+    cautions = [*frames.corrections, *_arranged_words(task.found or found)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
-    model = model.about(search.window_um(found, setting.pixel_um))
-    task = Task(model, _rearranged(data, found), start, known, found, options.free, unfitted)
-    task = dataclasses.replace(task, model=quick_enough(model, task.data, search.starts(task, biases_nm=(0.0,))[0]))
+    task = dataclasses.replace(
+        task, model=quick_enough(task.model, task.data, search.starts(task, biases_nm=(0.0,))[0])
+    )
     task, ends = _ends(task, frames.gain, cautions)
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
@@ -189,6 +191,12 @@ def _arranged_words(found: Arrangement) -> list[str]:
             "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
         )
     return words
+
+
+def _as_laid(task: Task, found: Arrangement) -> Task:
+    """The task with its frames laid as found, and its windows held where the light then lies."""
+    model = task.model.about(search.window_um(found, task.model.setting.pixel_um))
+    return dataclasses.replace(task, model=model, data=_rearranged(task.data, found), found=found)
 
 
 def _rearranged(data: Data, found: Arrangement) -> Data:

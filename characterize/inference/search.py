@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from characterize.captures import between
 from characterize.inference import leastsquares, residual
 from characterize.inference.arrange import Arrangement, few_frames
 from characterize.inference.constrained import Ball
@@ -87,6 +88,25 @@ def _added(plain: leastsquares.Model, image: Array, slopes: Array) -> leastsquar
         return found + image, None if rates is None else rates + slopes
 
     return images
+
+
+def oriented(tasks: Sequence[Task]) -> Task:
+    """Of tasks that differ by how the frames lie the one that a short fit to some of them makes likeliest.
+
+    The first unless another is better by what a short fit may be off; those within that cannot be told from it.
+    """
+    if len(tasks) == 1:
+        return tasks[0]
+    few = few_frames(tasks[0].model.setting)
+    merits = np.array([_short(task, few, starts(task, biases_nm=(0.0,)))[0].merit for task in tasks])
+    best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
+    found = [task.found for task in tasks if task.found is not None]
+    near = [one for one, merit in zip(found, merits, strict=True) if merit < merits[best] + _PROMISING]
+    turns = {between(found[best].orientation, o.orientation) for o in near if o.reordered == found[best].reordered}
+    alike = {*found[best].alike, *turns} - {0}
+    return dataclasses.replace(
+        tasks[best], found=dataclasses.replace(found[best], alike=tuple(sorted(alike)), others=())
+    )
 
 
 def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:

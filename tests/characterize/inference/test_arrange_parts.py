@@ -48,6 +48,30 @@ def test_noise_is_taken_off_the_norm_and_never_more_than_nine_tenths():
     assert arrange._likeness(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
 
 
+def test_a_scan_sees_the_likeness_of_frames_in_their_order():
+    """The plain form, frame by frame: of pictures with noise, one dark, taken end to end."""
+    light, expected = RNG.normal(0, 1, (2, 3, 7, 10)) ** 3
+    expected[2] = 0
+    noise, back = np.array([0.3, 60.0, 1.1]), np.array([2, 1, 0])
+    plain = [arrange._likeness(light[j], expected[i], noise[j])[0] for i, j in enumerate(back)]
+    spectra = arrange._Spectra.of(light, noise), arrange._Spectra.of(expected, np.zeros(3))
+    assert spectra[0].alike(spectra[1], back) == pytest.approx(np.mean(plain), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("stated", "back", "way"),
+    [
+        ((0.95, 0.7, 0.954, 0.6), (0.96, 0.5, 0.96, 0.5), (0, False)),  # end to end is little better
+        ((0.77, 0.73, 0.954, 0.956), (0.925, 0.6, 0.72, 0.7), (2, False)),  # mirrored; of equals the plainer
+        ((0.72, 0.73, 0.953, 0.95), (0.954, 0.955, 0.7, 0.6), (0, True)),  # its twin, end to end
+        ((0.5, 0.5, 0.5, 0.5), (0.6, 0.6, 0.97, 0.6), (2, True)),  # both
+        ((0.93, 0.955, 0.93, 0.93), (0.9, 0.9, 0.9, 0.9), (0, False)),  # turned is better, not beyond doubt
+    ],
+)
+def test_ways_are_weighed_each_at_its_best(stated, back, way):
+    assert arrange._way(np.array(stated), np.array(back)) == way
+
+
 def test_frames_lose_the_plane_of_their_rim_and_holes_take_the_median():
     y, x = np.mgrid[-1:1:9j, -1:1:12j]
     frame = 30 + 2.0 * x - 5 * y

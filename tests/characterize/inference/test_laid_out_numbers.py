@@ -9,6 +9,7 @@ from characterize.captures import Gain
 from characterize.inference import arrange, leastsquares, residual, verdict
 from characterize.inference.arrange import Arrangement, _Frames
 from characterize.inference.leastsquares import Data, Prior
+from characterize.model import vector
 
 RNG = np.random.default_rng(34)
 DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3, 35e3, 20e3])
@@ -44,7 +45,7 @@ def test_a_stack_end_to_end_is_worth_a_twentieth_less_than_one_as_stated(monkeyp
     monkeypatch.setattr(arrange, "_expected", lambda model, x, clipped: stack)
     seen = 5.3 * (stack[::-1] if turned else stack)
     frames = _Frames(None, None, seen, np.zeros(4), np.zeros(4), np.arange(4)[::-1])
-    assert frames._score(np.zeros(3)) == pytest.approx(want, abs=1e-6)
+    assert frames.scanned(vector(), np.zeros(1))[1] == pytest.approx(want, abs=1e-6)
 
 
 def test_every_second_depth_is_left_out_and_then_the_others(monkeypatch):
