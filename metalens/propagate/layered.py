@@ -29,7 +29,7 @@ def product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
     return complex(real, imaginary)
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
     """w = p² to ``work[0]`` of the rays of a row of reach², by Newton's method as in
     :func:`metalens.lens.media.square` from tan² ``s`` in the rarest medium, which is put right.
@@ -55,7 +55,7 @@ def rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
         w[j] = n2[0] * s[j] / (1 + s[j])
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
     """Optical paths of a row of rays."""
     far[:] = 0.0
@@ -64,7 +64,7 @@ def lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
             far[j] += n2[i] * t[i] / np.sqrt(n2[i] - w[j])
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def levels(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
     """√(passed / spread) of a row of rays."""
     g, along, in_s, in_p = out, work[1], work[2], work[3]
@@ -84,7 +84,7 @@ def levels(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
         out[j] = np.sqrt((in_s[j] + in_p[j]) / 2 / (g[j] * along[j]))
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def beside(w, n2, series, work):  # type: ignore[no-untyped-def]
     """Real and imaginary part of C of a row of rays, to ``work[1]`` and ``work[2]``."""
     real, imaginary, u = work[1], work[2], work[3]
@@ -96,7 +96,7 @@ def beside(w, n2, series, work):  # type: ignore[no-untyped-def]
             real[j], imaginary[j] = real[j] * u[j] + series[i, 0], imaginary[j] * u[j] + series[i, 1]
 
 
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
 def _film_row(reach2, less, numbers, s, work, re, im):  # type: ignore[no-untyped-def]
     """Kernel of :mod:`metalens.propagate.paths` through films to one point, along a row of reach²; its paths less
     ``less``."""
