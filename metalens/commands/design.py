@@ -226,9 +226,8 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     about["provenance"] = store.Provenance(config=config.dumps(wanted), inputs=inputs)
     conversion: Conversion | None = None
     others: list[Quality] = []
-    if wanted.wavelengths:
-        each = several.each(wanted, made_of)
-        lights = [design.Wanted(*_phase(one, options, radius_um)[:2], weight) for one, weight in each]
+    lights = [design.Wanted(*_phase(one, options, radius_um)[:2], w) for one, w in several.each(wanted, made_of)]
+    if lights:
         made, (quality, *others) = design.make_several(lights, cell=cell, proxy=proxy, **about)
     elif made_of.turned is not None:
         made, quality, conversion = design.make_turned(phase, focus, library=made_of, hand=wanted.hand, **about)
@@ -240,7 +239,7 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     made, found = words.neighbours(made, quality, conversion, radius_um, solve=options.own_cell)
     checked = _checkable(wanted, options, quality)
     check = check_focus(made, expected=quality.strehl if others else 1.0) if checked else None
-    beside = several.judged(made, wanted.wavelengths, others, check=checked)
+    beside = several.judged(made, wanted.wavelengths, lights[1:], others, check=checked)
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:

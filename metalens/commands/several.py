@@ -6,7 +6,7 @@ from typing import Any
 
 from metalens import design
 from metalens.commands import design_words as words
-from metalens.design import FocusCheck, Quality
+from metalens.design import FocusCheck, Quality, Wanted
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens
 from metalens.pillars import PillarLibrary
@@ -44,11 +44,13 @@ def check(wavelengths: tuple[Beside, ...], profile: str) -> None:
 
 def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
     """The design (:class:`metalens.commands.design.Design`) as each wavelength is to see it, and its weight; its own
-    first.
+    first. Nothing where there is no other.
 
     Raises:
         ConfigError: a library for circular light.
     """
+    if not wanted.wavelengths:
+        return
     if made_of.turned is not None:
         raise ConfigError("wavelengths: turned pillars make one phase at all of them; need a library for any light")
     yield wanted, 1.0
@@ -59,15 +61,17 @@ def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
         yield replace(wanted, **told, wavelengths=()), one.weight
 
 
-def judged(made: Lens, beside: Sequence[Beside], found: Sequence[Quality], *, check: bool) -> tuple[Judged, ...]:
+def judged(
+    made: Lens, beside: Sequence[Beside], wanted: Sequence[Wanted], found: Sequence[Quality], *, check: bool
+) -> tuple[Judged, ...]:
     """Every other wavelength with its quality, and the exact sum about its focus if that is asked for."""
     out = []
-    for light, quality in zip(beside, found, strict=True):
+    for light, one, quality in zip(beside, wanted, found, strict=True):
         seen = replace(
             made,
-            wavelength_um=1e-3 * light.wavelength_nm,
-            sensor_distance_um=1e3 * (light.sensor_distance_mm or 1e-3 * made.sensor_distance_um),
-            source_distance_um=1e3 * (light.source_distance_mm or 1e-3 * made.source_distance_um),
+            wavelength_um=one.focus.wavelength_um,
+            sensor_distance_um=one.focus.sensor_distance_um,
+            source_distance_um=one.focus.source_distance_um,
         )
         out.append(Judged(light, quality, design.check_focus(seen, expected=quality.strehl) if check else None))
     return tuple(out)
