@@ -37,7 +37,7 @@ def real(value: float) -> bytes:
     """Whole numbers as such, their reciprocals as such, all others as IEEE double."""
     if value > 0 and value == round(value):
         return b"\0" + unsigned(round(value))
-    if value > 0 and 1 / round(1 / value) == value:
+    if 0 < value < 1 and 1 / round(1 / value) == value:
         return b"\x02" + unsigned(round(1 / value))
     return b"\x07" + struct.pack("<d", value)
 

@@ -184,7 +184,9 @@ def test_causes_that_are_stated_are_reckoned_with_as_stated():
     assert causes._size(task, "index") == 0.003
     assert causes._size(task, "pinhole_um") == 0.0
     assert causes._size(task, "stitching_nm") == 11.0
-    assert causes._size(task, "bandwidth_nm") == PARAMETERS[PLACE["bandwidth_nm"]].unstated > 0
+    assert causes._size(task, "bandwidth_nm") == PARAMETERS[PLACE["bandwidth_nm"]].sigma > 0
+    assert PARAMETERS[PLACE["glass_um"]].sigma == math.inf  # of which no interval would end
+    assert causes._size(task, "glass_um") == PARAMETERS[PLACE["glass_um"]].plausible < math.inf
 
 
 def test_the_phase_of_a_moved_field_is_that_of_the_focus_there():

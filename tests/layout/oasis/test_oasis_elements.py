@@ -1,6 +1,7 @@
 """Elements of OASIS byte by byte, as SEMI P39 defines them: integers, reals, deltas, point lists, repetitions."""
 
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -70,7 +71,10 @@ def test_reals_of_all_eight_forms(data, value):
     assert cursor(data).real() == value
 
 
-@pytest.mark.parametrize(("value", "data"), [(1000.0, "00 e8 07"), (0.25, "02 04"), (1.3, None), (-2.5, None)])
+@pytest.mark.parametrize(
+    ("value", "data"),
+    [(1000.0, "00 e8 07"), (0.25, "02 04"), (0.3, None), (1.3, None), (2.5, None), (1e3 / 3, None), (-2.5, None)],
+)
 def test_reals_are_written_in_their_shortest_exact_form(value, data):
     want = b"\7" + struct.pack("<d", value) if data is None else bytes.fromhex(data)
     assert oasis.real(value) == want
@@ -183,9 +187,25 @@ def test_placements_are_listed_from_each_to_the_next():
     assert out[:used].tobytes() == bytes.fromhex(want)
 
 
-def test_the_end_record_has_256_bytes_and_the_checksum_of_all_before():
-    import zlib
+def test_bytes_are_packed_only_where_that_makes_them_fewer():
+    """Noise, then runs of one letter: packed they are one byte more than as they are, as many, and fewer."""
+    noise, more = np.random.default_rng(4).bytes(30), set()
+    for run in range(30):
+        raw = b"a" + noise + b"a" * run
+        made = oasis.compressed(raw, 9)
+        packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+        size = 4 + len(packer.compress(raw) + packer.flush())  # CBLOCK, type 0, and the two lengths
+        more.add(size - len(raw))
+        if made == raw:
+            assert size >= len(raw)
+            continue
+        assert made[:4] == bytes([34, 0, len(raw), len(made) - 4])
+        assert len(made) == size < len(raw)
+        assert zlib.decompress(made[4:], -15) == raw
+    assert {-1, 0, 1} < more
 
+
+def test_the_end_record_has_256_bytes_and_the_checksum_of_all_before():
     before = b"anything"
     data = oasis.end((300, 0, 0, 0, 17, 0), zlib.crc32(before))
     assert len(data) == oasis.END_SIZE == 256

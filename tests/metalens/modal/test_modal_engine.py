@@ -9,6 +9,7 @@ from metalens import modal, rcwa
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
+from metalens.modal import engine
 from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate, geometric_mean, nearest_pairs
@@ -323,3 +324,26 @@ def test_elements_refuse_films_and_tilted_walls_by_name(shape):
 def test_absorbing_half_space_is_refused():
     with pytest.raises(CellError, match="absorbs"):
         modal.solve(Cell(0.4, 0.7, Index(3.6), Index(1.45, 0.1)), 0.2, 0.85)
+
+
+@pytest.mark.parametrize(("asked", "each"), [(4e-3, 8e-4), (6e-6, 2e-6)])
+def test_upright_pillars_that_a_tilted_one_stands_on_are_asked_for_a_fifth_of_its_tolerance(monkeypatch, asked, each):
+    """One at each of four diameters, of the light that was asked for; the modal solver holds no less than 2e-6."""
+    told = []
+
+    def upright(bare, diameter_um, wavelength_um, **light):
+        told.append((bare.sidewall_rad, wavelength_um, light))
+        return diameter_um
+
+    monkeypatch.setattr(engine, "solve", upright)
+    monkeypatch.setattr(engine.anchored, "solve_anchored", lambda *words, tolerance: (words, tolerance))
+    light = Light(0.83, 0.07, "p", math.pi / 2)
+    leaning = Cell(0.4, 0.61, sidewall_rad=0.03)
+    (whole, diameter_um, lit, nodes), tolerance = engine._as_built(leaning, 0.2, light, asked)
+    assert (whole, diameter_um, lit, tolerance) == (leaning, 0.2, light, asked)
+    half = 0.61 * math.tan(0.03)
+    assert [0.2 - half <= node <= 0.2 + half for node in nodes] == [True] * 4
+    for wall, wavelength_um, given in told:
+        assert (wall, wavelength_um) == (0.0, 0.83)
+        assert given.pop("tolerance") == pytest.approx(each, rel=1e-12)
+        assert given == {"angle_rad": 0.07, "azimuth_rad": math.pi / 2, "polarization": "p"}

@@ -68,6 +68,47 @@ def test_angular_spectrum_nears_the_sum_as_padding_grows():
     assert np.linalg.norm(limited - want) < 2e-2 * np.linalg.norm(want)
 
 
+@pytest.mark.parametrize("limited", [False, True])
+def test_angular_spectrum_is_the_sum_over_the_frequencies_of_the_padded_grid(limited):
+    """U(X, Y) = Σ_j Σ_f t_j exp(2πi f (X - x_j) + i k_z d) / N, summed as it stands: no transform, no indices.
+
+    9 rows of 0.3 um and 6 columns of 0.45 um, thrice as many with the padding; frequencies beyond 1 / wavelength
+    decay, and with a limit those go that turn by more than half a turn from one frequency to the next. The window lies
+    off the middle, 4 steps of 0.9 um by 3, of two columns and of three rows; the chief ray meets the sensor 3 columns
+    to the right and 2 rows up.
+    """
+    random = np.random.default_rng(3)
+    phase, level = random.uniform(-9, 9, (9, 6)), random.uniform(0, 1, (9, 6))
+    step, d, depths, pad = (0.3, 0.45), 2.6, [21.0, 900.0], 3
+    tangents = 3 * step[1] / d, -2 * step[0] / d
+    got = propagate.angular_spectrum(
+        phase, level, pad=pad, band_limited=limited, wavelength_um=WAVELENGTH, sensor_distance_um=d, pitch_um=step[1],
+        row_um=step[0], depths_um=depths, angle_rad=tuple(np.arctan(tangents)), window_um=(3.6, 2.7),
+        samples=(4, 3), offset_um=(-1.5 * step[1], 1.0 * step[0]),
+    )  # fmt: skip
+    y, x = ((np.arange(n) - (n - 1) / 2) * s for n, s in zip((9, 6), step, strict=True))
+    X, Y = (1.5 + 2 * (np.arange(4) - 1.5)) * step[1], (-1 + 3 * (np.arange(3) - 1)) * step[0]
+    fy, fx = (np.arange(-(n * pad // 2), (n * pad + 1) // 2) / (n * pad * s) for n, s in zip((9, 6), step, strict=True))
+    assert (len(fy), len(fx)) == (27, 18)
+    kz = 2 * np.pi * np.emath.sqrt(WAVELENGTH**-2 - fx**2 - fy[:, None] ** 2)
+    h = np.exp(1j * kz * d)
+    if limited:  # the slope of k_z d, 2 pi d f / sqrt(1 / wavelength² - f²), below half the padded width
+        kept = [
+            d * np.abs(f) / np.sqrt(np.maximum(WAVELENGTH**-2 - f**2, 1e-9)) <= n * pad * s / 2
+            for f, n, s in zip((fy, fx), (9, 6), step, strict=True)
+        ]
+        h = h * kept[0][:, None] * kept[1]
+        assert 0 < kept[0].sum() < 27
+        assert 0 < kept[1].sum() < 18
+    for light, z in zip(got, depths, strict=True):
+        source = np.array([-z * tangents[0], -z * tangents[1], -z])
+        r = np.sqrt((x - source[0]) ** 2 + (y[:, None] - source[1]) ** 2 + z**2)
+        leaving = level * np.exp(1j * (phase + K * (r - np.linalg.norm(source))))
+        ahead = [np.exp(2j * np.pi * np.outer(f, at)) for f, at in ((fy, y), (fx, x), (fy, Y), (fx, X))]
+        want = ahead[2].T @ (h * (ahead[0].conj() @ leaving @ ahead[1].conj().T)) @ ahead[3] / (27 * 18)
+        assert np.abs(light - want).max() < 1e-11 * np.abs(want).max()  # rounding
+
+
 def test_evanescent_cut_off_exactly_hit_gives_finite_light():
     geometry = GEOMETRY | dict(pitch_um=0.425, window_um=4 * 0.425, samples=4)  # 1/(2p) is 1/λ: cut-off on the grid
     field = propagate.angular_spectrum(np.zeros((8, 8)), np.ones((8, 8)), depths_um=np.inf, **geometry)
