@@ -1,7 +1,8 @@
 """A default is a promise: who leaves a key or an argument out gets tomorrow what he gets today.
 
 ``tests/defaults.txt`` is the list that was promised; whoever changes a default changes its line there too, and says so
-in the change log. What is new need not stand in it; a name that goes takes its line along.
+in the change log. What is new need not stand in it; a name that goes takes its line along. So are priors, by which the
+intervals of every fit without metrology are what they are: ``tests/priors.txt``.
 """
 
 import ast
@@ -59,6 +60,19 @@ def test_defaults_are_the_promised_ones(package):
     assert {name: here[name] for name in known if name in here} == {n: v for n, v in known.items() if n in here}
     assert len(known.keys() - here.keys()) < 0.05 * len(known)  # lines of names that are gone: strike them out
     assert len(known) > 0.8 * len(here)
+
+
+def test_priors_are_the_promised_ones():
+    """Of every parameter of lens and bench: sigma, bounds, start, what is reckoned with where it is held, the step."""
+    from characterize.model.parameters import PARAMETERS, UNFITTED
+
+    here = [
+        f"{p.name}: {p.start:g} +- {p.sigma:g} within {p.low:g} to {p.high:g}, {'fitted' if p.free else 'held'}, "
+        f"unstated {p.unstated:g}, scale {p.scale:g}"
+        for p in PARAMETERS
+    ]
+    here += [f"{row.name}: 0 +- {row.sigma:g}, never fitted" for row in UNFITTED]
+    assert here == (Path(__file__).parent / "priors.txt").read_text(encoding="utf-8").splitlines()
 
 
 def test_defaults_are_read_from_fields_arguments_and_methods():
