@@ -99,6 +99,49 @@ def test_one_process_takes_the_whole_batch():
     assert (parallel.rank(), parallel.ranks(), parallel.mean_of([1.5])) == (0, 1, [1.5])
 
 
+@pytest.fixture
+def second_of_three(monkeypatch):
+    """The process with number 1 of three; sums over them are twice what it has, and 5."""
+    monkeypatch.setattr(parallel, "ranks", lambda: 3)
+    monkeypatch.setattr(parallel, "rank", lambda: 1)
+    monkeypatch.setattr(parallel, "_reduced", lambda value: 2 * value + 5)
+
+
+def test_gradients_are_means_over_processes_each_in_its_place(second_of_three):
+    """Shapes and dtypes of their own, and a parameter without a gradient: (2 g + 5) / 3 of each number."""
+    draw = torch.Generator().manual_seed(3)
+    shapes = ((2, 3), (4,), (), (3, 1, 2))
+    kinds = (torch.float32, torch.float64, torch.float32, torch.float32)
+    parameters = [
+        torch.nn.Parameter(torch.zeros(s, dtype=kind))
+        for s, kind in zip(((7,), *shapes), (kinds[0], *kinds), strict=True)
+    ]
+    grads = [torch.randn(s, generator=draw, dtype=kind) for s, kind in zip(shapes, kinds, strict=True)]
+    for parameter, grad in zip(parameters[1:], grads, strict=True):
+        parameter.grad = grad.clone()
+    parallel.average(parameters)
+    assert parameters[0].grad is None
+    for parameter, grad in zip(parameters[1:], grads, strict=True):
+        torch.testing.assert_close(parameter.grad, (2 * grad + 5) / 3)
+
+
+def test_a_process_takes_its_rows_of_a_batch_and_its_share_of_the_work(second_of_three):
+    frames = Frames(*(torch.rand(6, 2, 4, 4) for _ in range(3)))
+    pose = Pose(*(torch.rand(6, 2) for _ in Pose.__slots__))
+    batch = Batch(frames, torch.rand(6, 4, 4), torch.rand(6, 3), pose)
+    mine = parallel.part_of(batch)
+    assert torch.equal(mine.frames.coverage, frames.coverage[2:4])
+    assert torch.equal(mine.mask, batch.mask[2:4])
+    assert torch.equal(mine.slip_mm, batch.slip_mm[2:4])
+    assert torch.equal(getattr(mine.pose, Pose.__slots__[0]), getattr(pose, Pose.__slots__[0])[2:4])
+    with pytest.raises(TrainingError, match="5 frames on 3 processes"):
+        parallel.part_of(Batch(frames, torch.rand(5, 4, 4), torch.rand(5, 3)))
+    assert parallel.mean_of([1.5, -2.0]) == pytest.approx([8 / 3, 1 / 3])
+    done = []
+    assert parallel.each(lambda item: done.append(item) or 10.0 * item, [3, 4, 5, 6, 7, 8]) == [5, 85, 5, 5, 145, 5]
+    assert done == [4, 7]
+
+
 def test_normalisation_over_processes_is_that_of_torch_in_one(monkeypatch):
     monkeypatch.setattr(parallel, "_summed", lambda value: value)  # a sum over one process
     x = torch.randn(4, 3, 5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
