@@ -8,7 +8,7 @@ own lens.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
+from codesign.evaluate.shown import Result as Result
 from codesign.evaluate.shown import Trial as Trial
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
@@ -33,63 +34,6 @@ from metalens.image import Imager, UniformImager, low_snr
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
 TURNS = 4  # corrections of where an eye looks, each twenty times as fine as the one before
 BEFORE, EACH = 100_000, 120  # first number of the people who calibrated before, and their frames
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Result:
-    """One run in the experiment.
-
-    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
-    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
-    and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
-    slippage along x, y, z that the run's training saw. how: subjects were calibrated.
-    """
-
-    name: str
-    mmacs: float
-    trial: Trial
-    slip_mm: Array
-    centre: Array
-    iou: Array
-    gaze_deg: Array
-    predicted_deg: Array
-    told_deg: Array
-    reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    how: Calibrator | None = None
-
-    @property
-    def within(self) -> Array:
-        """(n,) frames whose slippage training saw."""
-        return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
-
-    def gaze(self, kind: str) -> float:
-        """Mean gaze error over the judged frames of a group, deg."""
-        return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
-
-    @property
-    def slip_error_mm(self) -> Array:
-        """(n, 3) absolute errors of the slippage."""
-        return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
-
-    @property
-    def slip_rest_mm(self) -> Array:
-        """(n, 3) absolute errors beside the mean error of the subject's calibration, nan for frames that calibrated.
-
-        What is constant of a person (size of the face, and the camera's turn on it) is no slippage: a device is zeroed
-        where its wearer calibrates.
-        """
-        error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
-        out = np.full_like(error, math.nan)
-        for subject in np.unique(self.trial.subject):
-            mine = self.trial.subject == subject
-            out[mine & judged] = np.abs(error[mine & judged] - error[mine & ~judged].mean(0))
-        return out
-
-    def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
-        """(subjects,) means of (n,) values, of which nan are left out; nan where none is left."""
-        keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        mine = (values[keep & (self.trial.subject == s)] for s in np.unique(self.trial.subject))
-        return np.array([one.mean() if len(one) else math.nan for one in mine])
 
 
 def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tuple[States, Trial]:
@@ -177,6 +121,7 @@ def experiment(
     _check(sources)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[Trial] = []
+    visible: list[Array] = []
     answers: list[list[Answers]] = [[] for _ in sources]
     prepared = [ready(source, image=config.image) for source in sources]
     how = [calibrator(source, imager, config) for source, imager in zip(sources, prepared, strict=True)]
@@ -184,6 +129,7 @@ def experiment(
         states, trial = states_of(config, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
         trials.append(trial)
+        visible.append((made.labels.shift_um * 1e-3).numpy())
         for kept, source, imager in zip(answers, sources, prepared, strict=True):
             seen = through(source, made, imager, seed=NOISE + subject, snr_db=config.snr_db)
             kept.append(_answers(source, seen))
@@ -194,7 +140,7 @@ def experiment(
     yield (
         config.subjects,
         [
-            _result(label, source, kept, whole, config, one)
+            replace(_result(label, source, kept, whole, config, one), visible_mm=np.concatenate(visible))
             for label, source, kept, one in zip(labels, sources, answers, how, strict=True)
         ],
     )

@@ -1,12 +1,16 @@
-"""What a virtual experiment shows to whom."""
+"""What a virtual experiment shows to whom, and what comes of it."""
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
+
+if TYPE_CHECKING:
+    from codesign.gaze import Calibrator
 
 Points = Literal["random", "spread"]
 AXIAL, LATERAL = "axial", "lateral"
@@ -96,3 +100,68 @@ class ExperimentConfig:
     def frames(self) -> int:
         """Of all subjects."""
         return self.subjects * len(self.stimuli_deg) * len(self.slips_mm)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Result:
+    """One run in the experiment.
+
+    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
+    and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
+    slippage along x, y, z that the run's training saw. how: subjects were calibrated. visible_mm: (n, 3) displacement
+    of the head as the camera sees it, its own turn on the mount included: all that can be read.
+    """
+
+    name: str
+    mmacs: float
+    trial: Trial
+    slip_mm: Array
+    centre: Array
+    iou: Array
+    gaze_deg: Array
+    predicted_deg: Array
+    told_deg: Array
+    reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    how: "Calibrator | None" = None
+    visible_mm: Array | None = None
+
+    @property
+    def within(self) -> Array:
+        """(n,) frames whose slippage training saw."""
+        return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
+
+    def gaze(self, kind: str) -> float:
+        """Mean gaze error over the judged frames of a group, deg."""
+        return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
+
+    @property
+    def slip_error_mm(self) -> Array:
+        """(n, 3) absolute errors of the slippage."""
+        return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
+
+    @property
+    def slip_visible_mm(self) -> Array:
+        """(n, 3) absolute errors of one who reads the visible displacement exactly; nan where it is not known."""
+        blank = np.full_like(self.trial.slip_mm, math.nan)
+        return blank if self.visible_mm is None else np.asarray(np.abs(self.visible_mm - self.trial.slip_mm))
+
+    @property
+    def slip_rest_mm(self) -> Array:
+        """(n, 3) absolute errors beside the mean error of the subject's calibration, nan for frames that calibrated.
+
+        What is constant of a person (size of the face, and the camera's turn on it) is no slippage: a device is zeroed
+        where its wearer calibrates.
+        """
+        error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
+        out = np.full_like(error, math.nan)
+        for subject in np.unique(self.trial.subject):
+            mine = self.trial.subject == subject
+            out[mine & judged] = np.abs(error[mine & judged] - error[mine & ~judged].mean(0))
+        return out
+
+    def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
+        """(subjects,) means of (n,) values, of which nan are left out; nan where none is left."""
+        keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
+        mine = (values[keep & (self.trial.subject == s)] for s in np.unique(self.trial.subject))
+        return np.array([one.mean() if len(one) else math.nan for one in mine])

@@ -232,6 +232,31 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
     assert found[judged] == pytest.approx(np.tile([0.1, 0.2, 0.3], (judged.sum(), 1)))
 
 
+def _turned(place, about_x, about_y):
+    """A place as a camera sees it that is turned about x, then about y, z away from the lens."""
+    cos, sin = np.cos(about_x), np.sin(about_x)
+    first = np.array([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
+    cos, sin = np.cos(about_y), np.sin(about_y)
+    return np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) @ first @ place
+
+
+def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(folder):
+    """Read exactly, it errs by a constant of the subject: where the eye stands before the turned camera."""
+    source = retraining.load(folder / "run")
+    config = replace(SMALL, subjects=2, people=2, axial_mm=(2.5,), lateral_mm=(-5.0,))
+    *_, (_, (found,)) = experiment.experiment([source], config)
+    place = np.array([2.4, -0.3, 21.0])
+    for subject in range(2):
+        states, _ = experiment.states_of(config, subject, source.run.scenes(9))
+        off = _turned(place, *states.mount_rad[0].tolist()) - place
+        assert 0.02 < np.linalg.norm(off[:2]) < 0.55  # up to 1 degree about either axis at 21 mm
+        mine = found.trial.subject == subject
+        assert (found.visible_mm - found.trial.slip_mm)[mine] == pytest.approx(np.tile(off, (mine.sum(), 1)), abs=1e-9)
+        assert found.slip_visible_mm[mine] == pytest.approx(np.tile(np.abs(off), (mine.sum(), 1)), abs=1e-9)
+    (row,) = command.summary([found], config)["runs"]
+    assert row["slip_visible_mm"] == pytest.approx(np.abs(found.visible_mm - found.trial.slip_mm).mean(), rel=1e-9)
+
+
 def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and pupil are told nothing."""
     rng, config = np.random.default_rng(3), ExperimentConfig(subjects=2)
