@@ -19,6 +19,7 @@ from codesign.optics.stack import OpticsConfig
 from metalens.field import Window
 from metalens.field.plan import spectral
 from metalens.image import Imager
+from metalens.psf import Nodes
 
 DEPTHS_MM = (14.0, 30.0)  # of the faces that the frames hold
 COUNT, STEP_UM = 7, 200.0
@@ -35,24 +36,43 @@ def bound_mm(
         whole: the image of the lens: its wavelengths and its windows of the PSFs are used.
         share: (y, x) of the field that the PSFs vary over.
     """
-    seen, step = whole.plan.window, blur.step_of(config.pixels)
-    near, far = (1 / (1e3 * d) for d in DEPTHS_MM)
+    with torch.no_grad():
+        at, plan = centres_um(settings, config, share), whole.plan
+        return spread_mm(told(settings, place, at, plan.waves, plan.window, config))
+
+
+def told(
+    settings: OpticsConfig,
+    place: Tensor,
+    at_um: Tensor,
+    waves: Nodes,
+    seen: Window,
+    config: ReaderConfig,
+    depths_mm: tuple[float, float] = DEPTHS_MM,
+) -> Tensor:
+    """(points, depths) information on the depth of windows about these points, per mm²; differentiable in ``place``.
+
+    Args:
+        at_um: (points, [x, y]) on the sensor. seen: of the PSFs, on the reader's pixels.
+    """
+    near, far = (1 / (1e3 * d) for d in depths_mm)
     depths = 1 / torch.linspace(far, near, COUNT, dtype=torch.float64).flip(0)
     fine = Window(FOLDS * seen.samples, config.pitch_um / FOLDS, seen.curved, seen.components, seen.flux)
-    texture = Texture(config.pitch_um, 2 * step, CONTRAST, relative_noise(config.sensor, albedo=ALBEDO), folds=FOLDS)
-    at = centres_um(settings, config, share)
-    with torch.no_grad():
-        pair = (
-            spectral(formed.optics_of(settings, place), at, depths + way * STEP_UM / 2, whole.plan.waves, fine)
-            for way in (-1, 1)
-        )
-        told = blinder_information(*pair, step_um=STEP_UM, sample_um=fine.step_um, texture=texture)
-    return spread_mm(told)
+    noise = relative_noise(config.sensor, albedo=ALBEDO)
+    texture = Texture(config.pitch_um, 2 * blur.step_of(config.pixels), CONTRAST, noise, folds=FOLDS)
+    plane = formed.optics_of(settings, place)
+    pair = (spectral(plane, at_um, depths + way * STEP_UM / 2, waves, fine) for way in (-1, 1))
+    return blinder_information(*pair, step_um=STEP_UM, sample_um=fine.step_um, texture=texture)
 
 
 def spread_mm(information: Tensor) -> float:
     """Mean of 1 / √(J + 1 / prior²) of information per mm²."""
-    return float((1 / torch.sqrt(information.clamp_min(0) + PRIOR_MM**-2)).mean())
+    return float(spreads_mm(information).mean())
+
+
+def spreads_mm(information: Tensor) -> Tensor:
+    """1 / √(J + 1 / prior²) of information per mm²."""
+    return 1 / torch.sqrt(information.clamp_min(0) + PRIOR_MM**-2)
 
 
 def centres_um(settings: OpticsConfig, config: ReaderConfig, share: tuple[float, float]) -> Tensor:

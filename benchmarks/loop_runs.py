@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
 from codesign.network.architecture import largest
 from codesign.optics import formed
@@ -56,6 +57,7 @@ window_samples = {window}
 depth_count = 16
 focus_mm = {focus_mm}
 polynomials = {polynomials}
+family = "{family}"
 """
 BUDGET = 20.0  # MMACs that the one network stays below
 WINDOW_UM = 300.0  # of the PSFs
@@ -70,6 +72,7 @@ class Recipe:
     and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss. steps: of ``batch``
     frames.
     seed: of weights, frames and noise. image, fwhm_nm: see :class:`codesign.optics.stack.OpticsConfig`.
+    asphere_rad: coefficients of radial terms of a lens that stands; none for the hyperbolic one.
     """
 
     focus_mm: float
@@ -87,6 +90,7 @@ class Recipe:
     seed: int = 0
     image: Literal["true", "uniform"] = "uniform"
     fwhm_nm: float = 0.0
+    asphere_rad: tuple[float, ...] = ()
 
     @property
     def toml(self) -> str:
@@ -98,7 +102,7 @@ class Recipe:
             slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=self.rate if self.moves else 0.0,
             optics_weight=self.optics_weight, batch=self.batch, seed=self.seed, image=self.image, fwhm_nm=self.fwhm_nm,
             window=2 * int(WINDOW_UM / self.pitch_um / 2) + 1, focus_mm=self.focus_mm,
-            polynomials=35 if self.moves else 0,
+            polynomials=35 if self.moves else len(self.asphere_rad), family="radial" if self.asphere_rad else "free",
         )  # fmt: skip
 
 
@@ -108,7 +112,7 @@ def finished(folder: Path, recipe: Recipe) -> None:
     store.write_text(folder / "run.toml", recipe.toml)
     settings = runs.load(folder / "run.toml")
     path = folder / "checkpoint.safetensors"
-    going = runs.resume(path, settings) if path.exists() else runs.start(settings)
+    going = runs.resume(path, settings) if path.exists() else _begun(settings, recipe)
     chosen = largest(settings.space)
     going.trainer.architecture = chosen
     for record in runs.train(going, path):
@@ -122,6 +126,15 @@ def finished(folder: Path, recipe: Recipe) -> None:
     side = scenes.pixels + 2 * scenes.margin
     said = formed.described(settings.optics, coefficients, side, margin=scenes.margin)
     store.write_text(folder / "result.json", json.dumps({"rows": finish(going), "image": said}))
+
+
+def _begun(settings: runs.RunConfig, recipe: Recipe) -> runs.Run:
+    """A run before its first step, behind the recipe's lens."""
+    fresh = runs.start(settings)
+    if recipe.asphere_rad:
+        with torch.no_grad():
+            fresh.trainer.model.coefficients_rad.copy_(torch.tensor(recipe.asphere_rad, dtype=torch.float64))
+    return fresh
 
 
 def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> None:
