@@ -11,7 +11,8 @@ from characterize.captures import stage
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-_UNITS = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "\\u00b5m": 1.0, "micron": 1.0, "microns": 1.0, "mm": 1e3, "cm": 1e4}
+_MICRON = dict.fromkeys(("um", "µm", "\\u00b5m", "micron", "microns"), 1.0)
+_UNITS = {"nm": 1e-3, **_MICRON, "mm": 1e3, "cm": 1e4, "inch": 25400.0}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,10 +43,12 @@ def read(path: Path) -> Tags:
 
 
 def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) -> Tags:
+    """Steps without a unit are in um; of a unit that is no length (pixels) neither steps nor a pixel are told."""
     if int(str(about.get("channels", 1))) > 1:
         raise CaptureError(f"{path}: {about['channels']} channels in one file; save the one that is to be fitted")
-    scale = _UNITS.get(str(about.get("unit", "")).lower(), math.nan)
-    step = float(str(about.get("spacing", "nan"))) * (1.0 if math.isnan(scale) else scale)
+    unit = str(about.get("unit", "")).lower()
+    scale = _UNITS.get(unit, math.nan)
+    step = float(str(about.get("spacing", "nan"))) * (scale if unit else 1.0)
     pixel = per_pixel * scale
     position = np.arange(pages) * step if math.isfinite(step) and step != 0 else np.empty(0)
     notes = (f"stage step of {step:.4g} um from the ImageJ tags",) if len(position) else ()

@@ -1,0 +1,67 @@
+"""Stage and pixel by the tags of TIFF files that are written with them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from characterize.captures import tiff_tags
+from metalens.ground.errors import CaptureError
+
+tifffile = pytest.importorskip("tifffile")
+FRAMES = np.arange(4 * 6 * 5, dtype=np.uint16).reshape(4, 6, 5)
+
+
+@pytest.mark.parametrize(
+    ("unit", "um"),
+    [("nm", 1e-3), ("um", 1.0), ("micron", 1.0), ("mm", 1e3), ("cm", 1e4), ("inch", 25400.0), ("pixel", None)],
+)
+def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit, um):
+    """Pixels of 1 / 8 unit along x and 1 / 5 along y: that of x. A unit that is no length tells nothing."""
+    about = {"axes": "ZYX", "spacing": 2.5, "unit": unit}
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, resolution=(8.0, 5.0), metadata=about)
+    found = tiff_tags.read(tmp_path / "a.tif")
+    if um is None:
+        assert (len(found.position_um), math.isnan(found.pixel_um), found.notes) == (0, True, ())
+        return
+    assert found.pixel_um == pytest.approx(um / 8, rel=1e-12)
+    assert found.position_um == pytest.approx(2.5 * um * np.arange(4), rel=1e-12)
+    step, pixel = f"stage step of {2.5 * um:.4g} um from the ImageJ tags", f"pixel of {um / 8:.4g} um from the tags"
+    assert found.notes == (step, f"{pixel} of the file")
+
+
+@pytest.mark.parametrize(
+    ("about", "steps"),
+    [({"unit": "um"}, []), ({"unit": "um", "spacing": 0.0}, []), ({"spacing": 2.5}, [0, 2.5, 5, 7.5])],
+)
+def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(tmp_path, about, steps):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, metadata={"axes": "ZYX"} | about)
+    found = tiff_tags.read(tmp_path / "a.tif")
+    assert found.position_um.tolist() == steps
+    assert math.isnan(found.pixel_um)
+    assert len(found.notes) == bool(steps)
+
+
+def test_two_channels_are_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES.reshape(2, 2, 6, 5), imagej=True, metadata={"axes": "ZCYX"})
+    with pytest.raises(CaptureError, match="2 channels in one file"):
+        tiff_tags.read(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(("unit", "um"), [("nm", 1e-3), ("µm", 1.0), ("mm", 1e3), (None, 1.0)])
+def test_ome_gives_positions_and_the_pixel_along_x(tmp_path, unit, um):
+    about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeY": 0.91}
+    about |= {} if unit is None else {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": "cm"}
+    planes = {"PositionZ": [3.5, 1.5, -2.0, 8.25], "PositionZUnit": ["mm", "um", "nm", "mm"]}
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about | {"Plane": planes})
+    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    assert found.pixel_um == pytest.approx(0.37 * um, rel=1e-12)
+    assert found.position_um == pytest.approx([3500.0, 1.5, -2e-3, 8250.0], rel=1e-12)
+    assert found.notes == (f"pixel of {0.37 * um:.4g} um from the tags of the file",)
+
+
+def test_a_plain_file_tells_nothing(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", metadata=None)
+    found = tiff_tags.read(tmp_path / "a.tif")
+    assert (len(found.position_um), found.notes) == (0, ())
+    assert math.isnan(found.pixel_um)
