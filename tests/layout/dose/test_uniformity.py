@@ -20,8 +20,9 @@ def test_the_worst_error_may_lie_below():
 
 def test_or_above():
     tally = Tally()
-    tally.merge(np.array([-0.01, 0.07, 0.0, 1.0]))
+    tally.merge(np.array([-0.01, 0.07, 0.0049, 1.0]))
     assert tally.worst == 0.07
+    assert tally.result(slope=2.0, shift=0.001).rms == pytest.approx(0.071)  # of one pillar its own error
 
 
 def test_nothing_taken_in_is_no_error():

@@ -9,7 +9,7 @@ from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
 from metalens.modal.few_modes import few_modes, root, squared
-from metalens.modal.homogeneous import below, definite_inverse, eigen_pairs, modes
+from metalens.modal.homogeneous import below, corrected, definite_inverse, eigen_pairs, modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import few_scattering, half_space, scattering
@@ -125,6 +125,26 @@ def test_a_product_by_strips_is_the_whole_product(n, dtype):
 def test_root_refuses_what_is_far_from_a_diagonal():
     square = np.array([[1.0, 50.0], [-50.0, 1.0]])
     assert root(square, np.array([1.0, -1.0]), 1.0, 1e-12) is None
+
+
+@pytest.mark.parametrize(
+    ("half_phase_rad", "lowest", "want"),
+    [
+        (None, 3e-10, 0.0),
+        (None, -3e-10, 0.0),
+        (None, 2e-9, 2e-9),
+        (None, 0.7, 0.7),  # a family without the zero order
+        (0.4, 0.16 * 1.049, 0.4**2),
+        (0.4, 0.16 * 0.951, 0.4**2),
+        (0.4, 0.16 * 1.051, 0.16 * 1.051),
+        (0.4, 0.16 * 0.949, 0.16 * 0.949),
+    ],
+)
+def test_the_zero_order_has_its_exact_wavenumber_where_this_family_has_it(half_phase_rad, lowest, want):
+    """Within a twentieth of the square of half the phase over a cell, which meshes hold far better; no others move,
+    and rounding leaves no square below 0."""
+    given = np.array([lowest, 9.1, -1e-12, 0.161])
+    assert corrected(given.copy(), half_phase_rad).tolist() == [want, 9.1, 0.0, 0.161]
 
 
 @pytest.mark.parametrize("half_phase", [None, 0.05, 0.3, 1.3])
