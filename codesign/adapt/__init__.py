@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from codesign.adapt import correction as correction
     from codesign.adapt import report as report
+    from codesign.adapt import retrained as retrained
     from codesign.adapt import sure as sure
     from codesign.adapt import train as train
     from codesign.adapt.reading import bootstrap as bootstrap
@@ -25,6 +26,7 @@ __getattr__, __dir__, __all__ = attach(
         "correction": "",
         "network": "train",
         "report": "",
+        "retrained": "",
         "sure": "",
         "train": "",
     },

@@ -9,6 +9,7 @@ import numpy as np
 
 from characterize.inference import AsBuilt
 from codesign.network import Architecture, Baseline, check, smallest
+from codesign.optics import Stack
 from codesign.train import Run, RunConfig
 from codesign.train import run as runs
 from metalens.ground import manifest, reading
@@ -18,11 +19,15 @@ from metalens.lens import Lens
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
-    """A finished run that is trained on: its network, the architecture that was chosen, its row of result.json."""
+    """A finished run that is trained on: its network, the architecture that was chosen, its row of result.json.
+
+    made: of a retraining, the lens as made; None where images are those of the run's own lens.
+    """
 
     run: Run
     architecture: Architecture
     row: dict[str, Any]
+    made: Stack | None = None
 
     @property
     def settings(self) -> RunConfig:
@@ -61,9 +66,14 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
 
 
+def is_retraining(folder: Path) -> bool:
+    """Whether a folder is one of `metalens retrain`."""
+    return (folder / "retrain.toml").is_file()
+
+
 def _no_retraining(folder: Path) -> None:
     """Refuse a folder of `metalens retrain`, which holds a network and not the run that it belongs to."""
-    if (folder / "retrain.toml").is_file():
+    if is_retraining(folder):
         raise TrainingError(
             f"{folder} holds a retraining, no run: its network was trained on for one made lens; give the folder that "
             "`metalens codesign RUN.toml -o FOLDER` wrote"

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import Source, bootstrap
-from codesign.adapt import train as retraining
+from codesign.adapt import Source, bootstrap, retrained
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
 from codesign.gaze import People, people_file
@@ -32,13 +31,14 @@ def run(options: Options) -> int:
     if len(set(names)) < len(names):
         raise ConfigError(f"names {', '.join(names)}: two are alike; give every run one of its own")
     folder, config = options.output, options.settings
-    sources = [retraining.load(path) for path in options.runs]
+    sources = [retrained.load(path) for path in options.runs]
     with options.claim_folder(folder) as draft:
         results: list[Result] = []
         steps = experiment(sources, config, names=names)
         for _, found in options.console.track(steps, total=config.subjects, label="subjects"):
             results = found
-        values = summary(results, config) | {"images": images(options.runs, names)}
+        shown = {name: retrained.lens_of(path) for name, path in zip(names, options.runs, strict=True)}
+        values = summary(results, config) | {"images": images(options.runs, names), "lenses": shown}
         pictures = {
             "samples.png": experiment_plots.samples(sources[0], config),
             "ambiguity.png": experiment_plots.ambiguity(results[0]),
@@ -59,16 +59,20 @@ def _made(source: Source, config: ExperimentConfig) -> store.Provenance:
 
 
 def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """How every run's images were formed and how wrong they are, as the run itself found; None of older runs."""
+    """How every run's images were formed and how wrong they are, as the run itself found; None of older runs.
+
+    Of a retraining, those of the run that it went on from.
+    """
     return {
-        name: json.loads((folder / "result.json").read_text("utf-8")).get("image")
+        name: json.loads((retrained.run_of(folder) / "result.json").read_text("utf-8")).get("image")
         for name, folder in zip(names, folders, strict=True)
     }
 
 
 def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the folders, numbered where they repeat."""
-    stems = [reading.shown(path.resolve().name) for path in paths]
+    """Names of the folders, of a network in a folder with its own, numbered where they repeat."""
+    places = (path.resolve() for path in paths)
+    stems = [reading.shown(p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}") for p in places]
     return tuple(s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems))
 
 
@@ -119,6 +123,12 @@ def _of_reach(row: dict[str, Any]) -> str:
     )
 
 
+def _of_lenses(values: dict[str, Any]) -> list[str]:
+    """Sentences on the runs that are shown through another lens than the design's."""
+    made = {name: lens for name, lens in values.get("lenses", {}).items() if lens != "as designed"}
+    return [f"{name}: through the lens {lens}" for name, lens in made.items()]
+
+
 def _per_subject(result: Result) -> dict[str, Any]:
     error, axial = result.slip_error_mm, result.trial.group(AXIAL)
     return {
@@ -154,7 +164,7 @@ def table(values: dict[str, Any]) -> str:
     for r in values["ratios"]:
         low, high = r["interval"]
         lines.append(f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]")
-    lines += [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
+    lines += _of_lenses(values) + [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
     for name, found in values.get("images", {}).items():
         lines.append(f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}")
     return "\n".join(lines)
@@ -208,7 +218,7 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
         for r in values["runs"]
     ]
     reach = [f"{_of_reach(r)}." for r in values["runs"] if "beyond_training_mm" in r]
-    words = " ".join([_told(values["settings"]), *reach])
+    words = " ".join([_told(values["settings"]), *(f"{line}." for line in _of_lenses(values)), *reach])
     sections = [report.Section("Numbers", words, tables), report.Section("Figures", "", figures)]
     report.write(path, "Virtual experiment", sections, key_figures=keys)
 

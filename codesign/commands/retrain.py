@@ -1,42 +1,29 @@
 """RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and the next mask's correction."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from characterize.bench import Truth
 from characterize.inference import asbuilt
-from codesign.adapt import Lenses, RetrainConfig, Source, correction
+from codesign.adapt import Lenses, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
+from codesign.adapt.retrained import RECIPE, RESULT, Recipe, given
 from codesign.adapt.sure import judge
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
-from codesign.train import Record, RunConfig, Trainer, checkpoint
+from codesign.train import Record, Trainer, checkpoint
 from metalens import __version__, lens
 from metalens.ground import config, reading, store
 from metalens.ground.errors import TrainingError
 from metalens.ground.transaction import Draft
 from metalens.made import Bias
 
-LOG, RECIPE, RESULT = "log.jsonl", "retrain.toml", "result.json"
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """What a resume must find unchanged.
-
-    asbuilt, weights, truth: SHA-256 of the files; '' without one.
-    """
-
-    settings: RetrainConfig
-    asbuilt: str
-    weights: str
-    truth: str
-    run: RunConfig
+LOG = "log.jsonl"
 
 
 Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
@@ -55,7 +42,7 @@ def run(options: Options) -> int:
     with options.claim_work(options.output, keep=("*.safetensors",), resume=options.resume) as draft:
         _agree(draft, recipe, resume=options.resume)
         story = _story(options, draft.path, recipe, (source, result, design, truth, old))
-    options.console.result(_values(story, options.output), _text(story, options.output))
+    options.console.result(_values(story, options), _text(story, options.output))
     return 0
 
 
@@ -88,7 +75,7 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
     )
     if sure.usable:
         correction.write(folder, plan)
-    _keep(folder, options.output, (source, trained["retrained"]), story)
+    _keep(folder, options, (source, trained["retrained"]), story)
     if options.export:
         net = retraining.network(trained["retrained"])
         onnx_file.write(folder / "subnet_retrained.onnx", source.run, net, source.architecture)
@@ -100,8 +87,8 @@ def _recipe(options: Options, source: Source) -> Recipe:
         options.settings,
         reading.sha256(options.asbuilt),
         reading.sha256(options.run_dir / "checkpoint.safetensors"),
-        reading.sha256(options.truth) if options.truth else "",
         source.settings,
+        reading.sha256(options.truth) if options.truth else "",
     )
 
 
@@ -171,24 +158,25 @@ def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
     return words
 
 
-def _keep(folder: Path, target: Path, trained: tuple[Source, Trainer], story: retrain_report.Story) -> None:
+def _keep(folder: Path, options: Options, trained: tuple[Source, Trainer], story: retrain_report.Story) -> None:
     source, going = trained
     retraining.settle(going, source)
     cut = Subnet(retraining.network(going), source.architecture)
     checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
     retrain_report.write(folder / "report.html", story)
     store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
-    store.write_text(folder / RESULT, json.dumps(_values(story, target), indent=1) + "\n")
+    store.write_text(folder / RESULT, json.dumps(_values(story, options), indent=1) + "\n")
 
 
-def _values(story: retrain_report.Story, folder: Path) -> dict[str, Any]:
-    o = story.outcome
+def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
+    o, folder = story.outcome, options.output
     states = [
         {"name": p.name, "psf_error": error, "strehl": p.strehl, "light": p.light, "slip_mm": slip}
         for p, error, slip in story.proposals
     ]
     return {
         "folder": str(folder),
+        "given": given(folder, options.run_dir, options.asbuilt, options.truth),
         "rows": [{"case": retrain_report.CASES[name], **row} for name, row in o.rows().items()],
         "slip_mm": o.rows()["after"]["slip_mm"],
         "cases": o.rows(),

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from codesign.adapt import Source
+from codesign.adapt import train as retraining
 from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
@@ -168,18 +169,22 @@ def _check(sources: Sequence[Source]) -> None:
 
 
 def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> UniformImager | Imager:
-    """The imager of a run's lens; its network set to statistics of training frames, as they were formed.
+    """The imager of a run's lens, of a retraining the made one; its network set to statistics of training frames, as
+    they were formed.
 
     Raises:
         SceneError: the true image of this lens cannot be formed at the run's ``optics.image_tolerance``.
     """
     trainer = source.run.trainer
-    measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
-    recalibrate(trainer.model.net, source.architecture, assess.parts(measured))
+    if source.made is None:
+        measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
+        recalibrate(trainer.model.net, source.architecture, assess.parts(measured))
+    else:
+        retraining.settle(trainer, source)
     settings, scenes = trainer.optics, source.settings.scenes
     seen = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
-    return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin)
+    return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin, made=source.made)
 
 
 def sphere(source: Source, config: ExperimentConfig) -> Sphere:

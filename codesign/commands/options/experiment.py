@@ -16,7 +16,8 @@ class Options(Common):
     """Options of ``metalens evaluate experiment``.
 
     Attributes:
-        runs: folders of finished runs of one geometry; the first is compared with each of the others.
+        runs: folders of finished runs of one geometry; the first is compared with each of the others. A folder of
+            metalens retrain shows its network before the lens as made; nominal.safetensors in it, the unwarned one.
         output: folder for experiment.json, samples.png, ambiguity.png, errors.png, report.html and, of every run that
             tells the optic axis, people_1.h5 ...: what calibrates a wearer of that device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.

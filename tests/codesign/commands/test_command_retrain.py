@@ -1,20 +1,28 @@
 """``metalens retrain``: its files, what it overwrites, what a resume refuses."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
+from characterize.bench import Truth
 from characterize.inference import asbuilt
+from codesign.adapt import retrained
+from codesign.evaluate import gaze_experiment as experiment
+from codesign.optics import MadeLens
 from layout.process import process
 from metalens import lens
 from metalens.cli import main
+from metalens.ground import config
 
 DIES = """
 import os, signal, sys
@@ -128,3 +136,51 @@ def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(fol
     page = (folder / "open" / "report.html").read_text()
     assert "No correction" in page
     assert "Written to no file" in page
+
+
+LOOK = ["--subjects", "2", "--grid", "4", "3", "--share", "0.3", "--people", "3"]
+
+
+def _shown(folder, *runs, out):
+    places = [str(folder / run) for run in runs]
+    return main(["evaluate", "experiment", *places, "-o", str(folder / out), *LOOK, "--json", "--force"])
+
+
+def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(folder, capsys):
+    """What the run read through its design, the unwarned and the retrained network read through the lens as made."""
+    assert _retrain(folder, "--quiet", "--truth", str(folder / "truth.toml"), out="told") == 0
+    capsys.readouterr()
+    assert _shown(folder, "run", "told/nominal.safetensors", "told", out="shown") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in told["runs"]] == ["run", "told nominal", "told"]
+    assert list(told["lenses"].values()) == ["as designed", "as made", "as made"]
+    assert "told: through the lens as made" in (folder / "shown" / "report.html").read_text()
+    made, plain = retrained.load(folder / "told"), retrained.load(folder / "run")
+    design = lens.load_plain(folder / "run" / "lens.h5")
+    response = asbuilt.load(folder / "asbuilt.h5").response
+    true = config.load(folder / "truth.toml", Truth)
+    wanted = MadeLens(design, made.settings.optics, response=response).stack(true.vector())
+    assert torch.equal(made.made.intensity, wanted.intensity)
+    assert plain.made is None
+    kept = load_file(folder / "told" / "retrained.safetensors")
+    before = plain.run.trainer.model.net.state_dict()
+    moved = {n: w for n, w in made.run.trainer.model.net.state_dict().items() if not torch.equal(w, before[n])}
+    assert moved
+    assert all(torch.equal(weights, kept[f"/trainer/net/{name}"]) for name, weights in moved.items())
+    through = [experiment.ready(source, image="true") for source in (plain, made)]
+    assert not torch.equal(through[0].stack, through[1].stack)
+
+
+def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(folder, tmp_path, capsys):
+    for name in ("run", "asbuilt.h5"):
+        (shutil.copytree if (folder / name).is_dir() else shutil.copy)(folder / name, tmp_path / name)
+    assert _retrain(tmp_path, "--quiet", out="told") == 0
+    assert retrained.lens_of(tmp_path / "told") == "as fitted"
+    assert _shown(tmp_path, "told/known.safetensors", out="shown") == 2
+    assert "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err
+    asbuilt.save(tmp_path / "asbuilt.h5", m.asbuilt(sigma=0.2))
+    assert _shown(tmp_path, "told", out="shown") == 2
+    assert "asbuilt.h5 is not what it was retrained from" in capsys.readouterr().err
+    (tmp_path / "run").rename(tmp_path / "away")
+    assert _shown(tmp_path, "told", out="shown") == 2
+    assert "its run is no longer at" in capsys.readouterr().err
