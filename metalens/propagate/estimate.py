@@ -293,26 +293,38 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
     lengths = [*case.centre_um, case.sensor_distance_um, case.wavelength_um]
     numbers: Any = np.array([*case.tangents, reference_depth(case), *lengths])
     inverse = np.array(case.inverse_depths_per_um)[depths]
-    given = [_of_depths(case, one, (e, x), numbers, inverse) for one in light]
+    spans = _lit(light)
+    given = [_of_depths(case, one, (e, x, spans), numbers, inverse) for one in light]
     re, im = (np.concatenate([parts[i] for parts in given], axis=1) for i in (0, 1))
     out = np.zeros((re.shape[1], len(points)), complex)
     total: Any = sum_nodes
+    more: tuple[Any, ...] = (spans,)
     if case.behind is not None:
         k = case.wavenumber
         total, numbers = sum_rays, (*case.centre_um, (k, *media_arrays(case.behind, k, case.reach_um)))
-    split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, out[:, a:b]))
+        more = ()
+    split(len(points), lambda a, b: total(re, im, e, x, points[a:b], numbers, *more, out[:, a:b]))
     return np.asarray(out * case.area_um2).reshape(len(light), len(depths), -1)
 
 
-def _of_depths(case: Case, light: Array, at_um: tuple[Array, Array], numbers: Array, inverse: Array) -> Array:
-    """(real and imaginary, row, depth, column) light (row, column) with the phase of every depth."""
-    e, x = at_um
-    out = np.empty((2, len(e), len(inverse), len(x)))
+def _lit(light: Array) -> Array:
+    """(row, 2) first column of each row with light of any component (component, row, column), and that after the last:
+    a round lens leaves the corners of its square dark."""
+    there = (light != 0).any(0)
+    last = there.shape[1] - there[:, ::-1].argmax(1)
+    return np.stack([there.argmax(1), np.where(there.any(1), last, 0)], 1)
+
+
+def _of_depths(case: Case, light: Array, at_um: tuple[Array, Array, Array], numbers: Array, inverse: Array) -> Array:
+    """(real and imaginary, row, depth, column) light (row, column) with the phase of every depth; at_um: places of rows
+    and columns, and what :func:`_lit` found."""
+    e, x, spans = at_um
+    out = np.zeros((2, len(e), len(inverse), len(x)))
     turn: Any = curved
     if case.front:
         angle = depth_factors(case, e[:, None], x, case.tangents, inverse[:, None, None])
         turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
         out[:] = turned.real, turned.imag
     else:
-        split(len(e), lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, out[0, a:b], out[1, a:b]))
+        split(len(e), lambda a, b: turn(light[a:b], e[a:b], x, numbers, inverse, spans[a:b], out[0, a:b], out[1, a:b]))
     return out

@@ -1,11 +1,11 @@
 """Grids for wide windows (:mod:`metalens.propagate.wide`): how fine, how far, and what is faded out."""
 
 import functools
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 
 from metalens.ground.arrays import Array
 from metalens.lens import media
@@ -178,8 +178,16 @@ def _axis(case: Case, i: int, fit: Fit, faded: tuple[float, float, float], toler
 
 
 def _quick(points: float) -> int:
-    """Size of a transform: factors 2, 3 and 5."""
-    return int(scipy.fft.next_fast_len(math.ceil(points - 1e-9), real=True))
+    """Size of a transform: a multiple of 4 of factors 2, 3, 5 and 7; others take up to twice as long a point."""
+    return next(n for n in itertools.count(4 * math.ceil((points - 1e-9) / 4), 4) if _smooth(n))
+
+
+@functools.lru_cache(maxsize=4096)
+def _smooth(n: int) -> bool:
+    for factor in (2, 3, 5, 7):
+        while n % factor == 0:
+            n //= factor
+    return n == 1
 
 
 def _band(case: Case, i: int, extra: float) -> float:

@@ -156,41 +156,49 @@ def _source(x, y, numbers, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def curved(light, e, x, numbers, inverse, re, im):  # type: ignore[no-untyped-def]
-    """Light on the nodes (row, column) with the phase of every depth less the reference's, to (row, depth, column)."""
+def curved(light, e, x, numbers, inverse, spans, re, im):  # type: ignore[no-untyped-def]
+    """Light on the nodes (row, column) with the phase of every depth less the reference's, to (row, depth, column);
+    of each row the columns spans[row, 0] to spans[row, 1], where there is light."""
+    near = np.empty(x.size)
     for i in range(e.size):
+        for j in range(spans[i, 0], spans[i, 1]):
+            near[j] = _source(x[j], e[i], numbers, numbers[2])
         for z in range(inverse.size):
-            for j in range(x.size):
-                path = _source(x[j], e[i], numbers, inverse[z]) - _source(x[j], e[i], numbers, numbers[2])
-                t = path / numbers[6]
+            for j in range(spans[i, 0], spans[i, 1]):
+                t = (_source(x[j], e[i], numbers, inverse[z]) - near[j]) / numbers[6]
                 c, s = turns64(t - np.rint(t))
                 a, b = light[i, j].real, light[i, j].imag
                 re[i, z, j], im[i, z, j] = a * c - b * s, a * s + b * c
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True)
-def _kernel_row(X, Y, dy, x, numbers, re, im):  # type: ignore[no-untyped-def]
-    """Kernel of :mod:`metalens.propagate.paths` from a row of lens nodes to the window offset (X, Y)."""
+def _kernel_row(X, Y, dx, dy, w, numbers, re, im):  # type: ignore[no-untyped-def]
+    """Kernel of :mod:`metalens.propagate.paths` from a row of lens nodes, ``w`` from the window's centre, to the window
+    offset (X, Y)."""
     distance, wavelength = numbers[5], numbers[6]
     k = 2 * np.pi / wavelength
-    for j in range(x.size):
-        dx = numbers[3] - x[j]
-        w2 = dx * dx + dy * dy + distance * distance
-        q = X * X + Y * Y + 2 * (X * dx + Y * dy)
-        r = np.sqrt(w2 + q)
-        t = q / ((r + np.sqrt(w2)) * wavelength)
+    for j in range(dx.size):
+        q = X * X + Y * Y + 2 * (X * dx[j] + Y * dy)
+        r = np.sqrt(w[j] * w[j] + q)
+        both = 1 / (r * (r + w[j]))
+        t = q * both * r / wavelength
         c, s = turns64(t - np.rint(t))
-        near = 1 / r
+        near = both * (r + w[j])
         scale = distance / (2 * np.pi) * near * near
         re[j], im[j] = scale * (c * near + k * s), scale * (s * near - k * c)
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def sum_nodes(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-def]
-    """Add light (row, depth, column) times the kernel to ``out`` (depth, point) at window offsets (point, [X, Y])."""
-    h_re, h_im = np.empty(x.size), np.empty(x.size)
-    for p in range(points.shape[0]):
-        for i in range(e.size):
-            _kernel_row(points[p, 0], points[p, 1], numbers[4] - e[i], x, numbers, h_re, h_im)
+def sum_nodes(re, im, e, x, points, numbers, spans, out):  # type: ignore[no-untyped-def]
+    """Add light (row, depth, column) times the kernel to ``out`` (depth, point) at window offsets (point, [X, Y]); of
+    each row the columns spans[row, 0] to spans[row, 1]. A row serves all points while it is near."""
+    w, dx, h_re, h_im = np.empty(x.size), numbers[3] - x, np.empty(x.size), np.empty(x.size)
+    for i in range(e.size):
+        a, b = spans[i, 0], spans[i, 1]
+        dy = numbers[4] - e[i]
+        for j in range(a, b):
+            w[j] = np.sqrt(dx[j] * dx[j] + dy * dy + numbers[5] * numbers[5])
+        for p in range(points.shape[0]):
+            _kernel_row(points[p, 0], points[p, 1], dx[a:b], dy, w[a:b], numbers, h_re[a:b], h_im[a:b])
             for z in range(re.shape[1]):
-                out[z, p] += product(re[i, z], im[i, z], h_re, h_im)
+                out[z, p] += product(re[i, z, a:b], im[i, z, a:b], h_re[a:b], h_im[a:b])

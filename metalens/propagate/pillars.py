@@ -22,6 +22,8 @@ from metalens.propagate.geometry import Case
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth factors on the light of several
 # maps: light on the window is Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
 Pupils = Callable[[Array, Array], tuple[Array, Array]]
+Bands = list[tuple[slice, slice]]
+BAND = 128  # nodes whose shares of an even grid are taken at once
 KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once, and of maps' copies in a thread
 DEVICE_ROWS = 256
 
@@ -32,7 +34,7 @@ class Moments:
 
     blocks: of rows and columns; carrier: the phase that is taken off; table: its polynomials, where they are small
     enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks (on other devices than the
-    processor: at the pillars).
+    processor: at the pillars); bands: of each, the nodes that are taken at once and the moments that have a share.
     """
 
     blocks: tuple[Blocks, Blocks]
@@ -40,6 +42,7 @@ class Moments:
     table: Any
     rows: torch.Tensor
     columns: torch.Tensor
+    bands: tuple[Bands, Bands]
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -87,7 +90,25 @@ def moments(
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
     found = [weight(place) for weight, place in zip(weights, places, strict=True)]
     polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found]
-    return Moments(blocks, wave, table, polynomials[0], polynomials[1])
+    return Moments(blocks, wave, table, polynomials[0], polynomials[1], (_bands(found[0]), _bands(found[1])))
+
+
+def _bands(weights: Array) -> Bands:
+    """Nodes and the moments that are not 0 at all of them; one band of all where most are not."""
+    bands = []
+    for start in range(0, len(weights), BAND):
+        at = slice(start, min(start + BAND, len(weights)))
+        there = np.flatnonzero(weights[at].any(0))
+        bands.append((at, slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 0)))
+    if sum(to.stop - to.start for _, to in bands) > weights.shape[1] * len(bands) / 2:
+        return [(slice(0, len(weights)), slice(0, weights.shape[1]))]
+    return bands
+
+
+def _in(bands: Bands, start: int, stop: int) -> Bands:
+    """The bands of nodes from start to stop."""
+    cut = [(slice(max(at.start, start), min(at.stop, stop)), to) for at, to in bands]
+    return [(at, to) for at, to in cut if at.start < at.stop]
 
 
 def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
@@ -178,9 +199,12 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
                 powers.append(kernel(*few, table[i:end], along, shares, bases, 0, part))
 
         split(count, work)
-        sums = (nodes.flatten(0, 1) @ plan.columns).view(-1, 2 * n)
-        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
-        out = torch.addmm(out, plan.rows[at].T, sums)
+        sums = torch.zeros((count * rows.nodes * 2, n), dtype=out.dtype)
+        for at, to in plan.bands[1]:
+            sums[:, to].addmm_(nodes.flatten(0, 1)[:, at], plan.columns[at, to])
+        sums, before = sums.view(-1, 2 * n), panel.start * rows.nodes
+        for at, to in _in(plan.bands[0], before, panel.stop * rows.nodes):
+            out[to].addmm_(plan.rows[at, to].T, sums[at.start - before : at.stop - before])
     return out.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(powers)
 
 
@@ -189,22 +213,28 @@ def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.
     phase, level = (m.detach().numpy() for m in maps)
     none = np.empty((0, 0), phase.dtype)
     targets = tuple(none if t is None else t.numpy() for t in out)
-    (rows, columns), (m, n) = plan.blocks, plan.counts
+    rows, (m, n) = plan.blocks[0], plan.counts
     inner = grad.movedim(0, 1).reshape(m, 2 * n)
     kernel: Any = spread
     fixed = _fixed(plan, phase.dtype)
     for panel in plan.panels:
         table = _table(plan, panel, phase.dtype)
-        at = slice(panel.start * rows.nodes, panel.stop * rows.nodes)
-        nodes = (
-            ((plan.rows[at] @ inner).view(-1, n) @ plan.columns.T).view(-1, 2, columns.count * columns.nodes).numpy()
-        )
+        nodes = _given(plan, panel, inner).numpy()
 
         def work(a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel) -> None:
             part = nodes[a * rows.nodes : b * rows.nodes]
             kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
 
         split(panel.stop - panel.start, work)
+
+
+def _given(plan: Moments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
+    """Gradients (m, re/im · n) of the moments to those of the nodes of a panel (row node, re/im, column node)."""
+    (rows, columns), n = plan.blocks, plan.counts[1]
+    before, stop = panel.start * rows.nodes, panel.stop * rows.nodes
+    sums = torch.cat([plan.rows[at, to] @ inner[to] for at, to in _in(plan.bands[0], before, stop)]).view(-1, n)
+    nodes = torch.cat([sums[:, to] @ plan.columns[at, to].T for at, to in plan.bands[1]], 1)
+    return nodes.view(-1, 2, columns.count * columns.nodes)
 
 
 def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:

@@ -32,7 +32,7 @@ from metalens.propagate.operators import depth_basis
 from metalens.propagate.paths import from_source, over_blocks, reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 
-BAND_BYTES = 8e6  # of the depths that are mixed at once
+BAND_BYTES = 3e6  # of the depths that are mixed at once
 EVERY = 3  # point of the grid of the lens whose light says which depth fields are needed
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
@@ -40,7 +40,8 @@ CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 @dataclass(frozen=True, eq=False, slots=True)
 class WidePlan:
     """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x) depth fields on the grid of the
-    lens, its phases included; coefficients: (depth, b); chirp, transfer: (Y, X) behind the first and second transform.
+    lens, its phases included; coefficients: (depth, b); chirp, transfer: (X, Y) behind the first and second transform,
+    as light lies in memory between them.
     left: of the light of all depths that fewer fields may leave out, root mean square.
     """
 
@@ -89,7 +90,8 @@ def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.de
     kind = torch.complex64 if dtype == torch.float32 else torch.complex128
     fields, coefficients = _depth_fields(case, found, tolerance / 2)
     lens = _lens_phase(case, found)
-    given = [torch.tensor(a, dtype=kind, device=device) for a in (coefficients, *_behind(case, found))]
+    arrays = coefficients, *(np.ascontiguousarray(a.T) for a in _behind(case, found))
+    given = [torch.tensor(a, dtype=kind, device=device) for a in arrays]
     table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind, device=device)
     for one, field in zip(table, fields, strict=True):
         one.copy_(torch.from_numpy(field * lens))
@@ -219,12 +221,11 @@ def fields_wide(gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | 
     out = None if gathered.requires_grad else gathered.new_empty((count, my, mx))
     for start in range(0, count, step):
         some = slice(start, start + step)
-        light = torch.fft.fft(fields[some] * gathered, n=x.first)[..., : x.size]
-        light = torch.fft.fft(light, n=y.first, dim=-2)[..., : y.size, :]
-        light *= plan.chirp
+        light = torch.fft.fft(fields[some] * gathered, n=x.first)[..., : x.size].mT  # every transform is along the last
+        light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
         light = torch.fft.fft2(light)
         light *= plan.transfer
-        light = torch.fft.ifft(light, n=y.fine, dim=-2, norm="forward")[..., : my * y.every : y.every, :]
+        light = torch.fft.ifft(light, n=y.fine, norm="forward")[..., : my * y.every : y.every].mT
         seen = torch.fft.ifft(light, n=x.fine, norm="forward")[..., : mx * x.every : x.every]
         if out is None:
             parts.append(seen)
@@ -240,10 +241,10 @@ def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
     bands, out = [], None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
     for start in range(0, my, step):
         some = fields[:, start : start + step]
-        field = (coefficients @ some.reshape(count, -1)).view(depths, -1, mx)
-        light = field.real.square() + field.imag.square()
+        field = torch.view_as_real((coefficients @ some.reshape(count, -1)).view(depths, -1, mx))
         if out is None:
-            bands.append(light)
+            bands.append(field.square().sum(-1))
         else:
-            out[:, start : start + step] = light
+            squares = field.square_()
+            torch.add(squares[..., 0], squares[..., 1], out=out[:, start : start + step])
     return torch.cat(bands, 1) if out is None else out

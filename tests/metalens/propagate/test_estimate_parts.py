@@ -268,3 +268,18 @@ def test_a_window_that_has_no_plan_is_cut_until_its_corners_have_one(plans):
     assert made.method == "tiled"
     assert [len(row) for row in made.tiles] == [4, 4, 4, 4]
     assert made.seconds == pytest.approx(16 * (0.05 + 0.02 + 81e6 * 3e-9))
+
+
+def test_dark_ends_of_rows_are_passed_over_and_change_no_sum():
+    """Light of two components from the first column of either to the last of either; the direct sum of a lens whose
+    corners are dark is that over its whole square."""
+    light = np.zeros((2, 4, 7), complex)
+    light[0, 0, 3], light[1, 0, 5], light[0, 1], light[1, 3, 6] = 1j, -2.0, 0.5, 1e-30
+    np.testing.assert_array_equal(estimate._lit(light), [[3, 6], [0, 7], [0, 0], [6, 7]])
+    e, x = np.linspace(-5, 5, 9), np.linspace(-7, 7, 12)
+    round_ = np.where(e[:, None] ** 2 / 25 + x**2 / 49 < 0.8, RNG.normal(size=(9, 12)) + 0.3j, 0)
+    at = np.array([0, 2]), np.array([3, 1])
+    some = Sample(CASE, 1.0, round_, 0.0, 1, (e, x))
+    faint = replace(some, moments=np.where(round_ == 0, 1e-40, round_))  # no end is dark
+    got, want = (estimate._direct(one, np.array([0, 2]), at) for one in (some, faint))
+    np.testing.assert_allclose(got, want, rtol=1e-13)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from metalens.propagate import compiled
+from metalens.propagate import compiled, pillars
 
 ROWS, COLUMNS, NODES, LENGTH, CHUNK = 13, 11, 7, 5, 4
 BASES = np.array([0, 5, 8]), np.array([0, 5, 6])  # the last blocks begin earlier, so that they end within the lens
@@ -79,3 +79,27 @@ def test_a_phase_that_is_no_number_is_told_where_nothing_is_lit():
     case = Case(np.float64)
     case.phase[11, CHUNK - 1] = np.nan
     assert np.isnan(compiled.gather(*case.given, np.zeros((2 * NODES, 2, 3 * NODES))))
+
+
+def _grid_shares():
+    """(300 nodes, 90) shares of an even grid: seven neighbours of each node, 0 elsewhere."""
+    place, grid = np.linspace(4.0, 85.0, 300)[:, None], np.arange(90)
+    return np.where(np.abs(place - grid) < 3.5, np.cos(0.4 * (place - grid)), 0.0)
+
+
+def test_bands_hold_every_share_and_leave_zeros_out():
+    """All but zeros of an even grid; one band where shares are dense. A band one moment short on either side would
+    lose some."""
+    weights = _grid_shares()
+    bands, held = pillars._bands(weights), np.zeros_like(weights)
+    for at, to in bands:
+        held[at, to] = weights[at, to]
+    np.testing.assert_array_equal(held, weights)
+    assert [at.stop - at.start for at, _ in bands] == [128, 128, 44]
+    assert sum((at.stop - at.start) * (to.stop - to.start) for at, to in bands) < 0.5 * weights.size
+    assert pillars._bands(weights + 1) == [(slice(0, 300), slice(0, 90))]
+
+
+def test_bands_of_a_panel_are_cut_to_its_nodes():
+    bands = [(slice(0, 128), slice(0, 40)), (slice(128, 256), slice(30, 80)), (slice(256, 300), slice(70, 90))]
+    assert pillars._in(bands, 100, 256) == [(slice(100, 128), slice(0, 40)), (slice(128, 256), slice(30, 80))]

@@ -203,7 +203,7 @@ def test_grids_of_a_wide_window_hold_its_light_its_fade_and_the_kernels_band(tol
         period = axis_.fine * 0.9 / axis_.every
         beyond = grids._beyond(LARGE, fits, [a.guard for a in found])[i]
         width = 2 * (half + beyond) + 4 * sharp**2 / k / axis_.guard
-        assert width * (1 - 1e-9) <= period < 1.1 * width  # factors of 2, 3 and 5 lie as close
+        assert width * (1 - 1e-9) <= period < 1.1 * width  # multiples of 4 of factors 2, 3, 5 and 7 lie as close
         assert min(period / coarse, axis_.fine) * (1 - 1e-9) <= axis_.size < 1.1 * period / coarse + 8
         assert axis_.step_um * axis_.first == pytest.approx(0.85 * axis_.stretch_um * axis_.size / period, rel=1e-9)
         band = grids._band(LARGE, i, fit.extra_um)
@@ -219,3 +219,9 @@ def test_windows_whose_rays_no_quadratic_follows_have_no_grids():
     near = replace(LARGE, sensor_distance_um=30.0)
     assert grids.axes(near, 1e-4) is None
     assert grids.seconds(near, 1e-4) == math.inf
+
+
+@pytest.mark.parametrize(("points", "size"), [(577.2, 588), (576.0, 576), (1801.0, 1920), (625.0, 640), (101.0, 108)])
+def test_transforms_have_sizes_that_are_quick(points, size):
+    """The next multiple of 4 whose only factors are 2, 3, 5 and 7 (1804 to 1916 hold one of 11 or more)."""
+    assert grids._quick(points) == size

@@ -84,7 +84,8 @@ def test_the_stack_takes_it_and_says_what_it_errs():
     exact = psf.psf_stack(phase, level, **ABOUT, **WINDOW, integrate=False, tolerance=1e-7)
     want = exact.intensity * exact.energy_um2[:, None, None] / exact.step_um**2
     true = np.linalg.norm(light - want) / np.linalg.norm(want)
-    assert true / 1.1 < stack.error < 12 * true  # energies are compared too: they share the scatter of float32
+    least = 1.5e-6  # is stated in any case: 0.02 of the setting (5e-5) and the rounding of transforms, 1e-6 each
+    assert true / 1.1 < stack.error < max(12 * true, least)  # energies are compared too: they share float32's scatter
 
 
 def test_gradients_are_those_of_differences():

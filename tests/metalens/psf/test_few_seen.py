@@ -59,10 +59,10 @@ def judged(maps, case, setting, light_of, **about):
     return stated, float(np.linalg.norm(light - best) / np.linalg.norm(best))
 
 
-@pytest.mark.parametrize(("seed", "least"), [(17, 0.6), (55, 0.45), (3, 0.08)])
+@pytest.mark.parametrize(("seed", "least"), [(117, 0.75), (5, 0.45), (129, 0.08)])
 def test_a_wide_window_states_no_less_than_its_error(seed, least):
-    """17: what is seen of few points, half as much again (``SCATTER``), and sums of few (``SPARSE``); 55: the
-    latter alone; 3: an error 400 times below the setting, of which few points see less than half (``MISSED``)."""
+    """117: what is seen of few points, half as much again (``SCATTER``), and sums of few (``SPARSE``); 5: the
+    latter alone; 129: an error 500 times below the setting, of which few points see four fifths (``MISSED``)."""
     about = {"pitch": 0.62, "wavelength": 0.47, "depth": 3600.0}
     maps, offset, _ = lens(seed, (150, 190), 0.62, 0.47, 240.0, 4500.0, lambda rng: rng.uniform(0, 1.2))
     given = {"pitch_um": 0.62, "wavelength_um": 0.47, "sensor_distance_um": 240.0, "depths_um": [3600.0]}
