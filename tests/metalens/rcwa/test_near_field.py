@@ -65,21 +65,21 @@ def _airy(indices, heights, light, z):
 @pytest.mark.parametrize("polarization", ["s", "p"])
 @pytest.mark.parametrize("slab", [2.3, 1.9 + 0.3j])
 def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(polarization, slab):
-    """A pillar of the medium around it is a film; one film under it and one over it. Rounding alone is left."""
+    """A pillar of the medium around it is a film; one film under it, an absorbing one over it. Rounding is left."""
     medium = Index(slab.real, slab.imag)
-    films = {"under": (Film(Index(1.9), 0.07),), "over": (Film(Index(1.3), 0.11),)}
+    films = {"under": (Film(Index(1.9), 0.07),), "over": (Film(Index(1.3, 0.2), 0.11),)}
     cell = Cell(0.37, 0.47, medium, Index(1.46), Index(1.1), medium, **films)
     light = Light(WAVELENGTH, 0.5, polarization, 0.6)
     z = np.linspace(-0.43, 0.91, 24)
     got = near_field(cell, 0.2, light, x_um=[0.03, 0.11], y_um=[-0.07], z_um=z, harmonics=2)
-    want = _airy([1.46, 1.9, slab, 1.3, 1.1], [0.07, 0.47, 0.11], light, z + 0.07)
+    want = _airy([1.46, 1.9, slab, 1.3 + 0.2j, 1.1], [0.07, 0.47, 0.11], light, z + 0.07)
     k = K0 * math.sin(0.5) * np.array([math.cos(0.6), math.sin(0.6)])
     for i, x in enumerate((0.03, 0.11)):
         turn = np.exp(1j * (k[0] * x - k[1] * 0.07))
         assert np.abs(got.e[:, :, 0, i] - turn * want[0]).max() < 1e-12
         assert np.abs(got.h[:, :, 0, i] - turn * want[1]).max() < 1e-12
     assert got.converged
-    assert got.index[:, 0, 0] == pytest.approx(np.array([1.46, 1.9, slab, 1.3, 1.1])[np.searchsorted(
+    assert got.index[:, 0, 0] == pytest.approx(np.array([1.46, 1.9, slab, 1.3 + 0.2j, 1.1])[np.searchsorted(
         [-0.07, 0, 0.47, 0.58], z)])  # fmt: skip
 
 
