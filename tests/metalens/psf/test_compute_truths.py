@@ -118,6 +118,18 @@ def test_pillars_of_random_phases_add_by_power_at_the_middle_of_the_window():
     assert compute._incoherent(5.3, CASE) == pytest.approx(math.sqrt(5.3) * kernel, rel=1e-5)
 
 
+@pytest.mark.parametrize("many", [98, 99])
+def test_an_estimate_looks_at_few_of_the_samples_of_windows_above_a_size(monkeypatch, many):
+    """9 x 11 samples are 99: more than 98, and not more than 99."""
+    phase, level = maps(SINGLE)
+    told = []
+    monkeypatch.setattr(compute, "_few_seen", lambda result, tolerance: told.append(tolerance) or result)
+    monkeypatch.setattr(compute, "MANY", many)
+    found = compute.intensity(phase.requires_grad_(), level, [CASE], [1.0], tolerance=4e-3)  # not by the exact sum
+    assert found.reason.startswith("windowed")
+    assert bool(told) is (many == 98)
+
+
 def test_few_of_many_samples_may_miss_half_as_much_again_and_a_part_of_the_setting():
     found = compute._few_seen(Result(torch.ones(1), 3e-4, "typed", 1.0), 8e-3)
     assert found.error == pytest.approx(math.hypot(1.5 * 3e-4, 0.02 * 8e-3), rel=1e-12)
