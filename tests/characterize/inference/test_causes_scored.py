@@ -81,19 +81,6 @@ def test_changes_of_nothing_have_no_degrees():
     assert fit_of(np.ones(PIXELS)).lean("fitted", 3.3 * SLOPES[:1]) == Lean("fitted", 0.0, 0, 1.0)
 
 
-@pytest.mark.parametrize(("share", "degrees"), [(0.8e-3, 0), (1.2e-3, 1)])
-@pytest.mark.parametrize("size", [0.05, 30.0])
-def test_a_change_of_which_the_fit_leaves_less_than_a_thousandth_of_the_square_is_not_told(share, degrees, size):
-    """Whatever its size: along a slope, and beside all of them by the root of its share."""
-    slopes = np.array([4.0, 0.5, 20.0, 7.0])[:, None] * np.eye(4, PIXELS)
-    rest = RNG.normal(size=PIXELS)
-    fit = Fitted(NAMES, slopes, slopes @ slopes.T, rest, ALONE, np.zeros(4))
-    change = size * (math.sqrt(1 - share) * np.eye(1, PIXELS, 2) + math.sqrt(share) * np.eye(1, PIXELS, 6))
-    found = fit.lean("hidden", change)
-    assert found.degrees == degrees
-    assert found.chi2 == pytest.approx(degrees * rest[6] ** 2, rel=1e-9)
-
-
 def test_what_a_cause_would_be_taken_for_is_said_in_sigma_the_largest_first():
     """Of slopes without overlap a change c of slope j moves its parameter by c, and by c |slope j| in sigma."""
     size = np.array([4.0, 0.5, 20.0, 7.0, 3.0])

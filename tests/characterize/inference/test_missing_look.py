@@ -49,3 +49,16 @@ def test_slopes_are_over_the_noise_and_priors_add_to_what_they_know(monkeypatch)
     assert fit.known[0, 1] == pytest.approx(rows[0] @ rows[1], rel=1e-9)
     assert np.diag(fit.known) == pytest.approx((rows**2).sum(1) + np.array([1 / 0.09, 1 / 4.41]), rel=1e-9)
     assert fit.shared == pytest.approx(SHARED * (counted / noise).reshape(IMAGE.shape), rel=1e-12)
+
+
+@pytest.mark.parametrize(("share", "degrees"), [(0.8e-3, 0), (1.2e-3, 1)])
+@pytest.mark.parametrize("size", [0.05, 30.0])
+def test_a_change_of_which_the_fit_leaves_less_than_a_thousandth_of_the_square_is_not_told(share, degrees, size):
+    """Whatever its size: along a slope, and beside all of them by the root of its share."""
+    slopes = np.array([4.0, 0.5, 20.0, 7.0])[:, None] * np.eye(4, IMAGE.size)
+    rest = draw.normal(size=IMAGE.size)
+    fit = missing.Fitted(tuple("abcd"), slopes, slopes @ slopes.T, rest, np.zeros((2, *IMAGE.shape)), np.zeros(4))
+    change = size * (math.sqrt(1 - share) * np.eye(1, IMAGE.size, 2) + math.sqrt(share) * np.eye(1, IMAGE.size, 6))
+    found = fit.lean("hidden", change)
+    assert found.degrees == degrees
+    assert found.chi2 == pytest.approx(degrees * rest[6] ** 2, rel=1e-9)
