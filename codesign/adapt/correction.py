@@ -20,6 +20,8 @@ from metalens.ground.errors import ConfigError
 from metalens.lens import DiameterMap, Lens
 from metalens.made import STEEPEST, Bias, Sensitivity, State, of_process, transmission
 
+_RAYS = 8  # of the places where the corrected map is judged
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Correction:
@@ -133,15 +135,24 @@ def overlap(one: Array, other: Array) -> float:
     return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
 
 
-def write(folder: Path, plan: Correction) -> None:
-    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5."""
+def uneven_nm(x: Array) -> Array:
+    """(places,) nm that the corrected map takes off at the axis, half-way and along the rim, of all parameters."""
+    turn = 2 * np.pi * np.arange(_RAYS) / _RAYS
+    rho = np.repeat([0.5, 1.0], _RAYS)
+    u, v = (np.append(0.0, rho * np.tile(way(turn), 2)) for way in (np.cos, np.sin))
+    return np.asarray(state(x).bias_um(u, v) * 1e3 - state(x)["bias_nm"])
+
+
+def write(folder: Path, plan: Correction, *, evened: bool = True) -> None:
+    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5 where it is ``evened``."""
     from metalens import lens as lenses
 
     rows = [f"{d:.3f},{b:.3f}" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)]
     store.write_text(folder / "bias.csv", "\n".join(["drawn_nm,bias_nm", *rows]) + "\n")
     pairs = ", ".join(f"[{d:.3f}, {b:.3f}]" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True))
     store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
-    lenses.save(folder / "lens_corrected.h5", plan.lens)
+    if evened:
+        lenses.save(folder / "lens_corrected.h5", plan.lens)
 
 
 def present_bias(path: Path | None) -> Bias:

@@ -27,7 +27,7 @@ class Story:
 
     apart: PSF errors against the nominal lens of the fitted lens and of the lens that judges. curves: {job: (step,
     loss)}. proposals: states of the next lens with their slippage errors, mm. cautions: in words. refused: why the
-    correction is not written; empty where it is.
+    correction is not written; uneven: why the table alone is; empty where they are.
     """
 
     outcome: Outcome
@@ -38,6 +38,7 @@ class Story:
     proposals: Sequence[tuple[Proposal, float, float]]
     cautions: Sequence[str] = field(default_factory=tuple)
     refused: str = ""
+    uneven: str = ""
 
 
 def write(path: Path, story: Story) -> None:
@@ -160,6 +161,8 @@ def _mask(story: Story) -> Section:
         "varies over the lens; draw it with the new table. The spacer is no matter of the mask: the last row sets it "
         "right as well."
     )
+    if story.uneven and not story.refused:
+        text += f"\n\nNo lens_corrected.h5 is written: {story.uneven}."
     if story.refused:
         text = f"{story.refused[0].upper()}{story.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
     return Section(

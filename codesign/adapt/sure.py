@@ -11,7 +11,6 @@ from metalens.ground.errors import ConfigError
 
 DRAWS = 24
 WIDE_NM = 2.0  # standard deviation of the table's entries beyond which it is no table: the step of drawn diameters
-PROCESS = ("bias_nm", "height_nm", "index", "sidewall_deg", "bias_r_nm")
 _SETTLED = (  # word of a cause, and what states it
     ("side wall", "the side wall by a cross-section ([[known]] sidewall_deg)"),
     ("refractive index", "the index by ellipsometry ([[known]] index)"),
@@ -31,11 +30,23 @@ _FRAMES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a correction, in words, and the parameters that it follows."""
+
+    words: str
+    names: tuple[str, ...]
+
+
+TABLE = Part("the bias table", ("bias_nm", "height_nm", "index", "sidewall_deg"))
+MAP = Part("what varies over the lens", ("bias_x_nm", "bias_y_nm", "bias_r_nm", "bias_a_nm", "bias_o_nm"))
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Sureness:
-    """How the posterior spreads a bias table.
+    """How the posterior spreads a correction.
 
-    table_nm: (draws, knots) the table of every draw. sigma_nm: (knots,) its standard deviation. words: why it is
+    table_nm: (draws, knots) that of every draw. sigma_nm: (knots,) its standard deviation. words: why it is
     refused, and what to capture or measure; empty where it may be used.
     """
 
@@ -49,11 +60,19 @@ class Sureness:
         return not self.words
 
 
-def judge(result: AsBuilt, table: Callable[[Array], Array], *, wide_nm: float = WIDE_NM, seed: int = 5) -> Sureness:
-    """The table that every draw of the posterior would ask for, and whether they agree.
+def judge(
+    result: AsBuilt,
+    table: Callable[[Array], Array],
+    *,
+    part: Part = TABLE,
+    wide_nm: float = WIDE_NM,
+    seed: int = 5,
+) -> Sureness:
+    """What every draw of the posterior would ask for, and whether they agree.
 
     Args:
-        table: (knots,) bias table of all parameters of one lens.
+        table: (knots,) of the bias table, or of what is taken off at some places of the lens, nm, of all parameters of
+            one lens. part: which of them.
     """
     try:
         drawn = np.array([table(result.parameters(row)) for row in result.samples(DRAWS, seed=seed)])
@@ -62,25 +81,25 @@ def judge(result: AsBuilt, table: Callable[[Array], Array], *, wide_nm: float = 
     sigma = drawn.std(axis=0, ddof=1)
     if sigma.max() <= wide_nm:
         return Sureness(drawn, sigma, "")
-    ranges = [(name, *result.interval(name)) for name in PROCESS if name in result.names]
+    ranges = [(name, *result.interval(name)) for name in part.names if name in result.names]
     told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
     return Sureness(
         drawn,
         sigma,
-        f"no correction: the posterior leaves the bias table open by {sigma.max():.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {told}). Settle it by {_settled(result, table, sigma, wide_nm)}",
+        f"no correction: the posterior leaves {part.words} open by {sigma.max():.1f} nm (1 sigma, at most "
+        f"{wide_nm:g} allowed; {told}). Settle it by {_settled(result, table, sigma, (part, wide_nm))}",
     )
 
 
-def _settled(result: AsBuilt, table: Callable[[Array], Array], sigma: Array, wide_nm: float) -> str:
+def _settled(result: AsBuilt, table: Callable[[Array], Array], sigma: Array, wanted: tuple[Part, float]) -> str:
     """What would make the table narrow, the most telling first: causes to state, and frames where these say too little.
 
     By the table's slopes along every parameter that it follows; a cause moves all of them together, at most by the sum.
     """
-    best, place = table(result.parameters()), int(np.argmax(sigma))
+    (part, wide_nm), best, place = wanted, table(result.parameters()), int(np.argmax(sigma))
     slopes = np.zeros(len(result.names))
     for i, name in enumerate(result.names):
-        if name in PROCESS:
+        if name in part.names:
             moved = result.value.copy()
             moved[i] += 0.1 * result.sigma[i]
             slopes[i] = (table(result.parameters(moved)) - best)[place] / (0.1 * result.sigma[i])

@@ -11,7 +11,7 @@ from codesign.adapt import Lenses, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained import RECIPE, RESULT, Recipe, given
-from codesign.adapt.sure import judge
+from codesign.adapt.sure import MAP, judge
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
@@ -69,12 +69,13 @@ def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retr
     sure = judge(
         result, lambda x: correction.table(design, x, response=made.response, old=old, range_um=printed).bias_nm
     )
+    even = judge(result, correction.uneven_nm, part=MAP)
     apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
     story = retrain_report.Story(
-        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found), sure.words
+        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found), sure.words, even.words
     )
     if sure.usable:
-        correction.write(folder, plan)
+        correction.write(folder, plan, evened=even.usable)
     _keep(folder, options, (source, trained["retrained"]), story)
     if options.export:
         net = retraining.network(trained["retrained"])
@@ -187,6 +188,7 @@ def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
         "truth_known": story.lenses.known,
         "next_lens": states,
         "correction_refused": story.refused,
+        "map_refused": story.uneven,
     }
 
 
@@ -206,4 +208,6 @@ def _text(story: retrain_report.Story, folder: Path) -> str:
         )
     if story.refused:
         lines.append(f"next mask: {story.refused}")
+    elif story.uneven:
+        lines.append(f"next mask, bias.toml alone: {story.uneven}")
     return "\n".join([*lines, f"open {folder / 'report.html'}"])

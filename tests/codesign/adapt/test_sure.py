@@ -12,7 +12,7 @@ import made_lens as m
 
 from characterize.inference.asbuilt import WithinModel
 from characterize.model import PLACE
-from codesign.adapt import sure
+from codesign.adapt import correction, sure
 from metalens.ground.errors import ConfigError
 
 KNOTS = np.array([0.7, 1.0, 1.6])
@@ -62,6 +62,23 @@ def test_two_lenses_that_fit_alike_are_wide_however_sharp_each_is():
     draws[::2, i] += 9.3
     assert sure.judge(narrow, table).usable
     assert not sure.judge(replace(narrow, draws=draws), table).usable
+
+
+def test_a_map_is_judged_apart_from_the_table():
+    """The mean bias to 0.1 nm, a bow of the diameters to 5: half of it, 2.5 nm, at axis and rim, where -0.5 and 0.5 of
+    it are taken off; half-way -0.25."""
+    sharp = m.asbuilt(sigma=0.1)
+    i = sharp.names.index("bias_r_nm")
+    covariance = sharp.covariance.copy()
+    covariance[i, i] = 25.0
+    bowed = replace(sharp, covariance=covariance)
+    assert sure.judge(bowed, table).usable
+    found = sure.judge(bowed, correction.uneven_nm, part=sure.MAP)
+    assert found.sigma_nm == pytest.approx([2.5] + [1.25] * 8 + [2.5] * 8, rel=0.45)  # 24 draws: 15 % is one sigma
+    assert "what varies over the lens open" in found.words
+    assert "bias_r_nm" in found.words
+    assert "height_nm" not in found.words
+    assert sure.judge(sharp, correction.uneven_nm, part=sure.MAP).usable
 
 
 def test_draws_that_no_table_can_hold_are_refused():

@@ -1,5 +1,6 @@
 """``metalens retrain``: its files, what it overwrites, what a resume refuses."""
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -123,6 +124,22 @@ def test_a_foreign_folder_is_not_overwritten_by_force(folder, capsys):
     assert _retrain(folder, "--force", out="thesis") == 2
     assert "not made by metalens" in capsys.readouterr().err
     assert (folder / "thesis" / "chapter.txt").exists()
+
+
+def test_where_the_map_alone_is_open_the_table_is_written(folder, capsys):
+    """A bow known to 5 nm, all else to 0.1."""
+    made = m.asbuilt()
+    covariance = made.covariance.copy()
+    covariance[made.names.index("bias_r_nm")] *= 2500.0  # on the diagonal alone
+    asbuilt.save(folder / "bowed.h5", dataclasses.replace(made, covariance=covariance))
+    truth = ["--truth", str(folder / "truth.toml")]
+    assert _retrain(folder, "--json", *truth, record="bowed.h5", out="bowed") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["correction_refused"] == ""
+    assert "what varies over the lens" in told["map_refused"]
+    assert (folder / "bowed" / "bias.toml").exists()
+    assert not (folder / "bowed" / "lens_corrected.h5").exists()
+    assert "No lens_corrected.h5 is written" in (folder / "bowed" / "report.html").read_text()
 
 
 @pytest.mark.slow
