@@ -26,6 +26,7 @@ from metalens.ground.arrays import Array
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
+_PATCHY, _SPOT = 3.0, 0.2  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +125,8 @@ def look(task: Task, mode: Solution) -> Looked:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
             found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees))
     found.append(_ghost(task, x, image, root, fit))
+    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / max(float((root > 0).sum()), 1.0)):
+        found.append(_patch(task, x, root, fit))
     told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
     return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
@@ -253,6 +256,40 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
             best = max(best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0])))
     chance = min(1.0, len(places) * float(stats.chi2.sf(best, 1)) / 2)
     return Lean("a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance)
+
+
+def _patch(task: Task, x: Array, root: Array, fit: Fitted) -> Lean:
+    """The place on the lens whose light, left out, explains most; its chance is that of the best of many.
+
+    The light that is left out of a spot is linear in its depth, as long as it is a small share of all: -2 Re(E* E_s).
+    """
+    u, v = _places()
+    names = [f"residual_{k}" for k in range(len(u))]
+    dark = np.asarray(task.model.with_residual(np.zeros(len(u)), _spots).images(x, names)[1])
+    best, place = 0.0, 0
+    for k, one in enumerate((dark * root).reshape(len(u), 1, -1)):
+        left, score = fit.left(one)
+        seen = float((one * left).sum())
+        if seen > 1e-3 * float((one**2).sum()) and score[0] > 0:
+            chi2 = float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
+            best, place = max((best, place), (chi2, k))
+    x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
+    chance = min(1.0, len(u) * float(stats.chi2.sf(best, 1)) / 2)
+    return Lean(f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the lens", best, 1, chance)
+
+
+def _places() -> tuple[Array, Array]:
+    """(places,) u and v of spots on the lens, a spot's width apart."""
+    t = np.arange(-1, 1 + _SPOT / 2, _SPOT)
+    u, v = (part.ravel() for part in np.meshgrid(t, t))
+    inside = np.hypot(u, v) <= 1
+    return u[inside], v[inside]
+
+
+def _spots(u: Array, v: Array, count: int) -> Array:
+    """(count, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1) of its amplitude there."""
+    places = zip(*_places(), strict=True)
+    return np.stack([1j * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (_SPOT / 1.5) ** 2) for a, b in places][:count])
 
 
 def _moved(light: Array, shift: tuple[int, int]) -> Array:

@@ -2,24 +2,27 @@
 
 import dataclasses
 import math
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import ndimage, stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
+from characterize.bench import bench
 from characterize.captures import clean
-from characterize.inference import causes, estimate
+from characterize.inference import causes, estimate, missing
 from characterize.inference.estimate import Options
 from characterize.inference.missing import CHANCE, Fitted, Lean, Looked, look, untold, words
 from characterize.inference.prepare import data_of
 from characterize.inference.search import Task, refine
 from characterize.model import PLACE, ForwardModel, Setting, vector
 from metalens.ground.errors import FitError
+from metalens.lens import DiameterMap
 from metalens.made import Bends, maps
 
 rng = np.random.default_rng(20)
@@ -201,6 +204,26 @@ def test_faults_of_a_bench_are_named(cause):
     told = [one.cause for one in found if one.chance < CHANCE] or found[:2]
     assert any(str(one).startswith(cause) for one in told[:2]), told
     assert words(found)
+
+
+def test_a_patch_without_pillars_is_named_with_its_place():
+    """4.8 by 3.2 um of 40 about x 6, y -9: 1.2 % of the light of a spot, 70 of 6000 e; places are 4 um apart."""
+    d = b.lens().diameters
+    gone = (abs(d.y_um + 9.0) < 1.6)[:, None] & (abs(d.x_um - 6.0) < 2.4)
+    holed = dataclasses.replace(b.lens(), diameters=DiameterMap(np.where(gone, 0, d.diameter_um), d.pitch_um))
+    light = bench.irradiance(holed, b.truth(), b.RESPONSE)
+    first = lean_of(light * (6000.0 / light.max()) + bench.background(b.truth()), 6)[0]
+    assert first.chance < CHANCE
+    x, y = map(float, re.search(r"patch .* about x (\S+), y (\S+) um", first.cause).groups())
+    assert math.hypot(x - 6.0, y + 9.0) < 4.0
+
+
+def test_patches_are_seldom_found_in_noise(monkeypatch):
+    """The best of 81 places: a chance of 1e-4 takes a chi-square of 22 where one place has 15."""
+    monkeypatch.setattr(missing, "_PATCHY", -100.0)
+    (one,) = (one for one in lean_of(b.electrons(), 5) if one.cause.startswith("a patch"))
+    assert one.chance == pytest.approx(min(1.0, 81 * stats.chi2.sf(one.chi2, 1) / 2))
+    assert one.chance > 1e-2
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, 45.0, 110.0])

@@ -15,7 +15,7 @@ RESIDUAL = draw.normal(size=IMAGE.shape) * 4
 SHARED = draw.normal(size=(2, 3, 4, 5))
 
 
-def looked(monkeypatch, chi2_per_dof):
+def looked(monkeypatch, chi2_per_dof, patched=False):
     data = SimpleNamespace(
         usable=USABLE, saturated=FULL, variance=lambda image: 2.5 * image + 9.0, shared=lambda image: SHARED
     )
@@ -25,6 +25,7 @@ def looked(monkeypatch, chi2_per_dof):
     mode = SimpleNamespace(value=np.array([0.2, -3.0]), residual_sigma=RESIDUAL, chi2_per_dof=chi2_per_dof)
     monkeypatch.setattr(missing.causes, "changes", lambda *_: ())
     monkeypatch.setattr(missing, "_ghost", lambda *_: missing.Lean("ghost", 0.0, 0, 1.0))
+    monkeypatch.setattr(missing, "_patch", lambda *_: missing.Lean("patch", 4.0, int(patched), 0.03))
     return missing.look(task, mode)
 
 
@@ -38,6 +39,13 @@ def test_residuals_are_counted_in_the_noise_that_they_show_but_never_in_less_tha
     assert made.fit.pull == pytest.approx(np.array([0.6 / 0.09, -4.3 / 4.41]) / noise, rel=1e-12)
     assert not made.leans
     assert made.reckoned().sigma.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("sigma", "sought"), [(2.9, 0), (3.1, 1)])
+def test_patches_are_looked_for_where_chi_square_is_above_that_of_noise(monkeypatch, sigma, sought):
+    """By three of its sigma, the root of two over the pixels that count."""
+    above = sigma * math.sqrt(2 / (USABLE & ~FULL).sum())
+    assert len(looked(monkeypatch, 1 + above, patched=True).leans) == sought
 
 
 def test_slopes_are_over_the_noise_and_priors_add_to_what_they_know(monkeypatch):

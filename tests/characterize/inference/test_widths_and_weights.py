@@ -86,7 +86,8 @@ def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spr
     )  # fmt: skip
     mode = SimpleNamespace(value=np.array([0.3]), residual_sigma=off, chi2_per_dof=chi2)
     monkeypatch.setattr(causes, "changes", lambda *_: [causes.Change("made", change[None])])
-    monkeypatch.setattr(missing, "_ghost", lambda *_: Lean("ghost", 0.0, 0, 1.0))
+    for name in ("_ghost", "_patch"):
+        monkeypatch.setattr(missing, name, lambda *_: Lean("none", 0.0, 0, 1.0))
     (lean,) = missing.look(task, mode).leans
     own = other - fitted * (fitted @ other) / (fitted @ fitted + prior**-2)
     moved = fitted @ other / (fitted @ fitted + prior**-2)
