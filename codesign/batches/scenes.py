@@ -81,6 +81,12 @@ class SceneConfig:
             )
 
     @property
+    def pupil_depths_um(self) -> tuple[float, float]:
+        """Least and largest depth of the pupils before the lens, whoever they are of (two standard deviations)."""
+        reach = self.slip_mm[2] * 1e3 + 2e3 * self.depth_sd_mm
+        return Rig().distance_um - reach, Rig().distance_um + reach
+
+    @property
     def motion(self) -> Motion:
         """The ranges that states are drawn from, at unit scale."""
         depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)

@@ -76,7 +76,7 @@ def _work(
             _events(journal, going, record)
         if (limit := going.trainer.pitch_held_um) is not None and not held:
             held = True
-            console.say(f"step {record.step}: {_of_pitch(settings, limit)}")
+            console.say(f"step {record.step}: {_of_pitch(going, limit)}")
         if record.step % settings.checkpoint_every == 0:
             console.say(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
@@ -95,7 +95,13 @@ def _work(
     return [end.row for end in ends], said
 
 
-def _of_pitch(settings: RunConfig, limit_um: float) -> str:
+def _of_pitch(going: Run, limit_um: float) -> str:
+    settings = going.settings
+    if limit_um <= going.trainer.model.finest_um:
+        return (
+            f"the pitch is held at {limit_um:.3f} um and asks for less, where the smallest network would be beyond "
+            f"the budget of {min(settings.run.budgets_mmacs):g} MMACs"
+        )
     if limit_um <= settings.optics.sample_um:
         more = settings.optics.sample_um / 2
         return (

@@ -11,14 +11,20 @@ from metalens.image import sensor as camera
 
 def scale_of(run: Run) -> exported.Scale:
     """What a run's networks answer in."""
-    inner = run.settings.inner
+    inner, pitch = run.settings.inner, float(run.trainer.model.pitch_um.detach())
     return exported.Scale(
-        frame_mm=run.window_um * 1e-3,
+        frame_mm=pixels_of(run) * pitch * 1e-3,
         slip_mm=inner.slip_scale_mm,
         elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
         axis=inner.axis_weight > 0,
         points=inner.point_weight > 0,
     )
+
+
+def pixels_of(run: Run) -> int:
+    """Pixels along a side of the run's sensor."""
+    settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
+    return camera.pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
 
 
 def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> None:
@@ -27,6 +33,5 @@ def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> No
     Raises:
         OSError: the target cannot be written.
     """
-    settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
-    size = camera.pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
-    exported.write(path, Subnet(net, architecture), scale_of(run), size=size, pitch_um=pitch)
+    pitch = float(run.trainer.model.pitch_um.detach())
+    exported.write(path, Subnet(net, architecture), scale_of(run), size=pixels_of(run), pitch_um=pitch)

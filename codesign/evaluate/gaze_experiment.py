@@ -25,9 +25,9 @@ from codesign.evaluate.shown import Trial as Trial
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
 from codesign.gaze import Calibrator, Person, Readings, Sphere, angle_deg, face_angles, shared
-from codesign.network import recalibrate
+from codesign.network import losses, recalibrate
 from codesign.optics import formed
-from codesign.train import Answers, Seen, assess, read_out
+from codesign.train import Answers, Seen, assess, frame_wide, read_out
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.image import Imager, UniformImager, low_snr
@@ -104,7 +104,8 @@ def through(
         at = replace(sensor, pitch_um=float(pitch))
         sensor = replace(low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um)
     pixels = read_out(light, trainer.optics.sample_um, pitch, sensor, generator=noise, quiet=quiet)
-    return Seen(pixels, batch.mask, batch.slip_mm, trainer.inner.batch)
+    wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
+    return Seen(pixels, losses.framed(batch.mask, wide), batch.slip_mm, trainer.inner.batch, wide=wide)
 
 
 @torch.no_grad()

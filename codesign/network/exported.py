@@ -28,8 +28,8 @@ OUTPUTS = {  # name: what it is
 class Scale:
     """What turns a network's answers into lengths and angles.
 
-    frame_mm: edge of the image on the sensor. slip_mm: unit of the slippage. elevation_rad: of the face's normal above
-    the direction to the camera. axis, points: whether training gave them weight; what it did not is left out.
+    frame_mm: edge of all pixels. slip_mm: unit of the slippage. elevation_rad: of the face's normal above the direction
+    to the camera. axis, points: whether training gave them weight; what it did not is left out.
     """
 
     frame_mm: float

@@ -122,6 +122,21 @@ def resized(mask: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
 
 
+def framed(mask: Tensor, wide: float) -> Tensor:
+    """Coverage over a frame ``wide`` times as wide as the image that the mask is of, about its middle; 0 beyond it.
+
+    On as many cells: the mask's own where the frame is as wide as the image.
+    """
+    if wide == 1:
+        return mask
+    size = int(mask.shape[-1])
+    cell = torch.arange(size, dtype=torch.float64)
+    edge = (torch.arange(size + 1, dtype=torch.float64) - size / 2) * wide + size / 2
+    shared = torch.minimum(edge[1:, None], cell + 1) - torch.maximum(edge[:-1, None], cell)
+    weights = (shared.clamp_min(0) / wide).to(mask)
+    return weights @ mask @ weights.mT
+
+
 def at_pixels(logits: Tensor, mask: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
     """Logits, interpolated, and the mask's coverage, averaged, on a grid of ``pixels`` along a side."""
     size = (pixels, pixels)

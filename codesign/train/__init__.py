@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from codesign.train.evolution import pareto as pareto
     from codesign.train.finish import End as End
     from codesign.train.finish import finished as finished
+    from codesign.train.formation import frame_wide as frame_wide
     from codesign.train.formation import read_out as read_out
     from codesign.train.inner import Batch as Batch
     from codesign.train.inner import InnerConfig as InnerConfig
@@ -59,6 +60,7 @@ __getattr__, __dir__, __all__ = attach(
         "pareto": "evolution",
         "pictures": "",
         "place": "placement",
+        "frame_wide": "formation",
         "read_out": "formation",
         "run": "",
     },

@@ -8,7 +8,7 @@ from torch import Tensor
 from codesign.batches import depth_um, irradiance, samples
 from codesign.network import Architecture, Baseline, Supernet, blur, losses, recalibrate
 from codesign.optics import Stack, formed
-from codesign.train.formation import read_out
+from codesign.train.formation import frame_wide, read_out
 from codesign.train.inner import InnerConfig, Scenes, Trainer
 from metalens.image import Imager, UniformImager
 
@@ -17,7 +17,8 @@ from metalens.image import Imager, UniformImager
 class Seen:
     """Frames as the sensor gave them, with their truth.
 
-    frames: (n, 1, y, x) standardised. mask: (n, y, x). slip_mm: (n, 3). batch: frames at a time.
+    frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm: (n, 3). batch: frames at a time.
+    wide: the frame's width over the image's (:func:`frame_wide`).
     vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`; None where it is not known.
     """
 
@@ -26,6 +27,7 @@ class Seen:
     slip_mm: Tensor
     batch: int
     vergence: Tensor | None = None
+    wide: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,7 @@ class Assessment:
 def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None) -> Seen:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
     prepared: UniformImager | Imager | None = None
+    pitch, wide = trainer.model.pitch_um, 1.0
     pixels, masks, slips, depths = [], [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)
@@ -54,12 +57,12 @@ def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | Non
             prepared = formed.imager(*given, margin=scenes.margin, made=stack)
         light = irradiance(batch.frames, prepared, margin=scenes.margin)
         noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
-        pitch = trainer.model.pitch_um
+        wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
         pixels.append(read_out(light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))
-        masks.append(batch.mask)
+        masks.append(losses.framed(batch.mask, wide))
         slips.append(batch.slip_mm)
         depths.append(blur.window_vergence(depth_um(batch.frames, margin=scenes.margin)))
-    return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch, torch.cat(depths))
+    return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch, torch.cat(depths), wide)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,7 +102,7 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
     axis = [f.axis for f in found if f.axis is not None and inner.axis_weight]
     return Answers(
         slip,
-        torch.cat([f.centre for f in found]),
+        torch.cat([f.centre for f in found]) * seen.wide,
         shared,
         torch.cat(spread).exp() * torch.tensor(inner.slip_scale_mm) if spread else None,
         torch.cat(depth) if depth else None,

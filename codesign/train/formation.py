@@ -63,6 +63,16 @@ def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None, rea
     return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6)
 
 
+def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
+    """Width of the sensor's frame over that of its image: 1, or more where the pixels do not divide the image.
+
+    The last pixels then reach beyond the image, by half a pixel at most; a network sees the frame and tells places in
+    it, so its labels are those of the frame (:func:`codesign.network.losses.framed`).
+    """
+    wide = camera.pixel_count(samples, sample_um, pitch_um) * pitch_um / (samples * sample_um)
+    return 1.0 if abs(wide - 1) < 1e-9 else wide
+
+
 def network_macs(net: Supernet | Baseline, architecture: Architecture, window_um: float, pitch_um: Tensor) -> Tensor:
     """Multiply-accumulates of one member at this pitch, differentiable."""
     size = window_um / pitch_um * architecture.resolution

@@ -20,7 +20,7 @@ from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train.ahead import Ahead
 from codesign.train.evolution import Count, sandwich
-from codesign.train.formation import depth_loss, network_macs, read_out
+from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
 from codesign.train.light import Light
 from codesign.train.moving import Model, Schedule, model
 from metalens.ground.errors import ConfigError, TrainingError
@@ -33,8 +33,8 @@ class InnerConfig:
 
     steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest (sandwich rule); with
         ``architecture`` fixed, that one alone is trained.
-    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image, nor
-        so coarse that least resolution leaves a network less than 16 pixels.
+    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image or
+        than the run's budgets allow, nor so coarse that least resolution leaves a network less than 16 pixels.
     slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of windows.
     axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read from; 0 where slippage alone
         counts: they cost a tenth of what is read along the axis.
@@ -257,18 +257,20 @@ class Trainer:
             resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
         }  # fmt: skip
         batch, pose, parts = given.batch, given.batch.pose, []
+        wide = frame_wide(given.light.shape[-1], self.optics.sample_um, float(pitch.detach()))
+        mask = losses.framed(batch.mask, wide)
         shift = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
             answer = self.model.net(frames[finer[a]], a)
-            loss = losses.task(answer, batch.mask, shift, scale, slip_weight=self.inner.slip_weight)
+            loss = losses.task(answer, mask, shift, scale, slip_weight=self.inner.slip_weight)
             loss = loss + losses.reading(answer, given.vergence, shift, scale, depth_weight=self.inner.depth_weight)
-            parts.append(loss if pose is None else loss + self._pose(answer, pose))
+            parts.append(loss if pose is None else loss + self._pose(answer, pose, wide))
         macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
         return torch.stack(parts).mean(), macs
 
-    def _pose(self, answer: Prediction, pose: Pose) -> Tensor:
+    def _pose(self, answer: Prediction, pose: Pose, wide: float) -> Tensor:
         weights = {"axis_weight": self.inner.axis_weight, "point_weight": self.inner.point_weight}
-        return losses.pose(answer, pose.axis, pose.points, **weights)
+        return losses.pose(answer, pose.axis, pose.points / wide, **weights)
 
     def _light(self, step: int, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
         """What images this step's frames, and the optics loss."""
@@ -324,11 +326,8 @@ class Trainer:
                     group["lr"] = rates[name]
                 optimiser.step()
         if rates["pitch"] > 0:  # pixels finer than the image's samples show nothing new
-            finest, coarsest = min(self.optics.sample_um, self._begins_um), max(self._coarsest_um, self._begins_um)
-            wanted = float(self.model.pitch_um.detach())
-            self.pitch_held_um = finest if wanted < finest else coarsest if wanted > coarsest else None
-            with torch.no_grad():
-                self.model.log_pitch.clamp_(math.log(finest), math.log(coarsest))
+            finest = min(max(self.optics.sample_um, self.model.finest_um), self._begins_um)
+            self.pitch_held_um = self.model.hold(finest, max(self._coarsest_um, self._begins_um))
 
     def _culprits(self) -> str:
         bad = [

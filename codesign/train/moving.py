@@ -41,17 +41,26 @@ class Schedule:
 class Model:
     """What training moves.
 
-    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um.
+    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um. finest_um: pitch below
+    which no network of the run keeps its budget; 0 for none.
     """
 
     net: Supernet | Baseline
     coefficients_rad: nn.Parameter
     log_pitch: nn.Parameter
+    finest_um: float = 0.0
 
     @property
     def pitch_um(self) -> Tensor:
         """Pixel pitch, always above 0."""
         return self.log_pitch.exp()
+
+    def hold(self, finest_um: float, coarsest_um: float) -> float | None:
+        """Bring the pitch back between these; the one that it was held at, None where it was between them."""
+        wanted = float(self.pitch_um.detach())
+        with torch.no_grad():
+            self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
+        return finest_um if wanted < finest_um else coarsest_um if wanted > coarsest_um else None
 
 
 def model(

@@ -1,8 +1,9 @@
 """A co-design run from its config: joint training, search over architectures under budgets, and what is kept of it."""
 
 import functools
+import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from codesign.batches import VALIDATION, EyeScenes, Pool, PoolScenes, SceneConfig, fill, parallel
-from codesign.network import Architecture, Name, Space, cost
+from codesign.network import Architecture, Name, Space, cost, smallest
 from codesign.optics import OpticsConfig
 from codesign.train import assess, checkpoint, evolution
 from codesign.train.evolution import Candidate, Plan, Search
@@ -20,7 +21,7 @@ from codesign.train.formation import network_macs
 from codesign.train.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
 from codesign.train.words import Part
 from metalens.ground import config
-from metalens.ground.errors import ConfigError
+from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Sensor
 from metalens.image.sensor import pixel_count
 
@@ -89,6 +90,12 @@ class RunConfig:
                 f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}, ambiguity_pairs = "
                 f"{self.ambiguity_pairs}: need a pool of a batch or more (or 0), and pairs of 0 or more"
             )
+        near, far = (1e-3 * depth for depth in self.scenes.pupil_depths_um)
+        if not self.optics.depths_mm[0] <= near <= far <= self.optics.depths_mm[1]:
+            raise ConfigError(
+                f"optics.depths_mm = {self.optics.depths_mm} does not hold the eyes, {near:g} to {far:g} mm before the "
+                "lens (scenes.slip_mm, scenes.depth_sd_mm): widen it, beyond them too, for the faces about the eyes"
+            )
         for resolution in (self.space.resolution[0], 1.0):
             cost.input_size(self.scenes.pixels * self.optics.sample_um, self.run.pitch_um, resolution)
 
@@ -146,7 +153,7 @@ def start(settings: RunConfig) -> Run:
     """A fresh run; renders the pool of frames where there is one.
 
     Raises:
-        TrainingError: a budget is below the smallest network.
+        TrainingError: a budget is below the smallest network at the pitch that the run begins with.
     """
     seed, frozen = settings.inner.seed, settings.run.frozen
     inner = settings.inner
@@ -174,7 +181,7 @@ def start(settings: RunConfig) -> Run:
     )
     run = Run(settings, trainer, [])
     if settings.network == "supernet":
-        _affordable(run, moves=inner.pitch.rate > 0)
+        made.finest_um = _affordable(run, moves=inner.pitch.rate > 0)
     return run
 
 
@@ -184,16 +191,38 @@ def _pool(scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed
     return fill(EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool)
 
 
-def _affordable(run: Run, *, moves: bool) -> None:
-    """Refuse a budget that no network keeps, at the run's pitch or, if that moves, at any."""
+def _affordable(run: Run, *, moves: bool) -> float:
+    """The finest pitch that leaves the smallest network within every budget; 0 where the samples' own does.
+
+    Raises:
+        TrainingError: it is coarser than the pitch that the run begins with.
+    """
     settings, net = run.settings, run.trainer.model.net
-    coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])
-    pitch = torch.tensor(coarsest if moves else settings.run.pitch_um, dtype=torch.float64)
+    least, budget = smallest(settings.space), min(settings.run.budgets_mmacs) * 1e6
 
-    def count(architecture: Architecture) -> float:
-        return float(network_macs(net, architecture, run.window_um, pitch))
+    def count(pitch_um: float) -> float:
+        return float(network_macs(net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64)))
 
-    evolution.affordable(settings.space, count, min(settings.run.budgets_mmacs) * 1e6)
+    begins, coarsest = settings.run.pitch_um, cost.coarsest_um(run.window_um, settings.space.resolution[0])
+    if count(begins) > budget:
+        coarser = _finest(count, budget, begins, coarsest)
+        way = "" if coarser is None else f", or begin with run.pitch_um = {math.ceil(coarser * 100) / 100:g} or more"
+        raise TrainingError(
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.1f} MMACs at "
+            f"run.pitch_um = {begins:g}: raise run.budgets_mmacs{way}"
+        )
+    finest = min(settings.optics.sample_um, begins)
+    return 0.0 if not moves or count(finest) <= budget else _finest(count, budget, finest, begins) or begins
+
+
+def _finest(count: Callable[[float], float], budget: float, low_um: float, high_um: float) -> float | None:
+    """The finest pitch within the budget, where the low one is beyond it; None where the high one is too."""
+    if high_um <= low_um or count(high_um) > budget:
+        return None
+    for _ in range(40):
+        middle = math.sqrt(low_um * high_um)
+        low_um, high_um = (low_um, middle) if count(middle) <= budget else (middle, high_um)
+    return high_um
 
 
 def save(path: Path, run: Run) -> None:

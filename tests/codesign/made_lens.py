@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -44,7 +45,7 @@ image = "uniform"
 aperture_mm = 0.12
 sensor_distance_mm = 0.3
 focus_mm = 3.0
-depths_mm = [2.0, 6.0]
+depths_mm = [12.0, 40.0]
 depth_count = 3
 sample_um = 3.0
 window_samples = 11
@@ -57,6 +58,7 @@ budgets_mmacs = [2.0]
 pitch_um = 3.0
 """
 OPTICS = OpticsConfig(0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11, image="uniform")
+SEEN = replace(OPTICS, depths_mm=(12.0, 40.0))  # of TINY, where eyes are
 
 
 @functools.lru_cache

@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found():
-    return retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), SHORT, TRUTH)
+    return retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT, TRUTH)
 
 
 def _accuracy(error, n=50):
@@ -99,9 +99,9 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
 def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(found):
     assert found.known
     assert len(found.drawn) == 2
-    true = MadeLens(m.small(), m.OPTICS).stack(TRUTH.vector())
+    true = MadeLens(m.small(), m.SEEN).stack(TRUTH.vector())
     assert torch.equal(found.judges[0].intensity, true.intensity)
-    blind = retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), SHORT)
+    blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT)
     assert not blind.known
     assert not any(torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn)
 
@@ -110,7 +110,7 @@ def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(fo
     """As on a real bench: the error of a frame is its mean over the lenses, so one lens and three compare."""
     config = replace(SHORT, judge=3)
     source = retraining.load(folder)
-    blind = retraining.lenses(MadeLens(m.small(), m.OPTICS), m.asbuilt(), config)
+    blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), config)
     going = retraining.trainer(source, config, (blind.nominal,))
     told = retraining.outcome(source, config, blind, {"nominal": going, "retrained": going})
     assert told.known is None
@@ -217,7 +217,7 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
 
     Budget: 3 % of the image's tolerance, and the squares of a sample that its PSFs are averaged over, 5 %.
     """
-    settings = replace(m.OPTICS, image="true", image_tolerance=0.1)
+    settings = replace(m.SEEN, image="true", image_tolerance=0.1)
     made = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.judges[0])
     other = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.nominal)
     assert made is formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.judges[0])

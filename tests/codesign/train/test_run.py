@@ -124,6 +124,13 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
     [
         ('preset = "laptp"', r"preset is 'laptp'; did you mean 'laptop'\?"),
         ("[run]\npitch_um = 500.0", "pixels of a"),
+        (
+            "[optics]\ndepths_mm = [17.9, 50.0]",
+            r"optics.depths_mm = \(17.9, 50.0\) does not hold the eyes, 17.5 to 24.5",
+        ),
+        ("[optics]\ndepths_mm = [12.0, 24.4]", "does not hold the eyes, 17.5 to 24.5 mm"),
+        ("[scenes]\ndepth_sd_mm = 3.0", "does not hold the eyes, 11.5 to 30.5 mm"),
+        ("[scenes]\nslip_mm = [2.0, 1.5, 9.5]", "does not hold the eyes, 11.5 to 30.5 mm"),
         ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
         ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
         ("[run]\nbudgets_mmacs = [4.0, 2.0, 4]", "two are alike"),
@@ -143,6 +150,31 @@ def test_bad_configs_are_refused_by_name(tmp_path, change, message):
 def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
     with pytest.raises(TrainingError, match="below the smallest network"):
         run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+
+
+def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_budget(settings):
+    """From the pitch that the refusal names it begins; asked for finer pixels, it is held where the budget ends."""
+
+    def of(pitch_um):
+        optics, scenes = replace(settings.optics, sample_um=4.5), replace(settings.scenes, pixels=192, pool=0)
+        budgets = replace(settings.run, budgets_mmacs=(1.5,), pitch_um=pitch_um)
+        return replace(settings, optics=optics, scenes=scenes, run=budgets)
+
+    with pytest.raises(TrainingError, match=r"at run.pitch_um = 9: raise run.budgets_mmacs, or begin with") as no:
+        run.start(of(9.0))
+    named = float(str(no.value).split(" = ")[-1].split(" ")[0])
+    with pytest.raises(TrainingError, match="below the smallest network"):
+        run.start(of(named - 0.02))
+    run.start(of(named))
+    going = run.start(of(named + 2.0))
+    made = going.trainer.model
+    assert named - 0.01 < made.finest_um <= named
+    made.log_pitch.data.fill_(math.log(made.finest_um / 2))  # where no network keeps the budget
+    going.trainer.optimisers.clear()
+    going.trainer._apply({"pitch": 0.1}, finite=True)
+    assert going.trainer.pitch_held_um == made.finest_um
+    assert going.macs(smallest(settings.space)) == pytest.approx(1.5e6, rel=1e-3)
+    assert "beyond the budget of 1.5 MMACs" in command_codesign._of_pitch(going, made.finest_um)
 
 
 def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
