@@ -118,9 +118,10 @@ def experiment(
         (subjects done, one :class:`Result` a run); results are there with the last subject only.
 
     Raises:
-        ConfigError: runs whose frames differ in size, samples or lens distance: they cannot share subjects' frames.
+        ConfigError: runs whose frames differ in size, samples or lens distance: they cannot share subjects' frames; or
+            eyes that slip to where a run's images hold no depth.
     """
-    _check(sources)
+    _check(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[Trial] = []
     visible: list[Array] = []
@@ -157,7 +158,7 @@ def joined(trials: Sequence[Trial]) -> Trial:
     return Trial(*(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__))
 
 
-def _check(sources: Sequence[Source]) -> None:
+def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
     if not sources:
         raise ConfigError("no run to evaluate; give one run folder or more")
     views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
@@ -167,6 +168,14 @@ def _check(sources: Sequence[Source]) -> None:
             f"the runs see frames of different (pixels, margin, sample_um, sensor_distance_mm): {views}; "
             "compare runs of one geometry"
         )
+    slips = config.slips_mm[:, 2]
+    for source in sources:
+        eye_mm, held = 1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um, source.settings.optics.depths_mm
+        if not held[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= held[1]:
+            raise ConfigError(
+                f"axial_mm {config.axial_mm}: eyes {eye_mm + slips.min():g} to {eye_mm + slips.max():g} mm before the "
+                f"lens, where the run's images hold optics.depths_mm = {held}: let them slip less, or train on more"
+            )
 
 
 def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> UniformImager | Imager:

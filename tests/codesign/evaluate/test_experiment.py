@@ -145,6 +145,13 @@ def test_an_eye_that_would_slip_into_the_lens_is_refused():
         experiment.states_of(replace(SMALL, axial_mm=(-21.0,)), 0, scenes)
 
 
+@pytest.mark.parametrize(("axial", "words"), [((-9.5,), "11.5 to 21 mm"), ((2.5, 19.5), "21 to 40.5 mm")])
+def test_eyes_that_slip_to_where_images_hold_no_depth_are_refused(folder, axial, words):
+    source = retraining.load(folder / "run")
+    with pytest.raises(ConfigError, match=rf"{words} before the lens, where the run's images hold optics.depths_mm"):
+        next(experiment.experiment([source], replace(SMALL, axial_mm=axial)))
+
+
 def test_a_network_of_others_reads_the_experiment_by_sphere_and_has_no_overlap(tmp_path):
     source = retraining.load(m.finished_baseline(tmp_path / "run"))
     config = replace(SMALL, subjects=2, hidden=0, axial_mm=(2.5,), lateral_mm=())
