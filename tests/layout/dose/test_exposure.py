@@ -76,7 +76,15 @@ def test_a_power_law_tail_is_fitted_where_two_gaussians_fail():
 
 @pytest.mark.parametrize(
     ("radius", "density"),
-    [([1, 2, 3], [1, 1, 1]), ([1, 3, 2, 4], [1] * 4), ([0, 1, 2, 3], [1] * 4), ([1, 2, 3, 4], [1, 1, 0, 1])],
+    [
+        ([1, 2, 3], [1, 1, 1]),
+        ([1, 3, 2, 4], [1] * 4),
+        ([1, 2, 2, 4], [1] * 4),
+        ([0, 1, 2, 3], [1] * 4),
+        ([1, 2, 3, 4], [1, 1, 0, 1]),
+        ([1, 2, 3, np.inf], [1] * 4),
+        ([1, 2, 3, 4], [1, 1, np.nan, 1]),
+    ],
 )
 def test_an_impossible_table_is_refused(radius, density):
     with pytest.raises(ProcessError, match="at least 4 rising radii"):
