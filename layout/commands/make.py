@@ -81,9 +81,8 @@ def _refuse_beyond_plain(options: Options, source: Lens) -> None:
         ProcessError: naming the option.
     """
     disc = source.cell.shape.kind == "circle" and not source.cell.shape.hole
-    for name in ("study", "step", "stl"):
-        if getattr(options, name) and not (source.diameters.plain and disc):
-            raise ProcessError(f"--{name} takes round pillars on a square lattice, not {source.cell.described}")
+    if options.study and not (source.diameters.plain and disc):
+        raise ProcessError(f"--study takes round pillars on a square lattice, not {source.cell.described}")
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:

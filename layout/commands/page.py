@@ -119,7 +119,7 @@ def _shaped(job: Job) -> Section:
     """Of pillars that are not round."""
     turned = job.source.diameters.angle_rad is not None
     turns = f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees" if turned else ""
-    area = [abs(polygon.twice_area(made.outline)) / 2 for made in job.plan.classes]
+    area = [made.twice_area / 2 for made in job.plan.classes]
     rows = [["classes", len(area)], ["least area / nm²", min(area)], ["largest area / nm²", max(area)]]
     text = (
         f"Each is a {job.source.cell.shape.name}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"

@@ -8,7 +8,6 @@ from layout.certify import Survey
 from layout.files import Window, sites_in
 from layout.mask import Lattice, MaskPlan
 from layout.rules import DrcReport
-from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
@@ -135,7 +134,7 @@ def _thumbnail(plan: MaskPlan, lattice: Lattice, most: int = 700) -> Array:
     (rows, columns) in per cent, NaN where there is no pillar. Every n-th pillar would show rings that are not there.
     """
     step = max(1, -(-max(lattice.rows, lattice.columns) // most))
-    areas = np.array([0.0, *(polygon.twice_area(made.outline) / 2 for made in plan.classes)])
+    areas = np.array([0.0, *(made.twice_area / 2 for made in plan.classes)])
     table = 100 * areas / (lattice.pitch * lattice.down)
     edges = np.arange(0, lattice.columns, step)
     rows = []

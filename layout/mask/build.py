@@ -61,9 +61,8 @@ def prepare(
     diameters = source.diameters if isinstance(source, Lens) else source
     steps = pitch_units(diameters.steps_um[0], process), pitch_units(diameters.steps_um[1], process)
     found, classes = _drawn(source, process)
-    plain = diameters.plain and classes[0].round
-    if not plain:
-        _refuse_beyond_plain(process, with_doses)
+    if with_doses and not (diameters.plain and classes[0].round):
+        _refuse_doses_beyond_plain(process)
     x0, y0, axis = _origin(found.sites.shape, steps, process.rules.grid_nm)
     lattice = found.sites.lattice("LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True)
     lattice = dataclasses.replace(lattice, row_pitch=steps[1], centred=diameters.lattice.centred)
@@ -138,7 +137,7 @@ def wafer_mark(source: Lens | DiameterMap, process: Process, *, name: str, mark_
 def _dosed(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
     """A plan without its lens, corrected where the process asks for it."""
     if not all(each.round for each in bare.classes):
-        _refuse_beyond_plain(process, with_doses=True)
+        _refuse_doses_beyond_plain(process)
     solution = None
     if process.exposure.corrected:
         bare, solution = dosed.corrected(bare, process)
@@ -158,15 +157,9 @@ def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, t
     return found, _plain_classes(found.diameters_nm, process)
 
 
-def _refuse_beyond_plain(process: Process, with_doses: bool) -> None:
-    """What is only known for round pillars on a square lattice.
-
-    Raises:
-        ProcessError: a negative tone, or a dose correction that is asked for.
-    """
-    if process.tone == "negative":
-        raise ProcessError("tone = 'negative': need round pillars on a square lattice; take positive")
-    if with_doses and process.exposure.corrected:
+def _refuse_doses_beyond_plain(process: Process) -> None:
+    """Raises: ProcessError: a dose correction of what is only known for round pillars on a square lattice."""
+    if process.exposure.corrected:
         raise ProcessError(
             "exposure: doses are corrected for round pillars on a square lattice alone; leave the correction to the "
             "writer (--no-dose) or set exposure.correct = false"

@@ -94,9 +94,9 @@ def wafer_mark(plan: MaskPlan, process: Process, *, mark_um: float, width_um: fl
     unit, layers = Units(plan), process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
     some = [_variant(made, f"W{n}", layers.witness, 1.0) for n, made in enumerate(_spread(sizes, _ON_WAFER))]
-    sites = _blocks(np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK)
+    sites = _blocks(np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK, plan.lattices[0])
     middle = unit(mark_um / 4)
-    lattice = _centred("WITNESS", sites, unit, middle)
+    lattice = _centred("WITNESS", sites, plan, middle)
     lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
     half = unit(mark_um / 2)
     window = unit.snapped(Box(-half, -half, half, half).grown(unit(CLEAR_UM / 2))).polygon
@@ -145,15 +145,16 @@ def _tests(
         _variant(made, f"W{n}", process.layers.witness, 1.0) for n, made in enumerate(_spread(sizes, _WITNESSED))
     ]
     first = len(plan.classes) + 1
-    dose_map = _blocks(np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK)
+    own = plan.lattices[0]
+    dose_map = _blocks(np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK, own)
     columns = 2 if len(witnesses) > 1 else 1
     numbers = np.arange(first + len(doses), first + len(doses) + len(witnesses))
-    witness_map = _blocks(np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns), _WITNESS)
+    witness_map = _blocks(np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns), _WITNESS, own)
     inner, outer = unit(radius_um + CLEAR_UM), die.right - unit(process.die.street_um + CLEAR_UM)
     middle = (inner + outer) // 2
     lattices, windows = [], []
     for name, sites, x in (("DOSETEST", dose_map, -middle), ("WITNESS", witness_map, middle)):
-        lattice = _centred(name, sites, unit, x)
+        lattice = _centred(name, sites, plan, x)
         box = _extent(lattice)
         if min(abs(box.left), abs(box.right)) < inner or max(abs(box.left), abs(box.right)) > outer:
             need = (box.right - box.left) / unit.per_um + 2 * CLEAR_UM + process.die.street_um
@@ -208,26 +209,29 @@ def _spread(sizes: Sequence[PillarClass], count: int) -> list[PillarClass]:
     return [sizes[i] for i in picked]
 
 
-def _blocks(numbers: Array, side: int) -> Array:
-    """Class numbers (rows, columns) as square blocks of pillars with spaces between."""
-    step = side + _SPACE
-    sites = np.zeros((numbers.shape[0] * step - _SPACE, numbers.shape[1] * step - _SPACE), np.uint16)
+def _blocks(numbers: Array, side: int, lattice: Lattice) -> Array:
+    """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with spaces between, on a lattice."""
+    step, wide = side + _SPACE, 2 if lattice.centred else 1
+    sites = np.zeros((numbers.shape[0] * step - _SPACE, wide * (numbers.shape[1] * step - _SPACE)), np.uint16)
     for (i, j), number in np.ndenumerate(numbers):
-        sites[i * step : i * step + side, j * step : j * step + side] = number
+        sites[i * step : i * step + side, wide * j * step : wide * (j * step + side)] = number
+    if lattice.centred:  # every other site, those of neighbouring rows in turn
+        sites[np.add.outer(*map(np.arange, sites.shape)) % 2 == 1] = 0
     return sites
 
 
-def _centred(name: str, sites: Array, unit: Units, x: int) -> Lattice:
-    rows, columns = sites.shape
-    grid, pitch = unit.grid, unit.pitch
-    left, top = x - (columns - 1) * pitch // 2, (rows - 1) * pitch // 2
-    return Lattice.of(name, sites, pitch=pitch, x0=left // grid * grid, y0=top // grid * grid)
+def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> Lattice:
+    """Sites about (x, 0), as far apart as those of the lens."""
+    (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
+    left, top = x - (columns - 1) * like.pitch // 2, (rows - 1) * like.down // 2
+    made = Lattice.of(name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid)
+    return dataclasses.replace(made, row_pitch=like.row_pitch, centred=like.centred)
 
 
 def _extent(lattice: Lattice) -> Box:
-    reach = lattice.pitch // 2
-    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.pitch
-    return Box(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0).grown(reach)
+    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
+    box = Box(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
+    return box.grown(max(lattice.constant, lattice.down) // 2)
 
 
 def _label(process: Process, unit: Units, die: Box, default: str) -> tuple[tuple[Array, ...], Box]:

@@ -31,10 +31,11 @@ class PillarClass:
     """All pillars of one diameter (and dose): one cell of the mask.
 
     name: of the cell. diameter_nm, diameter_units: of the circle that ``outline`` stands for, as drawn.
-    layer: (layer, datatype). outline: (n, 2) of the pillar. drawn: polygons that are written (the outline itself,
-    or what is left of the lattice square for a negative tone). dose: relative to the base dose. goal: wanted exposure
-    of the edge, relative to dose-to-size (1 but in a dose test). round: whether the outline stands for a circle of that
-    diameter; else the diameter is the size of the shape.
+    layer: (layer, datatype). outline: (n, 2) of the pillar, convex or not, counter-clockwise. drawn: polygons that are
+    written (the outline itself; in pieces where it has holes; or what is left of the lattice square for a negative
+    tone). dose: relative to the base dose. goal: wanted exposure of the edge, relative to dose-to-size (1 but in a dose
+    test). round: whether the outline stands for a circle of that diameter; else the diameter is the size of the shape.
+    holes: what is left out of the outline, clockwise.
     """
 
     name: str
@@ -46,6 +47,17 @@ class PillarClass:
     dose: float = 1.0
     goal: float = 1.0
     round: bool = True
+    holes: tuple[Array, ...] = ()
+
+    @property
+    def contours(self) -> tuple[Array, ...]:
+        """The outline and the holes in it."""
+        return self.outline, *self.holes
+
+    @property
+    def twice_area(self) -> int:
+        """Twice the area of the pillar, holes left out, in squared database units."""
+        return sum(polygon.twice_area(contour) for contour in self.contours)
 
     @property
     def polygons(self) -> tuple[Array, ...]:

@@ -1,8 +1,9 @@
 """Pillars that are not round, or turned one by one: a class for every drawn size and turn.
 
 Of a film with openings the openings are drawn. All edges of a pillar (or opening) move alike, by the bias of the
-process at its size; its turn is rounded to a step, its corners to the grid. Rounding of the corners by the etch is not
-made up for.
+process at its size; its turn is rounded to a step, its corners to the grid (a circle, also that of a ring's hole, keeps
+its area as round pillars do). A pillar with a hole is written as polygons that share the cut through the middle of the
+hole. Rounding of the corners by the etch is not made up for.
 """
 
 import math
@@ -15,8 +16,9 @@ from layout.mask.cells import Cells
 from layout.mask.held import hold
 from layout.mask.plan import MOST_CLASSES, PillarClass
 from layout.process import Process
+from layout.shapes import polygon, region
 from metalens.cell import Cell
-from metalens.cell.shapes import turned
+from metalens.cell.shapes import Conic, Loop, Outline, turned
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError, ProcessError
 from metalens.ground.units import nm
@@ -33,7 +35,7 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
     """The pillars of a lens as classes, and what is drawn for each.
 
     Raises:
-        ProcessError: a shape in several parts or with hollows, too many classes, a pillar of less than a step.
+        ProcessError: too many classes, a pillar of less than a step, a hole that the grid or the bias closes.
         LensError: no pillar.
     """
     d, cell = source.diameters, source.cell
@@ -60,15 +62,6 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
 
 
 def _check(cell: Cell, process: Process) -> None:
-    outline = cell.outline(cell.pitch_um / 2)
-    corners = outline.parts[0].vertices(32)
-    edge = np.roll(corners, -1, axis=0) - corners
-    bend = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
-    if len(outline.parts) > 1 or bend.min() < -_FLAT:
-        raise ProcessError(
-            f"a mask of {cell.described}: pillars are drawn in one part without hollows (the rules are checked between "
-            "convex shapes); need a circle, square, rectangle, ellipse, or a convex polygon"
-        )
     if process.bias.isolated_nm:
         raise ProcessError(
             f"bias.isolated_nm = {process.bias.isolated_nm} is known for round pillars on a square lattice; need 0 for "
@@ -131,23 +124,48 @@ def _steps(size_nm: Array, design_nm: Array, process: Process) -> Array:
 
 def _class(cell: Cell, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
     """What is drawn for a key."""
-    grid, (both, turn) = process.rules.grid_nm, divmod(key, turns)
+    both, turn = divmod(key, turns)
     length, drawn = divmod(both, _LENGTHS)
-    if length:  # each axis has the bias of its own size
-        cell = sized(cell, float(drawn), float(length))
-        outline = cell.outline(drawn * nm).parts[0].vertices(process.rules.vertices)
-    else:
-        outline = _biased(cell, drawn, process)
-    corners = turned(outline, math.radians(turn * process.rules.angle_step_deg)) / nm / unit_nm
-    points = np.asarray(np.rint(corners / grid) * grid, np.int64)
-    points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
     name = f"D{drawn:05}L{length:05}" if length else name
-    layer = process.layers.pillar
-    return PillarClass(name, float(drawn), round(drawn / unit_nm), layer, points, round=False)
+    both_sizes = sized(cell, float(drawn), float(length)) if length else None  # each axis has the bias of its own size
+    made = both_sizes.outline(drawn * nm) if both_sizes else _biased(cell, drawn, process)
+    step_nm = process.rules.grid_nm * unit_nm
+    turn_rad = math.radians(turn * process.rules.angle_step_deg)
+    contours = [_gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm for part in made.parts]
+    outline, holes = contours[0], tuple(hole[::-1] for hole in contours[1:])
+    pieces = tuple(region.without_holes([outline, *holes], grid=process.rules.grid_nm)) if holes else ()
+    layer, units = process.layers.pillar, round(drawn / unit_nm)
+    return PillarClass(name, float(drawn), units, layer, outline, pieces, round=False, holes=holes)
 
 
-def _biased(cell: Cell, drawn: int, process: Process) -> Array:
-    """(n, 2) the outline of a drawn size: all edges moved alike by the bias of the process."""
+def _gridded(part: Conic | Loop, turn_rad: float, step_nm: float, process: Process, name: str) -> Array:
+    """(n, 2) whole grid steps about the site, counter-clockwise: a circle of its area, any other part corner by corner.
+
+    Raises:
+        ProcessError: fewer than three corners are left, or a circle of less than four steps.
+    """
+    if isinstance(part, Conic) and part.half_x_um == part.half_y_um:
+        across = 2 * part.half_x_um / nm / step_nm
+        if across < 4:
+            raise ProcessError(f"class {name}: a circle of {across * step_nm:.3g} nm; need four steps of the grid")
+        return polygon.pillar(across, vertices=process.rules.vertices, shape=process.rules.shape).points
+    corners = turned(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
+    points = np.asarray(np.rint(corners), np.int64)
+    points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
+    if len(points) < 3 or polygon.twice_area(points) <= 0:
+        raise ProcessError(f"class {name}: nothing is left on a grid of {step_nm:g} nm; take a finer grid_nm")
+    return points
+
+
+def _biased(cell: Cell, drawn: int, process: Process) -> Outline:
+    """The outline of a drawn size: all edges moved alike by the bias of the process.
+
+    Raises:
+        ProcessError: the bias closes a hole.
+    """
     made = float(process.bias.made_nm(np.array(float(drawn)))) * nm
-    return np.asarray(cell.outline(made, grow_um=drawn * nm - made).parts[0].vertices(process.rules.vertices))
+    outline = cell.outline(made, grow_um=drawn * nm - made)
+    if len(outline.parts) != len(cell.outline(made).parts):
+        raise ProcessError(f"a {cell.shape.name} drawn {drawn} nm wide would have no hole; need a larger size")
+    return outline

@@ -4,6 +4,8 @@ The exposed area is the die without pillars, marks, verniers and labels. It is w
 pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around the marks and labels without
 these, each on its own layer, and the rest of the die (FRAME). All of them abut; none overlaps another. Without a die a
 frame one pitch wide (RIM) goes around the lattice: the squares of its last pillars would end in slits half a gap wide.
+A lattice square is a rectangle where rows lie closer or farther than columns; of a hexagonal lattice it is a brick, two
+columns of the grid wide, and those of the next row stand half a brick off.
 """
 
 import dataclasses
@@ -26,17 +28,17 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
     Raises:
         ProcessError: a pillar wider than its lattice square, lattices of different pitches.
     """
-    pitches = {lattice.pitch for lattice in plan.lattices}
-    if len(pitches) > 1:
+    kinds = {(lattice.pitch, lattice.down, lattice.centred) for lattice in plan.lattices}
+    if len(kinds) > 1:
         raise ProcessError(
-            f"tone 'negative' with lattices of pitches {sorted(pitches)}: put them on masks of their own"
+            f"tone 'negative' with lattices of pitches {sorted({each[0] for each in kinds})}: put them on masks of "
+            "their own"
         )
-    pitch = pitches.pop()
-    square = _square(pitch, plan.grid)
+    square = _square(plan.lattices[0], plan.grid)
     classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
-    clear = [box for lattice in plan.lattices for box in _empty(lattice, square)]
-    figures = _surroundings(plan, process, boxes) or [_rim(boxes, pitch, process)]
+    clear = [box for lattice in plan.lattices for box in _empty(lattice, square[0], square[3])]
+    figures = _surroundings(plan, process, boxes) or [_rim(boxes, plan.lattices[0].constant, process)]
     if clear:
         figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
     kept = [figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)]
@@ -44,9 +46,9 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
 
 
 def lattice_box(lattice: Lattice, grid: int) -> Array:
-    """(4, 2) corners of all lattice squares together."""
-    left, bottom, right, top = _square(lattice.pitch, grid)
-    across, down = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.pitch
+    """(4, 2) corners of all lattice squares together (of bricks: with the half ones at the ends of every other row)."""
+    left, bottom, right, top = _square(lattice, grid)
+    across, down = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
     x, y = lattice.x0, lattice.y0
     return rectilinear.corners(np.array([x + left, y - down + bottom, x + across + right, y + top]))
 
@@ -56,10 +58,10 @@ def _unexposed(process: Process) -> set[LayerNumber]:
     return {process.layers.aperture, process.layers.outline, process.layers.fields}
 
 
-def _square(pitch: int, grid: int) -> tuple[int, int, int, int]:
+def _square(lattice: Lattice, grid: int) -> tuple[int, int, int, int]:
     """Left, bottom, right, top of the lattice square about a site, on the grid; squares of neighbours abut."""
-    low = -(pitch // 2 // grid) * grid
-    return low, low, low + pitch, low + pitch
+    left, bottom = (-(step // 2 // grid) * grid for step in (lattice.constant, lattice.down))
+    return left, bottom, left + lattice.constant, bottom + lattice.down
 
 
 def _around(made: PillarClass, square: tuple[int, int, int, int], grid: int) -> PillarClass:
@@ -67,24 +69,32 @@ def _around(made: PillarClass, square: tuple[int, int, int, int], grid: int) -> 
     if left < square[0] or bottom < square[1] or right > square[2] or top > square[3]:
         raise ProcessError(
             f"class {made.name}: {right - left} by {top - bottom} units, wider than the lattice square of "
-            f"{square[2] - square[0]}: tone 'negative' draws what is left of the square; widen the pitch"
+            f"{square[2] - square[0]} by {square[3] - square[1]}: tone 'negative' draws what is left of the square; "
+            "widen the pitch"
         )
-    left_over = region.difference([rectilinear.corners(np.array(square))], [made.outline])
+    left_over = region.difference([rectilinear.corners(np.array(square))], made.contours)
     return dataclasses.replace(made, drawn=tuple(region.without_holes(left_over, grid=grid)))
 
 
-def _empty(lattice: Lattice, square: tuple[int, int, int, int]) -> list[Array]:
-    """Rectangles over all sites without pillar: equal runs of neighbouring rows together."""
-    pitch, made = lattice.pitch, []
+def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
+    """Rectangles over what no pillar's square covers: equal runs of neighbouring rows together.
+
+    left_of, top_of: edges of a square about its site. In columns of the grid: a brick covers two of them.
+    """
+    made: list[Array] = []
     open_runs: dict[tuple[int, int], int] = {}
 
     def close(run: tuple[int, int], end: int) -> Array:
-        left, right = (lattice.x0 + column * pitch + square[0] for column in run)
-        top, bottom = (lattice.y0 - row * pitch + square[3] for row in (open_runs.pop(run), end))
+        left, right = (lattice.x0 + column * lattice.pitch + left_of for column in run)
+        top, bottom = (lattice.y0 - row * lattice.down + top_of for row in (open_runs.pop(run), end))
         return rectilinear.corners(np.array([left, bottom, right, top]))
 
+    wide = 2 if lattice.centred else 1
     for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
-        for row, empty in enumerate(block == 0, first):
+        free = np.ones((len(block), lattice.columns + wide - 1), bool)
+        for part in range(wide):
+            free[:, part : part + lattice.columns] &= block == 0
+        for row, empty in enumerate(free, first):
             edges = np.flatnonzero(np.diff(np.r_[False, empty, False])).tolist()
             runs = set(zip(edges[::2], edges[1::2], strict=True))
             made += [close(run, row) for run in sorted(open_runs.keys() - runs)]

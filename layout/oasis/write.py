@@ -90,13 +90,20 @@ def cell_name(number: int, name: str) -> bytes:
 
 
 def _square_symmetric(made: PillarClass) -> bool:
-    """Whether a quarter turn and a mirror leave what is drawn as it is."""
+    """Whether a quarter turn and a mirror leave the pillar, and what is drawn around it, as it is."""
 
     def corners(*shapes: Array) -> set[tuple[int, int]]:
         return {(int(x), int(y)) for shape in shapes for x, y in shape}
 
-    drawn = corners(*made.polygons)
-    return all(corners(*(p @ m for p in made.polygons)) == drawn for m in (_QUARTER, _MIRROR))
+    def edges(*shapes: Array) -> set[frozenset[tuple[int, int]]]:
+        ends = [np.concatenate([s, np.roll(s, -1, axis=0)], axis=1).tolist() for s in shapes]
+        return {frozenset(((a, b), (c, d))) for a, b, c, d in itertools.chain.from_iterable(ends)}
+
+    own, drawn = edges(*made.contours), corners(*made.polygons)
+    return all(
+        edges(*(c @ m for c in made.contours)) == own and corners(*(p @ m for p in made.polygons)) == drawn
+        for m in (_QUARTER, _MIRROR)
+    )
 
 
 def _piece_list(lattice: Lattice, fold: bool) -> list[Piece]:

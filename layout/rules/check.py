@@ -7,45 +7,22 @@ each kind once, polygon to polygon.
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask import Lattice, MaskPlan, PillarClass
+from layout.mask import Lattice, MaskPlan
 from layout.process import Rules
 from layout.rules import loops as drc_loops
 from layout.rules.figures import figures_kept, frame_kept
+from layout.rules.outlines import Outlines
 from layout.rules.report import DrcReport, Violation
 from layout.rules.zones import in_zones, structures_apart
-from layout.shapes import convex, polygon
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
 _SHOWN = 500  # violations of one rule that are listed with their place
 _BLOCK_SITES = 1 << 21
 _MOST_KINDS = 1500
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Shapes:
-    """Different outlines of the classes: ``kind[class number]`` is 0 for none, else 1 + index into ``outlines``."""
-
-    outlines: list[Array]
-    kind: Array
-    reach: Array
-
-    @classmethod
-    def of(cls, classes: tuple[PillarClass, ...]) -> "_Shapes":
-        number: dict[bytes, int] = {}
-        outlines: list[Array] = []
-        kind = np.zeros(len(classes) + 1, np.int64)
-        for k, made in enumerate(classes, 1):
-            key = np.ascontiguousarray(made.outline, np.int64).tobytes()
-            if key not in number:
-                outlines.append(np.asarray(made.outline, np.int64))
-                number[key] = len(outlines)
-            kind[k] = number[key]
-        return cls(outlines, kind, np.array([0.0, *map(convex.reach, outlines)]))
 
 
 def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcReport:
@@ -65,11 +42,10 @@ def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcR
     if plan.standing is not None:
         frame_kept(plan, rules, report)
         plan = plan.standing  # gaps and features are those of what stays
-    shapes = _Shapes.of(plan.classes)
-    features = {k: convex.width(o) * plan.unit_nm for k, o in enumerate(shapes.outlines, 1)}
+    shapes = Outlines.of(plan.classes)
     for lattice in plan.lattices:
         counts, density = _count(plan, lattice, rules, report)
-        _features(plan, lattice, rules, (shapes, features, counts), report)
+        _features(plan, lattice, rules, (shapes, counts), report)
         _gaps(plan, lattice, rules, (shapes, counts), report, foot_nm)
         report.maximum_density = max(report.maximum_density, density)
     figures_kept(plan, rules, report)
@@ -83,7 +59,7 @@ def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) ->
     window = rules.density_window_um * 1e3 / plan.unit_nm / 2
     side, down = (max(1, round(window / step)) for step in (lattice.pitch, lattice.down))
     tiles = (math.ceil(lattice.rows / down) + 1, math.ceil(lattice.columns / side) + 1)
-    area = np.array([0.0, *(polygon.twice_area(made.outline) / 2 for made in plan.classes)])
+    area = np.array([0.0, *(made.twice_area / 2 for made in plan.classes)])
     counts, cover = np.zeros(len(area), np.int64), np.zeros(tiles)
     for first, block in lattice.blocks(max(1, _BLOCK_SITES // lattice.columns)):
         drc_loops.count_and_cover(block, first, area, (down, side), counts, cover)
@@ -98,20 +74,24 @@ def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) ->
     return counts, float(share.max(initial=0.0))
 
 
-def _features(
-    plan: MaskPlan, lattice: Lattice, rules: Rules, found: tuple[_Shapes, dict[int, float], Array], report: DrcReport
-) -> None:
-    shapes, features, counts = found
+def _features(plan: MaskPlan, lattice: Lattice, rules: Rules, found: tuple[Outlines, Array], report: DrcReport) -> None:
+    """Widths of the pillars, and the spaces between edges of one pillar: its hole, its hollows."""
+    shapes, counts = found
     used = np.flatnonzero(counts[1:]) + 1
-    for k in used.tolist():
-        report.minimum_feature_nm = min(report.minimum_feature_nm, features[int(shapes.kind[k])])
-    bad = [k for k in used.tolist() if features[int(shapes.kind[k])] < rules.minimum_feature_nm - 1e-9]
-    for k in bad:
-        report.add("feature", int(counts[k]), None)
-    for x, y, k in itertools.islice(_sites_of(lattice, bad), _SHOWN):
-        width = features[int(shapes.kind[k])]
-        box = _box(plan.classes[k - 1].outline, x, y)
-        report.add("feature", 0, Violation("feature", box, width, rules.minimum_feature_nm, plan.classes[k - 1].name))
+    of = shapes.kind[used] - 1
+    widths, spaces = shapes.widths[of] * plan.unit_nm, shapes.spaces[of] * plan.unit_nm
+    report.minimum_feature_nm = min(report.minimum_feature_nm, float(widths.min(initial=math.inf)))
+    report.minimum_gap_nm = min(report.minimum_gap_nm, float(spaces.min(initial=math.inf)))
+    for rule, value, limit in (
+        ("feature", widths, rules.minimum_feature_nm),
+        ("gap", spaces, rules.minimum_gap_nm),
+    ):
+        bad = dict(zip(used[value < limit - 1e-9].tolist(), value[value < limit - 1e-9].tolist(), strict=True))
+        for k in bad:
+            report.add(rule, int(counts[k]), None)
+        for x, y, k in itertools.islice(_sites_of(lattice, list(bad)), _SHOWN):
+            box = _box(plan.classes[k - 1].outline, x, y)
+            report.add(rule, 0, Violation(rule, box, bad[k], limit, plan.classes[k - 1].name))
 
 
 def _sites_of(lattice: Lattice, classes: list[int]) -> Iterator[tuple[int, int, int]]:
@@ -127,7 +107,7 @@ def _gaps(
     plan: MaskPlan,
     lattice: Lattice,
     rules: Rules,
-    found: tuple[_Shapes, Array],
+    found: tuple[Outlines, Array],
     report: DrcReport,
     foot_nm: Array | None,
 ) -> None:
@@ -138,21 +118,22 @@ def _gaps(
         return
     if len(kinds) > _MOST_KINDS:
         raise ProcessError(f"{len(kinds)} different outlines, the check takes {_MOST_KINDS}; raise diameter_step_nm")
-    narrow = np.zeros(len(shapes.outlines) + 1, np.int64)
+    narrow = np.zeros(len(shapes.contours) + 1, np.int64)
     narrow[kinds] = np.arange(1, len(kinds) + 1)
-    kind, outlines = narrow[shapes.kind], [shapes.outlines[k - 1] for k in kinds]
+    kind = narrow[shapes.kind]
     widest = float(shapes.reach[kinds].max())
     limit = rules.minimum_gap_nm / plan.unit_nm
     foot = np.zeros(len(kinds) + 1)
     if foot_nm is not None:
         np.maximum.at(foot, kind[1:][counts[1:] > 0], foot_nm[counts[1:] > 0])
     reach = max(2 * widest + limit, (foot.max() + rules.minimum_foot_gap_nm) / plan.unit_nm)
-    offsets = _offsets(lattice.pitch, lattice.down, reach)
+    offsets = _offsets(lattice, reach)
     steps = np.array([lattice.pitch, lattice.down])
     table = np.zeros((len(offsets), len(kinds) + 1, len(kinds) + 1), np.int64)
     for block, new, _ in _with_rows_above(lattice, int(offsets[:, 1].max())):
         drc_loops.pair_histogram(block, new, kind, offsets, table)
-    bad, least = _measure(table, offsets * steps, outlines, limit)
+    bad, least = _measure(table, offsets * steps, (shapes, kinds), limit)
+    least = min(least, float(shapes.spaces[kinds - 1].min()))
     report.minimum_gap_nm = min(report.minimum_gap_nm, least * plan.unit_nm)
     if bad:
         _report_gaps(plan, lattice, (kind, offsets, table), bad, report)
@@ -200,14 +181,17 @@ def _feet_found(lattice: Lattice, rules: Rules, least: float, pairs: int, report
         report.add("foot", 0, Violation("foot", (*box, lattice.y0), least, rules.minimum_foot_gap_nm, text))
 
 
-def _offsets(pitch: int, down: int, reach: float) -> Array:
-    """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each opposite pair; at least four."""
-    across, up = (max(1, int(reach // step)) for step in (pitch, down))
+def _offsets(lattice: Lattice, reach: float) -> Array:
+    """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each opposite pair; the nearest
+    sites on all sides in any case (of a centred lattice two columns off, too).
+    """
+    pitch, down, beside = lattice.pitch, lattice.down, 2 if lattice.centred else 1
+    across, up = max(beside, int(reach // pitch)), max(1, int(reach // down))
     steps = [
         (i, j)
         for j in range(up + 1)
         for i in range(-across, across + 1)
-        if (j > 0 or i > 0) and (max(abs(i), j) == 1 or math.hypot(i * pitch, j * down) < reach)
+        if (j > 0 or i > 0) and ((abs(i) <= beside and j <= 1) or math.hypot(i * pitch, j * down) < reach)
     ]
     return np.array(steps)
 
@@ -223,10 +207,11 @@ def _with_rows_above(lattice: Lattice, above: int) -> Iterator[tuple[Array, int,
 
 
 def _measure(
-    table: Array, moves: Array, outlines: list[Array], limit: float
+    table: Array, moves: Array, drawn: tuple[Outlines, Array], limit: float
 ) -> tuple[dict[tuple[int, int, int], float], float]:
     """{(offset, kind, kind): gap} below the limit, and the least gap of all, in database units."""
-    reach = np.array([0.0, *map(convex.reach, outlines)])
+    shapes, kinds = drawn
+    reach = np.array([0.0, *shapes.reach[kinds]])
     m, a, b = np.nonzero(table)
     standing = (a > 0) & (b > 0)
     m, a, b = m[standing], a[standing], b[standing]
@@ -237,7 +222,8 @@ def _measure(
         if least_possible[i] >= max(limit, least):
             break
         key = int(m[i]), int(a[i]), int(b[i])
-        gap = convex.gap(outlines[key[1] - 1], outlines[key[2] - 1], int(moves[m[i], 0]), int(moves[m[i], 1]))
+        one, two = (int(kinds[n - 1]) - 1 for n in key[1:])
+        gap = shapes.gap(one, two, int(moves[m[i], 0]), int(moves[m[i], 1]))
         least = min(least, gap)
         if gap < limit - 1e-9:
             bad[key] = gap

@@ -126,7 +126,7 @@ def groups(
 
 def gathered(some: list[list[flat.Shapes]]) -> Layer:
     """All of them, those of one outline together; they are let go on the way."""
-    outlines = [_filled(plain(np.asarray(group[0].outline, np.int64))) for group in some]
+    outlines = [filled(plain(np.asarray(group[0].outline, np.int64))) for group in some]
     cells = [group[0].cell for group in some]
     total, at = sum(len(shape.x) for group in some for shape in group), 0
     kind, x, y = (np.empty(total, np.int32) for _ in range(3))
@@ -146,7 +146,7 @@ def plain(points: Array) -> Array:
     return np.asarray(points[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]])
 
 
-def _filled(points: Array) -> Array:
+def filled(points: Array) -> Array:
     """Corners without dents shallower than a unit, which rounding leaves in turned and round shapes."""
     if is_convex(points) or len(points) < 4:
         return points

@@ -8,7 +8,9 @@ import numpy as np
 
 from layout.mask import EXPOSED, Lattice, MaskPlan
 from layout.process import Rules, Zone
+from layout.rules.layer import is_convex
 from layout.rules.report import DrcReport, Violation
+from layout.shapes import region
 from metalens.ground.arrays import Array
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top; database units
@@ -50,13 +52,21 @@ def _standing(plan: MaskPlan, lattice: Lattice, zone: Box) -> Iterator[tuple[int
     for k in np.unique(block[block > 0]).tolist():
         rows, columns = np.nonzero(block == k)
         xy = np.column_stack([lattice.x0 + (columns + left) * pitch, lattice.y0 - (rows + top) * down])
-        hit = xy[_overlaps(plan.classes[k - 1].outline, xy, zone)]
+        hit = xy[_overlaps(plan.classes[k - 1].contours, xy, zone)]
         if len(hit):
             yield k, hit
 
 
-def _overlaps(outline: Array, xy: Array, zone: Box) -> Array:
-    """(n,) whether the convex outline at each site shares area with the rectangle: no edge of either separates them."""
+def _overlaps(contours: tuple[Array, ...], xy: Array, zone: Box) -> Array:
+    """(n,) whether an outline without its holes, at each site, shares area with the rectangle."""
+    if len(contours) == 1 and is_convex(contours[0]):
+        return _meets(contours[0], xy, zone)
+    points = np.concatenate(contours)
+    return np.asarray(np.any([_meets(points[three], xy, zone) for three in region.triangles(contours)], axis=0))
+
+
+def _meets(outline: Array, xy: Array, zone: Box) -> Array:
+    """(n,) whether a convex outline at each site shares area with the rectangle: no edge of either separates them."""
     low, high = outline.min(0) + xy, outline.max(0) + xy
     meets = (low[:, 0] < zone[2]) & (high[:, 0] > zone[0]) & (low[:, 1] < zone[3]) & (high[:, 1] > zone[1])
     corners = np.array([(zone[i], zone[j]) for i in (0, 2) for j in (1, 3)])

@@ -12,6 +12,13 @@ def reach(points: Array) -> float:
     return float(np.sqrt((points.astype(float) ** 2).sum(1).max()))
 
 
+def hull(points: Array) -> Array:
+    """(m, 2) corners of the convex polygon around points (n, 2), counter-clockwise."""
+    from scipy.spatial import ConvexHull
+
+    return np.asarray(points[ConvexHull(points).vertices])
+
+
 def width(points: Array) -> float:
     """Least distance of two parallel lines with the polygon between them: one of them runs along an edge."""
     edges = np.roll(points, -1, axis=0) - points

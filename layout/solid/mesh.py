@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from layout.shapes import region
+from layout.solid.sections import Section
 from layout.solid.tile import Tile, check_count
 from metalens import __version__
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
+from metalens.ground.units import nm
 
 STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
 _METRE = 1e-6  # of a um
@@ -51,6 +54,32 @@ def frustum(foot_um: float, top_um: float, height_um: float, *, sides: int = 8) 
     return mesh
 
 
+def prism(section: Section, height_um: float, *, sides: int = 8) -> Mesh:
+    """A tapered pillar of any section; a curved part as ``sides`` edges of its area.
+
+    Raises:
+        ProcessError: the surface is not closed.
+    """
+    contours = [
+        tuple(part.vertices(sides)[:: part.sign] for part in (low, high))
+        for low, high in zip(section.foot.parts, section.top.parts, strict=True)
+    ]
+    counts = [len(low) for low, _ in contours]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    foot, top = (np.concatenate([pair[end] for pair in contours]) for end in (0, 1))
+    total, faces = int(starts[-1]), []
+    for start, count in zip(starts, counts, strict=False):
+        here, after = start + np.arange(count), start + (np.arange(count) + 1) % count
+        faces += [np.stack([here, after, after + total], -1), np.stack([here, after + total, here + total], -1)]
+    for end, turn in ((0, -1), (1, 1)):
+        filled = region.triangles([pair[end] / nm for pair in contours])
+        faces.append(filled[:, ::turn] + end * total)
+    rings = [np.column_stack([ring, np.full(total, z)]) for ring, z in ((foot, 0.0), (top, height_um))]
+    mesh = Mesh(np.concatenate(rings), np.concatenate(faces))
+    check_watertight(mesh)
+    return mesh
+
+
 def check_watertight(mesh: Mesh) -> None:
     """Every edge must belong to two triangles, run through once in each direction, and the volume be positive.
 
@@ -73,6 +102,8 @@ def volume_um3(mesh: Mesh) -> float:
 
 def meshes(pillars: Tile, *, sides: int = 8) -> list[Mesh]:
     """One checked surface for each class of pillars."""
+    if pillars.shaped:
+        return [prism(section, pillars.height_um, sides=sides) for section in pillars.shaped]
     pairs = zip(pillars.foot_um.tolist(), pillars.top_um.tolist(), strict=True)
     return [frustum(foot, top, pillars.height_um, sides=sides) for foot, top in pairs]
 

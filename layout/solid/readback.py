@@ -1,6 +1,5 @@
 """Solids read back as they were written: parts, box around them and volume against the pillars that were asked for."""
 
-import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,8 @@ def stl_differences(path: Path, pillars: Tile, *, sides: int = 8) -> tuple[str, 
     """
     data = np.memmap(path, np.uint8, "r")
     said = struct.unpack("<I", data[80:84].tobytes())[0] if len(data) >= 84 else -1
-    each = 4 * sides - 4
+    shapes = meshes(pillars, sides=sides)
+    each = len(shapes[0].triangles)
     wanted = each * len(pillars.kind)
     if said != wanted or len(data) != 84 + STL.itemsize * wanted:
         return (f"{said} triangles in {len(data)} bytes, planned {wanted}",)
@@ -37,14 +37,13 @@ def stl_differences(path: Path, pillars: Tile, *, sides: int = 8) -> tuple[str, 
         low, high = np.minimum(low, corners.min((0, 1))), np.maximum(high, corners.max((0, 1)))
         a, b, c = (corners - middle).transpose(1, 0, 2)
         volume += float((a * np.cross(b, c)).sum() / 6)
-    shapes = meshes(pillars, sides=sides)
     planned = sum(
         volume_um3(shape) * int(n)
         for shape, n in zip(shapes, np.bincount(pillars.kind, minlength=len(shapes)), strict=True)
     )
-    reach = np.array([shape.vertices_um[:, :2].max(0) for shape in shapes])[pillars.kind]
+    least, reach = (np.array([end(s.vertices_um[:, :2], 0) for s in shapes])[pillars.kind] for end in (np.min, np.max))
     place = np.column_stack([pillars.x_um, pillars.y_um])
-    box = np.r_[(place - reach).min(0), 0.0, (place + reach).max(0), pillars.height_um]
+    box = np.r_[(place + least).min(0), 0.0, (place + reach).max(0), pillars.height_um]
     farthest = float(np.abs(place).max())
     step = float(np.spacing(np.float32(farthest + reach.max())))
     found = _boxes(np.r_[low, high], box, 2 * step + 1e-6)
@@ -61,14 +60,14 @@ def step_differences(path: Path, pillars: Tile) -> tuple[str, ...]:
     """
     parts = _step_parts(path)
     found: list[str] = []
+    sections = pillars.sections
     for kind, name in enumerate(pillars.names):
         here = pillars.kind == kind
         volume, places = parts.get(name, (0.0, np.empty((0, 3))))
         if len(places) != int(here.sum()):
             found.append(f"{name}: {len(places)} solids, planned {int(here.sum())}")
             continue
-        foot, top = float(pillars.foot_um[kind]) / 2, float(pillars.top_um[kind]) / 2
-        planned = math.pi * pillars.height_um / 3 * (foot**2 + foot * top + top**2)
+        planned = sections[kind].volume_um3(pillars.height_um)
         if abs(1e9 * volume / planned - 1) > _VOLUME:
             found.append(f"{name}: volume {1e9 * volume:.9g} um3, planned {planned:.9g}")
         place = np.column_stack([pillars.x_um[here], pillars.y_um[here], np.zeros(int(here.sum()))])

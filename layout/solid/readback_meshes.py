@@ -14,7 +14,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from layout.solid.sections import Section
 from layout.solid.tile import Tile
+from metalens.cell.shapes import Conic, Outline, turned
 from metalens.ground.arrays import Array
 
 _NAMESPACE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
@@ -114,14 +116,14 @@ def _positions(tree: dict[str, Any], buffer: bytes, number: int) -> Array:
 
 
 def _differences(parts: dict[str, _Part], pillars: Tile) -> tuple[str, ...]:
-    found = []
+    found, sections = [], pillars.sections
     for kind, name in enumerate(pillars.names):
         here = pillars.kind == kind
         part = parts.get(name)
         if part is None or len(part.places) != int(here.sum()):
             found.append(f"{name}: {0 if part is None else len(part.places)} copies, planned {int(here.sum())}")
             continue
-        found += [f"{name}: {text}" for text in _shape(part, pillars, kind)]
+        found += [f"{name}: {text}" for text in _shape(part, sections[kind], pillars.height_um)]
         off = _off(part.places, np.column_stack([pillars.x_um[here], pillars.y_um[here], np.zeros(int(here.sum()))]))
         if off > _PLACE_UM:
             found.append(f"{name}: a copy stands {off:.3g} um off its place")
@@ -129,25 +131,46 @@ def _differences(parts: dict[str, _Part], pillars: Tile) -> tuple[str, ...]:
     return (*found, *([f"meshes that were not planned: {', '.join(strange[:5])}"] if strange else []))
 
 
-def _shape(part: _Part, pillars: Tile, kind: int) -> list[str]:
-    """Volume, height, width of foot and top, and closure of a mesh."""
-    foot, top = float(pillars.foot_um[kind]) / 2, float(pillars.top_um[kind]) / 2
+def _shape(part: _Part, section: Section, height_um: float) -> list[str]:
+    """Volume, height, outlines of foot and top, and closure of a mesh."""
     a, b, c = (part.corners[part.triangles[:, k]] for k in range(3))
     volume = float((a * np.cross(b, c)).sum() / 6)
-    planned = math.pi * pillars.height_um / 3 * (foot**2 + foot * top + top**2)
+    planned = section.volume_um3(height_um)
     found = []
     if abs(volume / planned - 1) > 3 * _DIGITS:
         found.append(f"volume {volume:.9g} um3, planned {planned:.9g}")
     z = part.corners[:, 2]
-    if max(abs(z.min()), abs(z.max() - pillars.height_um)) > _DIGITS * pillars.height_um:
-        found.append(f"from {z.min():.6g} to {z.max():.6g} um high, planned 0 to {pillars.height_um:.6g}")
-    if float(np.abs(np.cross(b - a, c - a).sum(0)).max()) > _DIGITS * foot * pillars.height_um * 10:
+    if max(abs(z.min()), abs(z.max() - height_um)) > _DIGITS * height_um:
+        found.append(f"from {z.min():.6g} to {z.max():.6g} um high, planned 0 to {height_um:.6g}")
+    if float(np.abs(np.cross(b - a, c - a).sum(0)).max()) > _DIGITS * section.foot.radius_um * height_um * 10:
         found.append("its surface is not closed")
-    for at, radius, end in ((z.min(), foot, "foot"), (z.max(), top, "top")):
-        ring = np.hypot(*part.corners[np.abs(z - at) < pillars.height_um / 2, :2].T)
-        if not radius * (1 - _DIGITS) <= ring.max() <= 1.1 * radius or np.ptp(ring) > 2 * _DIGITS * radius:
-            found.append(f"corners of its {end} lie {ring.min():.6g} to {ring.max():.6g} um from the middle")
+    for at, outline, end in ((z.min(), section.foot, "foot"), (z.max(), section.top, "top")):
+        corners = part.corners[np.abs(z - at) < height_um / 2, :2]
+        away, low, high = _beside(corners, outline)
+        if not away <= 2 * _DIGITS:
+            found.append(f"corners of its {end} lie {low:.6g} to {high:.6g} um from the middle")
     return found
+
+
+def _beside(corners: Array, outline: Outline) -> tuple[float, float, float]:
+    """How far corners are from one of the parts of an outline, over its reach, and how near and far from the middle.
+
+    A curve's lie on one line of its form, up to 1.1 times as far out; at least three are on every part.
+    """
+    reach = np.hypot(*corners.T)
+    away = np.full((len(outline.parts), len(corners)), np.inf)
+    for own, part in zip(away, outline.parts, strict=True):
+        if isinstance(part, Conic):
+            x, y = turned(corners, -part.angle_rad).T
+            form = np.hypot(x / part.half_x_um, y / part.half_y_um)
+            near = (form >= 1 - _DIGITS) & (form <= 1.1)
+            own[near] = np.abs(form[near] - np.median(form[near])) if near.any() else np.inf
+        else:
+            apart = np.hypot(*(corners[:, None] - np.array(part.corners_um)).transpose(2, 0, 1))
+            own[:] = apart.min(1) / outline.radius_um
+    spread = float(away.min(0).max(initial=np.inf if not len(corners) else 0.0))
+    held = ((away <= 2 * _DIGITS).sum(1) >= 3).all()
+    return spread if held else np.inf, float(reach.min(initial=np.inf)), float(reach.max(initial=0.0))
 
 
 def _off(places: Array, planned: Array) -> float:

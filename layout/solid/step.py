@@ -5,6 +5,7 @@ the order of memory addresses: both are renumbered here.
 """
 
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from layout.solid.sections import Section
 from layout.solid.tile import Tile, check_count
+from metalens.cell.shapes import Conic, Loop
 from metalens.ground import store
 from metalens.ground.errors import ProcessError
 
@@ -52,11 +55,10 @@ def write_step(path: str | Path, pillars: Tile) -> None:
     slab = Solid.make_box(float(np.ptp(x)) + 2 * half, float(np.ptp(y)) + 2 * half, 1.0).wrapped
     corner = (float(x.min()) - half, float(y.min()) - half, -1.0)
     pieces = [Piece("substrate", slab, (0.75, 0.85, 0.95), [corner])]
-    for kind, name in enumerate(pillars.names):
+    for kind, section in enumerate(pillars.sections):
         here = pillars.kind == kind
         places = [(x, y, 0.0) for x, y in zip(pillars.x_um[here].tolist(), pillars.y_um[here].tolist(), strict=True)]
-        shape = _pillar(float(pillars.foot_um[kind]), float(pillars.top_um[kind]), pillars.height_um)
-        pieces.append(Piece(name, shape, (0.25, 0.35, 0.75), places))
+        pieces.append(Piece(section.name, _pillar(section, pillars.height_um), (0.25, 0.35, 0.75), places))
     write_pieces(path, "metalens tile", pieces, unit_m=1e-6)
 
 
@@ -91,12 +93,34 @@ def write_pieces(path: str | Path, label: str, pieces: Sequence[Piece], *, unit_
         part.write_text(_ordered(_renumbered(text)), encoding="utf-8")
 
 
-def _pillar(foot_um: float, top_um: float, height_um: float) -> Any:
-    from build123d import Solid
+def _pillar(section: Section, height_um: float) -> Any:
+    """Each part of the section as a body of its own, holes cut out of the first."""
+    pairs = zip(section.foot.parts, section.top.parts, strict=True)
+    whole, *holes = (_body(foot, top, height_um, upright=section.upright) for foot, top in pairs)
+    for hole in holes:
+        whole = (whole - hole).solid()
+    return whole.wrapped
 
-    if abs(foot_um - top_um) < 1e-6:
-        return Solid.make_cylinder(foot_um / 2, height_um).wrapped
-    return Solid.make_cone(foot_um / 2, top_um / 2, height_um).wrapped
+
+def _body(foot: Conic | Loop, top: Conic | Loop, height_um: float, *, upright: bool) -> Any:
+    from build123d import Face, Solid
+
+    if isinstance(foot, Conic) and isinstance(top, Conic) and foot.half_x_um == foot.half_y_um:
+        if upright:
+            return Solid.make_cylinder(foot.half_x_um, height_um)
+        return Solid.make_cone(foot.half_x_um, top.half_x_um, height_um)
+    if upright:
+        return Solid.extrude(Face(_wire(foot, 0.0)), (0, 0, height_um))
+    return Solid.make_loft([_wire(foot, 0.0), _wire(top, height_um)], ruled=True)
+
+
+def _wire(part: Conic | Loop, z_um: float) -> Any:
+    from build123d import Location, Wire
+
+    if isinstance(part, Conic):
+        made = Wire.make_ellipse(part.half_x_um, part.half_y_um)
+        return made.moved(Location((0, 0, z_um), (0, 0, math.degrees(part.angle_rad))))
+    return Wire.make_polygon([(x, y, z_um) for x, y in part.vertices(0).tolist()], close=True)
 
 
 def _document(unit_m: float) -> tuple[Any, Any, Any]:
@@ -152,7 +176,8 @@ def _ordered(text: str) -> str:
     if _STYLES not in text:
         return text
     start, end = text.rindex("#", 0, text.index(_STYLES)), text.rindex("ENDSEC;")
-    styles = {int(n): body for n, body in _ENTITY.findall(text[start:end])}
+    # the kernel breaks lines by the length of its own numbers: a break less or more at 999 and 1000
+    styles = {int(n): re.sub(r"\n\s*", "", body) for n, body in _ENTITY.findall(text[start:end])}
     uses = {n: [int(m) for m in _REFERENCE.findall(body)] for n, body in styles.items()}
     new: dict[int, int] = {}
 

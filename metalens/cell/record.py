@@ -170,10 +170,15 @@ class Cell:
             low, high = (middle, high) if self.gap_um(middle) > gap_um else (low, middle)
         return round(low, 4)
 
-    def size_um(self, width_um: float) -> float:
-        """The size of the shape whose least width across is this."""
+    def size_um(self, width_um: float, gap_um: float = 0.0) -> float:
+        """The least size of the shape that is nowhere narrower than this (a ring's wall, a cross's bar), and whose
+        holes and hollows are nowhere narrower than ``gap_um``.
+        """
+        if self.round:
+            return width_um
         unit = self.pitch_um / 2
-        return width_um if self.round else width_um * unit / self.outline(unit).narrowest_um
+        solid, space = self.outline(unit).spans_um
+        return unit * max(width_um / solid, gap_um / space)
 
     def gap_um(self, size_um: float, *, grow_um: float = 0.0) -> float:
         """Least distance between neighbouring pillars of this size; 0 where they touch."""

@@ -169,7 +169,8 @@ def printable(
     Raises:
         LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
     """
-    thinnest, widest = cell.size_um(limits.min_diameter_nm * 1e-3), cell.widest_um(limits.min_gap_nm * 1e-3)
+    gap_um = limits.min_gap_nm * 1e-3
+    thinnest, widest = cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
     low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
     if low >= high:
         raise LensError(

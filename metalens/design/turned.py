@@ -95,8 +95,9 @@ def _check(cell: Cell, turned: Turned, limits: Limits) -> None:
             f"turned towards each other, the process prints {limits.min_gap_nm:g} nm: take a larger pitch, or lower "
             "diameters_um of the library"
         )
-    if outline.narrowest_um < limits.min_diameter_nm * 1e-3 - 1e-9:
+    narrowest_um, _ = outline.spans_um
+    if narrowest_um < limits.min_diameter_nm * 1e-3 - 1e-9:
         raise LensError(
-            f"a {cell.shape.name} of {turned.size_um:.4g} um is {1e3 * outline.narrowest_um:.4g} nm wide, the process "
+            f"a {cell.shape.name} of {turned.size_um:.4g} um is {1e3 * narrowest_um:.4g} nm wide, the process "
             f"prints {limits.min_diameter_nm:g} nm: take a ratio nearer to 1, or a longer pillar"
         )

@@ -90,6 +90,6 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
 def _outline(lens: Lens, size_um: float, length_um: float, turn_rad: float, x_um: float, y_um: float) -> Array:
     """(n, 2) corners of one pillar where it stands."""
     cell = sized(lens.cell, float(size_um), float(length_um)) if length_um else lens.cell
-    corners = cell.outline(float(size_um)).parts[0].vertices(32)
+    corners = cell.outline(float(size_um)).line(32)
     placed: Array = turned(corners, float(turn_rad)) + np.array([x_um, y_um])
     return placed

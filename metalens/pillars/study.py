@@ -139,7 +139,7 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
     Raises:
         CellError: there is none.
     """
-    low, high = cell.size_um(study.min_diameter_um), cell.widest_um(study.min_gap_um)
+    low, high = cell.size_um(study.min_diameter_um, study.min_gap_um), cell.widest_um(study.min_gap_um)
     if low >= high:
         raise CellError(
             f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "

@@ -109,7 +109,7 @@ def _corners(lens: Lens, size_um: float, length_um: float, turn_rad: float) -> A
     from metalens.cell.shapes import turned
 
     cell = axes.sized(lens.cell, size_um, length_um) if length_um else lens.cell
-    corners = cell.outline(size_um).parts[0].vertices(_CORNERS)
+    corners = cell.outline(size_um).line(_CORNERS)
     return np.asarray(turned(corners, turn_rad))
 
 

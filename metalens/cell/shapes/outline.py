@@ -5,7 +5,7 @@ polygons it is made of. Lengths in um, +x right, +y down, the site of the pillar
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from metalens.ground.errors import CellError
 
 Point = tuple[float, float]
 _ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
+_ASIDE = 1e-4  # of an edge, from its end
 _PROBES = np.array([[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]])  # over the radius, no two alike
 _DIRECTIONS = np.stack([np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1)
 
@@ -114,6 +115,31 @@ class Outline:
         """(sign, (n, 2) corners) of every part: what a mask or a solid is made of; ellipses keep their area."""
         return tuple((part.sign, part.vertices(count)) for part in self.parts)
 
+    def turned(self, angle_rad: float) -> "Outline":
+        """The same about the origin from +x towards +y."""
+        made: list[Conic | Loop] = []
+        for part in self.parts:
+            if isinstance(part, Conic):
+                made.append(replace(part, angle_rad=part.angle_rad + angle_rad))
+            else:
+                corners = turned(np.array(part.corners_um), angle_rad).tolist()
+                made.append(replace(part, corners_um=tuple((x, y) for x, y in corners)))
+        return Outline(tuple(made))
+
+    def line(self, count: int = 64) -> Array:
+        """(n, 2) one closed line around the solid part, for pictures: to every hole and back on the same way.
+
+        It encloses the area of the section (ellipses by ``count`` corners); a mask is drawn from :meth:`polygons`.
+        """
+        made = self.parts[0].vertices(count)
+        for hole in self.parts[1:]:
+            inner = hole.vertices(count)[::-1]
+            apart = ((made[:, None] - inner) ** 2).sum(axis=-1)
+            here, there = np.unravel_index(int(apart.argmin()), apart.shape)
+            around = np.roll(inner, -there, axis=0)
+            made = np.concatenate([made[: here + 1], around, around[:1], made[here:]])
+        return made
+
     def boundary(self, step_um: float) -> tuple[Array, Array]:
         """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit normals there, out of the part."""
         points, normals = [], []
@@ -153,11 +179,32 @@ class Outline:
     @property
     def narrowest_um(self) -> float:
         """Least width across, between parallel lines (of the outermost part, its hollows filled)."""
-        corners = self.parts[0].vertices(64)
-        edge = np.roll(corners, -1, axis=0) - corners
-        across = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-        reach = corners @ np.concatenate([across, _DIRECTIONS]).T
-        return float(np.ptp(reach, axis=0).min())
+        return _across(self.parts[0].vertices(64))
+
+    @property
+    def spans_um(self) -> tuple[float, float]:
+        """Least width of what is solid (walls of rings, bars of crosses) and least space within (holes, hollows; inf).
+
+        Convex outlines and holes between parallel lines, all else edge to edge, where one lies before the other (edges
+        that share a corner do not). Curves are taken as 64 edges of the same area: 1e-3 of their radius.
+        """
+        parts = [corners[::sign] for sign, corners in self.polygons()]
+        bends = [_bends(corners[:: part.sign]) for corners, part in zip(parts, self.parts, strict=True)]
+        start, end = np.concatenate(parts), np.concatenate([np.roll(c, -1, axis=0) for c in parts])
+        of = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
+        along = (end - start) / np.hypot(*(end - start).T)[:, None]
+        i, j = np.nonzero(along @ along.T < -_ALIKE)  # those that run against each other
+        counted = (of[i] != of[j]) | np.array(bends)[of[i]]
+        counted &= (start[i] != end[j]).any(axis=1) & (end[i] != start[j]).any(axis=1)
+        i, j = i[counted], j[counted]
+        holes = [_across(c) for c, bent in zip(parts[1:], bends[1:], strict=True) if not bent]
+        solid, space = self.narrowest_um, min(holes, default=math.inf)
+        for tip in (start[i] + _ASIDE * (end - start)[i], end[i] - _ASIDE * (end - start)[i]):
+            foot, before = _foot(tip, start[j], end[j])
+            within, away = self.inside(*((tip + foot) / 2).T), np.hypot(*(tip - foot).T)
+            solid = min(solid, float(away[before & within].min(initial=math.inf)))
+            space = min(space, float(away[before & ~within].min(initial=math.inf)))
+        return solid, space
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
         """Least distance to its copies at these lattice steps; 0 where they touch or overlap (within 1 % of radius)."""
@@ -196,6 +243,28 @@ def turned(corners: Array, angle_rad: float) -> Array:
     """(n, 2) corners turned from +x towards +y."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.asarray(corners @ np.array([[c, s], [-s, c]]))
+
+
+def _across(corners: Array) -> float:
+    """Least distance of parallel lines with a polygon between them."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    across = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    reach = corners @ np.concatenate([across, _DIRECTIONS]).T
+    return float(np.ptp(reach, axis=0).min())
+
+
+def _bends(corners: Array) -> bool:
+    """Whether an anticlockwise polygon has hollows."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    after = np.roll(edge, -1, axis=0)
+    return bool((edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]).min() < -_ALIKE * np.abs(edge).max() ** 2)
+
+
+def _foot(tip: Array, start: Array, end: Array) -> tuple[Array, Array]:
+    """(n, 2) nearest points of lines from start to end, and whether they lie on these edges."""
+    edge = end - start
+    along = ((tip - start) * edge).sum(axis=1) / (edge**2).sum(axis=1)
+    return start + along[:, None] * edge, (along > -_ALIKE) & (along < 1 + _ALIKE)
 
 
 def _anticlockwise(points: Array) -> Array:

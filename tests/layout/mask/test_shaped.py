@@ -16,9 +16,10 @@ from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from layout.rules import check as drc
 from metalens.cell import Cell, Lattice
-from metalens.cell.shapes import Circle, Cross, Ellipse, Rectangle, Ring, Square
+from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring, Square
 from metalens.ground.errors import ProcessError
 from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.made import Bias
 from metalens.pillars import Proxy
 
 PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01)
@@ -177,9 +178,8 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
 @pytest.mark.parametrize(
     ("made", "change", "words"),
     [
-        (lens(Ring(0.4), turned=False), {}, "without hollows"),
-        (lens(Cross(0.3), turned=False), {}, "without hollows"),
-        (lens(), {"tone": "negative"}, "negative"),
+        (lens(Ring(0.01), turned=False), {}, "four steps of the grid"),
+        (lens(Ring(0.05), turned=False), {"bias": Bias(table_nm=((80.0, -30.0), (300.0, -30.0)))}, "no hole"),
         (hexagonal(), {"exposure": processes.Exposure(alpha_um=0.02, beta_um=10.0, eta=0.6)}, "--no-dose"),
         (hexagonal(), {"bias": dataclasses.replace(PROCESS.bias, isolated_nm=4.0)}, "isolated_nm"),
         (hexagonal(row_um=0.0), {}, "no multiple of the grid"),
@@ -222,7 +222,7 @@ def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypat
 def test_all_edges_of_a_shape_move_by_the_bias_of_its_size():
     """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of both; no ratio of 240."""
     process = SimpleNamespace(bias=SimpleNamespace(made_nm=lambda drawn: drawn - 12.0), rules=PROCESS.rules)
-    corners = shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process)
+    corners = shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process).parts[0].vertices(32)
     assert np.ptp(corners, axis=0) * 1e3 == pytest.approx([240.0, 0.55 * 228 + 12], abs=1e-9)
 
 
@@ -254,3 +254,154 @@ def test_a_class_is_as_wide_as_its_widest_corners_whatever_the_unit(unit_nm):
     assert found.sum() == (lens().diameters.diameter_um > 0).sum()
     assert within == PROCESS.rules.diameter_step_nm / 2
     assert {one.diameter_nm for one in drawn} == {240.0}
+
+
+U = Polygon(
+    ((-0.5, -0.45), (0.5, -0.35), (0.5, 0.5), (0.2, 0.5), (0.2, 0.0), (-0.2, -0.1), (-0.25, 0.4), (-0.5, 0.4)), 0.2
+)
+LATTICES = {"square": Lattice(), "rectangular": Lattice("rectangular", 1.1), "hexagonal": Lattice("hexagonal")}
+
+
+def of_sizes(shape, kind, rows=9, columns=14):
+    """A lens of two sizes without mirror images, on any lattice."""
+    rng, lattice = np.random.default_rng(12), LATTICES[kind]
+    size = rng.choice([0.0, 0.22, 0.26], (rows, columns))
+    row_um = 0.0
+    if lattice.centred:
+        size[np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 1] = 0
+        row_um = 0.346
+    return Lens(
+        DiameterMap(size, 0.4, lattice, row_um),
+        Cell(0.4, shape=shape, lattice=lattice),
+        PROXY,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+    )
+
+
+def region(path, cell):
+    """A layer of a cell as KLayout merges it."""
+    db = pytest.importorskip("klayout.db")
+    read = db.Layout()
+    read.read(str(path))
+    return db.Region(db.RecursiveShapeIterator(read, read.cell(cell), read.layer(1, 0))).merged()
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+@pytest.mark.parametrize("kind", list(LATTICES))
+@pytest.mark.parametrize("shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind)
+def test_rings_crosses_and_hollow_polygons_are_drawn_with_their_area_on_their_sites(shape, kind, suffix, tmp_path):
+    """KLayout merges the pieces of a ring into one polygon with one hole; no piece touches itself."""
+    made = of_sizes(shape, kind)
+    plan, found = written(made, tmp_path, suffix)
+    d = made.diameters
+    rows, columns = np.nonzero(d.diameter_um)
+    want = np.stack([1e3 * d.x_um[columns], 1e3 * d.y_um[rows]], 1) + np.array(plan.axis)
+    sizes = dict(
+        zip(map(tuple, np.rint(want).astype(int).tolist()), d.diameter_um[rows, columns].tolist(), strict=True)
+    )
+    merged = region(tmp_path / f"m.{suffix}", "LENS")
+    assert sum(p.area2() for p in merged.each()) == 2 * sum(axis_of(c)[1] for *_, c in found)  # pieces do not overlap
+    assert merged.count() == len(rows) == len(found) / (2 if shape.kind == "ring" else 1)
+    for x, y, corners in found:
+        outline = made.cell.outline(sizes[x, y])
+        share = axis_of(corners)[1] / (1e6 * outline.area_um2) * (2 if shape.kind == "ring" else 1)
+        # circles keep their area to 1e-3; half a unit along 1.3 um of edges, random over 8 or more, is 0.7 % of 25 000
+        assert share == pytest.approx(1, rel=2e-3 if shape.kind == "ring" else 1.2e-2)
+        assert len(np.unique(corners, axis=0)) == len(corners)
+    holes = [polygon.holes() for polygon in merged.each()]
+    assert set(holes) == {1 if shape.kind == "ring" else 0}
+
+
+@pytest.mark.parametrize("kind", list(LATTICES))
+@pytest.mark.parametrize("shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind)
+def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(shape, kind, tmp_path):
+    """The least width and space: the next whole nm below passes its check, the next above does not."""
+    db = pytest.importorskip("klayout.db")
+    made = of_sizes(shape, kind)
+    plan = build.plan(made, PROCESS, furnished=False)
+    gdsii_write.write(plan, tmp_path / "m.gds")
+    drawn = region(tmp_path / "m.gds", "LENS")
+    found = drc.check(plan, PROCESS.rules)
+    # of curves chords at an angle are no widths; edges that share a corner count for neither
+    how = (db.Region.Projection, 10) if shape.kind == "ring" else (db.Region.Euclidian, 45)
+    for value, check in ((found.minimum_feature_nm, drawn.width_check), (found.minimum_gap_nm, drawn.space_check)):
+        assert check(math.floor(value), False, *how).is_empty()
+        assert not check(math.floor(value) + 1, False, *how).is_empty()
+    outline = made.cell.outline(0.22)
+    solid, space = (1e3 * v for v in outline.spans_um)
+    assert found.minimum_feature_nm == pytest.approx(solid, abs=1.5)  # corners on a grid of 1 nm
+    assert found.minimum_gap_nm <= space + 1.5
+
+
+def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
+    made = of_sizes(Ring(0.45), "square")
+    rules = dataclasses.replace(PROCESS.rules, minimum_feature_nm=65, minimum_gap_nm=105)
+    found = drc.check(build.plan(made, PROCESS, furnished=False), rules)
+    few = int((made.diameters.diameter_um == 0.22).sum())  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
+    assert found.counts["feature"] == few
+    assert found.counts["gap"] == few
+    assert {round(v.value) for v in found.violations} == {60, 98}  # flats of the circles stand on whole nm
+
+
+def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
+    """The ring of 260 nm has a hole of 117: a zone of 60 by 60 about its site is free, one of 140 by 140 is not."""
+    made = of_sizes(Ring(0.45), "square")
+    row, column = np.argwhere(made.diameters.diameter_um == 0.26)[0]
+    x, y = made.diameters.x_um[column], made.diameters.y_um[row]
+    plan = build.plan(made, PROCESS, furnished=False)
+    for side, pillars in ((0.06, 0), (0.14, 1)):
+        zone = processes.Zone(x - side / 2, y - side / 2, side, side)
+        rules = dataclasses.replace(PROCESS.rules, exclusion=(zone,))
+        assert drc.check(plan, rules).counts["exclusion"] == pillars
+
+
+@pytest.mark.parametrize("kind", ["rectangular", "hexagonal"])
+def test_dose_test_and_witness_cells_stand_on_the_lattice_of_the_lens(kind):
+    """Pillars 1.1 pitches apart along y, and long along y, would touch on a square lattice."""
+    made = of_sizes(Ellipse(1.5) if kind == "rectangular" else Circle(), kind)
+    plan = build.plan(made, PROCESS)
+    lens_ = plan.lattices[0]
+    assert [each.name for each in plan.lattices] == ["LENS", "DOSETEST", "WITNESS"]
+    for each in plan.lattices[1:]:
+        assert (each.pitch, each.down, each.centred) == (lens_.pitch, lens_.down, lens_.centred)
+        sites = each.whole()
+        if each.centred:
+            assert not sites[np.add.outer(np.arange(each.rows), np.arange(each.columns)) % 2 == 1].any()
+        blocks = np.bincount(sites.ravel())[1:]
+        assert set(blocks[blocks > 0]) == {16**2 if each.name == "DOSETEST" else 40**2}
+
+
+def exposed(path):
+    """(merged, twice the area of the pieces, outline) of all that is written with the pillars, as KLayout reads it."""
+    db = pytest.importorskip("klayout.db")
+    mask, found, area = db.Layout(), db.Region(), 0
+    mask.read(str(path))
+    for index in mask.layer_indexes():
+        if mask.get_info(index).layer in (1, 3, 4, 5, 6):
+            raw = db.Region(mask.top_cell().begin_shapes_rec(index))
+            raw.merged_semantics = False
+            area += sum(p.area2() for p in raw.each())
+            found += raw
+    return found.merged(), area, db.Region(mask.top_cell().begin_shapes_rec(mask.find_layer(10, 0))).merged()
+
+
+@pytest.mark.parametrize(
+    "made",
+    [of_sizes(Ring(0.45), "hexagonal"), of_sizes(Cross(0.35, 0.3), "rectangular"), of_sizes(U, "hexagonal"), lens()],
+    ids=["ring", "cross", "own", "turned"],
+)
+def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(made, tmp_path):
+    found = []
+    for tone in ("positive", "negative"):
+        plan = build.plan(made, dataclasses.replace(PROCESS, tone=tone))
+        gdsii_write.write(plan, tmp_path / f"{tone}.gds")
+        assert verify.compare(plan, gdsii_read.read(tmp_path / f"{tone}.gds")).ok
+        found.append(exposed(tmp_path / f"{tone}.gds"))
+    (stays, _, die), (drawn, area, _) = found
+    assert (drawn & stays).is_empty()
+    assert ((drawn + stays) ^ die).is_empty()
+    assert area == sum(p.area2() for p in drawn.each())  # nothing is drawn (and exposed) twice
+    assert drc.check(plan, PROCESS.rules).pillars > (made.diameters.diameter_um > 0).sum()

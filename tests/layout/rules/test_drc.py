@@ -1,5 +1,6 @@
 """The check against closed forms, brute force and KLayout, on patches with seeded violations."""
 
+import dataclasses
 import itertools
 import math
 
@@ -226,24 +227,30 @@ def test_feet_that_nearly_meet_are_found():
 
 
 @pytest.mark.parametrize(
-    ("pitch", "down", "reach"),
+    ("pitch", "down", "reach", "beside"),
     [
-        (400, 400, 390.0),
-        (400, 400, 401.0),
-        (350, 350, 1060.0),
-        (300, 300, 1500.0),
-        (168, 291, 700.0),
-        (380, 150, 500.0),
+        (400, 400, 390.0, 1),
+        (400, 400, 401.0, 1),
+        (350, 350, 1060.0, 1),
+        (300, 300, 1500.0, 1),
+        (168, 291, 700.0, 2),
+        (168, 291, 320.0, 2),
+        (380, 150, 500.0, 1),
     ],
 )
-def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach):
-    """By brute force over all steps: one of each opposite pair, the left ones of the rows above included."""
-    steps = {tuple(s) for s in drc._offsets(pitch, down, reach).tolist()}
+def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach, beside):
+    """By brute force over all steps: one of each opposite pair, the left ones of the rows above included.
+
+    Of a centred lattice the next pillar of a row, two columns off, is as near as any.
+    """
+    lattice = Lattice.of("L", np.ones((2, 2), np.uint8), pitch=pitch, x0=0, y0=0)
+    lattice = dataclasses.replace(lattice, row_pitch=down, centred=beside == 2)
+    steps = {tuple(s) for s in drc._offsets(lattice, reach).tolist()}
     near = {
         (i, j)
         for i in range(-7, 8)
         for j in range(-7, 8)
-        if (i, j) != (0, 0) and (max(abs(i), abs(j)) == 1 or math.hypot(i * pitch, j * down) < reach)
+        if (i, j) != (0, 0) and ((abs(i) <= beside and abs(j) <= 1) or math.hypot(i * pitch, j * down) < reach)
     }
     assert steps | {(-i, -j) for i, j in steps} == near
     assert not steps & {(-i, -j) for i, j in steps}

@@ -118,3 +118,42 @@ def test_edges_cross_where_both_hold_the_same_point():
         assert straight._cross(a, b, c, d) == want
         met += want
     assert 40 < met < 260
+
+
+U = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (0.2, 0.5), (0.2, -0.2), (-0.3, -0.2), (-0.3, 0.5), (-0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("shape", "width", "space"),
+    [
+        (Circle(), 0.3, math.inf),
+        (Ellipse(0.3, 0.7), 0.09, math.inf),  # its shortest chord at right angles to a rim is shorter, and no width
+        (Ring(0.4), 0.09, 0.12),
+        (Square(0.2), 0.3, math.inf),
+        (Cross(0.3, 0.1), 0.09, math.inf),  # sides of two arms stand at right angles and face nowhere
+        (RegularPolygon(6, 0.2), 0.15 * math.sqrt(3), math.inf),
+        (Polygon(TRIANGLE), 0.3 * 1.0 * 0.9 / math.hypot(0.5, 0.9), math.inf),  # the height on its longest edge
+        (Polygon(U, 0.4), 0.06, 0.15),
+    ],
+    ids=lambda s: getattr(s, "kind", None),
+)
+def test_walls_bars_holes_and_hollows_are_as_wide_as_they_are(shape, width, space):
+    """Sizes of 0.3: by hand from the corners; curves are 64 edges of the same area (1e-3 of a radius)."""
+    found = shape.outline(0.3).spans_um
+    assert found == pytest.approx((width, space), rel=1e-3)
+    cell = Cell(0.5, shape=shape)
+    if not cell.round:  # what a process prints: 80 nm of width, 70 of space
+        assert cell.size_um(0.08, 0.07) == pytest.approx(0.3 * max(0.08 / width, 0.07 / space), rel=1e-3)
+
+
+def test_edges_of_one_line_do_not_cross_and_edges_that_lie_on_each_other_do():
+    assert Polygon(U).outline(0.3).area_um2 == pytest.approx(0.09 * (1 - 0.5 * 0.7))
+    with pytest.raises(CellError, match="cross"):
+        Polygon(((0, 0), (1, 0), (1, 1), (0.8, 0), (0.2, 0), (0, 1)))
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, Polygon(U, 0.3)], ids=lambda s: s.kind)
+def test_the_line_around_a_section_for_pictures_encloses_its_area(shape):
+    outline = shape.outline(0.31)
+    x, y = outline.line(48).T
+    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(outline.area_um2, rel=1e-12)
