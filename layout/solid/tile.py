@@ -20,7 +20,8 @@ class Tile:
 
     foot_um, top_um: (classes,) diameters (that of the circle around it of a pillar that is not round); x_um, y_um:
     (pillars,) centres; kind: (pillars,) class of each. height_um: of all pillars. pitch_um: of the lattice.
-    shaped: (classes,) sections of pillars that are not round, or turned.
+    shaped: (classes,) sections of pillars that are not round, or turned. site_um2: area of one pillar's cell; 0: of a
+    square lattice.
     """
 
     foot_um: Array
@@ -31,6 +32,7 @@ class Tile:
     height_um: float
     pitch_um: float
     shaped: tuple[Section, ...] = ()
+    site_um2: float = 0.0
 
     @property
     def sections(self) -> tuple[Section, ...]:
@@ -72,7 +74,7 @@ def tile(
     if not (grid.plain and lens.cell.shape.kind == "circle" and not lens.cell.shape.hole):
         found, kind = sections(lens, process, rows[row], columns[column])
         foot, top = (np.array([2 * getattr(each, end).radius_um for each in found]) for end in ("foot", "top"))
-        return Tile(foot, top, *place, kind, lens.cell.height_um, grid.pitch_um, found)
+        return Tile(foot, top, *place, kind, lens.cell.height_um, grid.pitch_um, found, grid.site_um2)
     step = process.rules.diameter_step_nm
     drawn = np.rint(process.written_diameter_nm(part[row, column] * 1e3) / step).astype(np.int64)
     sizes, kind = np.unique(drawn, return_inverse=True)
@@ -97,6 +99,8 @@ def check_count(pillars: Tile, form: str) -> None:
     limit, found = LIMITS[form], len(pillars.kind)
     if found > limit:
         side = (int(np.sqrt(limit)) - 1) * pillars.pitch_um
+        if pillars.site_um2:  # rows closer or farther than columns: one more line on each side
+            side = (int(np.sqrt(limit)) - 2) * float(np.sqrt(pillars.site_um2))
         raise ProcessError(
             f"{found:,} pillars are too many for {form} (at most {limit:,}); take a square of the lens with "
             f"side_um = {side:.1f} or less, or use the mask (OASIS) for the whole lens"

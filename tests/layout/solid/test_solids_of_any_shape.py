@@ -31,7 +31,16 @@ def lens(shape, kind="square", *, turned=False):
         size[np.add.outer(np.arange(6), np.arange(9)) % 2 == 1] = 0
     angle = np.radians(rng.integers(0, 40, size.shape)) if turned else None
     grid = DiameterMap(size, 0.42, lattice, angle_rad=angle)
-    return Lens(grid, Cell(0.42, shape=shape, lattice=lattice), PROXY, 0.94, 77.0, math.inf, "map", hand="left" if turned else "")
+    return Lens(
+        grid,
+        Cell(0.42, shape=shape, lattice=lattice),
+        PROXY,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+        hand="left" if turned else "",
+    )
 
 
 def simpson(area):
@@ -146,3 +155,14 @@ def test_pillars_of_two_sizes_have_their_width_and_length_as_made():
 def test_what_walls_close_and_openings_of_a_film_are_refused(shape, degrees, words):
     with pytest.raises(ProcessError, match=words):
         verbs.tile(lens(shape), Process(etch=Etch(sidewall_deg=degrees)))
+
+
+def test_the_square_that_would_do_holds_no_more_than_a_file_takes_on_a_hexagonal_lattice():
+    there = np.where(np.add.outer(np.arange(150), np.arange(260)) % 2 == 0, 0.2, 0.0)
+    grid = DiameterMap(there, 0.42, Lattice("hexagonal"))
+    made = Lens(grid, Cell(0.42, lattice=grid.lattice), PROXY, 0.94, 77.0, math.inf, "map")
+    with pytest.raises(ProcessError, match=r"side_um = \d") as refused:
+        verbs.check_count(verbs.tile(made, TILTED), "STEP")
+    side = float(str(refused.value).split("side_um = ")[1].split(" ")[0])
+    for centre in ((0.0, 0.0), (0.1, 0.13)):
+        verbs.check_count(verbs.tile(made, TILTED, side_um=side, centre_um=centre), "STEP")
