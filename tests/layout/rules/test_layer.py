@@ -114,6 +114,6 @@ def test_dents_shallower_than_a_unit_are_filled(depth, kept):
     """In the slanted side of a triangle of 900 x 900, from its middle inwards."""
     inwards = depth / math.sqrt(2)
     dented = np.array([[0, 0], [900, 0], [450 - inwards, 450 - inwards], [0, 900]])
-    made = layer._filled(dented)
+    made = layer.filled(dented)
     assert len(made) == (4 if kept else 3)
     assert set(map(tuple, made.tolist())) == set(map(tuple, (dented if kept else dented[[0, 1, 3]]).tolist()))
