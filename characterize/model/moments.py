@@ -6,7 +6,6 @@ field's own derivative there (:func:`window.turned`), so that one field and a fe
 parameters: d|E|² = 2 Re sum c_ab conj(E) E_ab. The coefficients change little across a pixel and are put on after it.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -163,25 +162,26 @@ def _through(blur: Sums, conjugate: Array, field: Array, ways: tuple[Array, Arra
     Weights reach over a few samples only: blocks of rows leave out those that are zero for all of them.
     """
     y, x = (way[: degree + 1] for way in ways)
-    fine, count = x.shape[1], len(_by_rows(degree))
-    across = weighted(x.reshape(-1, x.shape[2]), field.T).reshape(degree + 1, fine, -1).transpose(2, 0, 1)
-    out: Array | float = 0.0
+    fine, counts = x.shape[1], [degree + 1 - b for b in range(degree + 1)]
+    places = fine * np.concatenate([[0], np.cumsum(counts)])
+    across = weighted(x.reshape(-1, x.shape[2]), field.T).reshape(-1, field.shape[0]).T.copy()
+    out = [np.zeros((len(py), 2 * places[-1]), y.dtype) for py, _ in blur.pairs]
+    turned = np.empty((min(_BLOCK, y.shape[1]), places[-1]), field.dtype)
     for first in range(0, y.shape[1], _BLOCK):
         rows = slice(first, first + _BLOCK)
         seen = np.flatnonzero(y[0, rows].any(0))
-        part = slice(int(seen[0]), int(seen[-1]) + 1)
-        turned = np.concatenate(
-            [
-                weighted(y[b, rows, part], across[part, : degree + 1 - b].reshape(part.stop - part.start, -1))
-                for b in range(degree + 1)
-            ],
-            1,
-        ).reshape(-1, count, fine)
-        turned *= conjugate[rows, None]
-        down = [weighted(py[:, rows], turned.reshape(len(turned), -1)) for py, _ in blur.pairs]
-        out = out + np.stack([one.reshape(-1, count, fine) for one in down])
-    sums = [one @ px.T.astype(one.dtype) for one, (_, px) in zip(np.asarray(out), blur.pairs, strict=True)]
-    return np.asarray(sum(sums)).transpose(1, 0, 2)
+        part, block = slice(int(seen[0]), int(seen[-1]) + 1), turned[: len(y[0, rows])]
+        for b, count in enumerate(counts):
+            at = block[:, places[b] : places[b + 1]].view(y.dtype)
+            np.matmul(y[b, rows, part], across[part, : count * fine].view(y.dtype), out=at)
+        by_power = block.reshape(len(block), -1, fine)
+        by_power *= conjugate[rows, None]
+        for down, (py, _) in zip(out, blur.pairs, strict=True):
+            down += py[:, rows] @ block.view(y.dtype)
+    sums = [one.view(field.dtype).reshape(len(one), -1, fine) for one in out]
+    return np.asarray(sum(s @ px.T.astype(s.dtype) for s, (_, px) in zip(sums, blur.pairs, strict=True))).transpose(
+        1, 0, 2
+    )
 
 
 def _tables(
@@ -192,54 +192,54 @@ def _tables(
     cut = np.ix_(some, some)
     keep = lens[2][cut]
     p, q = (part[cut][keep] for part in lens[:2])
-    Y, X = (legendre.mapped(_PLACES, *end) for end in grid.ends_um())
+    axes = [legendre.mapped(_PLACES, *end) for end in grid.ends_um()]
     to_y, to_x = (legendre.interpolation(_PLACES, np.linspace(-1, 1, n)) for n in (grid.rows, grid.columns))
-    places = [(float(a), float(b)) for a, b in itertools.product(Y, X)]
-    seen = np.stack([_directions(turned, p, q, place) for place in places])
-    shapes = np.linalg.qr(np.stack([seen[:, 0] ** a * seen[:, 1] ** b for a, b in powers(_DEGREE)], -1))
+    places = np.repeat(axes[0], _PLACES)[:, None], np.tile(axes[1], _PLACES)[:, None]
+    seen = _directions(turned, p, q, places)
+    shapes = np.linalg.qr(np.stack([seen[0] ** a * seen[1] ** b for a, b in powers(_DEGREE)], -1))
     out = {}
     for name, factor in factors.items():
         values = factor.values(cut)[:, keep].astype(complex)
         found = _fitted(shapes, values, _moves(turned, factor, p, q, places), missed)
         if found is not None:
             degree, table = found
-            square = table.reshape(_PLACES, _PLACES, *table.shape[1:])
-            out[name] = degree, np.einsum("yi,ijcf,xj->fcyx", to_y, square, to_x, optimize=True)
+            square = np.moveaxis(table, 0, -1).reshape(*table.shape[1:], _PLACES, _PLACES)
+            out[name] = degree, np.moveaxis(to_y @ square @ to_x.T, 1, 0)
     return out
 
 
-def _directions(turned: Turned, p: Array, q: Array, place: tuple[float, float]) -> tuple[Array, Array]:
-    """(t, s) of the nodes seen from a place (Y, X) of the window, each between -1 and 1."""
-    by_x, by_y = turned.kernel.turning(p, q, place[1], place[0])
+def _directions(turned: Turned, p: Array, q: Array, places: tuple[Array, Array]) -> tuple[Array, Array]:
+    """(t, s) of the nodes (n,) seen from places (Y, X), (k, 1) each, of the window: (k, n), between -1 and 1."""
+    by_x, by_y = turned.kernel.turning(p, q, places[1], places[0])
     k, (band_y, band_x) = turned.kernel.k, turned.bands
     return k * by_x / band_x, k * by_y / band_y
 
 
-def _moves(turned: Turned, factor: Factor, p: Array, q: Array, places: list[tuple[float, float]]) -> list[Array]:
-    """What the window's own move adds at every place: derivative of the kernel's logarithm."""
+def _moves(turned: Turned, factor: Factor, p: Array, q: Array, places: tuple[Array, Array]) -> Array:
+    """(k, n) what the window's own move adds at every place, the slope of the kernel's logarithm; (1, 1) where none."""
     if not factor.moves:
-        return [np.zeros(1)] * len(places)
-    ends = [turned.kernel.moved(factor.moves, sign * STEP) for sign in (1, -1)]
+        return np.zeros((1, 1))
+    up, down = (_logarithm(turned.kernel.moved(factor.moves, sign * STEP), p, q, places) for sign in (1, -1))
     length = turned.kernel.distance_um if factor.moves == "distance" else 2 * math.pi / turned.kernel.k
-    up, down = ([_logarithm(end, p, q, place) for place in places] for end in ends)
-    return [factor.um * (a - b) / (2 * STEP * length) for a, b in zip(up, down, strict=True)]
+    return np.asarray(factor.um * (up - down) / (2 * STEP * length))
 
 
-def _logarithm(kernel: Kernel, p: Array, q: Array, place: tuple[float, float]) -> Array:
-    path, r = kernel.path(p, q, place[1], place[0])
+def _logarithm(kernel: Kernel, p: Array, q: Array, places: tuple[Array, Array]) -> Array:
+    path, r = kernel.path(p, q, places[1], places[0])
     return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.distance_um / r**2))
 
 
-def _fitted(shapes: tuple[Array, Array], values: Array, moved: list[Array], missed: float) -> tuple[int, Array] | None:
+def _fitted(shapes: tuple[Array, Array], values: Array, moved: Array, missed: float) -> tuple[int, Array] | None:
     """(degree, (places, powers, frames) coefficients) of the least degree that is close; None where none is.
 
     shapes: orthonormal ones (places, nodes, powers), and the triangles that make them of the powers.
     """
     basis, triangle = shapes
-    wanted = np.stack([(values + more).T for more in moved])
-    amounts = basis.transpose(0, 2, 1) @ wanted
-    size = float(np.linalg.norm(wanted - 1j * wanted.imag.mean(1, keepdims=True)) ** 2)
-    left = float(np.linalg.norm(wanted) ** 2) - np.cumsum((np.abs(amounts) ** 2).sum((0, 2)))
+    wanted = (values + moved[:, None]).transpose(0, 2, 1)
+    amounts = basis.transpose(0, 2, 1) @ np.broadcast_to(wanted, (len(basis), *wanted.shape[1:]))
+    repeats = len(basis) / len(wanted)
+    size = repeats * float(np.linalg.norm(wanted - 1j * wanted.imag.mean(1, keepdims=True)) ** 2)
+    left = repeats * float(np.linalg.norm(wanted) ** 2) - np.cumsum((np.abs(amounts) ** 2).sum((0, 2)))
     for degree in range(_DEGREE + 1):
         count = len(powers(degree))
         if left[count - 1] <= missed**2 * size:
