@@ -1,6 +1,7 @@
-"""The least of a quadratic inside limits: between bounds by BVLS (SciPy), inside a ball too by SLSQP (NLopt)."""
+"""The least of a quadratic inside limits: between bounds by BVLS (SciPy), inside a ball by SLSQP (NLopt); one led."""
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -47,6 +48,59 @@ def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array
     held = np.where(found.active_mask < 0, low[loose], high[loose])
     out[loose] = np.where(found.active_mask == 0, np.clip(found.x / own[loose], low[loose], high[loose]), held)
     return out
+
+
+class Led:
+    """The quadratic sᵀCs + 2 gᵀs, one of s led and the others at their least between bounds (p,)."""
+
+    def __init__(self, curvature: Array, gradient: Array, i: int, *, low: Array, high: Array) -> None:
+        self.curvature, self._gradient, self._i = curvature, gradient, i
+        self._low, self._high = low, high
+        self._rest = np.flatnonzero(np.arange(len(gradient)) != i)
+        self._free = self._solved(self._rest, self._gradient)
+
+    def _solved(self, free: Array, pull: Array) -> Array:
+        """(free, 2) how these go with what is led, and against their pull."""
+        inner = self.curvature[np.ix_(free, free)]
+        both = np.stack([self.curvature[free, self._i], pull[free]], 1)
+        return np.asarray(np.linalg.lstsq(inner, both, rcond=1e-14)[0])
+
+    def change(self, step: Array) -> float:
+        """Of the quadratic by a step."""
+        return float(step @ (2 * self._gradient + self.curvature @ step))
+
+    def held(self, step: Array) -> Array:
+        """(p,) whether a step of the others ends on a bound."""
+        on = (step == self._low) | (step == self._high)
+        on[self._i] = False
+        return np.asarray(on)
+
+    def others(self, way: float) -> Array:
+        """(p,) step of all with one led to ``way``, or as far as its bounds let it."""
+        i, rest = self._i, self._rest
+        step = np.zeros(len(self._low))
+        step[i] = np.clip(way, self._low[i], self._high[i])
+        step[rest] = -self._free[:, 1] - self._free[:, 0] * step[i]
+        if ((step < self._low) | (step > self._high))[rest].any():
+            pull = self._gradient + self.curvature[:, i] * step[i]
+            inner = self.curvature[np.ix_(rest, rest)]
+            step[rest] = between(inner, pull[rest], self._low[rest], self._high[rest])
+        return step
+
+    def way(self, sign: int, room: float, step: Array, held: Array) -> float:
+        """How far the one led goes until the quadratic has changed by ``room``, the ``held`` of a step kept there.
+
+        Where it is more everywhere, to the least.
+        """
+        i, still = self._i, np.where(held, step, 0.0)
+        free = self._rest[~held[self._rest]]
+        pull = self._gradient + self.curvature @ still
+        answers = self._solved(free, pull)
+        bend = float(self.curvature[i, i] - self.curvature[free, i] @ answers[:, 0])
+        slope = float(pull[i] - self.curvature[free, i] @ answers[:, 1])
+        least = self.change(still) - float(pull[free] @ answers[:, 1])
+        root = math.sqrt(max(slope**2 - bend * (least - room), 0.0))
+        return (sign * root - slope) / max(bend, 1e-300)
 
 
 def step(

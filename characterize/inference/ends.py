@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -29,15 +30,20 @@ _NEAR = 0.6  # sigma of a step from which on slopes must hold
 _STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell, in all, while these are said to hold
 _FAR = 1.25  # times the goal: a step at most
 _TURNS, _MOST_TURNS = 20, 40  # where steps go to and fro, and where they still go on
+_ALIKE = 0.05  # sigma within which a mode and a walk foretell the same end
+_TRIED = 3  # from a mode, where a walk knows another begin too: enough for one that is straight
 _HIGH = 1.0  # sigma above the goal at which a step that missed is taken back
 _BELOW = 0.5  # of -2 ln L, by which a place is a better mode
 _BEYOND = 0.02  # of an interval: a place that lies so far beyond its end
 _UNSURE = 0.5  # of what is still to go, by a straight model that does not hold yet
+_SURE, _LITTLE = 0.8, 0.01  # share of a way that is gone back on, and of it by which another place must be farther
+_IDLE = 3  # places in a row that were not
+_SHORT_OF = 0.05  # of the way, by which an end may fall short of what was foretold
 _WORTH, _SPARE = 0.1, 0.05  # sigma by which a begin must reach beyond what is found, and must promise to on its way
 POINTS = 61  # of the curve of a walk
 _MODE = -1  # the first mode among stops of a walk; then -2 ...
 Begin = tuple[int, Array | None, float]
-"""A valley, a place in it or its own lowest, and how far the parabola reaches from there."""
+"""A valley, a place in it or its own lowest, and how far the parameter is thought to reach from there."""
 Wanted = tuple[int, int, Begin | None]
 """A parameter, the side (-1, 1), and from where."""
 
@@ -99,45 +105,94 @@ def end(
     begin: Array | None = None,
     most: float = math.inf,
     beyond: float = -math.inf,
+    promised: float = math.inf,
+    turns: int = _MOST_TURNS,
 ) -> End:
     """The farthest to one side where the misfit has risen by no more than ``goal`` squared.
 
     Where it is not found in time, the farthest place with less that was met.
 
-    begin: (p,) a place with less, instead of the valley's. most: by how much the parameter goes in a step.
+    begin: (p,) a place near it, instead of the valley's. most: by how much the parameter goes in a step.
     beyond: times ``sign``, what is reached already. What promises less is given up: though what is still to go by the
         straight model were half as much again, or half of it where it goes back.
+    promised: times ``sign``, where the end is thought to be. Where that is reached and steps lead no farther, as along
+        a bent valley of hardly any slope, it is found. turns: at most.
     """
     here = Spot(valley.mode, valley.bottom, valley.slopes) if begin is None else _there(valley, begin)
-    lowest = valley.least - valley.above
-    far, missed, back, turn, steps, done, onward = _FAR * goal, 0.0, False, 0, 0, False, True
-    seen, met, first = dict[float, float](), list[tuple[Array, float]](), here.x
-    while turn < (_MOST_TURNS if onward else _TURNS):
+    way = _Way(valley, i, sign, (goal, promised), begun=None if begin is None else here)
+    far, missed, back, turn, onward = _FAR * goal, 0.0, False, 0, True
+    while turn < min(turns, _MOST_TURNS if onward else _TURNS):
         turn += 1
-        step, least, size = _outwards(here, i, sign, lowest + goal**2, valley.prior, (far, most))
-        if steps:
-            seen[float(here.x[i])] = max(least - lowest, 0.0)
+        step, least, size = _outwards(here, i, sign, way.lowest + goal**2, valley.prior, (far, most))
+        if way.steps:
+            way.seen[float(here.x[i])] = max(least - way.lowest, 0.0)
         close = size < _CLOSE and _short(step[i], here.x[i] + step[i] - valley.mode[i], most)
-        held = missed <= _STRAIGHT and not (close and missed > 0 and here.misfit > lowest + (goal + _CLOSE) ** 2)
+        held = missed <= _STRAIGHT and not (close and missed > 0 and here.misfit > way.lowest + (goal + _CLOSE) ** 2)
         again = not held and (size < _NEAR or back)
         given_up = not again and _at_most(sign * here.x[i], sign * step[i] * max(1.0, size / far)) < beyond
-        if done := steps > 0 and ((held and close) or given_up):
-            break
+        if way.steps and ((held and close) or given_up):
+            return way.ended(float(here.x[i] + step[i]))
+        if way.settled:
+            return way.ended(way.sure)
         if again:  # with slopes that hold here
             here, missed = Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)), 0.0
             continue
         there, off = _moved(valley, here, step)
-        steps, rise = steps + 1, there.misfit - lowest
+        way.steps, rise = way.steps + 1, way.saw(there)
         if rise < -_BELOW:
-            return End(float(there.x[i]), [(float(there.x[i]), 0.0)], met, there.x, steps, done=False)
-        met += [(there.x, rise)] if rise < goal**2 else []
-        back = rise > (goal + _HIGH) ** 2 and (off > size / 2 or there.misfit > here.misfit > lowest + goal**2)
+            return End(float(there.x[i]), [(float(there.x[i]), 0.0)], way.met, there.x, way.steps, done=False)
+        back = rise > (goal + _HIGH) ** 2 and (off > size / 2 or there.misfit > here.misfit > way.lowest + goal**2)
         onward = sign * step[i] > 0 and not back
         here, missed = (here, missed) if back else (there, missed + off)
         far = min(size, far) / 2 if back else min(_FAR * goal, 2 * far)
-    at = here.x + step if done else max([first, *(x for x, _ in met)], key=lambda x: sign * x[i])
-    place = float(np.clip(at[i], valley.prior.low[i], valley.prior.high[i]))
-    return End(place, list(seen.items())[-3:], met, None, steps, done)
+    return way.ended(None)
+
+
+class _Way:
+    """What was met on the way to an end: places inside, their misfit, and how far the parameter goes for sure.
+
+    That is where the misfit is as high as allowed on the straight way from the mode to a place: it rises as a square.
+
+    wanted: goal, and where the end is thought to be. begun: where it was begun, if not at the mode.
+    """
+
+    def __init__(self, valley: Valley, i: int, sign: int, wanted: tuple[float, float], begun: Spot | None) -> None:
+        self._valley, self._i, self._sign, self._level, self._promised = valley, i, sign, wanted[0] ** 2, wanted[1]
+        self.lowest, self.steps, self._far, self._idle = valley.least - valley.above, 0, -math.inf, 0
+        self.seen, self.met = dict[float, float](), list[tuple[Array, float]]()
+        if begun is not None:
+            self.saw(begun)
+
+    def saw(self, there: Spot) -> float:
+        """Take note of a place; its rise."""
+        middle, rise = float(self._valley.mode[self._i]), there.misfit - self.lowest
+        if rise < self._level:
+            self.met.append((there.x, rise))
+        above, way = self._valley.above, float(there.x[self._i]) - middle
+        share = 1.0 if rise <= self._level else math.sqrt(max(self._level - above, 0.0) / (rise - above))
+        far = self._sign * (middle + share * way) if share > _SURE else -math.inf
+        farther = far > self._far + _LITTLE * abs(way)
+        self._far, self._idle = max(far, self._far), 0 if farther else self._idle + 1
+        return rise
+
+    @property
+    def sure(self) -> float:
+        """Place that the parameter reaches."""
+        return self._sign * self._far
+
+    @property
+    def settled(self) -> bool:
+        """Whether it is where it was thought to be, and the last places were no farther."""
+        way = self._promised - self._sign * float(self._valley.mode[self._i])
+        return self._idle >= _IDLE and self._far > self._promised - _SHORT_OF * way
+
+    def ended(self, place: float | None) -> End:
+        """At a place within the bounds; without one, at the farthest inside that was met."""
+        i, prior = self._i, self._valley.prior
+        places = [float(self._valley.mode[i]), *(float(x[i]) for x, _ in self.met)]
+        at = max(places, key=lambda x: self._sign * x) if place is None else place
+        at = float(np.clip(at, prior.low[i], prior.high[i]))
+        return End(at, list(self.seen.items())[-3:], self.met, None, self.steps, place is not None)
 
 
 def _short(step: float, way: float, most: float) -> bool:
@@ -174,7 +229,8 @@ def _outwards(
     Where it is allowed nowhere: to the least. limits: size of the step, and by how much the parameter goes, at most.
     What would leave its bounds stays on them.
     """
-    about = _Straight(here, i, prior)
+    curvature, gradient = here.slopes.T @ here.slopes, here.slopes.T @ here.rest
+    about = constrained.Led(curvature, gradient, i, low=prior.low - here.x, high=prior.high - here.x)
     rest = about.others(0.0)
     least, tried, step = here.misfit + about.change(rest), set[bytes](), rest
     held = np.zeros(len(rest), bool)
@@ -183,59 +239,8 @@ def _outwards(
         way = about.way(sign, allowed - here.misfit, step, held)
         step = about.others(float(np.clip(way, -limits[1], limits[1])))
         held = about.held(step)
-    size = math.sqrt(max(float(step @ about.curvature @ step), 0.0))
+    size = math.sqrt(max(float(step @ curvature @ step), 0.0))
     return (step * (limits[0] / size) if size > limits[0] else step), least, size
-
-
-class _Straight:
-    """The misfit by the straight model about a spot, one parameter led, the others fitted inside their bounds."""
-
-    def __init__(self, here: Spot, i: int, prior: Prior) -> None:
-        self.curvature, self._gradient, self._i = here.slopes.T @ here.slopes, here.slopes.T @ here.rest, i
-        self._low, self._high = prior.low - here.x, prior.high - here.x
-        self._rest = np.flatnonzero(np.arange(len(here.x)) != i)
-        self._free = self._solved(self._rest, self._gradient)
-
-    def _solved(self, free: Array, pull: Array) -> Array:
-        """(free, 2) how these go with what is led, and against their pull."""
-        inner = self.curvature[np.ix_(free, free)]
-        both = np.stack([self.curvature[free, self._i], pull[free]], 1)
-        return np.asarray(np.linalg.lstsq(inner, both, rcond=1e-14)[0])
-
-    def change(self, step: Array) -> float:
-        """Of the misfit by a step."""
-        return float(step @ (2 * self._gradient + self.curvature @ step))
-
-    def held(self, step: Array) -> Array:
-        """(p,) whether a step of the others ends on a bound."""
-        on = (step == self._low) | (step == self._high)
-        on[self._i] = False
-        return np.asarray(on)
-
-    def others(self, way: float) -> Array:
-        """(p,) step of all with one led to ``way``, or as far as its bounds let it."""
-        i, rest = self._i, self._rest
-        step = np.zeros(len(self._low))
-        step[i] = np.clip(way, self._low[i], self._high[i])
-        step[rest] = -self._free[:, 1] - self._free[:, 0] * step[i]
-        if ((step < self._low) | (step > self._high))[rest].any():
-            pull = self._gradient + self.curvature[:, i] * step[i]
-            inner = self.curvature[np.ix_(rest, rest)]
-            step[rest] = constrained.between(inner, pull[rest], self._low[rest], self._high[rest])
-        return step
-
-    def way(self, sign: int, room: float, step: Array, held: Array) -> float:
-        """How far the one led goes until the misfit has changed by ``room``, the ``held`` of a step kept there; where
-        it is more everywhere, to the least."""
-        i, still = self._i, np.where(held, step, 0.0)
-        free = self._rest[~held[self._rest]]
-        pull = self._gradient + self.curvature @ still
-        answers = self._solved(free, pull)
-        bend = float(self.curvature[i, i] - self.curvature[free, i] @ answers[:, 0])
-        slope = float(pull[i] - self.curvature[free, i] @ answers[:, 1])
-        least = self.change(still) - float(pull[free] @ answers[:, 1])
-        root = math.sqrt(max(slope**2 - bend * (least - room), 0.0))
-        return (sign * root - slope) / max(bend, 1e-300)
 
 
 def valley_of(task: Task, at: Solution, rise: float) -> Valley:
@@ -305,32 +310,32 @@ class Search:
         return Profile(low, high, value, rise, parabolic, (sides[0].done, sides[1].done))
 
     def _begins(self, i: int, sign: int) -> list[Begin]:
-        """Stops of the walk from where a parameter goes farthest, and modes, the farthest first.
+        """Modes, the farthest first; or, of a walk that passes them all, the places on it from where a parameter goes
+        farthest, after a mode that foretells as much: where the valley is straight it takes fewer images.
 
-        Each as far as it may reach and still be called a parabola: what ends nearer than it says hides no other.
+        Modes without a walk as far as they may reach and still be called a parabola: what ends nearer hides no other.
         """
-        out: list[Begin] = []
+        wide, out = PARABOLIC[1] if self._by is None else 1.0, list[Begin]()
         for k, one in self._valleys.items():
             room = self._level - one.above
             if k <= _MODE and room > 0:
-                out.append((k, None, sign * float(one.mode[i]) + PARABOLIC[1] * math.sqrt(room) * float(one.sigma[i])))
-        if self._by is not None:
-            modes = [one.mode for k, one in self._valleys.items() if k <= _MODE]
-            for k, x in self._by.outermost(i, sign, self._level):
-                here = self._by.value[k]
-                if not any(np.array_equal(here, mode) for mode in modes):
-                    out.append((k, None, sign * float(here[i] + PARABOLIC[1] * (x[i] - here[i]))))
-        return sorted(out, key=lambda begin: -begin[2])
+                out.append((k, None, sign * float(one.mode[i]) + wide * math.sqrt(room) * float(one.sigma[i])))
+        if self._by is None:
+            return sorted(out, key=lambda begin: -begin[2])
+        along = [(k, x, sign * float(x[i])) for k, x in self._by.outermost(i, sign, self._level)]
+        near = _ALIKE * float(self._valleys[_MODE].sigma[i])
+        return [one for one in out if abs(one[2] - along[0][2]) < near][:1] + along
 
     def _farthest(self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]) -> list[tuple[int, End]]:
         """Ends from all begins that reach beyond those found."""
         (i, sign, begins), valleys = asked
-        goal, far, out = math.sqrt(self._level), -math.inf, []
+        goal, far, sure, out = math.sqrt(self._level), -math.inf, True, []
         sigma = float(self._valleys[_MODE].sigma[i])
-        most = 2 * goal * sigma
+        about: dict[str, Any] = {"most": 2 * goal * sigma}
         for k, begin, reach in begins:
-            if reach > far + _WORTH * sigma:
-                worth = far + _SPARE * sigma
-                out.append((k, end(valleys[k], i, sign, goal, begin=begin, most=most, beyond=worth)))
-                far = max(far, sign * out[-1][1].place)
+            if reach > far + _WORTH * sigma or not sure:
+                about |= {"turns": _TRIED if self._by is not None and begin is None else _MOST_TURNS}
+                about |= {"begin": begin, "beyond": far + _SPARE * sigma, "promised": reach}
+                out.append((k, end(valleys[k], i, sign, goal, **about)))
+                far, sure = max(far, sign * out[-1][1].place), any(one.done for _, one in out)
         return out

@@ -90,7 +90,7 @@ def _profiles(
 ) -> tuple[dict[str, Profile], Solution | None]:
     """Of all named parameters; second: a better mode that one led to, where that is ``followed``.
 
-    Ends from the mode, from those of ``others`` and from the stops of a walk where a parameter goes farthest; then
+    Ends from the mode and those of ``others``, or from the places on a walk where a parameter goes farthest; then
     again from whatever was met on the way and lies beyond an end.
     """
     named = [i for i, name in enumerate(task.names) if not name.startswith(_OF_THE_BENCH)]

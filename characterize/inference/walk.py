@@ -29,7 +29,7 @@ _WIDEST = 0.35  # of the prior sigma: a step at most
 _VALLEYS, _AGAIN, _BRANCHES = 3, 3, 2
 _NEAR = Settings(iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False)
 _FAR = Settings(iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False)
-_FINE, _ON_IT = 1201, 3.0
+_FINE, _COARSE, _ON_IT = 1201, 101, 3.0
 _HUBER = Settings().huber
 Part = tuple[Model, Data]
 
@@ -97,18 +97,20 @@ class Walk:
         return (value - room)[inside].min(0), (value + room)[inside].max(0)
 
     def outermost(self, i: int, sign: int, level: float) -> list[tuple[int, Array]]:
-        """From where another parameter goes farthest to one side with a rise of ``level``: (stop, (p,) place there).
+        """From where another parameter goes farthest to one side with a rise of ``level``: (nearest stop, (p,) place).
 
-        One or two stops, each farther than its neighbours, farthest first. A stop where the other is hardly held, as
-        between valleys, is followed as far as a usual one.
+        One or two places, each farther than its neighbours, farthest first. Where the other is hardly held, as between
+        valleys, it is followed as far as usually.
         """
-        inside, size = self.rise < level, np.sqrt(self.spread[:, i, i])
-        step = np.sqrt(np.maximum(level - self.rise, 0.0)) * np.minimum(size, 2 * np.median(size[inside]))
-        far = np.concatenate([[-math.inf], np.where(inside, sign * self.value[:, i] + step, -math.inf), [-math.inf]])
+        _, rise, value, spread = self._between(_COARSE)
+        inside, size = rise < level, np.sqrt(spread[:, i, i])
+        step = np.sqrt(np.maximum(level - rise, 0.0)) * np.minimum(size, 2 * np.median(size[inside]))
+        far = np.concatenate([[-math.inf], np.where(inside, sign * value[:, i] + step, -math.inf), [-math.inf]])
         peaks = np.flatnonzero((far[1:-1] > far[:-2]) & (far[1:-1] >= far[2:]))
         best = peaks[np.argsort(-far[1:-1][peaks])][:_BRANCHES]
-        along = self.spread[:, :, i] / np.maximum(size**2, 1e-300)[:, None]
-        return [(int(k), self.value[k] + sign * step[k] * along[k]) for k in best]
+        along = spread[:, :, i] / np.maximum(size**2, 1e-300)[:, None]
+        nearest = np.abs(self.value[:, self.index] - value[:, self.index, None]).argmin(1)
+        return [(int(nearest[k]), value[k] + sign * step[k] * along[k]) for k in best]
 
     def draws(self, count: int, *, widened: float, rng: np.random.Generator) -> Array:
         """(count, p) of the posterior along the walk; ``widened``: factor of all variances."""
@@ -138,7 +140,7 @@ class Walk:
         away = (value - middle)[others]
         return bool(away @ leastsquares.invert(spread[np.ix_(others, others)]) @ away < _ON_IT**2)
 
-    def _between(self) -> tuple[Array, Array, Array, Array]:
+    def _between(self, count: int | None = None) -> tuple[Array, Array, Array, Array]:
         """Finely: values walked (m,), rise (m,), all parameters (m, p), covariance of the others (m, p, p).
 
         The rise by a cubic that keeps between its points, the others linearly.
@@ -149,7 +151,7 @@ class Walk:
         if len(close):
             some = slice(max(int(close[0]) - 1, 0), int(close[-1]) + 2)
         at, known = at[some], self.rise[some]
-        fine = np.union1d(np.linspace(at[0], at[-1], _FINE), at)
+        fine = np.union1d(np.linspace(at[0], at[-1], count or _FINE), at)
         rise = np.maximum(interpolate.PchipInterpolator(at, known)(fine), 0.0)
         value, spread = (interpolate.interp1d(at, part[some], axis=0)(fine) for part in (self.value, self.spread))
         value[:, self.index] = fine

@@ -287,32 +287,71 @@ def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
     assert found.place == pytest.approx(1.96, rel=1e-6)
 
 
-def test_modes_that_are_stops_of_the_walk_too_begin_once_and_begins_count_by_a_tenth_of_a_sigma(monkeypatch):
-    """Of three stops one is the mode; a begin that reaches 0.09 sigma beyond the first one's end is not worth it.
-
-    Each may go 1.18 times as far as its parabola says, as an interval may that is still called one.
-    """
-    valley = SimpleNamespace(mode=np.array([1.0, 2.0]), sigma=np.array([0.5, 1.0]), above=0.0)
+def test_a_mode_begins_first_where_it_foretells_what_the_walk_does_and_begins_count_by_a_tenth_of_a_sigma(monkeypatch):
+    """It reaches 2 + 2 · 1: within a twentieth of its sigma of 4.04, not of 4.06; the other mode, 3 above, 2.5 + 1 · 2.
+    A begin that reaches 0.09 sigma beyond the first one's end is not worth it."""
+    valley, other = (SimpleNamespace(mode=np.array([1.0, at]), sigma=np.array([0.5, size]), above=above)
+                     for at, size, above in ((2.0, 1.0, 0.0), (2.5, 2.0, 3.0)))  # fmt: skip
     found = object.__new__(ends.Search)
-    found._valleys, found._level = {-1: valley}, 4.0
-    places = np.array([[0.0, 2.0], [1.0, 2.0], [2.0, 2.5]])
-    found._by = SimpleNamespace(
-        value=places, outermost=lambda i, sign, level: [(k, np.array([9.0, 2.0 + k])) for k in range(3)]
-    )
-    for sign, reach in ((1, {-1: 2 + 1.18 * 2, 2: 2.5 + 1.18 * 1.5, 0: 2.0}), (-1, {-1: 0.36, 0: -2.0, 2: -4.27})):
-        begins = found._begins(1, sign)
-        assert [k for k, *_ in begins] == list(reach)
-        assert [far for *_, far in begins] == pytest.approx(list(reach.values()))
+    found._valleys, found._level = {-1: valley, -2: other, 3: valley}, 4.0
+    for reach, first in ((4.04, [(-1, 4.0)]), (4.06, []), (4.49, [(-2, 4.5)])):
+        places = [(3, np.array([9.0, reach])), (5, np.array([9.0, 3.1]))]
+        found._by = SimpleNamespace(outermost=lambda i, sign, level, places=places: places)
+        begins = found._begins(1, 1)
+        assert [(k, round(far, 9)) for k, _, far in begins] == [*first, (3, reach), (5, 3.1)]
+        assert [begin is None for _, begin, _ in begins] == [True] * len(first) + [False, False]
+        assert begins[-2][1] is places[0][1]
+    places[0][1][1] = 0.04  # downwards: the mode reaches 0
+    assert found._begins(1, -1)[0] == (-1, None, pytest.approx(0.0))
+
+
+@pytest.mark.parametrize("walked", [True, False])
+@pytest.mark.parametrize(("reach", "done", "count"), [(4.04, True, 1), (4.06, True, 2), (4.04, False, 2)])
+def test_a_begin_is_tried_where_it_promises_more_or_none_before_was_found(monkeypatch, walked, reach, done, count):
+    """By a tenth of a sigma of 1 beyond 3.95; from a mode beside a walk in few turns."""
+    tried, valley = [], SimpleNamespace(sigma=np.array([0.5, 1.0]))
 
     def reached(valley, i, sign, goal, **others):
-        tried.append(valley)
-        return SimpleNamespace(place=3.95)
+        tried.append(others)
+        return SimpleNamespace(place=3.95, done=done or len(tried) > 1)
 
     monkeypatch.setattr(ends, "end", reached)
-    for reach, count in ((4.04, 1), (4.06, 2)):
-        tried = []
-        begins = [(-1, None, 4.2), (2, None, reach)]
-        assert len(found._farthest(((1, 1, begins), {-1: valley, 2: valley}))) == count == len(tried)
+    found, place = object.__new__(ends.Search), np.array([9.0, 4.0])
+    found._level, found._by, found._valleys = 4.0, place if walked else None, {-1: valley}
+    begins = [(-1, None, 4.2), (2, place, reach), (2, place, 3.96)]
+    assert len(found._farthest(((1, 1, begins), {-1: valley, 2: valley}))) == count == len(tried)
+    assert [one["promised"] for one in tried] == [4.2, reach][:count]
+    assert [one["turns"] for one in tried] == [3 if walked else 40, 40][:count]
+
+
+class Steep:
+    """r = (u, 0.3 w, 3 + 0.15 w²): 9 + u² + 0.99 w² + ..., of which straight models know the 0.09 only."""
+
+    mode, above, least = np.zeros(2), 0.0, 9.0
+    prior = Prior(np.zeros(2), np.full(2, np.inf), np.full(2, -9.0), np.full(2, 9.0))
+
+    def __init__(self):
+        self.images = 0
+        self.bottom, self.slopes = self.residual(self.mode), self.slopes_at(self.mode)
+
+    def residual(self, x):
+        self.images += 1
+        return np.array([x[0], 0.3 * x[1], 3 + 0.15 * x[1] ** 2])
+
+    def slopes_at(self, x, rest=None):
+        return np.array([[1.0, 0.0], [0.0, 0.3], [0.0, 0.3 * x[1]]])
+
+
+def test_an_end_that_steps_get_no_nearer_to_is_found_where_it_was_foretold():
+    """At 1.96: of steps eleven times too long across it none leads farther. Where more was foretold, it is sought."""
+    valley, begin = Steep(), np.array([1.9, 0.8])
+    found = ends.end(valley, 0, 1, 1.96, begin=begin, promised=1.95)
+    assert found.done
+    assert found.place == pytest.approx(1.96, rel=0.05)
+    assert found.place < 1.96  # on the way to a place beside the valley
+    sought = Steep()
+    ends.end(sought, 0, 1, 1.96, begin=begin, promised=2.3)
+    assert valley.images < 10 < sought.images
 
 
 @pytest.mark.parametrize(("most", "reach"), [((99.0, 99.0), 5.0), ((2.0, 99.0), 2.0), ((99.0, 0.7), 0.7)])

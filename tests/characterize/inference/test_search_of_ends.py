@@ -25,7 +25,7 @@ class Told:
     def __init__(self, by):
         self.by, self.asked = by, []
 
-    def __call__(self, valley, i, sign, goal, *, begin, most, beyond):
+    def __call__(self, valley, i, sign, goal, *, begin, most, beyond, promised, turns):
         self.asked.append((valley.mode.tolist(), i, sign, goal, begin, most, beyond))
         valley.met += ((i, sign),)
         return self.by[i, sign]
@@ -183,7 +183,7 @@ def test_a_profile_along_a_walk_is_the_walk_between_what_was_seen_and_its_own_st
     search.ends(WANTED)
     assert asked == [(by.stops[2], 5.0)]
     assert search.beyond() == []
-    assert [k for k, *_ in search._begins(1, 1)] == [2, -1]  # a stop as long as the walk asks for it, and no mode
+    assert [k for k, *_ in search._begins(1, 1)] == [2]  # a stop as long as the walk asks for it, and no mode
     assert search.profile(0).parabolic
     made = search.profile(1)
     assert (made.low, made.high, made.parabolic) == (-8.0, 3.0, False)
