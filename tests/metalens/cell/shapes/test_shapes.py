@@ -50,6 +50,15 @@ def test_mask_polygon_keeps_the_area_and_the_cell_its_toml(shape):
     assert config.loads(config.dumps(cell), Cell) == cell
 
 
+@pytest.mark.parametrize(("grow_um", "parts"), [(0.1249, 2), (0.125, 1), (0.1251, 1)])
+def test_a_ring_whose_hole_is_closed_is_a_disc(grow_um, parts):
+    """Inner diameter 0.125 um, to both sides of and at the growth that closes it."""
+    made = Ring(0.25).outline(0.5, grow_um=grow_um)
+    assert len(made.parts) == parts
+    inner = max(0.125 - grow_um, 0.0)
+    assert made.area_um2 == pytest.approx(math.pi / 4 * ((0.5 + grow_um) ** 2 - inner**2))
+
+
 def test_areas_in_closed_form():
     assert Ellipse(0.5).outline(0.4).area_um2 == pytest.approx(math.pi * 0.2 * 0.1)
     assert Ring(0.25).outline(0.4).area_um2 == pytest.approx(math.pi * (0.2**2 - 0.05**2))
