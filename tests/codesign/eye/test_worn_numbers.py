@@ -221,13 +221,13 @@ def test_a_line_of_five_pixels_weighs_its_pixels_by_what_of_it_lies_in_each():
 
 def test_labels_follow_the_mask():
     was, after = torch.zeros(2, 5, 5), torch.zeros(2, 5, 5)
-    was[0, 1:4, 1:4], after[0, 1, 2], after[0, 3, 3] = 1.0, 1.0, 0.5
+    was[0, 1:4, 1:4], after[0, 1, 2], after[0, 3, 3] = 0.1, 0.3, 0.15  # less than a pixel in all
     was[1, 2, 2] = 1.0
     place = torch.tensor([[9.0, 8.0], [7.0, 6.0]], dtype=torch.float64)
     two, three = torch.tensor([0.8, 0.6], dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
     labels = Labels(three, three, three, three, three, three, place, place, two, torch.zeros(2, 9, 2))
     got = wear._labels(labels, was, after)
-    assert got.visible.tolist() == pytest.approx([0.8 * 1.5 / 9, 0.0])
+    assert got.visible.tolist() == pytest.approx([0.8 * 0.45 / 0.9, 0.0])
     assert got.centroid_px[0].tolist() == pytest.approx([3.5 / 1.5, 2.5 / 1.5])
     assert got.centroid_px[1].tolist() == [7.0, 6.0]  # nothing is left: where the pupil is
     grown = wear._labels(labels, after, was)
