@@ -44,8 +44,9 @@ def spec() -> PupilSpec:
     """The pupil: low aperture, point-sampled pixels at half the Nyquist step of the field."""
     pixel = WAVE_UM / (2 * NA * SAMPLING)
     return PupilSpec(
-        NA, WAVE_UM, pixel, window=SIDE, phase_order=ORDER, amplitude_order=0, drift_order=0, model="scalar"
-    )
+        NA, WAVE_UM, pixel, window=SIDE, phase_order=ORDER, amplitude_order=0, drift_order=0, model="scalar",
+        stage_sigma_um=0.0,
+    )  # fmt: skip
 
 
 def positions_um() -> np.ndarray:

@@ -15,7 +15,7 @@ from characterize.inference import Data, Prior, Settings, Solution, leastsquares
 from characterize.pupil import check as pupilcheck
 from characterize.pupil.free import Optics, freed, told
 from characterize.pupil.judge import Agreement, agree, spline
-from characterize.pupil.record import PupilModel, PupilSpec
+from characterize.pupil.record import PupilModel, PupilSpec, stage_sigma_um
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, FitRefused
@@ -70,9 +70,9 @@ def fit_pupil(
     """
     spec, frames = _complete(spec, capture), clean(capture)
     position = _positions(capture, spec)
-    data, background, notes = _crop(frames, spec)
-    stated = spec
-    spec, position, optics = _freed(spec, position, data, sparse if judge else 1)
+    stated = dataclasses.replace(spec, stage_sigma_um=stage_sigma_um(spec, position))
+    data, background, notes = _crop(frames, stated)
+    spec, position, optics = _freed(stated, position, data, sparse if judge else 1)
     held_out, between, start = _judge(spec, position, data, background, sparse if judge else len(position))
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
@@ -227,15 +227,17 @@ def _judge(
 ) -> tuple[Agreement | None, Agreement | None, Array | None]:
     """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a spline through the same planes.
 
-    Gains and backgrounds between neighbours, drift from its polynomial. Also the parameters of all planes so found,
-    where a fit of all of them starts. Nothing of too few planes.
+    Gains and backgrounds between neighbours, drift from its polynomial; all planes where they are stated, as it is not
+    seen how far those left out stand off. Also the parameters of all planes so found, where a fit of all of them
+    starts. Nothing of too few planes.
     """
     if len(position) < 2 * sparse + 1:
         return None, None, None
     seen = np.arange(0, len(position), sparse)
     hidden = np.setdiff1d(np.arange(seen[-1]), seen)
-    fitted, solution = _fit(spec, position[seen], data.planes(seen))
-    model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+    exact = dataclasses.replace(spec, stage_sigma_um=0.0)
+    fitted, solution = _fit(exact, position[seen], data.planes(seen))
+    model = PupilModel(exact, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
     model.span_um = fitted.span_um
     shared = fitted.layout().size - 2 * len(seen)
     order = np.argsort(position[seen])
@@ -245,8 +247,9 @@ def _judge(
     )
     x = np.concatenate([solution.value[:shared], gain, level])
     predicted, rest = model.images(x, False)[0][hidden], data.planes(hidden)
+    start = np.insert(x, fitted.layout().off.start, np.zeros(len(position) if spec.stage_sigma_um > 0 else 0))
     between = spline(position, data, seen, hidden)
-    return agree(predicted, rest, background), agree(between, rest, background), x
+    return agree(predicted, rest, background), agree(between, rest, background), start
 
 
 def _fit(spec: PupilSpec, position: Array, data: Data, start: Array | None = None) -> tuple[PupilModel, Solution]:
@@ -307,8 +310,8 @@ def _prior(model: PupilModel, start: Array) -> Prior:
     sigma[: layout.phase] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
     sigma[layout.phase :][: layout.amplitude] = [0.5 / n for n, _ in model.amplitude_indices]
     blur = layout.size - 2 * layout.frames - 1
-    drift = slice(layout.phase + layout.amplitude, blur)
-    sigma[drift] = 10 * model.spec.pixel_um
+    drift = slice(layout.phase + layout.amplitude, layout.off.start)
+    sigma[drift], sigma[layout.off] = 10 * model.spec.pixel_um, model.stage_sigma_um
     mean = np.zeros(layout.size)
     mean[drift] = start[drift]
     mean[blur:] = start[blur:]

@@ -35,6 +35,8 @@ def freed(
     start = np.concatenate([coarse(images.model), np.zeros(len(spec.free))])
     p = len(start) - len(spec.free)
     wide = np.full(len(start), np.inf)
+    off, mean = images.model.layout().off, start.copy()
+    wide[off], mean[off] = images.model.stage_sigma_um, 0.0
     wide[p - 2 * len(position_um) : p - len(position_um)] = 0.3  # gains
     wide[p:] = [FREE[name] for name in spec.free]
     low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
@@ -42,7 +44,7 @@ def freed(
     blur = p - 2 * len(position_um) - 1
     low[blur], high[blur] = 0.05 * spec.pixel_um, 4 * spec.pixel_um
     settings = Settings(iterations=40, step_tolerance=0.1, near=1.0, secant=True)
-    prior = Prior(start, wide, low, high)
+    prior = Prior(mean, wide, low, high)
     found = leastsquares.fit(images, data, start, prior=prior, settings=settings)
     made, position = images.optics(found.value[p:])
     spread = np.sqrt(np.diag(found.covariance)[p:] * max(1.0, found.chi2_per_dof))

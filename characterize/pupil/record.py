@@ -20,6 +20,7 @@ from metalens.ground.errors import CaptureError, FitError
 
 _BLOCK = 1 << 22  # samples of the fields that are formed at once
 FREE = {"numerical_aperture": 0.1, "index": 0.03, "pixel_um": 0.1, "step_um": 0.1}  # usual relative errors
+_STAGE = 0.1  # of the step, by which planes stand off where nobody says
 _SHARP = 0.01  # pixels of blur that are none: 5e-4 of the finest detail
 
 
@@ -35,6 +36,8 @@ class PupilSpec:
     window: pixels of the square that is fitted, centred on the bead; center: its (row, column), else found.
     phase_order, amplitude_order: highest radial Zernike order of phase and of log-amplitude.
     drift_order: of the polynomial sideways drift through the stack.
+    stage_sigma_um: by which single planes stand off their stated positions, standard deviation: a tenth of the step
+        without it, 0 for a stage that is believed.
     model: vector or scalar; auto takes vector above NA / index 0.6.
     model_error: share of the light that no model of this kind explains; keeps bright pixels from ruling the fit.
     mask: file (NPY, TIFF) of a known phase in the pupil, rad, on a square about the aperture's circle, rows along +y;
@@ -53,6 +56,7 @@ class PupilSpec:
     phase_order: int = 8
     amplitude_order: int = 5
     drift_order: int = 3
+    stage_sigma_um: float = math.nan
     model: Literal["auto", "vector", "scalar"] = "auto"
     model_error: float = 0.03
     mask: Path | None = None
@@ -70,6 +74,8 @@ class PupilSpec:
         for key in ("wavelength_um", "pixel_um", "step_um"):
             if not math.isnan(getattr(self, key)) and not 0 < abs(getattr(self, key)) < math.inf:
                 raise FitError(f"{key} = {getattr(self, key)}: need a finite length other than 0")
+        if self.stage_sigma_um < 0 or math.isinf(self.stage_sigma_um):
+            raise FitError(f"stage_sigma_um = {self.stage_sigma_um}: need a finite length of 0 or more")
         if self.phase_order < 4 or min(self.amplitude_order, self.drift_order) < 0 or self.window < 8:
             raise FitError(
                 "need phase_order >= 4, amplitude_order >= 0, drift_order >= 0 and a window of 8 pixels or more"
@@ -88,23 +94,33 @@ class PupilSpec:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which parameter is where: phase, log-amplitude, drift x and y, blur, gain and background of each frame."""
+    """Which parameter is where: phase, log-amplitude, drift x and y, stage, blur, gain and background of each frame.
+
+    stage: of frames whose stage error is a parameter, all or none.
+    """
 
     phase: int
     amplitude: int
     drift: int
     frames: int
+    stage: int
+
+    @property
+    def off(self) -> slice:
+        """Of the stage errors."""
+        first = self.phase + self.amplitude + 2 * self.drift
+        return slice(first, first + self.stage)
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.phase + self.amplitude + 2 * self.drift + 1 + 2 * self.frames
+        return self.phase + self.amplitude + 2 * self.drift + self.stage + 1 + 2 * self.frames
 
-    def split(self, x: Array) -> tuple[Array, Array, Array, Array, float, Array, Array]:
-        """The groups, in the order above."""
-        ends = np.cumsum([self.phase, self.amplitude, self.drift, self.drift, 1, self.frames, self.frames])
-        phase, amplitude, dx, dy, blur, gain, background = np.split(x, ends[:-1])
-        return phase, amplitude, dx, dy, float(blur[0]), gain, background
+    def split(self, x: Array) -> tuple[Array, Array, Array, Array, Array, float, Array, Array]:
+        """The groups, in the order above; no stage errors are zeros."""
+        sizes = [self.phase, self.amplitude, self.drift, self.drift, self.stage, 1, self.frames, self.frames]
+        phase, amplitude, dx, dy, dz, blur, gain, background = np.split(x, np.cumsum(sizes)[:-1])
+        return phase, amplitude, dx, dy, dz if self.stage else np.zeros(self.frames), float(blur[0]), gain, background
 
 
 class PupilModel:
@@ -119,6 +135,7 @@ class PupilModel:
     ) -> None:
         _need(spec, position_um)
         self.spec, self.position_um = spec, position_um
+        self.stage_sigma_um = stage_sigma_um(spec, position_um)
         self.span_um = max(float(np.abs(position_um).max()), 1e-9)
         highest = 2 * spec.numerical_aperture / spec.wavelength_um
         over = detector.fine_enough(spec.pixel_um, highest)
@@ -150,7 +167,8 @@ class PupilModel:
         self._mask = (
             1.0 if spec.mask is None else phase_mask(spec.mask, u, v, turn_rad=math.radians(spec.mask_turn_deg))
         )
-        turns = np.concatenate([1j * self.phase_basis, self.amplitude_basis, -1j * k * np.stack([self.sx, self.sy])])
+        ways = k * np.stack([-self.sx, -self.sy, self.cosine])
+        turns = np.concatenate([1j * self.phase_basis, self.amplitude_basis, 1j * ways])
         self._columns = self._square(turns.astype(np.complex64))
         self.components = weight[self.inside] * _components(self.sx * squeeze, self.sy * squeeze, spec.vectorial)
         y, x = self.grid.axes_um()
@@ -161,7 +179,8 @@ class PupilModel:
     def layout(self) -> Layout:
         """Where each parameter is."""
         n = len(self.position_um)
-        return Layout(len(self.phase_indices), len(self.amplitude_indices), self.spec.drift_order + 1, n)
+        many = len(self.phase_indices), len(self.amplitude_indices), self.spec.drift_order + 1
+        return Layout(*many, n, n if self.stage_sigma_um > 0 else 0)
 
     def names(self) -> list[str]:
         """Name of every parameter, with its unit."""
@@ -170,6 +189,7 @@ class PupilModel:
             *(f"phase {zernike.name(i)} / rad" for i in self.phase_indices),
             *(f"log-amplitude {zernike.name(i)}" for i in self.amplitude_indices),
             *(f"drift {axis} order {j} / um" for axis in "xy" for j in drift),
+            *(f"stage {i} / um" for i in range(self.layout().stage)),
             "blur / um",
             *(f"log-gain {i}" for i in range(n)),
             *(f"background {i} / e" for i in range(n)),
@@ -178,11 +198,11 @@ class PupilModel:
     def images(self, x: Array, jacobian: bool) -> tuple[Array, Array | None]:
         """Expected images (n, window, window) in electrons, and their derivatives by every parameter."""
         layout = self.layout()
-        phase, amplitude, dx, dy, blur, gain, background = layout.split(x)
+        phase, amplitude, dx, dy, dz, blur, gain, background = layout.split(x)
         envelope = self.components * np.exp(amplitude @ self.amplitude_basis)
         total = (envelope**2).sum()
         scale = (np.exp(gain) * self._norm / total)[:, None, None]
-        pupil = self._square(self._pupils(phase, dx, dy)[:, None] * envelope)
+        pupil = self._square(self._pupils(phase, dx, dy, dz)[:, None] * envelope)
         sharp = self._sharp and blur <= _SHARP * self.spec.pixel_um
         field = self._transform(pupil, sharp)
         intensity = (field.real**2 + field.imag**2).sum(1)
@@ -209,14 +229,17 @@ class PupilModel:
         pupil, field = at
         first, drift = layout.phase + layout.amplitude, self._legendre()
         block = max(1, _BLOCK // field.size)
-        for start in range(0, first + 2, block):
-            some = slice(start, min(start + block, first + 2))
+        last = first + 2 + bool(layout.stage)
+        for start in range(0, last, block):
+            some = slice(start, min(start + block, last))
             change = self._transform(pupil * self._columns[some, None, None], transfer is None)
             both = field.view(np.float32) * change.view(np.float32)
             slope = 2 * (both[..., ::2] + both[..., 1::2]).sum(2)
             for j, seen in zip(range(some.start, some.stop), self._seen(slope, transfer), strict=True):
                 if j < first:
                     out[j] = seen
+                elif j == first + 2:  # every plane by itself along the axis
+                    out[layout.off][np.arange(layout.stage), np.arange(layout.stage)] = seen
                 else:  # tilt along x or y, times each polynomial along the stack
                     place = first + (j - first) * layout.drift
                     out[place : place + layout.drift] = drift[:, :, None, None] * seen
@@ -228,10 +251,10 @@ class PupilModel:
             out[first + i, i] = light[i]
             out[first + layout.frames + i, i] = 1
 
-    def _pupils(self, phase: Array, dx: Array, dy: Array) -> Array:
+    def _pupils(self, phase: Array, dx: Array, dy: Array, dz: Array) -> Array:
         """(n, inside) phase factors of every frame: aberration, defocus, sideways drift."""
         drift = self._legendre()
-        angle = (phase @ self.phase_basis)[None] + self.k * self.position_um[:, None] * self.cosine
+        angle = (phase @ self.phase_basis)[None] + self.k * (self.position_um + dz)[:, None] * self.cosine
         angle = angle - self.k * ((dx @ drift)[:, None] * self.sx + (dy @ drift)[:, None] * self.sy)
         return np.asarray(np.exp(1j * angle) * self._mask)
 
@@ -295,6 +318,13 @@ def phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) -> Arra
     parts = [ndimage.map_coordinates(part, place, order=1, mode="nearest") for part in (turns.real, turns.imag)]
     found = parts[0] + 1j * parts[1]
     return np.asarray(found / np.maximum(np.abs(found), 1e-9))
+
+
+def stage_sigma_um(spec: PupilSpec, position_um: Array) -> float:
+    """By which single planes of a whole stack stand off: as stated, else a tenth of the mean step."""
+    if not math.isnan(spec.stage_sigma_um):
+        return spec.stage_sigma_um
+    return _STAGE * float(np.ptp(position_um)) / max(len(position_um) - 1, 1)
 
 
 def _need(spec: PupilSpec, position_um: Array) -> None:

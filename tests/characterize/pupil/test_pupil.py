@@ -125,7 +125,8 @@ def test_a_bead_on_a_steep_background_is_found_and_fitted(slope):
 
 def test_shuffled_planes_are_refused():
     model = PupilModel(SPEC, np.linspace(-8, 8, 9), phase_order=4, amplitude_order=1)
-    x = np.concatenate([truth(make())[:-10], np.full(9, math.log(3e4)), np.full(9, 20.0)])
+    begun, first = truth(make()), make().layout().off.start
+    x = np.concatenate([begun[:first], np.zeros(9), [0.2], np.full(9, math.log(3e4)), np.full(9, 20.0)])
     frames = model.images(x, False)[0]
     assert pupilfit.fit_pupil(shots_of(frames), dataclasses.replace(SPEC, step_um=2.0)).held_out.ncc > 0.97
     with pytest.raises(FitError, match="the stack is shuffled"):

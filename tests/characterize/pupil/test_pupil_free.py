@@ -67,7 +67,7 @@ def test_optics_known_roughly_are_found_within_three_sigma(free, wrong):
     ((name, value, sigma),) = found.optics
     assert name == free[0]
     assert abs(value - truth[name]) < max(3 * sigma, 0.004 * truth[name])
-    assert sigma < 0.01 * truth[name]
+    assert sigma < 0.015 * truth[name]  # of the step 1.3 %: nine planes that each stand off by a tenth of it
     assert abs(value - wrong[name]) > 0.05 * truth[name]
     assert found.held_out.ncc > found.between.ncc
     assert any(f"{name} = " in words for words in found.cautions)

@@ -67,12 +67,14 @@ def test_more_orders_begin_at_zero_and_the_rest_stays():
 
 
 def test_what_is_known_of_a_pupil_beforehand():
-    """3 rad for orders to 4, then falling with the cube; 0.5 / n; 10 pixels of drift; gains to 30 %; the rest free."""
+    """3 rad for orders to 4, then falling with the cube; 0.5 / n; 10 pixels of drift; gains to 30 %;
+    planes to a tenth of their step; the rest free."""
     pupil = model()
     layout = pupil.layout()
     start = RNG.normal(size=layout.size)
     prior = pupilfit._prior(pupil, start)
-    phase, amplitude, dx, dy, blur, gain, level = layout.split(prior.sigma)
+    phase, amplitude, dx, dy, dz, blur, gain, level = layout.split(prior.sigma)
+    assert dz == pytest.approx(np.full(4, 0.1 * (Z[-1] - Z[0]) / 3))
     assert phase == pytest.approx([3.0 * min(1.0, (4 / n) ** 3) for n, _ in pupil.phase_indices])
     assert amplitude == pytest.approx([0.5 / n for n, _ in pupil.amplitude_indices])
     assert np.concatenate([dx, dy]) == pytest.approx(np.full(2 * layout.drift, 4.0))
@@ -82,10 +84,11 @@ def test_what_is_known_of_a_pupil_beforehand():
     means, begun = layout.split(prior.mean), layout.split(start)
     assert not means[0].any()
     assert not means[1].any()
-    for one, other in zip(means[2:], begun[2:], strict=True):
-        assert one == pytest.approx(other)
+    assert not means[4].any()
+    for part in (2, 3, 5, 6, 7):
+        assert means[part] == pytest.approx(begun[part])
     low, high = layout.split(prior.low), layout.split(prior.high)
-    assert (low[4], high[4]) == pytest.approx((0.02, 1.6))
+    assert (low[5], high[5]) == pytest.approx((0.02, 1.6))
     assert np.isinf(np.delete(prior.low, layout.size - 9)).all()
 
 
@@ -94,14 +97,14 @@ def test_a_start_takes_light_and_level_from_the_frames():
     stack[:, 5:9, 6:11] += np.array([40.0, 90.0, 70.0, 30.0])[:, None, None]
     seen = Data(stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack)
     pupil = model()
-    phase, amplitude, dx, dy, blur, gain, level = pupil.layout().split(pupilfit._start(pupil, seen, 0.8))
+    phase, amplitude, dx, dy, dz, blur, gain, level = pupil.layout().split(pupilfit._start(pupil, seen, 0.8))
     assert phase[pupil.phase_indices.index((4, 0))] == 0.8
     assert np.count_nonzero(phase) == 1
     assert not amplitude.any()
     assert blur == pytest.approx(0.2)
     assert gain == pytest.approx(np.full(4, math.log(90.0 * 20)))
     assert level == pytest.approx(np.full(4, 12.0))
-    assert not np.concatenate([dx, dy]).any()
+    assert not np.concatenate([dx, dy, dz]).any()
 
 
 @pytest.mark.parametrize(("chi2", "widened"), [(0.4, 1.0), (1.6, 1.6), (9.0, 9.0)])
