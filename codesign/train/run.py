@@ -62,7 +62,7 @@ class RunConfig:
     checkpoint_every: steps. validation_batches: judge architectures. test_batches: judge the result.
     network: the elastic network, or a baseline in its place (no search; one row without a budget).
     ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that test out.
-    preset: of what is not given: smoke (a minute), laptop (hours on two cores), paper (GPUs).
+    preset: of what is not given: smoke (2 minutes), laptop (half an hour), paper (GPUs).
     scenes: what is looked at. optics: the lens and how its images are formed. sensor: noise and exposure.
     space: networks trained together. inner: training of weights and lens. search: of architecture and pitch.
     run: budgets, steps and seed.
