@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.field import gathered
 from metalens.field import patches as cutting
 from metalens.field.forming import Imager, between_nodes, blurred, psfs_used, trimmed, with_psfs
 from metalens.field.patches import relative
@@ -17,19 +18,21 @@ from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
 from metalens.psf import Nodes, Polarisation, Source
+from metalens.psf import spectrum as spectra
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
 OVERLAP = 4  # samples that two patches share
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
 NEGLECTED = 5  # of them at which the transform and the components of the field are judged
+ALL = 2  # of them at which pillars taken together are
 
 
 def imager(
     lens: Lens | Wave,
     scene_grid: Grid,
     *,
-    spectrum: Source | Nodes | None = None,
+    spectrum: Source | spectra.Measured | Nodes | None = None,
     layers: Layers | None = None,
     field: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-2,
@@ -41,7 +44,8 @@ def imager(
 
     Args:
         lens: a lens file's content, or a wave (:class:`SmoothWave`, :class:`PillarWave`).
-        spectrum: a diode, wavelengths with weights, or None for the design wavelength alone.
+        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.measured`), wavelengths with weights, or
+            None for the design wavelength alone.
         layers: films around the lens; by default those of the lens file with the cover of its cell (none for a wave).
         field: (x, y) angle in rad of the middle of the grid.
         tolerance: of the image of a 1/f texture, relative L2.
@@ -71,7 +75,9 @@ def imager(
     whole = patched(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
     made = thinned(whole, tolerance=tolerance)
     parts = {**made.parts, **_held_out(optics, whole)}
-    return replace(made, parts=parts, stray=stray_of(optics, scene_grid, float(plan.depths_um.mean()), middle))
+    return replace(
+        made, parts=parts, stray=stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
+    )
 
 
 def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
@@ -155,7 +161,7 @@ def trial(grid: Grid) -> Frames:
 
 def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     """Errors at places, depths and wavelengths that no node holds: interpolation, transform, components of the field
-    that are left out; light left outside."""
+    that are left out, pillars taken together; light left outside."""
     plan = made.plan
     draw = np.random.default_rng(7)
     pixels = torch.from_numpy(np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)).long()
@@ -177,4 +183,6 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
     found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
+    wave = float(plan.waves.wavelengths_um[0])
+    found["pillars"] = gathered.missing(optics, wave, plan.window, (at[:ALL], depths))
     return {**found, "edge": edge, "outside": outside}

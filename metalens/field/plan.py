@@ -39,7 +39,8 @@ class Grid:
 
     samples: (y, x) of the image that is returned. step_um: of the samples on the sensor.
     margin: samples around them that are rendered too, blurred in, and not returned.
-    depths_um: (least, largest) that the scene holds. window: samples of a PSF along an axis, odd.
+    depths_um: (least, largest) that the scene holds, inf for what is far away.
+    window: samples of a PSF along an axis, odd.
 
     A sample at (x, y) um from the axis shows the direction whose tangents are (x, y) / reduced distance, the sum of
     thickness / index from lens to sensor (without films the lens-sensor distance).
@@ -55,8 +56,8 @@ class Grid:
         near, far = self.depths_um
         if not (min(self.samples) >= 1 and self.step_um > 0 and self.margin >= 0):
             raise SceneError(f"{self}: need samples >= 1, step above 0 and margin >= 0")
-        if not 0 < near <= far < math.inf:
-            raise SceneError(f"depths {self.depths_um} um: need 0 < least <= largest, finite")
+        if not 0 < near <= far:
+            raise SceneError(f"depths {self.depths_um} um: need 0 < least <= largest (inf for what is far away)")
 
     @property
     def spare(self) -> int:
@@ -94,7 +95,7 @@ class Plan:
 def planned(
     optics: Optics,
     grid: Grid,
-    source: Source | Nodes,
+    source: Source | spectra.Measured | Nodes,
     middle_um: tuple[float, float],
     *,
     tolerance: float,
@@ -116,7 +117,7 @@ def planned(
     window = Window(grid.window, grid.step_um)
     half = grid.half_um
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
-    coarse = _coarse(source, 2) if isinstance(source, Source) else waves
+    coarse = waves if isinstance(source, Nodes) else _coarse(source, 2)
     ends = depth_nodes(grid, 3)
 
     def across(places: Tensor) -> Tensor:
@@ -245,7 +246,7 @@ def width(psfs: Tensor) -> float:
 def waves_of(
     optics: Optics,
     grid: Grid,
-    source: Source | Nodes,
+    source: Source | spectra.Measured | Nodes,
     middle_um: tuple[float, float],
     half_um: list[float],
     tolerance: float,
@@ -257,19 +258,19 @@ def waves_of(
     at = at * torch.tensor([half_um[1], half_um[0]], dtype=torch.float64) + torch.tensor(middle_um, dtype=torch.float64)
     ends, window = depth_nodes(grid, 2), Window(grid.window, grid.step_um)
     last = spectral(optics, at, ends, _coarse(source, 1), window)
+    beside = source.beside if isinstance(source, spectra.Measured) else 0.0
     for count in range(2, 17):
         made = _coarse(source, count)
         found = spectral(optics, at, ends, made, window)
         error = float(relative(last, found).max())
-        if error <= tolerance:  # of the rule before; this one is finer
-            return replace(_coarse(source, count - 1), error=error)
+        if error + beside <= tolerance:  # of the rule before; this one is finer
+            return replace(_coarse(source, count - 1), error=error + beside)
         last = found
     raise SceneError(f"16 wavelengths leave {error:.2g} of the image, above {tolerance:.2g}: raise the tolerance")
 
 
-def _coarse(source: Source, count: int) -> Nodes:
-    um, share = spectra.weight(source)
-    return Nodes(*spectra.gauss(um, share, count), np.nan)
+def _coarse(source: Source | spectra.Measured, count: int) -> Nodes:
+    return Nodes(*spectra.gauss(*spectra.points(source), count), np.nan)
 
 
 def placed(count: int, denser: float, span: tuple[float, float]) -> Tensor:

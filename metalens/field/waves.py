@@ -66,7 +66,8 @@ class PillarWave:
     diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in.
 
     Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`, the mean of both polarisations).
-    Light that single pillars scatter out of their cell's mean is lost to the image; it lands far outside the window.
+    Light that single pillars scatter out of their cell's mean is lost to the image; what of it lands in the window is
+    measured by :mod:`metalens.field.gathered`.
 
     Raises:
         SceneError: another lattice than a square one, turned pillars, or pillars that answer x and y apart.
@@ -104,12 +105,32 @@ class PillarWave:
             cells = self._gathered(wavelength_um, tilt).to(x_um.device)
             if not cells.requires_grad:
                 self._cells = {**dict(list(self._cells.items())[-15:]), key: cells}
-        half_y, half_x = (n * self._block * self.lens.diameters.pitch_um / 2 for n in cells.shape[-2:])
-        place = torch.stack([x_um / half_x, y_um / half_y], -1).to(cells)
+        pitch = self.lens.diameters.pitch_um
+        half = [n * self._block * pitch / 2 for n in cells.shape[-2:]]
+        # the cells are half a pitch past the lens's middle where one row or column more is added behind it
+        past = [(n - own) % 2 * pitch / 2 for n, own in zip(self._padded, self.diameter_um.shape, strict=True)]
+        place = torch.stack([(x_um - past[1]) / half[1], (y_um - past[0]) / half[0]], -1).to(cells)
         found = torch.nn.functional.grid_sample(
             cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
         )
         return torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+
+    @property
+    def _padded(self) -> tuple[int, int]:
+        """(y, x) pillars with the empty rows and columns that fill the last cells."""
+        y, x = (n + (-n) % self._block for n in self.diameter_um.shape)
+        return y, x
+
+    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex t of every pillar, 0 where there is none, with the factor of its neighbours; as
+        :meth:`factor` asks for them."""
+        return self._among(self._pillars(wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0)[0])
+
+    def _among(self, t: Tensor) -> Tensor:
+        """With the factor of unlike neighbours where the lens holds their rows."""
+        if self.lens.neighbours is None:
+            return t
+        return t * among.mean(t, self.lens.neighbours, self.lens.diameters.pitch_um)
 
     def orders(self, wavelength_um: float, orders: tuple[int, ...]) -> dict[int, float]:
         """Share of the light on the aperture that leaves in each diffraction order of the zones: 1 focuses."""
@@ -130,12 +151,9 @@ class PillarWave:
     def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
         """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
-        if self.lens.neighbours is not None:
-            t = t * among.mean(t, self.lens.neighbours, self.lens.diameters.pitch_um)
-        rest = torch.view_as_real(t * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
+        rest = torch.view_as_real(self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
         layers = torch.cat([rest, open_[None]])
-        size = layers.shape[-2:]
-        spare = [(-n) % self._block for n in size]
+        spare = [padded - n for padded, n in zip(self._padded, layers.shape[-2:], strict=True)]
         pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
         mean = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
         near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]

@@ -88,7 +88,8 @@ def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monke
 
 def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     """Places of the pixels between the outermost nodes, depths at 13 and 58 % of the range of 1/z; light that the true
-    PSFs lose is outside; the transform is judged at five of the places; half of what lies beyond a window is edge."""
+    PSFs lose is outside; the transform is judged at five of the places, pillars taken together at two; half of what
+    lies beyond a window is edge."""
     seen = {}
     true, used = psf_of(1.0, (16, 2)), psf_of(1.0, (16, 2))
     passed = torch.from_numpy(RNG.uniform(0.8, 0.95, (16, 2)))
@@ -114,6 +115,12 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
 
     monkeypatch.setattr(engine, "neglected", neglected)
     monkeypatch.setattr(engine, "unpolarised", unpolarised)
+
+    def missing(optics, wave, window, at):
+        seen.update(wave=wave, every=at)
+        return 0.0023
+
+    monkeypatch.setattr(engine.gathered, "missing", missing)
     monkeypatch.setattr(engine, "sampling", lambda optics, window, wave: SimpleNamespace(beyond=0.05 * wave))
     grid = Grid((31, 44), 2.0, (3e3, 9e3), window=7)
     parts = engine._held_out(OPTICS, SimpleNamespace(plan=PLAN, grid=grid))
@@ -132,6 +139,10 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert parts["spectrum"] == 0.004
     assert parts["transform"] == 0.017
     assert parts["polarisation"] == 0.0031
+    assert parts["pillars"] == 0.0023
+    assert seen["wave"] == 0.82
+    assert seen["every"][0].numpy() == pytest.approx(seen["at"].numpy()[:2])
+    assert seen["every"][1] is seen["depths"]
     for name in ("turned", "few"):
         assert seen[name][0].numpy() == pytest.approx(seen["at"].numpy()[:5])
     assert parts["edge"] == pytest.approx(0.05 * 0.82 / 2)

@@ -73,21 +73,21 @@ def test_the_image_holds_the_neighbours_that_the_lens_holds(lens):
 
 
 def test_the_gradient_to_a_pillar_is_that_of_differences_with_neighbours(lens):
-    """A third of the step: growing a patch changes slopes at its edge, and the answer is a tenth of that without."""
-    _differentiates(replace(lens, neighbours=ROWS), grown=3e-4, rel=8e-2)
+    """Growing a patch changes slopes at its edge as well."""
+    _differentiates(replace(lens, neighbours=ROWS))
 
 
 def test_the_gradient_to_a_pillar_is_that_of_differences(lens):
-    _differentiates(lens, grown=1e-3, rel=2e-2)
+    _differentiates(lens)
 
 
-def _differentiates(lens, grown, rel):
+def _differentiates(lens):
     diameter = torch.from_numpy(lens.diameters.diameter_um).clone()
     diameter = torch.where(diameter > 0, diameter.clamp(0.082, 0.318), 0.0)
     at, window = torch.tensor([[12.0, -7.0]], dtype=torch.float64), Window(9, STEP)
     weight = torch.linspace(0.3, 1.9, 81).reshape(9, 9)
     step = torch.zeros_like(diameter)
-    step[60:110, 90:120] = (diameter[60:110, 90:120] > 0) * grown  # a patch beside the axis grows
+    step[150:200, 90:170] = (diameter[150:200, 90:170] > 0) * 1e-3  # a patch beside the axis grows
 
     def score(d):
         optics = Optics(PillarWave(lens, diameter_um=d), Layers(), DISTANCE)
@@ -98,7 +98,7 @@ def _differentiates(lens, grown, rel):
     (slope,) = torch.autograd.grad(score(leaf), leaf)
     with torch.no_grad():
         wide = 0.5 * (score(diameter + step) - score(diameter - step))
-    assert float((slope * step).sum()) == pytest.approx(float(wide), rel=rel)  # float32
+    assert float((slope * step).sum()) == pytest.approx(float(wide), rel=2e-2)  # float32
 
 
 def test_other_orders_are_weak_and_sum_to_less_than_the_light(lens):
