@@ -9,6 +9,8 @@ from metalens.cell.shapes.every import Shape
 from metalens.cell.shapes.round import Circle
 from metalens.ground.errors import CellError
 
+_APART = 0.02  # of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
+
 
 @dataclass(frozen=True, slots=True)
 class Index:
@@ -160,20 +162,44 @@ class Cell:
         """The section of a pillar of this size, wider by ``grow_um``."""
         return self.shape.outline(size_um, grow_um=grow_um)
 
+    @property
+    def widening_um(self) -> tuple[float, float]:
+        """(least, most) that a section is wider than the size says: ends of a tilted wall, layers, their coats."""
+        slope, foot = -2 * math.tan(self.sidewall_rad), -self.height_um / 2
+        bare, coated = [], []
+        for layer in self.sections:
+            ends = [layer.grow_um + slope * height for height in (foot, foot + layer.height_um)]
+            foot += layer.height_um
+            bare += ends
+            coated += [wide + 2 * layer.coat_um for wide in ends]
+        return min(bare), max(coated)
+
     def widest_um(self, gap_um: float) -> float:
-        """The size at which neighbours are this far apart (0 where even the thinnest are nearer)."""
+        """The size at which neighbours are this far apart (0 where even the thinnest are nearer).
+
+        Where a foot, a pedestal or a coat is wider than the size, it is less where that comes within a fiftieth of the
+        pitch of its neighbour.
+        """
+        _, most = self.widening_um
+        wide = most if most > 0 else -math.inf
         if self.round:
-            return self.pitch_um - gap_um
+            return self.pitch_um - max(gap_um, _APART * self.pitch_um + wide)
         low, high = 0.0, 4 * self.pitch_um
         while high - low > 1e-4 * self.pitch_um:
             middle = (low + high) / 2
-            low, high = (middle, high) if self.gap_um(middle) > gap_um else (low, middle)
+            apart = self.gap_um(middle) > gap_um and (
+                wide < 0 or self.gap_um(middle, grow_um=wide) > _APART * self.pitch_um
+            )
+            low, high = (middle, high) if apart else (low, middle)
         return round(low, 4)
 
     def size_um(self, width_um: float, gap_um: float = 0.0) -> float:
         """The least size of the shape that is nowhere narrower than this (a ring's wall, a cross's bar), and whose
-        holes and hollows are nowhere narrower than ``gap_um``.
+        holes and hollows are nowhere narrower than ``gap_um``. Of a top or a layer that is thinner than the size at
+        least a fiftieth of the pitch is left.
         """
+        least, _ = self.widening_um
+        width_um = max(width_um, _APART * self.pitch_um - least if least < 0 else 0.0)
         if self.round:
             return width_um
         unit = self.pitch_um / 2

@@ -94,7 +94,8 @@ class Sweep:
         Raises:
             CellError: the diameters do not fit into the cell.
         """
-        low, high = self.diameters_um or (min(0.06, cell.pitch_um / 5), cell.widest_um(EDGE_GAP_UM))
+        thinnest = max(min(0.06, cell.pitch_um / 5), cell.size_um(0.0))
+        low, high = self.diameters_um or (thinnest, cell.widest_um(EDGE_GAP_UM))
         if not 0 < low < high:
             raise CellError(f"diameters_um = ({low:g}, {high:g}): need 0 < least < largest")
         if high >= cell.pitch_um if cell.round else cell.gap_um(high) <= 0:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from metalens.cell import Blend, Cell, Light, Material, check_subwavelength, index
+from metalens.cell import Blend, Cell, Light, Material, index, materials
 from metalens.ground.arrays import Array
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError
 from metalens.pillars import engines, workers
 from metalens.pillars.curve import Curve
-from metalens.pillars.record import PLAIN
+from metalens.pillars.record import PLAIN, Sweep, check_light
 from metalens.pillars.stretch import REACH
 from metalens.pillars.workers import Journal
 
@@ -33,7 +33,7 @@ class Study:
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t.
-    others: materials that the chosen cell is tried with as well.
+    others: materials that the chosen cell is tried with as well, where their sources hold all the wavelengths.
     """
 
     pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
@@ -105,10 +105,13 @@ def run(study: Study, console: Console | None = None, *, journal: Journal | None
         journal: of the curves that an interrupted run has solved; the verdicts are the same.
 
     Raises:
-        CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none.
+        CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none. Sizes
+            that do not fit.
+        MaterialError: unknown, or a wavelength outside the range of a material of the cell.
     """
     for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
-        check_subwavelength(study.made(pitch, study.heights_um[0]), wavelength)
+        check_light(study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,)))
+    tried, _ = others(study)
     shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
     cases = [(study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes]
     journal = journal or Journal(None)
@@ -116,9 +119,22 @@ def run(study: Study, console: Console | None = None, *, journal: Journal | None
     best = choice(study, verdicts)
     if best is None:
         return verdicts
-    cells = [study.made(*best, other) for other in study.others]
-    others = [(cell, wavelength) for cell in cells for wavelength in study.wavelengths_um]
-    return verdicts + _judged(study, others, journal, Console(quiet=True))
+    cells = [study.made(*best, other) for other in tried]
+    again = [(cell, wavelength) for cell in cells for wavelength in study.wavelengths_um]
+    return verdicts + _judged(study, again, journal, Console(quiet=True))
+
+
+def others(study: Study) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Other materials that are tried, without the study's own; and those whose sources lack a wavelength.
+
+    Raises:
+        MaterialError: an unknown name or a file that cannot be read.
+    """
+    named_else = [name for name in dict.fromkeys(study.others) if name != study.material]
+    ranges = {name: materials.material(name).range_um for name in named_else}
+    held = [all(low <= w <= high for w in study.wavelengths_um) for low, high in ranges.values()]
+    tried = tuple(name for name, holds in zip(named_else, held, strict=True) if holds)
+    return tried, tuple(name for name in named_else if name not in tried)
 
 
 def _judged(study: Study, cases: list[tuple[Cell, float]], journal: Journal, console: Console) -> list[Verdict]:
@@ -201,9 +217,8 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
     lines = [
         "# Cell study",
         "",
-        f"{_subject(study)}. Printable: diameter from "
-        f"{1e3 * study.min_diameter_um:g} nm to the pitch less {1e3 * study.min_gap_um:g} nm. Each entry is the phase, "
-        "in turns, that the longest stretch of diameters covers on which the phase rises, |t| >= "
+        f"{_subject(study)}. Printable: {_limits(study)}. Each entry is the phase, in turns, "
+        "that the longest stretch of diameters covers on which the phase rises, |t| >= "
         f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
         "in brackets the mean |t|² over it. **Bold**: a full turn.",
         "",
@@ -227,6 +242,14 @@ def _subject(study: Study) -> str:
         return f"Round pillars of {named(study.pillar)} on fused silica in air"
     substrate, cover = named(study.cell.substrate), named(study.cell.cover)
     return f"Pillars of {named(study.material)} on {substrate} under {cover}: {study.cell.described}"
+
+
+def _limits(study: Study) -> str:
+    """What is printed, in words."""
+    least, gap = f"{1e3 * study.min_diameter_um:g} nm", f"{1e3 * study.min_gap_um:g} nm"
+    if study.made(study.pitches_um[0], study.heights_um[0]).round:
+        return f"diameter from {least} to the pitch less {gap}"
+    return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
 
 
 def named(material: Material) -> str:
@@ -289,7 +312,8 @@ def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
             f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
             f"order up to {v.max_angle_deg:.0f} deg"
         )
-    return lines
+    _, outside = others(study)
+    return lines + [f"- {name} was not tried: its source does not hold {waves} nm" for name in outside]
 
 
 def rounded(value: object) -> object:

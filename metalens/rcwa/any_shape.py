@@ -16,7 +16,7 @@ from metalens.rcwa.conditions import direction
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import Operation
 from metalens.rcwa.problem import Problem, classes, problem, tangent, waves_of
-from metalens.rcwa.solver import MOST_COMPARED, compared, crowding, safety
+from metalens.rcwa.solver import MOST_COMPARED, NARROWEST, compared, crowding, safety
 from metalens.rcwa.stack import respond
 
 _FIRST = 3  # orders of the first truncation
@@ -25,6 +25,7 @@ _TILTED = {4: 10, 2: 7, 1: 6}  # of tilted walls, whose collocation costs some h
 _COMPARED = 4
 SAFETY = 7.0  # the most that :func:`metalens.rcwa.solver.safety` gives
 _ROUNDING = 1e-13
+_THIN = 1.0  # times more for walls of no width
 _COARSE = 3  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
@@ -107,7 +108,13 @@ def jones(
 
 @dataclass(frozen=True, slots=True)
 class Ladder:
-    """Truncations to try, how many before the last an error looks at, and the factor on it for pillars nearly touching.
+    """Truncations to try, how many before the last an error looks at, and the factor on it for what none resolves.
+
+    Errors swing with each narrow width by itself: gaps, walls of rings, bars of crosses, holes, hollows. Walls of
+    less than a fiftieth of the pitch are resolved by no truncation; there the factor rises to two, for gaps as
+    :func:`metalens.rcwa.solver.crowding` has it. Of 72 rings and crosses with walls of 0.004 to 0.2 pitches, at 7 to
+    15 orders against 21, two of 648 errors lay above a bar that went by outlines alone, by up to 2.3 times; now none
+    does, nor any of 540 of 60 thinner ones drawn afterwards: at most 0.8 of the bar.
 
     The first truncation that may be the last one has ``before`` below it, but where few are asked for.
     """
@@ -128,10 +135,12 @@ def ladder(this: Problem, harmonics: int | None, *, collocated: bool = False) ->
         raise CellError(f"harmonics = {harmonics}: need at least 1")
     cell, size_um = this.cell, this.size_um
     gap = cell.gap_um(size_um)
-    before = int(compared(min(gap, cell.outline(size_um).narrowest_um) / cell.pitch_um))
+    within = np.array(cell.outline(size_um).spans_um) / cell.pitch_um
+    before = int(max(compared(gap / cell.pitch_um), *compared(np.maximum(within, NARROWEST))))
     last = _last(this.classes, collocated) if harmonics is None else harmonics
     first = _FIRST + _COMPARED - before if harmonics is None else max(1, harmonics - before)
-    return Ladder(range(first, last + 1), before, float(crowding(gap, cell.pitch_um)))
+    thin = 1 + _THIN * max(0.0, 1 - float(within.min()) / NARROWEST)
+    return Ladder(range(first, last + 1), before, max(thin, float(crowding(gap, cell.pitch_um))))
 
 
 def _both(found: Jones) -> Array:

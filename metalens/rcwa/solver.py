@@ -123,7 +123,7 @@ _COMPARED, MOST_COMPARED = 4, 6  # truncations before, that an error looks at
 _SWING = 0.75  # of the swing of truncations with the number of orders in the narrowest width
 _SAFETY = 3.0  # from _ENOUGH orders on
 _MORE, _ENOUGH = 0.6, 13  # and so much more for each order below
-_CUSPS, _CROWDED = 5.0, 0.02  # more for pillars that touch, and the share of the pitch below which gaps count
+_CUSPS, NARROWEST = 5.0, 0.02  # more for pillars that touch, and the share of the pitch below which gaps count
 _COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
@@ -143,8 +143,8 @@ def compared(width: float | Array) -> Array:
     :func:`crowding` stands for it, and discs so thin are not resolved.
     """
     width = np.asarray(width)
-    swing = np.clip(np.ceil(_SWING / np.maximum(width, _CROWDED)), _COMPARED, MOST_COMPARED)
-    return np.where(width < _CROWDED, _COMPARED, swing).astype(int)
+    swing = np.clip(np.ceil(_SWING / np.maximum(width, NARROWEST)), _COMPARED, MOST_COMPARED)
+    return np.where(width < NARROWEST, _COMPARED, swing).astype(int)
 
 
 def safety(reach: int) -> float:
@@ -158,7 +158,7 @@ def crowding(gap_um: float | Array, pitch_um: float) -> Array:
     Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest truncation. The factor is 1
     from a fiftieth of the pitch on.
     """
-    return np.asarray(1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (_CROWDED * pitch_um), 0, 1))
+    return np.asarray(1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (NARROWEST * pitch_um), 0, 1))
 
 
 def _estimate(t: Array, reach: int, lags: Array) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from metalens import materials
-from metalens.cell import Cell, Lattice
+from metalens.cell import Cell, Lattice, Layer
 from metalens.cell.orders import check_subwavelength, propagating
 from metalens.cell.record import Index
 from metalens.cell.shapes import Circle, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
@@ -68,6 +68,23 @@ def test_the_widest_pillar_leaves_the_gap_that_was_asked_for():
     assert Cell(0.61).widest_um(0.13) == pytest.approx(0.48)
     assert Cell(0.61, shape=Square()).widest_um(0.13) == pytest.approx(0.48, abs=0.004)
     assert Cell(0.61, shape=Square(math.pi / 4)).widest_um(0.13) == pytest.approx(0.48 / math.sqrt(2), abs=0.004)
+
+
+def test_sizes_end_where_a_foot_a_pedestal_or_a_coat_comes_near_and_where_a_top_closes():
+    """By hand: a wall of 0.1 rad over 0.7 is 0.7 tan(0.1) = 70 nm wider at its foot and as much less at its top, a coat
+    of 20 nm adds 40; a fiftieth of the pitch is left between neighbours, and of the top."""
+    slant, pitch = 0.7 * math.tan(0.1), 0.32
+    for tilt in (0.1, -0.1):
+        wall = Cell(pitch, 0.7, sidewall_rad=tilt)
+        assert wall.widest_um(0.06) == pytest.approx(0.98 * pitch - slant)
+        assert wall.size_um(0.05) == pytest.approx(slant + 0.02 * pitch)
+        assert wall.size_um(0.09) == 0.09
+    assert Cell(pitch, 0.3, sidewall_rad=0.1).widest_um(0.06) == pytest.approx(pitch - 0.06)  # the foot is 36 nm away
+    pedestal = (Layer(0.1, grow_um=0.05, coat_um=0.02, coat=Index(1.5)), Layer(0.6, grow_um=-0.04))
+    layered = Cell(pitch, 0.7, shape=Square(), layers=pedestal)
+    assert layered.widening_um == pytest.approx((-0.04, 0.09))
+    assert layered.widest_um(0.06) == pytest.approx(0.98 * pitch - 0.09, abs=0.002)  # the boundary is stepped
+    assert layered.size_um(0.03) == pytest.approx(0.04 + 0.02 * pitch)
 
 
 def crossing(a, b, c, d):

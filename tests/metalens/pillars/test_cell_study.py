@@ -2,13 +2,16 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
 
 from metalens import cli
+from metalens.cell import Cell, Film, Index
+from metalens.cell.shapes import Cross
 from metalens.ground.console import Console
-from metalens.ground.errors import CellError, ConfigError, StoreError
+from metalens.ground.errors import CellError, ConfigError, MetalensError, StoreError
 from metalens.pillars import study as cell_study
 from metalens.pillars import study_plots, workers
 from metalens.pillars.study import Study
@@ -77,6 +80,57 @@ def test_pitch_without_room_is_refused():
 def test_pitches_above_cutoff_are_refused_and_named():
     with pytest.raises(CellError, match=r"pitch 0.7 um at 0.85 um: diffraction orders"):
         cell_study.run(Study(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,)))
+
+
+def test_other_materials_are_tried_where_they_hold_and_never_the_own_one_again():
+    """a-Si is tabulated from 0.31 to 2.066 um, Si-infrared beyond; what does not hold is said, not stumbled over."""
+    base = dataclasses.replace(SMALL, pitches_um=(0.9,), heights_um=(2.2,), wavelengths_um=(2.5,), pillar=Index(3.48))
+    far = dataclasses.replace(base, others=("a-Si", "Si-infrared", "a-Si"))
+    assert cell_study.others(far) == (("Si-infrared",), ("a-Si",))
+    own = dataclasses.replace(base, pillar="Si-infrared", others=("Si-infrared", "TiO2"), wavelengths_um=(1.5,))
+    assert cell_study.others(own) == (("TiO2",), ())
+    full = cell_study.Verdict(0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i")
+    assert "a-Si was not tried: its source does not hold 2500 nm" in cell_study.markdown(far, [full], command="x")
+
+
+@pytest.mark.parametrize(
+    ("cell", "others", "says"),
+    [
+        (Cell(0.3), ("a_Si",), "unknown material 'a_Si'"),
+        (Cell(0.3, under=(Film("Si-infrared", 0.1),)), ("a-Si",), "Si-infrared at 0.85 um"),
+        (Cell(0.3, substrate=Index(1.5, 0.1)), ("a-Si",), "substrate absorbs"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_before_any_cell_is(cell, others, says, monkeypatch):
+    monkeypatch.setattr(workers, "run", lambda tasks: pytest.fail("cells were solved first"))
+    with pytest.raises(MetalensError, match=says):
+        cell_study.run(dataclasses.replace(SMALL, cell=cell, others=others))
+
+
+def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
+    """The foot is 57 nm wider than the diameter: with a printable gap of 40 nm neighbours overlapped, and the study
+    ended with a refusal."""
+    cell = Cell(0.3, pillar=Index(3.6), sidewall_rad=0.04)
+    leaning = Study(
+        pitches_um=(0.3,),
+        heights_um=(0.7,),
+        wavelengths_um=(0.85,),
+        tolerance=0.1,
+        min_diameter_um=0.2,
+        min_gap_um=0.04,
+        cell=cell,
+    )
+    (only,) = cell_study.run(leaning)
+    assert only.to_um <= 0.98 * 0.3 - 0.7 * math.tan(0.04)
+
+
+def test_the_page_says_what_is_printable_of_any_shape():
+    crosses = Study(pitches_um=(0.3,), heights_um=(0.7,), wavelengths_um=(0.85,), cell=Cell(0.3, shape=Cross(0.4)))
+    verdict = cell_study.Verdict(0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si")
+    page = cell_study.markdown(dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x")
+    assert "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm" in page
+    discs = dataclasses.replace(crosses, cell=Cell(0.3))
+    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.markdown(discs, [verdict], command="x")
 
 
 TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"

@@ -8,8 +8,10 @@ import pytest
 from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer, Light
 from metalens.cell.orders import check_subwavelength
-from metalens.cell.shapes import Circle, Ellipse, Polygon, Rectangle, RegularPolygon
+from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring
 from metalens.ground.errors import CellError
+from metalens.rcwa.any_shape import ladder
+from metalens.rcwa.problem import problem
 
 ABOUT = {"height_um": 0.5, "pillar": Index(2.6), "substrate": Index(1.45), "cover": Index(1.0), "between": Index(1.1)}
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.3), (0.0, 0.6)))
@@ -54,6 +56,34 @@ def test_a_quarter_turn_exchanges_x_and_y(shape):
     assert np.abs(second.t - swap(first.t)).max() < 1e-9
     assert np.abs(second.r - swap(first.r)).max() < 1e-9
     assert np.abs(first.t[0, 0] - first.t[1, 1]) > 1e-2  # they do differ
+
+
+@pytest.mark.parametrize(
+    ("shape", "size_um", "before", "factor"),
+    [
+        (Rectangle(0.9), 0.3, 4, 1.0),
+        (Ring(0.5), 0.32, 5, 1.0),  # walls and hole of 0.16 and 0.32 pitches: 0.75 / 0.16
+        (Ring(0.75), 0.32, 6, 1.0),  # walls of 0.08
+        (Cross(0.15), 0.35, 6, 1.0),  # bars of 0.105
+        (Ring(0.99), 0.45, 6, 2 - 0.0045 / 0.02),  # walls of 0.0045, below a fiftieth: up to twice
+        (Cross(0.01), 0.46, 6, 2 - 0.0092 / 0.02),  # the gap of 0.08 is seen beside bars too thin to resolve
+    ],
+    ids=lambda v: getattr(v, "kind", None),
+)
+def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(shape, size_um, before, factor):
+    """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are wide."""
+    found = ladder(problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0), None)
+    assert found.before == before
+    assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
+
+
+def test_a_ring_with_thin_walls_lies_within_its_bar():
+    """Walls of 0.018 pitches against 20 orders, which 18 and 21 are within 1.1e-4 of; its bar was the 2.3th part of the
+    error while it went by the diameter of the ring."""
+    cell = Cell(0.477445, 0.582459, Index(3.534595), Index(1.689445), Index(1.0), Index(1.0), shape=Ring(0.935481))
+    found, finer = (rcwa.jones(cell, 0.267746, 0.85, harmonics=count) for count in (13, 20))
+    assert np.abs(found.t - finer.t).max() + 1.1e-4 < found.t_error
+    assert np.abs(found.r - finer.r).max() + 1.1e-4 < found.t_error
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 0.11])
