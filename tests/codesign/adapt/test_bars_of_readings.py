@@ -50,7 +50,7 @@ def test_frames_are_asked_for_where_the_model_alone_leaves_seven_tenths_of_what_
         by_cause=np.array([[1.0]]), within_covariance=np.array([[own**2]]),
         parameters=lambda values=(2.0,): np.array(values),
     )  # fmt: skip
-    words = sure._settled(result, lambda x: np.array([0.4, along]) * x[0], np.array([0.9, 3.9]), 3.3)
+    words = sure._settled(result, lambda x: np.array([0.4, along]) * x[0], np.array([0.9, 3.9]), (sure.TABLE, 3.3))
     assert words.startswith("the side wall by a cross-section")
     assert ("both sides of focus" in words) == asked
     assert ("the diameters themselves" in words) != asked
@@ -76,7 +76,7 @@ def test_causes_of_less_than_a_fifth_of_what_is_allowed_are_not_asked_for(second
         return out
 
     result.parameters = whole
-    words = sure._settled(result, table, np.array([0.9, 3.9]), 3.3)
+    words = sure._settled(result, table, np.array([0.9, 3.9]), (sure.TABLE, 3.3))
     assert words.startswith("the side wall by a cross-section")
     assert ("ellipsometry" in words) == named
     assert "micrographs" in words

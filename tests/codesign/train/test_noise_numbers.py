@@ -42,7 +42,7 @@ def test_seeds_of_judged_frames_are_of_their_stream_and_number(monkeypatch):
         return light
 
     part = torch.zeros(2, 1)
-    batch = SimpleNamespace(frames=None, mask=part, slip_mm=part)
+    batch = SimpleNamespace(frames=None, mask=torch.zeros(2, 1, 1), slip_mm=part)
     monkeypatch.setattr(assess, "read_out", read_out)
     monkeypatch.setattr(assess, "samples", lambda frames: None)
     monkeypatch.setattr(assess, "irradiance", lambda frames, optics, *, margin: part)
@@ -51,7 +51,7 @@ def test_seeds_of_judged_frames_are_of_their_stream_and_number(monkeypatch):
     monkeypatch.setattr(assess.blur, "window_vergence", lambda depth: part)
     trainer = SimpleNamespace(
         inner=SimpleNamespace(batch=2), optics=SimpleNamespace(sample_um=1.0), sensor=None,
-        model=SimpleNamespace(coefficients_rad=None, pitch_um=None),
+        model=SimpleNamespace(coefficients_rad=None, pitch_um=torch.tensor(1.0)),
     )  # fmt: skip
     for stream in (0, 4):
         assess.frames(trainer, SimpleNamespace(batch=lambda number, size: batch, margin=1, stream=stream), 3)
