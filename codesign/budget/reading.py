@@ -79,7 +79,8 @@ class Reading:
         whole = formed.imager(settings, coefficients, self.frame, margin=margin)
         if not isinstance(whole, Imager):
             raise TypeError("a device is imaged truly")
-        return Device(formed.wave_of(settings, coefficients), Layers(), settings.sensor_distance_mm * 1e3, whole)
+        plane = formed.optics_of(settings, coefficients)
+        return Device(plane.wave, plane.layers, plane.distance_um, whole)
 
     def stands(self, wave: object, layers: Layers, distance_um: float) -> Device:
         """The device of another lens plane behind films, on the frames of this run."""

@@ -103,7 +103,7 @@ def _formed(
     settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int, error: LensError | None
 ) -> Imager:
     wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
-    return _through(settings, Optics(wave, Layers(), settings.sensor_distance_mm * 1e3), frame, margin)
+    return _through(settings, _in_place(settings, wave), frame, margin)
 
 
 @torch.no_grad()
@@ -165,14 +165,18 @@ def live(settings: OpticsConfig, whole: Imager) -> Live:
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
     """Wave, surroundings and distance of the lens."""
     moving = settings if coefficients_rad.numel() else replace(settings, polynomials=0)
-    return Optics(wave_of(moving, coefficients_rad), Layers(), settings.sensor_distance_mm * 1e3)
+    return _in_place(settings, wave_of(moving, coefficients_rad))
+
+
+def _in_place(settings: OpticsConfig, wave: SmoothWave) -> Optics:
+    return Optics(wave, settings.layers or Layers(), settings.sensor_distance_mm * 1e3)
 
 
 @torch.no_grad()
 def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> float:
     """Relative L2 difference of the uniform image of a texture in depth from its true image: the error of 'uniform'."""
     true = imager(replace(settings, image="true"), coefficients_rad, frame, margin=margin)
-    one = imager(replace(settings, image="uniform"), coefficients_rad, frame, margin=margin)
+    one = imager(replace(settings, image="uniform", layers=None), coefficients_rad, frame, margin=margin)
     if not isinstance(true, Imager) or not isinstance(one, UniformImager):
         raise TrainingError("no pair of images to compare")
     return difference(one, true)

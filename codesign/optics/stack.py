@@ -18,7 +18,7 @@ from codesign.optics import families
 from codesign.optics.families import Family, Start
 from codesign.optics.lens_errors import LensError, LensErrors, variance_rad2, wave_front_rad
 from metalens.design import Focus, PhaseOf, profiles
-from metalens.field import Optics
+from metalens.field import Layers, Optics
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.ground.paths import source_path
@@ -58,6 +58,7 @@ class OpticsConfig:
     fwhm_nm: spectral width of the light source about ``wavelength_nm``, 0 for one wavelength. filter_nm: width of a
         band-pass filter before the sensor, 0 for none; the light that it stops is lost. Of the true image alone.
     image_tolerance: of the true image, relative L2 of a texture.
+    layers: films around the lens and an aperture stop, as in DESIGN.toml, for the true image alone.
     """
 
     aperture_mm: float = 1.0
@@ -81,6 +82,7 @@ class OpticsConfig:
     parts: int = 1
     apart_um: float = 0.0
     foci_mm: tuple[float, ...] = ()
+    layers: Layers | None = None
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -99,10 +101,10 @@ class OpticsConfig:
                 f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, image_tolerance = {self.image_tolerance}: "
                 "need widths of 0 or more and a tolerance between 0 and 1"
             )
-        if self.image == "uniform" and (self.fwhm_nm or self.filter_nm):
+        if self.image == "uniform" and (self.fwhm_nm or self.filter_nm or self.layers is not None):
             raise ConfigError(
-                f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm} with image = 'uniform', an image of one "
-                "wavelength: need image = 'true', or widths of 0"
+                f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, layers = {self.layers} with image = "
+                "'uniform', an image of one wavelength in air: need image = 'true', or widths of 0 and no layers"
             )
         if self.filter_nm and not self.fwhm_nm:
             raise ConfigError(f"filter_nm = {self.filter_nm} before a source of one wavelength: give fwhm_nm too")
@@ -144,7 +146,8 @@ class OpticsConfig:
     @property
     def focus(self) -> Focus:
         """What the hyperbolic part images onto the sensor."""
-        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.focus_mm * 1e3)
+        distances = self.sensor_distance_mm * 1e3, self.focus_mm * 1e3
+        return Focus(self.wavelength_nm * 1e-3, *distances, self.layers or Layers())
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -278,7 +281,11 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
     paths = [source_path(seen.x_um, seen.y_um, tangents, 1 / float(z)) for z in settings.depths_um]
     angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
     size = scipy.fft.next_fast_len(settings.pupil.nodes + _frequencies(settings) + 1)
-    return torch.polar(seen.weight, angle).to(torch.complex64), (size, size)
+    light = torch.polar(seen.weight, angle)
+    if settings.layers is not None and settings.layers.stop is not None:
+        about = settings.pupil.wavelength_um, (seen.x_um, seen.y_um), settings.pupil.step_um
+        light = light * torch.stack([settings.layers.lit(tangents, float(z), *about) for z in settings.depths_um])
+    return light.to(torch.complex64), (size, size)
 
 
 def _frequencies(settings: OpticsConfig) -> int:

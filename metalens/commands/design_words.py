@@ -115,6 +115,10 @@ def _films(layers: Layers) -> list[str]:
         if films:
             named = ", ".join(f"{film.thickness_um:g} um {film.material}" for film in films)
             found.append(f"  phase corrected for layers {where}: {named}")
+    if layers.stop is not None:
+        found.append(
+            f"  aperture stop of {2 * layers.stop.radius_um:g} um, {layers.stop.distance_um:g} um before the pillars"
+        )
     return found
 
 

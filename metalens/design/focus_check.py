@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,10 +69,11 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
     d = lens.diameters
     focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    aperture = focus.aperture(d.radius_um + d.pitch_um / 2)
+    radius = min(d.radius_um + d.pitch_um / 2, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um))
+    aperture = focus.aperture(radius)
     resolution, depth = lens.wavelength_um / (2 * aperture), after.index[0] * lens.wavelength_um / aperture**2
-    zones = (d.radius_um + d.pitch_um / 2) ** 2 / (lens.wavelength_um * after.reduced_um)
-    phase, level = lens.phase_rad(), lens.transmission()
+    zones = radius**2 / (lens.wavelength_um * after.reduced_um)
+    phase, level = lens.phase_rad(), lens.transmission() * _lit(lens)
     case = _case(lens, resolution, 0.0)
     axial = axial and after.thickness_um[0] > depth / 2
     arm, rest = _ARM * resolution, np.zeros_like(_ARM)
@@ -89,6 +91,13 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
     )
 
 
+def _lit(lens: Lens) -> Any:
+    """(y, x) share of the design source's light that passes the stop in front of every pillar; 1 without one."""
+    d = lens.diameters
+    places = d.x_um + 0 * d.y_um[:, None], d.y_um[:, None] + 0 * d.x_um
+    return lens.layers.lit((0.0, 0.0), lens.source_distance_um, lens.wavelength_um, places, d.pitch_um)
+
+
 def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
     """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
     return propagate.case(
@@ -99,7 +108,7 @@ def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
         depths_um=lens.source_distance_um,
         window_um=step_um,
         samples=1,
-        layers=lens.layers,
+        layers=lens.layers.open,
     )
 
 

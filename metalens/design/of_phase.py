@@ -207,9 +207,10 @@ class Sums:
     def quality(self, focus: Focus, radius_um: float, turns: float, *, period_um: float) -> Quality:
         """Of all pillars that were added; period_um: see :func:`metalens.design.sites.least_period_um`."""
         peak = abs(self.field) ** 2
+        lit_um = min(radius_um, focus.layers.footprint_um(focus.source_distance_um, focus.wavelength_um))
         return Quality(
             pillars=self.count,
-            numerical_aperture=focus.aperture(radius_um),
+            numerical_aperture=focus.aperture(lit_um),
             efficiency=peak / self.count**2,
             transmission=self.power / self.count,
             strehl=peak / self.level**2,
@@ -226,7 +227,8 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
     """Half field in rad at which coma, astigmatism and curvature of the field of the hyperbolic lens leave
     exp(-sigma²) = ``strehl`` on its sensor, which is flat.
 
-    sigma is the wave-front error over the aperture, with piston and tilt taken out: at most 60 degrees.
+    sigma is the wave-front error over the aperture (of the lens, what the stop lets light on), with piston and tilt
+    taken out: at most 60 degrees.
     """
     low, high = 0.0, np.pi / 3
     for _ in range(40):
@@ -242,6 +244,11 @@ def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> flo
     unit = np.linspace(-1, 1, 61)
     x, y = (g[np.hypot(*np.meshgrid(unit, unit)) <= 1] * radius_um for g in np.meshgrid(unit, unit))
     tangent = math.tan(angle_rad)
+    if focus.layers.stop is not None:  # the part of the lens that the angle's light falls on
+        lit = focus.layers.lit((tangent, 0.0), focus.source_distance_um, focus.wavelength_um, (x, y), 1e-6 * radius_um)
+        if (lit > 0).sum() < 30:  # a hundredth of the lens
+            return math.inf
+        x, y = x[lit > 0], y[lit > 0]
     path = profiles.hyperbolic(x, y, focus)
     for one in focus.paths_from(x, y, tangent):
         path = path + 2 * np.pi / focus.wavelength_um * one

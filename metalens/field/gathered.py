@@ -64,7 +64,7 @@ def _of_pillars(
         "samples": count * finer,
         "layers": optics.layers,
     }
-    chief = propagate.case(tuple(t.shape), **about).centre_um
+    chief = propagate.case(tuple(t.shape), **about | {"layers": optics.layers.open}).centre_um
     offset = [float(a) - b for a, b in zip(place, chief, strict=True)]
     made = psf_stack(torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False, tolerance=JUDGE)
     return torch.as_tensor(made.intensity).double()

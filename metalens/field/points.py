@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled, polarised
-from metalens.field.rays import Paths, Rays, rays, source_paths
+from metalens.field.rays import Paths, Rays, rays, source_paths, through_stop
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, media
@@ -122,7 +122,9 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     nodes = 2 * math.ceil(edge / step) + 2
     harmonics = math.floor(2 * period / window.step_um)
     half = window.samples * window.step_um / 2
-    beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * edge * half), 0.5)
+    stop = optics.layers.stop
+    lit = edge if stop is None else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
+    beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5)
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto the last of them
     size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
     quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
@@ -140,6 +142,8 @@ def psfs(
     finest_um: float = math.inf,
 ) -> Tensor:
     """(points, depths, h, w) share of the light on the aperture that falls on each sample from a source of that size.
+
+    The aperture is the stop where the layers have one.
 
     Source and sample are squares of one step: the light of a point, twice averaged over a square (sinc² in frequency,
     kept up to its second zero, 2 / step). Constant radiance is then kept to rounding, and nothing rings.
@@ -181,16 +185,27 @@ def _one(
     tilt = math.atan(math.hypot(*tangents.tolist()))
     factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
+    total: float | Tensor = pupil.given * grid.size**2 / (1 - grid.beyond)
+    if optics.layers.stop is not None:
+        about = tuple(tangents.tolist()), found, tuple(depths_um.tolist())
+        light = light * through_stop(optics.layers, *about, wavelength_um)
+        total = total * _taken(optics, depths_um, wavelength_um).to(found.passed.device, torch.float32)
     mixed = None
     if grid.components:
         fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
         mixed = strongest(fields, pupil.weight, grid.components)
-    total = pupil.given * grid.size**2 / (1 - grid.beyond)
     few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
     moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
     aside = (found.aside, found.aside[:, None]) if grid.curved else ()
     parts = torch.split(light, few)
     return torch.cat([_shown(_fluxes(part, mixed, aside, grid.size), ends, moves) for part in parts]) / total
+
+
+def _taken(optics: Optics, depths_um: Tensor, wavelength_um: float) -> Tensor:
+    """(depths, 1, 1) light through the stop over that on the whole lens, of sources on the axis."""
+    radius = optics.wave.radius_um
+    each = [(optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2 for depth in depths_um.tolist()]
+    return torch.tensor(each)[:, None, None]
 
 
 def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:

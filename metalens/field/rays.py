@@ -22,13 +22,14 @@ KEPT = 4  # field points whose rays are kept: a few MB each
 class Rays:
     """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the lens.
 
-    whole: √spread of each, 0 beyond the rim; passed: root of the power that faces let through; away_um: path to the
-    window's centre less that along the normal. aside: (nodes,) p - p0 along x and along y; middle: (x, y) of p0, the
-    middle of the pupil. slope, curvature: :func:`bending` there.
+    width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed: root of the power that faces let
+    through; away_um: path to the window's centre less that along the normal. aside: (nodes,) p - p0 along x and along
+    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`bending` there.
     """
 
     x_um: Tensor
     y_um: Tensor
+    width_um: Tensor
     whole: Tensor
     passed: Tensor
     away_um: Tensor
@@ -72,7 +73,18 @@ def rays(
     wide = torch.sqrt(media.spread(after, p))
     inside = ((radius - r) / (wide * width) + 0.5).clamp(0, 1)  # of a node across the rim, as wide as r changes with p
     passed = torch.sqrt(media.passed(after.order, p))
-    return Rays(x, y, inside * wide, passed, media.path(after, p), axis, middle, *bending(after, middle))
+    return Rays(x, y, wide * width, inside * wide, passed, media.path(after, p), axis, middle, *bending(after, middle))
+
+
+@functools.lru_cache(maxsize=KEPT)
+def through_stop(
+    layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float
+) -> Tensor:
+    """(depths, *shape) float32 share of each source's light that passes the stop before the lens at (x, y)."""
+    places = seen.x_um, seen.y_um
+    return torch.stack([layers.lit(tangents, depth, wavelength_um, places, seen.width_um) for depth in depths_um]).to(
+        torch.float32
+    )
 
 
 def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:

@@ -41,6 +41,11 @@ class Pupil:
         return self.wavelength_um * self.nodes / (2 * self.edge)
 
     @property
+    def step_um(self) -> float:
+        """Width of a node on the aperture."""
+        return 2 * self.radius_um / self.nodes
+
+    @property
     def field_step_um(self) -> float:
         """Coarsest sampling of the field: lambda / (2 sin of the rim's angle); of the intensity, half of it."""
         return self.wavelength_um / (2 * self.edge)

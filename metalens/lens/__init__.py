@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from metalens.lens.record import parts as parts
     from metalens.lens.record import save as save
     from metalens.lens.record import streamed as streamed
+    from metalens.lens.stop import Stop as Stop
     from metalens.lens.waves import saddle as saddle
 
 __getattr__, __dir__, __all__ = attach(
@@ -39,6 +40,7 @@ __getattr__, __dir__, __all__ = attach(
         "Media": "media",
         "Neighbours": "neighbours",
         "Pairs": "pairs",
+        "Stop": "stop",
         "check_gaps": "layers",
         "export": "",
         "from_parts": "record",

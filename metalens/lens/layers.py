@@ -1,12 +1,14 @@
-"""What stands before and behind the pillars: plane-parallel films and the medium that fills the rest."""
+"""What stands before and behind the pillars: plane-parallel films, the medium that fills the rest, and a stop."""
 
 import itertools
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 from metalens.cell import Film, Index, Material, index
 from metalens.ground.errors import ConfigError, PropagationError
 from metalens.lens.media import Media
+from metalens.lens.stop import Stop, crossing, lit_um, passed
 
 MOST_ABSORBED = 0.02
 
@@ -18,11 +20,13 @@ class Layers:
     front: between the source and the pillars (a cover glass, the substrate); the rest of the depth is air.
     behind: between the pillars and the sensor (filter, cover glass); the rest of the distance is ``cover``.
     cover: fills the gap behind the pillars; None for the cover of the lens' cell (air where there is none).
+    stop: aperture stop in front, as on the other face of the substrate; None where the lens is its own.
     """
 
     front: tuple[Film, ...] = ()
     behind: tuple[Film, ...] = ()
     cover: Material | None = None
+    stop: Stop | None = None
 
     @property
     def filling(self) -> Material:
@@ -31,7 +35,7 @@ class Layers:
 
     @property
     def plain(self) -> bool:
-        """Whether there is nothing but air."""
+        """Whether light goes through nothing but air; a stop may stand in it."""
         return not self.films and self.filling in ("air", Index(1.0))
 
     @property
@@ -49,6 +53,11 @@ class Layers:
             raise ConfigError(f"layers.cover = {self.cover!r}, but the cell has {cover!r}: leave layers.cover out")
         return replace(self, cover=cover)
 
+    @property
+    def open(self) -> "Layers":
+        """The same without a stop."""
+        return replace(self, stop=None)
+
     def after(self, distance_um: float, wavelength_um: float) -> Media:
         """Media from pillars to sensor, the cover first.
 
@@ -60,6 +69,53 @@ class Layers:
     def before(self, depth_um: float, wavelength_um: float) -> Media:
         """Media from a source at this depth to the pillars, air first."""
         return _media(self.front, "air", depth_um, wavelength_um, "source to lens")
+
+    def from_stop(self, wavelength_um: float) -> Media | None:
+        """Media from the stop to the pillars, the last film first; None where there is no way between them."""
+        left = 0.0 if self.stop is None else self.stop.distance_um
+        found: list[Film] = []
+        for film in reversed(self.front):
+            found.append(replace(film, thickness_um=min(film.thickness_um, left)))
+            left -= found[-1].thickness_um
+        thick = sum(film.thickness_um for film in found)
+        if thick + left == 0:
+            return None
+        return _media(tuple(found), "air", thick + left, wavelength_um, "stop to lens")
+
+    def lit(
+        self,
+        tangents: tuple[float, float],
+        depth_um: float,
+        wavelength_um: float,
+        at_um: tuple[Any, Any],
+        width_um: Any,
+    ) -> Any:
+        """Share of a source's light that passes the stop on its way to places (x, y) of the pillars, 0 to 1.
+
+        Args:
+            tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of the source, inf for collimated
+                light. width_um: of a place, over which the edge is shared out.
+
+        Raises:
+            PropagationError: the source lies behind the stop.
+        """
+        if self.stop is None:
+            return 1.0
+        before, between = self._around_stop(depth_um, wavelength_um)
+        return passed(self.stop, crossing(before, between, tangents, *at_um), width_um)
+
+    def footprint_um(self, depth_um: float, wavelength_um: float) -> float:
+        """Radius of what a source on the axis lights of the pillars' plane; inf without a stop."""
+        return math.inf if self.stop is None else lit_um(self.stop, *self._around_stop(depth_um, wavelength_um))
+
+    def _around_stop(self, depth_um: float, wavelength_um: float) -> tuple[Media | None, Media | None]:
+        if self.stop is not None and depth_um <= self.stop.distance_um:
+            raise PropagationError(
+                f"layers: a source {depth_um:g} um before the pillars lies behind the stop, {self.stop.distance_um:g} "
+                "um before them; need one in front of it"
+            )
+        before = None if math.isinf(depth_um) else self.before(depth_um, wavelength_um)
+        return before, self.from_stop(wavelength_um)
 
     def ghost(self, wavelength_um: float) -> float:
         """Share of the light that goes twice between the two faces that reflect most: the largest ghost image."""

@@ -32,7 +32,7 @@ def defocus_per_um(lens: Lens | Aperture, depth_um: float) -> float:
 
 def blur_um(lens: Lens | Aperture, depth_um: float) -> float:
     """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z - 1/z0|."""
-    return _aperture(lens).radius_um * sensor_reach_um(lens) * abs(defocus_per_um(lens, depth_um))
+    return _lit(lens, _aperture(lens).radius_um) * sensor_reach_um(lens) * abs(defocus_per_um(lens, depth_um))
 
 
 def sensor_reach_um(lens: Lens | Aperture) -> float:
@@ -101,8 +101,13 @@ def _aperture(lens: Lens | Aperture) -> Aperture:
 
 
 def _widest(lens: Lens | Aperture) -> float:
-    """Radius, at least one pitch."""
-    return lens.radius_um if isinstance(lens, Aperture) else max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    """Radius, at least one pitch, of what is lit."""
+    radius = lens.radius_um if isinstance(lens, Aperture) else max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    return _lit(lens, radius)
+
+
+def _lit(lens: Lens | Aperture, radius_um: float) -> float:
+    return min(radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um))
 
 
 def _reduced(lens: Lens | Aperture, depth_um: float) -> float:

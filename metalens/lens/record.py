@@ -217,7 +217,7 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
         arrays |= {f"{group}angle_rad": d.angle_rad}
     if d.length_um is not None:
         arrays |= {f"{group}length_um": d.length_um}
-    if lens.layers.films:
+    if lens.layers.films or lens.layers.stop is not None:
         attributes["layers"] = config.dumps(lens.layers)
     return arrays, attributes
 

@@ -53,7 +53,7 @@ def case(
 
     Raises:
         PropagationError: a length that is not positive, an angle of 90° or more, no depth, an offset that is no pair,
-            films without a gap and rays beyond their critical angle.
+            films without a gap and rays beyond their critical angle, a stop in front.
     """
     step_um, cells = window_of(window_um, samples)
     ax, ay = angles(angle_rad)
@@ -61,6 +61,11 @@ def case(
     depths = _depths(depths_um, offset_um)
     d = sensor_distance_um
     films: dict[str, Any] = {}
+    if layers is not None and layers.stop is not None:
+        raise PropagationError(
+            "layers: a stop is no part of a propagation from the pillars on; put Layers.lit onto their transmission "
+            "and give Layers.open (psf_stack does both)"
+        )
     if layers is not None and not layers.plain and d > 0:
         films = around(layers, float(d), float(wavelength_um))
     meets = [chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i]) for i in (0, 1)]

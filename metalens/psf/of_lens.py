@@ -121,7 +121,7 @@ def paths_um(lens: Lens, view: View, angle_rad: tuple[float, float], source: Sou
     grid = lens.diameters.grid._asdict()
     seen = {name: value for name, value in view.seen.items() if name != "source"} | grid
     about: dict[str, Any] = {"wavelength_um": lens.wavelength_um, "sensor_distance_um": lens.sensor_distance_um}
-    about["layers"] = lens.layers
+    about["layers"] = lens.layers.open
     case = propagate.case(lens.diameters.diameter_um.shape, angle_rad=angle_rad, **seen, **about)
     more = (0, 0) if view.source is None else reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]

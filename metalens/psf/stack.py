@@ -1,6 +1,7 @@
 """PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -59,7 +60,8 @@ def psf_stack(
         tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
         offset_um: (x, y) of the window from the chief ray.
         layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
-            that in air, and what the sensor distance gains is cover.
+            that in air, and what the sensor distance gains is cover. A stop in front shades the pillars as rays go
+            (:mod:`metalens.lens.stop`), of every depth apart: each costs a call.
         source: its size and shape where it is no point; the PSF is then that of a point blurred by the image of the
             source (:mod:`metalens.psf.extended`), its error ``budget.source``.
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
@@ -81,7 +83,8 @@ def psf_stack(
 
     Raises:
         PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window, a
-            tolerance that is not above 0, a window that no method reaches, a source of finite size in um at infinity.
+            tolerance that is not above 0, a window that no method reaches, a source of finite size in um at infinity, a
+            source behind the stop, derivatives in the geometry of a lens with a stop.
 
     A step too coarse for samples of |U|² (:func:`metalens.psf.cells.nyquist_um`) gives the mean over each cell.
 
@@ -90,7 +93,7 @@ def psf_stack(
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     maps, wanted = _among(maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source))
     about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
-    about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers}
+    about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers and layers.open}
     about |= {"depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)), "offset_um": _value(offset_um)}
     several, angles = _directions(angle_rad)
     cases, found = [], []
@@ -98,13 +101,49 @@ def psf_stack(
         seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
-        found.append(direction(maps, _centred(seen, cases[-1]), share.tolist(), wanted, moving))
+        given = _centred(seen, cases[-1]), share.tolist(), wanted, moving
+        found.append(_stopped(maps, given, layers) if layers and layers.stop else _free(maps, given))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
-    given_um2 = torch.stack([row[2] for row in found], -1) * cases[0].area_um2
-    stack = _budgeted(stack, worst, given_um2[..., None] if several else given_um2)
+    power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
+    stack = _budgeted(stack, worst, power * cases[0].area_um2)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
+
+
+_Given = tuple[list[Case], list[float], Wanted, Moving | None]  # cases and weights of the wavelengths of a direction
+_Found = tuple[torch.Tensor, list[Result], torch.Tensor]
+
+
+def _free(maps: tuple[torch.Tensor, torch.Tensor], given: _Given) -> _Found:
+    """:func:`direction`, the sum of squares (…, 1) for all depths alike."""
+    light, results, power = direction(maps, *given)
+    return light, results, power[..., None]
+
+
+def _stopped(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers) -> _Found:
+    """As :func:`_free` behind a stop: its shadow on the pillars is another at every depth, if it lies before them."""
+    cases, weights, wanted, moving = given
+    if moving is not None:
+        raise PropagationError("a stop has no derivatives in the geometry: give numbers")
+    inverse = cases[0].inverse_depths_per_um
+    on_pillars = layers.stop is not None and layers.stop.distance_um == 0
+    parts = []
+    for depths in [inverse] if on_pillars else [(one,) for one in inverse]:
+        seen = [dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases]
+        shadow = torch.stack([torch.from_numpy(_shadow(case, layers)) for case in seen]).to(maps[1])
+        parts.append(_free((maps[0], maps[1] * shadow), (seen, weights, wanted, None)))
+    results = [result for _, found, _ in parts for result in found]
+    return torch.cat([light for light, _, _ in parts], -3), results, torch.cat([power for _, _, power in parts], -1)
+
+
+def _shadow(case: Case, layers: Layers) -> Array:
+    """(y, x) share of the light of a case's first depth that passes the stop on its way to each pillar."""
+    y, x = case.pillars_um
+    inverse = case.inverse_depths_per_um[0]
+    depth = 1 / inverse if inverse else math.inf
+    places = x + 0 * y[:, None], y[:, None] + 0 * x
+    return np.asarray(layers.lit(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2)))
 
 
 def _directions(angle_rad: Any) -> tuple[bool, Any]:

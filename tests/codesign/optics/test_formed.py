@@ -11,12 +11,14 @@ from codesign.batches import flat
 from codesign.optics import formed, stack
 from codesign.optics.lens_errors import LensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig
+from metalens.cell import Film, Index
 from metalens.field.engine import normalised, trial
 from metalens.field.forming import with_psfs
 from metalens.field.plan import spectral
 from metalens.field.subset import term
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, UniformImager
+from metalens.lens import Layers, Stop
 
 SMALL = OpticsConfig(
     aperture_mm=0.3, sensor_distance_mm=2.0, focus_mm=30.0, polynomials=9, depths_mm=(16.0, 30.0), depth_count=6,
@@ -124,6 +126,7 @@ def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
     ("change", "message"),
     [
         ({"image": "uniform", "fwhm_nm": 30.0}, "image of one wavelength"),
+        ({"image": "uniform", "layers": Layers(stop=Stop(100.0, 300.0))}, "no layers"),
         ({"filter_nm": 10.0}, "one wavelength: give fwhm_nm"),
         ({"fwhm_nm": -1.0}, "widths of 0 or more"),
         ({"image_tolerance": 0.0}, "tolerance between 0 and 1"),
@@ -162,3 +165,24 @@ def test_made_lenses_differ_and_lose_light_to_haze():
     assert kept < 0.99
     assert ratio == pytest.approx(kept + (1 - kept) * shadow, rel=0.01)  # of 0.977 in the window, 1 was taken
     assert math.isfinite(made.error)
+
+
+def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
+    """A hole of half the width, nearly on the pillars, sends on a quarter of the light."""
+    glass = (Film(Index(1.45), 300.0),)
+    open_, stopped = (
+        replace(SMALL, polynomials=0, layers=Layers(front=glass, stop=s)) for s in (None, Stop(75.0, 300.0))
+    )
+    none = torch.zeros(0)
+    lit = [stack.stack(s, none).intensity.sum((1, 2)) for s in (open_, stopped)]
+    near = (
+        1 - 300 / 1.45 / (float(stopped.depths_um[0]) - 300 + 300 / 1.45)
+    ) ** -2  # the shadow is wider than the hole
+    assert float(lit[1][0] / lit[0][0]) == pytest.approx(0.25 * near, rel=0.03)  # of the light beyond the window
+    through = [formed.optics_of(s, none) for s in (open_, stopped)]
+    assert [plane.layers.stop for plane in through] == [None, Stop(75.0, 300.0)]
+    assert through[0].wave.focus.layers.front == glass
+    image = formed.imager(stopped, none, FRAME, margin=MARGIN)
+    middle = image.energy[len(image.plan.y_um) // 2, len(image.plan.x_um) // 2]
+    assert float(middle.min()) > 0.85  # of the light on the stop; the rest is bent beyond the window
+    assert float(middle.max()) < 1.02

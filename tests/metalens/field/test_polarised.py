@@ -246,7 +246,7 @@ def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
     near the normal, where s and p are alike to p²."""
     none = torch.zeros(0)
     aside, middle = torch.linspace(-1.4, 1.4, 29, dtype=torch.float64), torch.tensor([0.2, -0.1], dtype=torch.float64)
-    rays = Rays(none, none, none, none, none, aside, middle, none, none)
+    rays = Rays(none, none, none, none, none, none, aside, middle, none, none)
     found = factors(rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True)
     assert torch.isfinite(found.pupils).all()
     signs = torch.tensor(found.signs)[:, None, None]

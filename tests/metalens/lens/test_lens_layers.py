@@ -10,7 +10,7 @@ from metalens.cell.record import Cell, Film, Index
 from metalens.design import Focus, check_focus
 from metalens.ground import store
 from metalens.ground.errors import LensError, PropagationError
-from metalens.lens import Layers
+from metalens.lens import Layers, Stop
 from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45), cover=Index(1.21))
@@ -100,3 +100,19 @@ def test_maps_without_a_focus_are_known(medium):
     assert design.focuses(bent, focus, **about)
     for other in (axicon, flat, hologram, turned(1, flat), turned(3, hyperbolic), turned(1, hyperbolic)):
         assert not design.focuses(other, focus, **about)
+
+
+def test_a_stop_is_kept_in_the_file_and_seen_by_design_and_focus_check(proxy, tmp_path):
+    behind_stop = Layers(front=(Film(Index(1.45), 150.0),), stop=Stop(21.0, 150.0), cover=CELL.cover)
+    focus = Focus(0.85, 200.0, 2000.0, behind_stop)
+    one, quality = made(proxy, focus)
+    lens.save(tmp_path / "stop.h5", one)
+    assert lens.load(tmp_path / "stop.h5").layers == behind_stop
+    lit = 21.0 / (1 - (150 / 1.45) / (1850 + 150 / 1.45))  # similar triangles in reduced distances
+    assert quality.numerical_aperture == pytest.approx(1.21 * np.sin(np.arctan(lit / 200.0)), rel=1e-6)
+    found = check_focus(one)
+    assert found.passed, found.text
+    assert found.resolution_um == pytest.approx(0.85 / (2 * quality.numerical_aperture), rel=1e-6)
+    # coma of the hyperbolic lens grows with the aperture cubed: less of it, a wider field
+    whole = made(proxy, Focus(0.85, 200.0, 2000.0, behind_stop.open))[1]
+    assert quality.field_of_view_rad > 1.5 * whole.field_of_view_rad

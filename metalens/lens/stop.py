@@ -1,0 +1,99 @@
+"""An aperture stop before the pillars, as on the other face of their substrate: which rays pass it.
+
+Through plane-parallel media a ray keeps p = n sin θ. One from a source at s that reaches the pillars at x crosses the
+plane of the stop at
+
+    u = x - f (x - s),    f = bend(between) / bend(before),    bend = Σ t / √(n² - p²)    (:mod:`metalens.lens.media`)
+
+and one of collimated light at u = x - p bend(between): ``before`` are the media from source to pillars, ``between``
+those from stop to pillars. Of a field angle the lens then uses the part that its light falls on, which moves across
+the pillars by the thickness times the slope in the substrate: with it go astigmatism and field curvature.
+
+The shadow of the edge is that of rays. Its ripples, √(λ t / n) wide, are left out: behind a lens in focus they leave
+the irradiance as it is (the far field of a stop has no place), and out of focus they are those of an edge at the lens.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev, polynomial
+
+from metalens.ground.errors import ConfigError
+from metalens.lens import media
+from metalens.lens.media import Media
+
+DEGREE = 8  # of f over the squared way from source to pillars: to rounding up to 45 degrees
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A round hole about the axis.
+
+    radius_um: of the hole. distance_um: from its plane to that of the pillars, through the films in front of them that
+    lie there, the last one at the pillars, and air where they are thinner.
+
+    Raises:
+        ConfigError: a radius that is not above 0, a distance below 0.
+    """
+
+    radius_um: float
+    distance_um: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.radius_um) and self.radius_um > 0 and 0 <= self.distance_um < math.inf):
+            raise ConfigError(
+                f"stop: radius_um = {self.radius_um}, distance_um = {self.distance_um}; need a radius above 0 and a "
+                "distance of 0 or more"
+            )
+
+
+def crossing(
+    before: Media | None, between: Media | None, tangents: tuple[float, float], x: Any, y: Any
+) -> tuple[Any, Any]:
+    """(x, y) in um where the rays that reach the pillars at (x, y) cross the stop; numpy or torch.
+
+    Args:
+        before: media from source to pillars, None for collimated light. between: those from stop to pillars, None
+            where the stop lies on them. tangents: (x, y) of the ray to the middle of the lens, in air.
+    """
+    if between is None:
+        return x, y
+    slope = math.hypot(*tangents)
+    p = slope / math.hypot(1, slope)
+    if before is None:
+        way = float(media.bend(between.layers, p * p)) / math.hypot(1, slope)
+        return x - way * tangents[0], y - way * tangents[1]
+    back = float(media.bend(before.layers, p * p)) / math.hypot(1, slope)
+    dx, dy = x + back * tangents[0], y + back * tangents[1]
+    share = _share(before, between, dx * dx + dy * dy)
+    return x - share * dx, y - share * dy
+
+
+def _share(before: Media, between: Media, away2: Any) -> Any:
+    """f of the heading, of the squared lateral way from source to pillars."""
+    low, high = float(away2.min()), float(away2.max())
+    middle, reach = (low + high) / 2, max((high - low) / 2, 1e-9 * high, 1e-12)
+
+    def exact(u: Any) -> Any:
+        w = media.square(before.layers, middle + reach * u)
+        return media.bend(between.layers, w) / media.bend(before.layers, w)
+
+    powers = chebyshev.cheb2poly(chebyshev.chebinterpolate(exact, DEGREE))
+    return polynomial.polyval((away2 - middle) / reach, powers)
+
+
+def passed(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
+    """Share of light that passes where rays cross the stop at (x, y): 1 inside, 0 outside, over the edge as much of a
+    patch of ``width_um`` as lies inside; numpy or torch."""
+    radius = (at_um[0] * at_um[0] + at_um[1] * at_um[1]) ** 0.5
+    share = (stop.radius_um - radius) / width_um + 0.5
+    return share.clip(0, 1) if isinstance(share, np.ndarray) else share.clamp(0, 1)
+
+
+def lit_um(stop: Stop, before: Media | None, between: Media | None) -> float:
+    """Radius of what a source on the axis lights on the pillars (paraxial)."""
+    if before is None or between is None:
+        return stop.radius_um
+    return stop.radius_um / (1 - between.reduced_um / before.reduced_um)

@@ -1,0 +1,178 @@
+"""Stops on the other face of a substrate, against plane waves through the glass from the stop to the pillars."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from metalens import propagate
+from metalens.cell import Film, Index
+from metalens.design import Focus
+from metalens.field import Optics, SmoothWave, Window
+from metalens.field.points import psfs
+from metalens.ground.errors import ConfigError, PropagationError
+from metalens.lens import Layers, Stop, media
+from metalens.psf import psf_stack
+
+WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
+K = 2 * math.pi / WAVE
+PITCH, COUNT = 0.42, 280
+PLACE = (np.arange(COUNT) - (COUNT - 1) / 2) * PITCH
+X, Y = np.meshgrid(PLACE, PLACE)
+LEVEL = (np.hypot(X, Y) <= 58.0).astype(float)
+PHASE = -K * (np.sqrt(X**2 + Y**2 + SENSOR**2) - SENSOR) + 2.6 * (X / 62) ** 3
+STOP, THICK = 33.0, 80.0
+LAYERS = Layers(front=(Film(Index(GLASS), THICK),), stop=Stop(STOP, THICK))
+WINDOW = {"window_um": 41.0, "samples": 41}
+
+
+def _on_the_pillars(angle: tuple[float, float], depth_um: float) -> np.ndarray:
+    """(y, x) field before the pillars: the source's wave through the hole, its plane waves through glass."""
+    fine, count = PITCH / 2, 1280
+    place = (np.arange(count) - count // 2) * fine + PITCH / 2  # every second one is a pillar
+    x, y = np.meshgrid(place, place)
+    tx, ty = (math.tan(a) for a in angle)
+    slope = math.hypot(tx, ty)
+    sine = slope / math.hypot(1, slope)
+    if math.isinf(depth_um):
+        wave = np.exp(1j * K / math.hypot(1, slope) * (tx * x + ty * y))
+    else:  # Snell: the ray to the middle of the lens, back through glass and air
+        gap = depth_um - THICK
+        back = gap * slope + THICK * sine / math.sqrt(GLASS**2 - sine**2)
+        sx, sy = (-back * t / slope for t in (tx, ty)) if slope else (0.0, 0.0)
+        way = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + gap**2)
+        wave = np.exp(1j * K * way) / way
+    wave = wave * np.clip((STOP - np.hypot(x, y)) / fine + 0.5, 0, 1)
+    f = np.fft.fftfreq(count, fine)
+    along = np.sqrt((GLASS / WAVE) ** 2 - f**2 - f[:, None] ** 2 + 0j)
+    behind = np.fft.ifft2(np.fft.fft2(wave) * np.exp(2j * np.pi * along * THICK))
+    first = count // 2 - COUNT
+    return behind[first : first + 2 * COUNT : 2, first : first + 2 * COUNT : 2]
+
+
+def _summed(angle: tuple[float, float], depth_um: float) -> np.ndarray:
+    """(y, x) irradiance on every fourth row and second column of the window, of sum 1, by a plain sum over pillars."""
+    light = (_on_the_pillars(angle, depth_um) * LEVEL * np.exp(1j * PHASE))[LEVEL > 0]
+    x, y = X[LEVEL > 0], Y[LEVEL > 0]
+    across, down = np.arange(41)[::2] - 20.0, np.arange(41)[::4] - 20.0
+    out = np.empty((11, 21))
+    for row, below in enumerate(down):
+        dx, dy = (SENSOR * math.tan(angle[0]) + across)[:, None] - x, SENSOR * math.tan(angle[1]) + below - y
+        r = np.sqrt(dx * dx + dy * dy + SENSOR**2)
+        out[row] = np.abs((light * np.exp(1j * K * r) / r**2).sum(1)) ** 2
+    return out / out.sum()
+
+
+def _seen(angle: tuple[float, float], depth_um: float, layers: Layers) -> np.ndarray:
+    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "depths_um": [depth_um]}
+    found = psf_stack(PHASE, LEVEL, layers=layers, angle_rad=angle, integrate=False, **about, **WINDOW)
+    light = found.intensity[0, ::4, ::2]
+    return light / light.sum()
+
+
+def _apart(got: np.ndarray, want: np.ndarray) -> float:
+    return float(np.linalg.norm(got - want) / np.linalg.norm(want))
+
+
+# What is left out, ripples of the shadow, grows with thickness / index times the vergence out of focus: nothing in
+# focus; for the second, 80 / 1.45 / 3000 = 0.018 of the PSF. Steep light bends more than paraxially at the edge.
+@pytest.mark.parametrize(
+    ("angle", "depth_um", "most"),
+    [((0.0, 0.0), math.inf, 2e-3), ((0.12, -0.07), math.inf, 4e-3), ((0.35, 0.1), math.inf, 2e-2),
+     ((0.12, -0.07), 3000.0, 3e-2)],
+)  # fmt: skip
+def test_psf_behind_a_stop_is_that_of_waves_through_its_glass(
+    angle: tuple[float, float], depth_um: float, most: float
+) -> None:
+    want = _summed(angle, depth_um)
+    assert _apart(_seen(angle, depth_um, LAYERS), want) < most
+    on_pillars = replace(LAYERS, stop=Stop(STOP))  # the same hole there: other light where there is an angle
+    assert _apart(_seen(angle, depth_um, on_pillars), want) > 3 * most or angle == (0.0, 0.0)
+
+
+def test_depths_behind_a_stop_are_each_as_alone() -> None:
+    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "layers": LAYERS, **WINDOW}
+    all_ = psf_stack(PHASE, LEVEL, depths_um=[900.0, 2500.0], angle_rad=[[0.1, -0.05], [0.0, 0.2]], **about)
+    for i, depth in enumerate((900.0, 2500.0)):
+        one = psf_stack(PHASE, LEVEL, depths_um=[depth], angle_rad=(0.0, 0.2), **about)
+        np.testing.assert_array_equal(all_.intensity[1, i], one.intensity[0])
+        assert all_.energy_um2[1, i] == one.energy_um2[0]
+
+
+def test_rays_cross_the_stop_where_snell_has_them() -> None:
+    """A ray is followed forwards: from the source to a place of the stop, and on through glass to the pillars."""
+    layers = Layers(front=(Film(Index(1.3), 50.0), Film(Index(1.7), 120.0)), stop=Stop(300.0, 150.0))
+    depth, p = 2000.0, np.array([0.11, 0.31])
+    # from the stop: 120 um of 1.7 and 30 um of 1.3; from the source 20 um of 1.3 and air before
+    glass = sum(t * p / np.sqrt(n * n - p * p) for n, t in ((1.7, 120.0), (1.3, 30.0)))
+    before = glass + 20.0 * p / np.sqrt(1.3**2 - p * p) + (depth - 170.0) * p / np.sqrt(1 - p * p)
+    tangents = (0.2, 0.0)
+    sine = 0.2 / math.hypot(1, 0.2)
+    source = -float(media.reach(layers.before(depth, WAVE), sine))
+    x, u = source + before, source + before - glass
+    hole = replace(layers, stop=Stop(float(u[1]), 150.0))  # its edge where the second ray crosses
+    share = hole.lit(tangents, depth, WAVE, (x, np.zeros(2)), 1e-3)
+    assert share[0] == 1.0
+    assert share[1] == pytest.approx(0.5, abs=1e-3)  # 1e-6 um of 1e-3
+
+
+def test_image_engine_and_every_pillar_see_the_same_stop() -> None:
+    """PSFs by rays of a smooth wave against sums over pillars; 1.6e-2 is what both differ by without a stop as well."""
+    layers = Layers(front=(Film(Index(GLASS), 160.0),), stop=Stop(70.0, 160.0))
+    radius, pitch, step, fine = 130.0, 0.45, 3.0, 7
+    place = (np.arange(579) - 289) * pitch
+    x, y = np.meshgrid(place, place)
+
+    def bent(across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+        return 2.0 * (across / radius) ** 3 + 1.5 * (down / radius) ** 2 * (across / radius)
+
+    wave = SmoothWave(Focus(WAVE, 500.0, 6000.0, layers), radius, bent)
+    spots = torch.from_numpy(x), torch.from_numpy(y)
+    phase = (wave.carrier_rad(*spots) + bent(*spots)).numpy()
+    level = (np.hypot(x, y) <= radius).astype(float)
+    points = (np.arange(22 * fine) - (22 * fine - 1) / 2) / fine
+    triangles = np.maximum(1 - np.abs(points - (np.arange(21) - 10)[:, None]), 0)
+    for at, depth in (((0.0, 0.0), 2500.0), ((140.0, 50.0), math.inf)):
+        where = {"depths_um": torch.tensor([depth], dtype=torch.float64), "wavelength_um": WAVE}
+        window = Window(21, step, curved=True)
+        got = psfs(Optics(wave, layers, 500.0), torch.tensor([at], dtype=torch.float64), **where, window=window)
+        light = got[0, 0].double().numpy()
+        stack = psf_stack(
+            phase, level, pitch_um=pitch, wavelength_um=WAVE, sensor_distance_um=500.0, depths_um=[depth],
+            angle_rad=[math.atan(a / 500.0) for a in at], window_um=22 * step, samples=22 * fine, tolerance=3e-4,
+            layers=layers, integrate=False,
+        )  # fmt: skip
+        want = triangles @ stack.intensity[0] @ triangles.T
+        assert _apart(light / light.sum(), want / want.sum()) < 2e-2
+        # the light on the stop is the whole: 3 % are bent beyond 63 um, faces take nothing here
+        assert light.sum() == pytest.approx(1.0, abs=0.05)
+        assert stack.energy_um2[0] == pytest.approx(math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03)
+
+
+def test_light_that_the_stop_sends_beside_the_lens_is_lost() -> None:
+    """At 45 degrees of 80 um glass light lands 80 tan(asin(sin 45° / 1.45)) = 44.7 um aside, half beyond the rim."""
+    angle = (math.radians(45.0), 0.0)
+    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, **WINDOW}
+    seen = psf_stack(0 * PHASE, LEVEL, layers=LAYERS, angle_rad=angle, depths_um=[math.inf], **about)
+    aside = THICK * math.tan(math.asin(math.sin(angle[0]) / GLASS))
+    share = float(((np.hypot(X - aside, Y) <= STOP) & (LEVEL > 0)).sum() * PITCH**2)
+    assert seen.budget is not None
+    whole = seen.energy_um2[0] / (1 - seen.budget.outside)
+    assert whole == pytest.approx(share, rel=5e-3)  # of cells at the edge
+
+
+def test_stops_that_cannot_be_are_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match="radius above 0"):
+        Stop(0.0, 10.0)
+    with pytest.raises(ConfigError, match="distance of 0 or more"):
+        Stop(5.0, -1.0)
+    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, **WINDOW}
+    with pytest.raises(PropagationError, match="behind the stop"):
+        psf_stack(PHASE, LEVEL, depths_um=[80.0], layers=LAYERS, **about)
+    with pytest.raises(PropagationError, match=r"put Layers\.lit onto"):
+        propagate.case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
+    moving = torch.tensor(400.0, requires_grad=True)
+    with pytest.raises(PropagationError, match="no derivatives in the geometry"):
+        psf_stack(PHASE, LEVEL, depths_um=[900.0], layers=LAYERS, **about | {"sensor_distance_um": moving})
