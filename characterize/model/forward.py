@@ -67,8 +67,8 @@ class ForwardModel:
     def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
         if not lens.layers.plain or lens.layers.stop is not None:
             raise FitError(
-                f"the lens has layers ({len(lens.layers.films)} films, cover {lens.layers.filling}, {lens.layers.stop}), "
-                "the model of the fit has air alone: fit a lens that has no layers; its distance is then that in air"
+                f"the lens has layers ({len(lens.layers.films)} films, cover {lens.layers.filling}, {lens.layers.stop})"
+                ", the model of the fit has air alone: fit a lens that has no layers; its distance is then that in air"
             )
         self.lens, self.setting = lens, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))

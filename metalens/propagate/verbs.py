@@ -60,14 +60,7 @@ def case(
     tangents = float(np.tan(ax)), float(np.tan(ay))
     depths = _depths(depths_um, offset_um)
     d = sensor_distance_um
-    films: dict[str, Any] = {}
-    if layers is not None and layers.stop is not None:
-        raise PropagationError(
-            "layers: a stop is no part of a propagation from the pillars on; put Layers.lit onto their transmission "
-            "and give Layers.open (psf_stack does both)"
-        )
-    if layers is not None and not layers.plain and d > 0:
-        films = around(layers, float(d), float(wavelength_um))
+    films = _films(layers, float(d), float(wavelength_um))
     meets = [chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i]) for i in (0, 1)]
     made = Case(
         shape=(int(shape[-2]), int(shape[-1])),
@@ -85,6 +78,18 @@ def case(
     )
     _check_rays(made)
     return made
+
+
+def _films(layers: Layers | None, sensor_distance_um: float, wavelength_um: float) -> dict[str, Any]:
+    """What films add to a case."""
+    if layers is not None and layers.stop is not None:
+        raise PropagationError(
+            "layers: a stop is no part of a propagation from the pillars on; put Layers.lit onto their transmission "
+            "and give Layers.open (psf_stack does both)"
+        )
+    if layers is None or layers.plain or not sensor_distance_um > 0:
+        return {}
+    return around(layers, sensor_distance_um, wavelength_um)
 
 
 def _check_rays(case: Case) -> None:

@@ -101,8 +101,7 @@ def psf_stack(
         seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
-        given = _centred(seen, cases[-1]), share.tolist(), wanted, moving
-        found.append(_stopped(maps, given, layers) if layers and layers.stop else _free(maps, given))
+        found.append(_seen(maps, (_centred(seen, cases[-1]), share.tolist(), wanted, moving), layers))
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
     worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
@@ -113,6 +112,10 @@ def psf_stack(
 
 _Given = tuple[list[Case], list[float], Wanted, Moving | None]  # cases and weights of the wavelengths of a direction
 _Found = tuple[torch.Tensor, list[Result], torch.Tensor]
+
+
+def _seen(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None) -> _Found:
+    return _free(maps, given) if layers is None or layers.stop is None else _stopped(maps, given, layers)
 
 
 def _free(maps: tuple[torch.Tensor, torch.Tensor], given: _Given) -> _Found:
