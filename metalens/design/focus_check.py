@@ -94,7 +94,7 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
 def _lit(lens: Lens) -> Any:
     """(y, x) share of the design source's light that passes the stop in front of every pillar; 1 without one."""
     d = lens.diameters
-    places = d.x_um + 0 * d.y_um[:, None], d.y_um[:, None] + 0 * d.x_um
+    places = d.x_um, d.y_um[:, None]
     return lens.layers.lit((0.0, 0.0), lens.source_distance_um, lens.wavelength_um, places, d.pitch_um)
 
 

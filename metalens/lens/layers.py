@@ -94,7 +94,7 @@ class Layers:
 
         Args:
             tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of the source, inf for collimated
-                light. width_um: of a place, over which the edge is shared out.
+                light. at_um: x and y, broadcast. width_um: of a place, over which the edge is shared out.
 
         Raises:
             PropagationError: the source lies behind the stop.

@@ -145,7 +145,7 @@ def _shadow(case: Case, layers: Layers) -> Array:
     y, x = case.pillars_um
     inverse = case.inverse_depths_per_um[0]
     depth = 1 / inverse if inverse else math.inf
-    places = x + 0 * y[:, None], y[:, None] + 0 * x
+    places = x, y[:, None]
     return np.asarray(layers.lit(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2)))
 
 
