@@ -117,11 +117,25 @@ def test_masks_are_averaged_over_cells_and_interpolated_between_them():
         assert got.numpy() == pytest.approx(want, rel=1e-6)
 
 
+@pytest.mark.parametrize("wide", [1.3, 0.7])
+def test_a_frame_holds_the_share_of_its_cells_that_the_mask_covers(wide):
+    """Cells of 0.7 or 1.3 of the mask's about one middle: each the integral of the mask over it, by fine points."""
+    mask, fine = RNG.uniform(0, 1, (2, 5, 5)), 2000
+    place = np.floor(((np.arange(5 * fine) + 0.5) / fine - 2.5) * wide + 2.5).astype(int)
+    inside = (place >= 0) & (place < 5)
+    share = np.zeros((5, 5))
+    np.add.at(share, (np.repeat(np.arange(5), fine)[inside], place[inside]), 1 / fine)
+    got = losses.framed(torch.from_numpy(mask), wide).numpy()
+    assert got == pytest.approx(share @ mask @ share.T, abs=2e-3)  # half a point at each of some edges
+
+
 def test_masks_overlap_by_what_both_hold():
     """Threshold 0 of logits and a half of coverage: 2 of 4 pixels, none of 3, nothing at all, and no mask."""
     logits = torch.tensor([[[3.0, 0.1, 2.0], [-1, -2, -0.1]], [[1.0, 1, -1], [-1, -1, -1]], [[-1.0] * 3] * 2])
     mask = torch.tensor([[[0.9, 0.51, 0.4], [0.6, 0.2, 0.1]], [[0.1, 0.0, 0.8], [0.3, 0.3, 0.3]], [[0.5] * 3] * 2])
     assert losses.overlap(logits, mask).tolist() == pytest.approx([2 / 4, 0.0, 1.0])
+    assert losses.overlap(logits[:1], mask[1:2] * 0 + (logits[:1] == 0.1)).tolist() == pytest.approx([1 / 3])
+    assert losses.overlap(logits[2:], mask[1:2]).tolist() == [0.0]  # one pixel missed is not nothing at all
     told = losses.overlap(torch.zeros(3, 0, 0), mask)
     assert told.shape == (3,)
     assert torch.isnan(told).all()

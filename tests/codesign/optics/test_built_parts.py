@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
@@ -14,6 +15,7 @@ import made_lens as m
 from characterize.model.parameters import NAMES, vector
 from codesign.optics import built
 from metalens.image import Pupil, coordinates
+from metalens.lens import DiameterMap
 
 GATHER = getattr(built._gather, "py_func", built._gather)  # as written: a place beyond the table is an error
 
@@ -98,6 +100,56 @@ def test_a_wave_of_another_distance_is_the_design_s_defocused():
     assert np.array_equal(inside, np.abs(moved) > 0)
     assert (r[inside] < 62).all()
     assert inside.sum() == pytest.approx(math.pi / 4 * inside.size, rel=0.05)  # nodes across the aperture
+    assert abs(plain.sum()) > 0.97 * np.abs(plain).sum()  # of the design itself all focusing phase is off
     paths = np.hypot(r, 307.0) - 307.0 - np.hypot(r, 300.0) + 300.0
     turned = plain[inside] * np.exp(2j * np.pi / 0.85 * paths[inside])
     assert moved[inside] == pytest.approx(turned, abs=1e-6)
+
+
+def oblong():
+    """A lens of 31 x 20 um whose pillars stand on half of it, and its cells of 6 pillars: 13 x 9."""
+    sizes = np.random.default_rng(6).uniform(0.1, 0.3, (51, 78))
+    sizes[:, :40] = 0.0
+    sizes[20:30, :3] = 0.2
+    lens = dataclasses.replace(m.small(), diameters=DiameterMap(sizes, 0.4))
+    return built.MadeLens(lens, m.OPTICS)
+
+
+CELL_Y, CELL_X = (np.arange(9)[:, None] * 6 + 2.5 - 25.0) * 0.4, (np.arange(13) * 6 + 2.5 - 38.5) * 0.4
+
+
+def test_nodes_take_what_lies_straight_between_the_middles_of_cells():
+    """A field that grows evenly comes out as it is at any place; beyond the last middles as there."""
+    cells = (3 + 0.2 * CELL_X - 0.1 * CELL_Y) + 1j * (2 - 0.3 * CELL_X + 0.7 * CELL_Y)
+    y, x = np.array([[-8.7, 0.4], [3.3, 9.1]]), np.array([[-13.0, 11.2], [2.9, -0.4]])
+    got = oblong()._on_nodes(cells, x, y)
+    assert got == pytest.approx((3 + 0.2 * x - 0.1 * y) + 1j * (2 - 0.3 * x + 0.7 * y), abs=1e-12)
+    assert oblong()._on_nodes(cells, np.array([99.0]), np.array([-99.0])) == pytest.approx(cells[:1, -1], abs=1e-12)
+
+
+def test_the_lens_plane_lies_on_its_cells_and_bends_as_the_lens_was_bent():
+    """The same evenly growing field, now at rays; coma along x of 0.3 rad rms: 0.3 √8 (3 r³ - 2 r) cos."""
+    lens, known = oblong(), vector({"coma_x_rad": 0.3})
+    cells = (3 + 0.2 * CELL_X - 0.1 * CELL_Y) + 1j * (2 - 0.3 * CELL_X + 0.7 * CELL_Y)
+    rim = lens.design.diameters.radius_um
+    assert rim == pytest.approx(0.4 * math.hypot(25.0, 38.5))
+    y, x = torch.tensor([-8.7, 3.3, 0.9]).double(), torch.tensor([-13.0, 2.9, 9.4]).double()
+    u, v = x.numpy() / rim, y.numpy() / rim
+    want = (3 + 0.2 * x - 0.1 * y) + 1j * (2 - 0.3 * x + 0.7 * y)
+    flat = lens._plane(vector(), cells)
+    assert flat.added_rad is None
+    assert flat.radius_um == pytest.approx(rim + 0.2)
+    assert flat.factor(x, y, 0.85, 0.0).numpy() == pytest.approx(want.numpy(), abs=2e-6)
+    bent = np.exp(0.3j * math.sqrt(8) * (3 * (u**2 + v**2) - 2) * u)
+    assert lens._plane(known, cells).factor(x, y, 0.85, 0.0).numpy() == pytest.approx(want.numpy() * bent, abs=3e-6)
+    assert lens._plane(known, np.where(np.abs(cells) > 0, cells, 0)).half_um == pytest.approx((13 * 1.2, 9 * 1.2))
+
+
+def test_every_row_of_a_lens_has_the_phase_of_its_focus_off():
+    """Rows are taken 128 at a time; here 301: exp(-i phase) with -k (√(r² + d²) + √(r² + s²)) on them all."""
+    lens = built.MadeLens(m.small(), m.OPTICS)
+    d = lens.design.diameters
+    r2 = d.x_um**2 + d.y_um[:, None] ** 2
+    path = np.sqrt(r2 + 300.0**2) - 300.0 + np.sqrt(r2 + 3000.0**2) - 3000.0
+    turn = lens._carrier * np.exp(-2j * np.pi / 0.85 * path)
+    assert turn == pytest.approx(np.full(turn.shape, turn[150, 150]), abs=2e-4)  # complex64 of some 100 rad
