@@ -1,7 +1,6 @@
 """The PSF record: normalisation, angles, wavelengths, files, pixels, metrics; answers in closed form."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import propagate, psf
-from metalens.ground.errors import MaterialError, PropagationError, StoreError
+from metalens.ground.errors import PropagationError, StoreError
 from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
@@ -162,74 +161,6 @@ def test_axial_information_under_each_named_normalisation():
         psf_metrics.axial_information(dataclasses.replace(stack, depths_um=np.array([1.0, 1.0])), normalisation="sum")
 
 
-def test_gauss_rule_is_exact_for_polynomials_under_the_weight():
-    """Eigenvalues and first components are rounded to eps times the matrix and its size, and a moment of order n moves
-    by n times that: of a span of the line, to the power n."""
-    um, share = spectrum.weight(spectrum.Source(850.0, 30.0))
-    assert share.sum() == pytest.approx(1)
-    reach = np.abs(um - 0.85).max()
-    for count in (1, 2, 5):
-        x, w = spectrum.gauss(um, share, count)
-        for power in range(2 * count):
-            budget = 1e-14 * count * max(power, 1) * max(1.0, 0.85 / reach) * reach**power
-            found, want = ((v * (t - 0.85) ** power).sum() for t, v in ((x, w), (um, share)))
-            assert found == pytest.approx(want, rel=0, abs=budget)
-        assert (w > 0).all()
-
-
-def test_diode_line_has_its_peak_and_width():
-    um, share = spectrum.weight(spectrum.Source(850.0, 30.0, silicon_um=1e6))  # thick silicon: flat response times λ
-    line = share / um
-    half = um[line >= line.max() / 2]
-    assert (half[0] + half[-1]) / 2 == pytest.approx(0.85, abs=3e-4)
-    assert half[-1] - half[0] == pytest.approx(0.03, abs=6e-4)
-    thin = spectrum.weight(spectrum.Source(850.0, 30.0))[1]
-    assert (thin * um).sum() < (share * um).sum()  # thin silicon sees less of the red side
-
-
-@pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(633.4, 0.1), (940.0, 1e-3), (850.3, 2.3)])
-def test_a_narrow_line_keeps_its_peak_and_width(peak_nm, fwhm_nm):
-    """Cut at 2.5 FWHM a Gaussian loses 4e-9; silicon, below 2 % a nm, moves the mean by that times its variance."""
-    um, share = spectrum.weight(spectrum.Source(peak_nm, fwhm_nm))
-    mean = (um * share).sum() * 1e3
-    sigma = fwhm_nm / math.sqrt(8 * math.log(2))
-    assert mean == pytest.approx(peak_nm, abs=0.02 * sigma**2 + 1e-9)
-    assert math.sqrt(((um * 1e3 - mean) ** 2 * share).sum()) == pytest.approx(sigma, rel=2e-4)
-
-
-@pytest.mark.parametrize("fwhm_nm", [1e-300, 9.9e-4])
-def test_a_line_narrower_than_any_lens_resolves_is_refused(fwhm_nm):
-    with pytest.raises(PropagationError, match=rf"fwhm_nm={fwhm_nm}.* one wavelength"):
-        spectrum.Source(850.0, fwhm_nm)
-
-
-def test_the_narrowest_line_is_one_wavelength_to_a_lens_of_a_millimetre():
-    """Of 1 mm of path the contrast is 1 - (pi path width / wavelength²)² / (4 ln 2) = 1 - 6.8e-6."""
-    found = spectrum.nodes(spectrum.Source(850.0, 1e-3), path_um=1e3, tolerance=1e-5)
-    assert found.wavelengths_um == pytest.approx([0.85], abs=1e-8)
-    turn = math.pi * 1e3 * 1e-6 / 0.85**2
-    assert found.error == pytest.approx(turn**2 / (4 * math.log(2)), rel=0.02)
-
-
-@pytest.mark.parametrize(("fwhm_nm", "word"), [(250.0, "Si at 0.225 um"), (1e9, "wavelength")])
-def test_a_line_beyond_the_data_of_silicon_is_refused(fwhm_nm, word):
-    with pytest.raises(MaterialError, match=word):
-        spectrum.weight(spectrum.Source(850.0, fwhm_nm))
-
-
-def test_as_many_wavelengths_as_the_tolerance_needs():
-    source = spectrum.Source(850.0, 30.0)
-    few, more = (spectrum.nodes(source, path_um=10.0, tolerance=t) for t in (1e-2, 1e-5))
-    assert len(few.weights) < len(more.weights)
-    um, share = spectrum.weight(source)
-    for found, tolerance in ((few, 1e-2), (more, 1e-5)):
-        for path in (0.0, 3.3, 10.0):
-            want = np.exp(2j * np.pi * path / um) @ share
-            assert abs(np.exp(2j * np.pi * path / found.wavelengths_um) @ found.weights - want) <= tolerance
-    with pytest.raises(PropagationError, match="wavelengths needed"):
-        spectrum.nodes(source, path_um=3000.0, tolerance=1e-6)
-
-
 def test_polychromatic_psf_converges_with_the_nodes():
     phase, level = focus(96, wavelength=0.85)
     path = np.hypot(19.0, 120.0) - 120.0 + np.hypot(19.0, 1000.0) - 1000.0
@@ -244,30 +175,6 @@ def test_polychromatic_psf_converges_with_the_nodes():
     errors = [np.linalg.norm(r - results[-1]) / np.linalg.norm(results[-1]) for r in results[:2]]
     assert errors[0] < 1e-2
     assert errors[1] < 1e-3
-
-
-def test_thin_silicon_sees_what_its_absorption_leaves():
-    """17 um of silicon at 800 and 900 nm, half-width either side of the peak: 850 and 306 per cm (Green 2008)."""
-    um, share = spectrum.weight(spectrum.Source(850.0, 100.0, silicon_um=17.0))
-    blue, red = (float(np.interp(w, um, share)) for w in (0.8, 0.9))
-    seen = [w * (1 - np.exp(-a * 17e-4)) for w, a in ((0.8, 850.0), (0.9, 306.0))]
-    assert blue / red == pytest.approx(seen[0] / seen[1], rel=0.04)  # tables of silicon differ by 3 %
-    middle = float(np.interp(0.85, um, share)) / (0.85 * (1 - np.exp(-535.0 * 17e-4)))
-    assert blue / seen[0] / middle == pytest.approx(0.5, rel=0.04)  # full width at half maximum
-
-
-def test_error_of_the_nodes_is_the_worst_over_the_paths():
-    source = spectrum.Source(850.0, 42.0)
-    um, share = spectrum.weight(source)
-    found = spectrum.nodes(source, path_um=17.0, tolerance=3e-3)
-    paths = np.linspace(0, 17.0, 400)[:, None]
-    worst = np.abs(
-        np.exp(2j * np.pi * paths / found.wavelengths_um) @ found.weights - np.exp(2j * np.pi * paths / um) @ share
-    )
-    assert found.error == pytest.approx(worst.max(), rel=0.02)  # the largest is at the longest path, or near
-    fewer = spectrum.gauss(um, share, len(found.weights) - 1)
-    missed = np.exp(2j * np.pi * paths / fewer[0]) @ fewer[1] - np.exp(2j * np.pi * paths / um) @ share
-    assert np.abs(missed).max() > 3e-3  # no wavelength more than needed
 
 
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
