@@ -182,9 +182,9 @@ def _call(node: ast.Call) -> Iterator[tuple[str, str]]:
 
 def _replaced(node: ast.Call, at: int) -> str:
     axis = ast.literal_eval(node.keywords[at].value)
-    other = {0: 1, 1: 0, -1: -2, -2: -1}.get(axis, 0)
+    other = {0: 1, 1: 0, -1: -2, -2: -1, "x": "y", "y": "x"}.get(axis, 0)
     words = [ast.unparse(a) for a in node.args]
-    words += [f"{k.arg}={other}" if i == at else ast.unparse(k) for i, k in enumerate(node.keywords)]
+    words += [f"{k.arg}={other!r}" if i == at else ast.unparse(k) for i, k in enumerate(node.keywords)]
     return f"{ast.unparse(node.func)}({', '.join(words)})"
 
 

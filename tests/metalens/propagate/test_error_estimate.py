@@ -79,3 +79,34 @@ def test_products_of_sums_are_taken_over_pairs_of_unlike_draws():
     even = np.array([[0.02, 0.02 / 3, 0.02 * 0.8]]) * 15  # δ as the light itself: nothing is wrong but the floor
     level = 0.03 * np.mean(even[0] ** 2 / chance[0])
     assert estimate.square_error(value, points, chance, even) >= level * (1 - 1e-12)
+
+
+@pytest.mark.parametrize(("count", "drawn"), [(90, 45), (6, 8)])
+def test_draws_go_by_the_light_by_its_root_at_the_edges_and_by_what_lies_near(count, drawn):
+    """A third each, of every depth for itself; eight points of a depth at least."""
+    value = light(3, depths=2)[0]
+    rng = np.random.default_rng(8)
+    edges, near = rng.uniform(1, 10, value.shape[1]), rng.uniform(0, 1, value.shape[1])
+    points, chance = estimate.draw(value, estimate.scan(SHAPE), count, edges, near)
+    assert points.shape == (2, drawn)
+    for row, at, told in zip(value, points, chance, strict=True):
+        root = np.sqrt(row) * edges
+        density = (row + root / root.sum() + near / near.sum()) / 3
+        assert told == pytest.approx(density[at], rel=1e-12)
+        assert np.abs(np.bincount(at, minlength=len(row)) - drawn * density).max() < 1 + 1e-9
+    plain = estimate.draw(value, estimate.scan(SHAPE), 2 * value.shape[1] - 2)[1]
+    assert plain.shape == (2, value.shape[1] - 1)  # one less than all
+
+
+def test_parts_of_a_window_lie_one_after_the_other_and_have_neighbours_of_their_own():
+    """Means of 9 x 9 pixels, mirrored at the ends of each part."""
+    shapes, rng = [(5, 12), (11, 3)], np.random.default_rng(9)
+    mean = rng.uniform(0, 1, 60 + 33)
+    want = []
+    for part, (rows, columns) in zip((mean[:60], mean[60:]), shapes, strict=True):
+        around = np.pad(part.reshape(rows, columns), 4, mode="symmetric")
+        want += [around[i : i + 9, j : j + 9].mean() for i in range(rows) for j in range(columns)]
+    assert estimate._near(mean, shapes) == pytest.approx(np.array(want), rel=1e-12)
+    order = estimate._orders([(3, 5, 12), (3, 11, 3)])
+    assert order[:60].tolist() == estimate.scan((5, 12)).tolist()
+    assert order[60:].tolist() == (60 + estimate.scan((11, 3))).tolist()
