@@ -1,9 +1,12 @@
 """The loss by which fits from several starts are compared is the one that each of them lowers."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import special
 
+from characterize.inference import leastsquares
 from characterize.inference.leastsquares import Data, Prior, Settings, fit, invert
 
 
@@ -131,3 +134,41 @@ def test_longer_steps_bring_slopes_up_to_date():
     want = (np.exp(end) - np.exp(begin)) / (end - begin)
     assert end - begin > 0.1 * 0.012
     assert found.slopes[0] == pytest.approx(want * shape, rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.029, 0.031, 1.7])
+def test_a_jacobian_brought_up_to_date_explains_the_step_and_keeps_what_lies_across(size):
+    """Of all that give the images' change for the step, the one that changes nothing for steps at right angles to it in
+    the measure of the curvature; steps below 0.03 sigma teach nothing."""
+    rng = np.random.default_rng(12)
+    before = rng.normal(size=(3, 2, 4, 5))
+    image, later = rng.normal(40, 3, (2, 2, 4, 5))
+    usable = rng.uniform(size=image.shape) > 0.2
+    data = Data(image + 1.3, usable, np.zeros_like(usable), np.full(image.shape, 2.1**2), np.full(image.shape, 1.7))
+    wide = np.full(3, np.inf)
+    prior, x = Prior(np.zeros(3), np.array([0.3, np.inf, 2.0]), -wide, wide), np.array([0.2, -1.0, 3.0])
+    state = leastsquares._state(data, (x, image, before), prior, Settings(), travel=0.4)
+    step = rng.normal(size=3)
+    step *= size / np.sqrt(step @ state.curvature @ step)
+    found = leastsquares._secant(data, state, step, later, prior, Settings(), moved=size)
+    assert found.x == pytest.approx(x + step)
+    assert found.travel == pytest.approx(0.4 + size)
+    assert np.array_equal(found.image, later)
+    if size < 0.03:
+        assert np.array_equal(found.jacobian, before)
+        return
+    assert np.tensordot(step, found.jacobian, 1) == pytest.approx(later - image, abs=1e-9)
+    for other in np.eye(3):
+        across = other - step * (step @ state.curvature @ other) / size**2
+        assert np.tensordot(across, found.jacobian - before, 1) == pytest.approx(np.zeros_like(image), abs=1e-9)
+
+
+def test_what_a_jacobian_did_not_foresee_is_a_share_of_the_change_in_sigma_of_pixels_that_count():
+    """A change of 5 in one pixel foreseen as 2, of 3 in another foreseen whole, and one in a masked pixel."""
+    image, slopes = np.array([[[10.0, 20.0, 30.0]]]), np.array([[[[1.0, 1.5, 9.0]]]])
+    usable = np.array([[[True, True, False]]])
+    data = Data(image, usable, ~usable & False, np.array([[[2.0, 3.0, 1.0]]]) ** 2, np.full((1, 1, 3), 1e30))
+    free = Prior.none(np.zeros(1))
+    state = leastsquares._state(data, (np.zeros(1), image, slopes), free, Settings())
+    got = leastsquares._missed(state, np.array([2.0]), image + np.array([[[5.0, 3.0, -70.0]]]))
+    assert got == pytest.approx((3 / 2) / math.hypot(5 / 2, 3 / 3), rel=1e-12)

@@ -66,6 +66,12 @@ def test_walls_around_a_hole_are_widths_and_the_hole_is_a_space():
     assert report.minimum_gap_nm == 50.0
 
 
+def test_layers_without_polygons_hold_nothing():
+    rows, report = told(figures_kept, Figure("MARKS", {(3, 0): ()}))
+    assert rows == []
+    assert math.isinf(report.minimum_feature_nm)
+
+
 def test_what_a_negative_tone_draws_is_as_wide_as_a_gap_and_spares_what_is_as_wide_as_a_feature():
     """The lattice's squares count as drawn, and CLEAR lies in them; the second step's aperture does not."""
     frame = Figure("FRAME", {(1, 0): (box(1700 + 40, -1000, 1900, -400), box(600, -1000, 629, -400))})

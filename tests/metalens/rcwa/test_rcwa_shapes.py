@@ -72,8 +72,12 @@ def test_a_quarter_turn_exchanges_x_and_y(shape):
 )
 def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(shape, size_um, before, factor):
     """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are wide."""
-    found = ladder(problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0), None)
+    this = problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0)
+    found = ladder(this, None)
     assert found.before == before
+    assert found.reaches == range(7 - before, 16)  # seven orders may be the last ones; 15 of four mirrors
+    assert ladder(this, 9).reaches == range(9 - before, 10)
+    assert ladder(this, 4).reaches == range(1, 5)
     assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
 
 
