@@ -283,8 +283,9 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
     size = scipy.fft.next_fast_len(settings.pupil.nodes + _frequencies(settings) + 1)
     light = torch.polar(seen.weight, angle)
     if settings.layers is not None and settings.layers.stop is not None:
-        about = settings.pupil.wavelength_um, (seen.x_um, seen.y_um), settings.pupil.step_um
-        light = light * torch.stack([settings.layers.lit(tangents, float(z), *about) for z in settings.depths_um])
+        about = settings.pupil.wavelength_um, (seen.x_um.numpy(), seen.y_um.numpy()), settings.pupil.step_um
+        shadows = [settings.layers.shadow(tangents, float(z), *about) for z in settings.depths_um]
+        light = light * torch.from_numpy(np.stack(shadows))
     return light.to(torch.complex64), (size, size)
 
 

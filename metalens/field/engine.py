@@ -15,9 +15,10 @@ from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral
 from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
+from metalens.ground.arrays import Array
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
-from metalens.psf import Nodes, Polarisation, Source
+from metalens.psf import Nodes, Polarisation, Source, blur_um
 from metalens.psf import spectrum as spectra
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
@@ -185,4 +186,18 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
     wave = float(plan.waves.wavelengths_um[0])
     found["pillars"] = gathered.missing(optics, wave, plan.window, (at[:ALL], depths))
+    if optics.layers.stop is not None:
+        found["stop"] = _ripples(optics, wave, few, blur_um(true[:NEGLECTED].cpu().numpy(), plan.window.step_um))
     return {**found, "edge": edge, "outside": outside}
+
+
+def _ripples(optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], blur_um: Array) -> float:
+    """Error of the stop's shadow, the worst of some places and depths, of blurs (place, depth)."""
+    places, depths_um = seen
+    reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    found = []
+    for place, row in zip((places / reduced).tolist(), blur_um / reduced, strict=True):
+        rads = row / math.hypot(1, *place)
+        each = zip(depths_um.tolist(), rads.tolist(), strict=True)
+        found += [optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad) for z, rad in each]
+    return max(found)

@@ -38,7 +38,8 @@ class Imager:
     parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, polarisation (components of
         the field that are left out, all but a scalar where that is within the tolerance), edge (light that the rim
         bends out of the window, and that the transform folds back), pillars (taken together a few micrometres at a
-        time; 0 of a smooth phase). Beside them ``outside``: light that windows leave out.
+        time; 0 of a smooth phase), stop (of its shadow, where there is one).
+        Beside them ``outside``: light that windows leave out.
     stray: light of other diffraction orders, None where the lens tells nothing of them.
     """
 

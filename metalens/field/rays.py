@@ -80,11 +80,10 @@ def rays(
 def through_stop(
     layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float
 ) -> Tensor:
-    """(depths, *shape) float32 share of each source's light that passes the stop before the lens at (x, y)."""
-    places = seen.x_um, seen.y_um
-    return torch.stack([layers.lit(tangents, depth, wavelength_um, places, seen.width_um) for depth in depths_um]).to(
-        torch.float32
-    )
+    """(depths, *shape) complex64 amplitude of each source's light behind the stop at (x, y), over that without."""
+    x, y, width = (part.cpu().numpy() for part in (seen.x_um, seen.y_um, seen.width_um))
+    each = [layers.shadow(tangents, depth, wavelength_um, (x, y), width) for depth in depths_um]
+    return torch.from_numpy(np.stack(each).astype(np.complex64)).to(seen.x_um.device)
 
 
 def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:

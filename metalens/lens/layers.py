@@ -5,10 +5,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from metalens.cell import Film, Index, Material, index
+from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, PropagationError
 from metalens.lens.media import Media
-from metalens.lens.stop import Stop, crossing, lit_um, passed
+from metalens.lens.stop import Stop, crossing, left_out, lit_um, passed, shadow
 
 MOST_ABSORBED = 0.02
 
@@ -90,7 +93,7 @@ class Layers:
         at_um: tuple[Any, Any],
         width_um: Any,
     ) -> Any:
-        """Share of a source's light that passes the stop on its way to places (x, y) of the pillars, 0 to 1.
+        """Share of a source's rays that pass the stop on their way to places (x, y) of the pillars, 0 to 1.
 
         Args:
             tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of the source, inf for collimated
@@ -103,6 +106,34 @@ class Layers:
             return 1.0
         before, between = self._around_stop(depth_um, wavelength_um)
         return passed(self.stop, crossing(before, between, tangents, *at_um), width_um)
+
+    def shadow(
+        self,
+        tangents: tuple[float, float],
+        depth_um: float,
+        wavelength_um: float,
+        at_um: tuple[Any, Any],
+        width_um: Any,
+    ) -> Array:
+        """Complex amplitude of a source's light behind the stop over that without it, at places of the pillars: as
+        :meth:`lit` with the ripples of the edge (:mod:`metalens.lens.stop`); numpy arrays.
+        """
+        if self.stop is None:
+            return np.ones(np.broadcast_shapes(np.shape(at_um[0]), np.shape(at_um[1])))
+        around = self._around_stop(depth_um, wavelength_um)
+        return shadow(self.stop, around, tangents, wavelength_um, at_um, width_um)
+
+    def shadow_error(
+        self, tangents: tuple[float, float], depth_um: float, wavelength_um: float, blur_rad: float = 0.0
+    ) -> float:
+        """Relative L2 error of a PSF by what :meth:`shadow` leaves out; 0 without a stop.
+
+        blur_rad: radius of the PSF over its distance from the lens.
+        """
+        if self.stop is None:
+            return 0.0
+        zones = self.stop.radius_um * blur_rad / wavelength_um
+        return left_out(self.stop, self._around_stop(depth_um, wavelength_um), tangents, wavelength_um, zones)
 
     def footprint_um(self, depth_um: float, wavelength_um: float) -> float:
         """Radius of what a source on the axis lights of the pillars' plane; inf without a stop."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
+    from metalens.psf.metrics import blur_um as blur_um
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import aperture as aperture
     from metalens.psf.of_lens import from_lens as from_lens
@@ -57,6 +58,7 @@ __getattr__, __dir__, __all__ = attach(
         "among": "",
         "aperture": "of_lens",
         "beyond_faces": "vector",
+        "blur_um": "metrics",
         "export": "",
         "far_field": "directions",
         "from_lens": "of_lens",

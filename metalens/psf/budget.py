@@ -75,6 +75,7 @@ class Budget:
     neighbours: float = math.nan
     angle: float = math.nan
     glass: float = math.nan
+    stop: float = math.nan
     outside: float = math.nan
 
     @property
@@ -85,7 +86,7 @@ class Budget:
     @property
     def model(self) -> float:
         """What the model leaves out, as far as it is known."""
-        return _together(self.polarisation, self.neighbours, self.angle, self.glass)
+        return _together(self.polarisation, self.neighbours, self.angle, self.glass, self.stop)
 
     @property
     def total(self) -> float:

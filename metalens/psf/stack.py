@@ -19,6 +19,7 @@ from metalens.psf.budget import Budget, Polarisation
 from metalens.psf.compute import EXACT, KEPT, Result
 from metalens.psf.direction import Wanted, direction
 from metalens.psf.extended import Extent
+from metalens.psf.metrics import blur_um
 from metalens.psf.record import PsfStack
 
 
@@ -60,8 +61,8 @@ def psf_stack(
         tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
         offset_um: (x, y) of the window from the chief ray.
         layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
-            that in air, and what the sensor distance gains is cover. A stop in front shades the pillars as rays go
-            (:mod:`metalens.lens.stop`), of every depth apart: each costs a call.
+            that in air, and what the sensor distance gains is cover. A stop in front lays its shadow on the pillars
+            (:mod:`metalens.lens.stop`; its error is ``budget.stop``), of every depth apart: each costs a call.
         source: its size and shape where it is no point; the PSF is then that of a point blurred by the image of the
             source (:mod:`metalens.psf.extended`), its error ``budget.source``.
         integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
@@ -106,7 +107,7 @@ def psf_stack(
     worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
     power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
-    stack = _budgeted(stack, worst, power * cases[0].area_um2)
+    stack = _budgeted(stack, worst, power * cases[0].area_um2, _ripples(stack, cases, layers))
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
@@ -134,19 +135,20 @@ def _stopped(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Lay
     parts = []
     for depths in [inverse] if on_pillars else [(one,) for one in inverse]:
         seen = [dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases]
-        shadow = torch.stack([torch.from_numpy(_shadow(case, layers)) for case in seen]).to(maps[1])
-        parts.append(_free((maps[0], maps[1] * shadow), (seen, weights, wanted, None)))
+        shadow = torch.stack([torch.from_numpy(_shadow(case, layers)) for case in seen])
+        shaded = maps[0] + shadow.angle().to(maps[0]), maps[1] * shadow.abs().to(maps[1])
+        parts.append(_free(shaded, (seen, weights, wanted, None)))
     results = [result for _, found, _ in parts for result in found]
     return torch.cat([light for light, _, _ in parts], -3), results, torch.cat([power for _, _, power in parts], -1)
 
 
 def _shadow(case: Case, layers: Layers) -> Array:
-    """(y, x) share of the light of a case's first depth that passes the stop on its way to each pillar."""
+    """(y, x) complex amplitude of the light of a case's first depth at each pillar, over that without the stop."""
     y, x = case.pillars_um
     inverse = case.inverse_depths_per_um[0]
     depth = 1 / inverse if inverse else math.inf
     places = x, y[:, None]
-    return np.asarray(layers.lit(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2)))
+    return layers.shadow(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2))
 
 
 def _directions(angle_rad: Any) -> tuple[bool, Any]:
@@ -177,12 +179,29 @@ def _among(
     return maps, dataclasses.replace(wanted, fields=among.jones(*maps, neighbours, pitch_um))
 
 
-def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor) -> PsfStack:
-    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
+def _ripples(stack: PsfStack, cases: list[Case], layers: Layers | None) -> float:
+    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan without one."""
+    if layers is None or layers.stop is None:
+        return math.nan
+    light = stack.intensity.detach().cpu().numpy().reshape(-1, len(cases), *stack.intensity.shape[-3:])
+    blurs_um, found = blur_um(light, stack.step_um).max(0), []
+    for case, row in zip(cases, blurs_um, strict=True):
+        rads = row / propagate.chief_path(case)
+        found += [
+            layers.shadow_error(case.tangents, z, w, rad)
+            for z, rad in zip(stack.depths_um.tolist(), rads.tolist(), strict=True)
+            for w in stack.wavelengths_um.tolist()
+        ]
+    return max(found)
+
+
+def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor, stop: float) -> PsfStack:
+    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²; stop:
+    error of its shadow."""
     share = (stack.energy_um2.detach().cpu().double() / whole).min()
     outside = max(0.0, 1 - float(share))
-    budget = Budget(worst.error, sampling=worst.sampling, source=worst.source, polarisation=worst.rays, outside=outside)
-    return dataclasses.replace(stack, budget=budget)
+    parts = {"sampling": worst.sampling, "source": worst.source, "polarisation": worst.rays, "stop": stop}
+    return dataclasses.replace(stack, budget=Budget(worst.error, outside=outside, **parts))
 
 
 def _record(

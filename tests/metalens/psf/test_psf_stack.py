@@ -135,6 +135,15 @@ def test_pixels_are_differentiable_in_pitch():
     assert pitch.grad.item() == pytest.approx(want.item(), rel=1e-5)
 
 
+def test_blur_of_even_discs_is_their_radius():
+    """Of two discs, one off the middle; quarters lie on whole samples, one off at most."""
+    place = (np.arange(201) - 100) * 0.5
+    near, wide = (np.hypot(place - at, place[:, None] + 2 * at) <= b for at, b in ((0.0, 37.0), (7.0, 19.0)))
+    np.testing.assert_allclose(
+        psf_metrics.blur_um(np.stack([near, wide]).astype(float), 0.5), [37.0, 19.0], atol=0.5 / 0.404
+    )
+
+
 def test_metrics_of_gaussians_are_closed_forms():
     stack = gaussian_stack([2.0, 3.0])
     f = np.linspace(0, 0.2, 9)
