@@ -91,7 +91,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     task = dataclasses.replace(
         task, model=quick_enough(task.model, task.data, search.starts(task, biases_nm=(0.0,))[0])
     )
-    task, ends = _ends(task, frames.gain, cautions)
+    task, ends = search.placed(*_ends(task, frames.gain, cautions))
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):

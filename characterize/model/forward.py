@@ -116,9 +116,9 @@ class ForwardModel:
 
         Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5 sin² / d is missed at X off it.
         """
-        part = copy.copy(self)
+        part, reach = copy.copy(self), max(_NEAR_UM, *(abs(v) + self.setting.pixel_um for v in self.grid.middle_um))
         part.grid = dataclasses.replace(self.grid, middle_um=(float(middle_um[0]), float(middle_um[1])))
-        if max(abs(v) for v in middle_um) > _NEAR_UM:  # more directions beside those of the nominal window
+        if max(abs(v) for v in middle_um) > reach:  # wants more directions
             part._kept, part.groups = {}, [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)]
         return part
 
