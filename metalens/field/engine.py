@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.ground.arrays import Array
+from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
 from metalens.psf import Nodes, Polarisation, Source, blur_um
@@ -56,12 +58,13 @@ def imager(
             ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
 
     Raises:
-        SceneError: wavelengths, depths or field points that no number of meets the tolerance; PropagationError: films
-            thicker than the gap.
+        SceneError: a field that is not within 90 degrees, a polarisation that is none, wavelengths, depths or field
+            points that no number of meets the tolerance; PropagationError: films thicker than the gap.
 
     Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may leave it above the
         tolerance (``edge``: light that a small aperture's rim bends beyond the window).
     """
+    _check(field, polarisation)
     wave = wave_of(lens)
     focus = wave.focus  # type: ignore[attr-defined]
     if layers is None:
@@ -79,6 +82,14 @@ def imager(
     return replace(
         made, parts=parts, stray=stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
     )
+
+
+def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
+    """Refuse a field beyond 90 degrees and a polarisation that is none."""
+    if not all(abs(angle) < math.pi / 2 for angle in field):
+        raise SceneError(f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2")
+    if polarisation not in get_args(Polarisation):
+        raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
 
 
 def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:

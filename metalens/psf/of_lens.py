@@ -82,10 +82,14 @@ def from_lens(
             numbers.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, and ``flux`` or ``vector``
-            for turned pillars, those of two sizes and those that answer x and y apart (``auto`` takes the scalar there;
-            its error is in the budget).
+        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, no angle, and ``flux`` or
+            ``vector`` for turned pillars, those of two sizes and those that answer x and y apart (``auto`` takes the
+            scalar there; its error is in the budget).
     """
+    if not 0 < tolerance < 1:
+        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0 and below 1")
+    if not view.angles_rad:
+        raise PropagationError("angles_rad is empty, need one direction (x, y) or more")
     how: dict[str, Any] = {"tolerance": tolerance, "polarisation": polarisation, "own": left_out or _known(lens)}
     how["provenance"] = provenance or Provenance()
     if isinstance(spectrum, Source | Measured):

@@ -14,6 +14,7 @@ MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
 PATHS = 129  # from 0 to the longest, at which a rule is judged
 _NUMBER = re.compile(r"[+-]?\d*[.,]?\d*([eE][+-]?\d+)?")
+SUM_ERROR = 1e-6  # of weights: all light counts as so much more or less
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
 
 
@@ -45,12 +46,25 @@ class Nodes:
 
     source: the spectrum that they stand for, by which :func:`missed` judges them on any path; None for wavelengths as
         such.
+
+    Raises:
+        PropagationError: no wavelength, one that is not above 0, or weights that are not one of 0 or more for each, of
+            sum 1.
     """
 
     wavelengths_um: Array
     weights: Array
     error: float
     source: "Source | Measured | None" = None
+
+    def __post_init__(self) -> None:
+        waves, weights = np.asarray(self.wavelengths_um), np.asarray(self.weights)
+        if waves.ndim != 1 or not len(waves) or not (np.isfinite(waves) & (waves > 0)).all():
+            raise PropagationError(f"wavelengths_um is {waves}, need one wavelength above 0 or more")
+        if weights.shape != waves.shape or not (weights >= 0).all() or not abs(weights.sum() - 1) <= SUM_ERROR:
+            raise PropagationError(
+                f"{len(waves)} wavelengths with weights {weights}, need one of 0 or more each, sum 1"
+            )
 
 
 def weight(source: Source) -> tuple[Array, Array]:
@@ -95,9 +109,11 @@ def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measur
     factor of each drops out.
 
     Raises:
-        PropagationError: a file that is missing or no such table, curves without a common range, or light outside
+        PropagationError: no file, one that is missing or no such table, curves without a common range, or light outside
             ``within_um``, which the pillars are known for (less than 1e-4 of the largest value is left out there).
     """
+    if not files:
+        raise PropagationError("spectrum: no file; need one of wavelength in nm and value, or more")
     curves = [_curve(file) for file in files]
     low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
     if low >= high:

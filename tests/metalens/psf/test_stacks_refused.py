@@ -5,8 +5,10 @@ import pytest
 
 from metalens import psf
 from metalens.cell import Film, Index
-from metalens.ground.errors import PropagationError
+from metalens.field import Grid, imager
+from metalens.ground.errors import PropagationError, SceneError
 from metalens.lens import Layers, media
+from metalens.psf.spectrum import measured
 
 PHASE = np.random.default_rng(2).uniform(0, 6, (12, 15))
 ABOUT = dict(pitch_um=0.41, wavelength_um=0.87, sensor_distance_um=21.0, depths_um=[190.0], window_um=5.0, samples=9)
@@ -43,6 +45,53 @@ def test_arguments_that_mean_nothing(more, words):
 def test_maps_that_are_no_lens(phase, level, words):
     with pytest.raises(PropagationError, match=words):
         psf.psf_stack(phase, level, **ABOUT)
+
+
+@pytest.mark.parametrize(
+    ("waves", "weights", "words"),
+    [
+        ([], [], "wavelengths_um is .., need one wavelength above 0 or more"),
+        ([0.85, np.nan], [0.4, 0.6], "wavelengths_um is .0.85"),
+        ([0.84, 0.87], [1.0], r"2 wavelengths with weights .1\.., need"),
+        ([0.84, 0.87], [1.3, -0.3], "weights .* 1.3"),
+        ([0.84, 0.87], [0.4, 1.4], "need one of 0 or more each, sum 1"),  # an image of 1.8 times the light
+    ],
+)
+def test_wavelengths_that_are_no_spectrum(waves, weights, words):
+    with pytest.raises(PropagationError, match=words):
+        psf.Nodes(np.array(waves), np.array(weights), 0.0)
+
+
+@pytest.mark.parametrize("spectrum", [None, psf.Source(850.0, 10.0)])
+@pytest.mark.parametrize("tolerance", [0.0, -1e-3, 2.0, np.nan])
+def test_no_lens_is_looked_at_to_such_a_tolerance(spectrum, tolerance):
+    """Below 0 its square would be that of a tolerance; a spectrum would ask for wavelengths first."""
+    with pytest.raises(PropagationError, match=f"tolerance is {tolerance}, need a relative error above 0"):
+        psf.from_lens(None, psf.View((400.0,)), tolerance=tolerance, spectrum=spectrum)
+
+
+@pytest.mark.parametrize("spectrum", [None, psf.Source(850.0, 10.0)])
+def test_no_lens_is_looked_at_from_nowhere(spectrum):
+    with pytest.raises(PropagationError, match="angles_rad is empty, need one direction"):
+        psf.from_lens(None, psf.View((400.0,), ()), spectrum=spectrum)
+
+
+def test_curves_of_no_file():
+    with pytest.raises(PropagationError, match="spectrum: no file"):
+        measured([], within_um=(0.8, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (dict(field=(0.0, np.pi / 2)), "field of .0.0, 1.57.* rad, need angles"),
+        (dict(field=(np.nan, 0.1)), "field of .nan"),
+        (dict(polarisation="circular"), "polarisation = 'circular': need one of scalar, flux, vector, auto"),
+    ],
+)
+def test_images_of_no_field(more, words):
+    with pytest.raises(SceneError, match=words):
+        imager(None, Grid((7, 5), 4.8, (600.0, 900.0), margin=3, window=7), **more)
 
 
 def test_one_transmission_serves_a_batch_of_lenses():
