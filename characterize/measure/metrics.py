@@ -40,6 +40,9 @@ class Spot:
     ee80_um: radius about the centroid that holds 80 % of the light in the window.
     d4sigma_um: (major, minor) beam widths of ISO 11146-1, window iterated to three times the width.
     centroid_um: (x, y) from the window's centre.
+
+    Accuracy: pixels count as evenly lit, a second blur. Of an Airy disc, by where it lies on its pixels, FWHM and EE80
+    are up to 6 and 9 % wider than on the sensor at 2.3 pixels a FWHM, 0.4 and 2 % at 4.6.
     """
 
     fwhm_um: float
