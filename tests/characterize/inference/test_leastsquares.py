@@ -41,6 +41,26 @@ def test_the_variance_of_a_pixel_has_three_parts():
     data = Data(image, image > 0, image < 0, floor, scale, 0.03)
     want = [[[3.1 + 57 / 1.7 + (0.03 * 57) ** 2, 4.7], [2.2, 9.3 + 1300 / 2.3 + 39.0**2]]]
     assert data.variance(image) == pytest.approx(np.array(want), rel=1e-12)
+    seen = Data(image, image > 0, image < 0, floor, scale, 0.03, common_floor=0.3, common_light=0.02)
+    dark, flat = seen.shared(image)  # of the variance the one, of the light the other
+    assert dark**2 == pytest.approx(0.3 * floor, rel=1e-12)
+    assert flat.ravel() == pytest.approx([1.14, 0.0, 0.0, 26.0], rel=1e-12)
+
+
+def test_silent_pixels_weigh_nothing_and_far_ones_by_their_distance():
+    """Saturated below the model: silent; above it: whole; two sigma of 1.6, ten of 4 beyond 2.5; a masked one."""
+    level = np.array([[[10.0, 10.0, 10.0, 10.0, 10.0]]])
+    seen = np.array([[[9.0, 13.0, 13.2, -30.0, 99.0]]])
+    saturated = np.array([[[True, True, False, False, False]]])
+    usable = np.array([[[True, True, True, True, False]]])
+    sigma = np.array([[[1.0, 2.0, 1.6, 4.0, 5.0]]])
+    data = Data(seen, usable, saturated, sigma**2, np.full(level.shape, 1e30))
+    free = Prior.none(np.zeros(1))
+    state = leastsquares._state(data, (np.zeros(1), level, np.ones((1, *level.shape))), free, Settings(huber=2.5))
+    assert state.residual.ravel() == pytest.approx([0.0, 1.5, 2.0, -10.0, 17.8])
+    assert state.weight.ravel() == pytest.approx([0.0, 1.0, 1.0, 0.25, 0.0])
+    assert state.information.item() == pytest.approx(1 / 4 + 1 / 2.56 + 0.25 / 16)
+    assert state.gradient.item() == pytest.approx(-(1.5 / 2 + 2 / 1.6 - 0.25 * 10 / 4))
 
 
 def test_some_frames_keep_what_belongs_to_them():

@@ -100,6 +100,11 @@ def capture(n=1, **more):
     return Capture(np.zeros((n, 5, 6)), unknown, np.zeros((n, 2)), unknown, ("a",) * n, 8, **more)
 
 
+def test_angles_of_one_place_of_the_source_are_alike_to_a_millionth_of_a_degree():
+    at = SimpleNamespace(angle_deg=3.1234564, angle_y_deg=-0.2000006)
+    assert frames.Frame.field.fget(at) == (3.123456, -0.200001)
+
+
 def test_light_is_counted_above_the_median_of_the_rim():
     frame = np.full((6, 8), 50.0)
     frame[0, ::2] = frame[-1, 1::2] = 46.0  # 8 of 24 rim pixels lower

@@ -16,7 +16,7 @@ from characterize.inference.prepare import quick_enough
 from characterize.model import ForwardModel, Setting, thinplate
 from characterize.model.forward import spectrum, true_depth
 from characterize.model.moments import WHOLE
-from characterize.model.parameters import vector
+from characterize.model.parameters import PLACE, vector
 
 
 def test_lines_of_a_spectrum_have_the_moments_of_a_gaussian():
@@ -100,3 +100,67 @@ def test_a_window_off_the_chief_ray_sees_the_same_light_shifted_by_whole_pixels(
         assert np.abs(other[:, back[0], back[1]] - one[:, rows, columns]).max() < 2e-2 * np.abs(one).max()
     plain = model.images(moved)[0][:, back[0], back[1]]
     assert np.abs(plain - here[:, rows, columns]).max() > 8e-3 * here.max()
+
+
+SMALL = Setting(np.array([480.0, 800.0]), np.zeros((2, 2)), np.array([1.0, 1.7]), 1.5, 12, 16)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return ForwardModel(b.lens(), SMALL, b.RESPONSE)
+
+
+def test_a_background_rises_from_minus_one_to_one_across_the_frame(small):
+    """In electrons: its level, and its slopes along x and y by (column - 8) / 8 and (row - 6) / 6."""
+    dark = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}
+    light = small.images(vector(dark))[0]
+    seen = small.images(vector(dark | {"background_e": 7.0, "background_x_e": 3.0, "background_y_e": -5.0}))[0]
+    y, x = (np.arange(12)[:, None] - 6) / 6, (np.arange(16) - 8) / 8
+    assert seen - light == pytest.approx(np.tile(7 + 3 * x - 5 * y, (2, 1, 1)), abs=1e-9)
+
+
+def test_a_source_of_some_width_is_the_sum_of_its_points(small):
+    """Of 61 points on a disc, whose places and weights are exact to the third degree; its width there times d / z."""
+    values = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0, "log_gain": 10.0}
+    wide = small.images(vector(values | {"pinhole_um": 14.0}))[0]
+    point = small.images(vector(values))[0]
+    radius = 7.0 * np.sqrt((np.arange(5) + 0.5) / 5)  # rings of one area
+    want = np.mean([
+        small.images(vector(values | {"source_x_um": r * math.cos(a), "source_y_um": r * math.sin(a)}))[0]
+        for i, r in enumerate(radius)
+        for a in 2 * np.pi * (np.arange(7) + i / 3) / 7
+    ], axis=0)  # fmt: skip
+    off = np.abs(wide - want).max((1, 2)) / want.max((1, 2))
+    told = np.abs(point - want).max((1, 2)) / want.max((1, 2))
+    assert (off < 0.05 * told).all()
+    assert told[0] > 2 * told[1] > 0  # nearer: its image is larger
+
+
+def test_derivatives_by_the_bench_are_differences_with_a_wide_source(small):
+    """Central ones; the source's image grows with distance and depth. Slopes of fields are of fewer terms, which leaves
+    0.8 % of that by the wavelength."""
+    x = vector(b.VALUES | {"pinhole_um": 14.0, "log_gain": 10.0})
+    steps = {"distance_um": 0.03, "stage_zero_um": 0.3, "stage_scale": 1e-3, "pinhole_um": 0.05, "log_gain": 1e-4}
+    steps |= {"background_e": 1.0, "background_x_e": 1.0, "background_y_e": 1.0, "wavelength_nm": 0.3}
+    slopes = small.images(x, list(steps))[1]
+    for one, (name, step) in zip(slopes, steps.items(), strict=True):
+        way = step * (np.arange(len(x)) == PLACE[name])
+        want = (small.images(x + way)[0] - small.images(x - way)[0]) / (2 * step)
+        assert np.abs(one - want).max() < 1e-2 * np.abs(want).max(), name
+    alone = small.images(x, ["stage_scale"])[1]
+    assert alone[0] == pytest.approx(slopes[2], rel=1e-9, abs=1e-9 * np.abs(slopes[2]).max())
+
+
+def test_smooth_phases_are_those_of_the_paths_from_a_point_of_the_bench_to_a_window():
+    """Straight lines through the place of a node, at the wavelength that it is, but for a phase of all the lens."""
+    setting = Setting(np.array([480.0, 800.0]), np.tile([0.06, -0.04], (2, 1)), np.ones(2), 1.5, 12, 16)
+    (group,) = (model := ForwardModel(b.lens(), setting, b.RESPONSE)).groups
+    bench = {"wavelength_nm": 1.3, "distance_um": 2.0, "decentre_x_um": 0.8, "decentre_y_um": -0.4}
+    x = vector(bench | {"tilt_x_deg": 0.3, "tilt_y_deg": -0.2, "stage_zero_um": 9.0, "source_x_um": 3.0})
+    tx, ty = math.tan(0.06) + math.tan(math.radians(0.3)), math.tan(-0.04) + math.tan(math.radians(-0.2))
+    near_x, near_y, d = group.reduced.x_um, group.reduced.y_um, 112.0
+    for got, z in zip(model._phase(x, group) + group.reduced.known, (489.0, 809.0), strict=True):
+        enter = np.sqrt((near_x + z * tx - 3.0) ** 2 + (near_y + z * ty) ** 2 + z**2)
+        leave = np.sqrt((near_x - d * tx - 0.8) ** 2 + (near_y - d * ty + 0.4) ** 2 + d**2)
+        off = got - 2 * math.pi / 0.8513 * (enter + leave)
+        assert np.ptp(off) < 1e-9 * np.abs(got).max()

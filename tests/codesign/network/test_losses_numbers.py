@@ -117,9 +117,9 @@ def test_masks_are_averaged_over_cells_and_interpolated_between_them():
         assert got.numpy() == pytest.approx(want, rel=1e-6)
 
 
-@pytest.mark.parametrize("wide", [1.3, 0.7])
+@pytest.mark.parametrize("wide", [1.3, 0.7, 2.0])
 def test_a_frame_holds_the_share_of_its_cells_that_the_mask_covers(wide):
-    """Cells of 0.7 or 1.3 of the mask's about one middle: each the integral of the mask over it, by fine points."""
+    """Cells of 0.7, 1.3 or 2 of the mask's about one middle: each the integral of the mask over it, by fine points."""
     mask, fine = RNG.uniform(0, 1, (2, 5, 5)), 2000
     place = np.floor(((np.arange(5 * fine) + 0.5) / fine - 2.5) * wide + 2.5).astype(int)
     inside = (place >= 0) & (place < 5)

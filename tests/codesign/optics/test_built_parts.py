@@ -42,6 +42,7 @@ def test_cells_hold_the_mean_of_their_pillars_with_the_bias_where_each_stands():
         want = np.mean(terms) if terms else 0.0
         assert got[row, column] == pytest.approx(want, abs=1e-6)
     assert got[1, 1] == 0
+    assert GATHER(diameter[:, :6], carrier[:, :6], table, low, step, u[:6], v, bias, 3).shape == (2, 2)
 
 
 def test_empty_cells_take_the_nearest_filled_one():

@@ -31,6 +31,21 @@ def test_what_is_left_of_the_shortest_wave_is_told(finer):
         assert 0.4 * error < true <= error  # told twice, and for points as far apart as Nyquist's step allows
 
 
+@pytest.mark.parametrize("along", ["x", "y", "both"])
+def test_the_second_correction_vouches_where_the_fourth_is_nothing(along):
+    """Of a parabola, which means meet exactly: 1/12 of its bend is put on, of which the estimate takes its shares."""
+    fine = Cells(3, CASE, (0.11, 0.23))
+    at = np.arange(12 + 2 * BORDER) - 5.5 - BORDER
+    y, x = (at[:, None], at) if along == "both" else (0 * at[:, None], at) if along == "x" else (at[:, None], 0 * at)
+    got, error = integrated(torch.from_numpy(40 + 0.7 * x**2 + 0.4 * y**2)[None], fine)
+    bend = (0.7 if along != "y" else 0) / 12 + (0.4 if along != "x" else 0) / 12
+    inside = (np.arange(12) - 5.5).reshape(4, 3) ** 2
+    means = inside.mean(1)
+    first = 40 + 0.7 * means * (along != "y") + 0.4 * means[:, None] * (along != "x") + np.zeros((4, 4))
+    assert got[0].numpy() == pytest.approx(first + bend, rel=1e-12)
+    assert error == pytest.approx(0.11 * 0.23 * bend * 4 / np.linalg.norm(first), rel=1e-9)
+
+
 def drawn(seed, finer):
     """(light on fine samples, means over the cells) of a lens of random pupil: |sum of rays|², beat by beat."""
     draw = np.random.default_rng(seed)

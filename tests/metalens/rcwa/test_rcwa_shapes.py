@@ -81,6 +81,11 @@ def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(s
     assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
 
 
+def test_one_truncation_alone_is_told_as_knowing_nothing():
+    """Two numbers within the unit circle are two apart at most."""
+    assert rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=1).t_error == 2.0
+
+
 def test_a_ring_with_thin_walls_lies_within_its_bar():
     """Walls of 0.018 pitches against 20 orders, which 18 and 21 are within 1.1e-4 of; its bar was the 2.3th part of the
     error while it went by the diameter of the ring."""
