@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from metalens.ground.arrays import Array
+from metalens.ground.errors import PropagationError
 from metalens.ground.threads import split
 from metalens.propagate.blocks import CHUNK, NODES, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
 from metalens.propagate.compiled import gather, spread
@@ -153,6 +154,11 @@ class _Reduce(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
+        if torch.is_grad_enabled():
+            raise PropagationError(
+                "second derivatives of sums over pillars are not known: leave create_graph out, and take differences "
+                "of gradients"
+            )
         phase, level = ctx.saved_tensors
         need = ctx.needs_input_grad
         out_phase = torch.empty_like(phase) if need[0] else None

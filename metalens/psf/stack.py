@@ -51,7 +51,8 @@ def psf_stack(
 
     Args:
         phase_rad, transmission: (…, y, x) maps, numpy or torch, float32 or float64; leading axes are a batch of
-            lenses. With several wavelengths the axis before y is the wavelength. Torch maps are differentiable.
+            lenses. With several wavelengths the axis before y is the wavelength. Torch maps are differentiable
+            once; second derivatives (``create_graph``) are refused.
         wavelength_um: one, or several with ``weights`` (equal if None), whose intensities add (incoherent light).
         depths_um: source depths from the lens along its axis, inf for a plane wave.
         angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles: the light's direction has slopes

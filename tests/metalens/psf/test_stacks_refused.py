@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from metalens import psf
 from metalens.cell import Film, Index
@@ -92,6 +93,16 @@ def test_curves_of_no_file():
 def test_images_of_no_field(more, words):
     with pytest.raises(SceneError, match=words):
         imager(None, Grid((7, 5), 4.8, (600.0, 900.0), margin=3, window=7), **more)
+
+
+@pytest.mark.parametrize("polarisation", ["scalar", "flux"])
+def test_second_derivatives(polarisation):
+    phase = torch.from_numpy(PHASE).requires_grad_()
+    stack = psf.psf_stack(phase, np.ones((12, 15)), polarisation=polarisation, **ABOUT)
+    seen = stack.intensity[0, 4, 2] + 1e-3 * stack.energy_um2.sum()
+    assert float(torch.autograd.grad(seen, phase, retain_graph=True)[0].abs().max()) > 0
+    with pytest.raises(PropagationError, match="second derivatives of sums over pillars are not known: leave create"):
+        torch.autograd.grad(seen, phase, create_graph=True)
 
 
 def test_one_transmission_serves_a_batch_of_lenses():
