@@ -97,7 +97,7 @@ def _measure(
 def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
     """The tuned hyperbolic lens and double helix, of the pillars and aperture of a lens, with their names."""
     radius, measured = lens.diameters.radius_um + lens.diameters.pitch_um / 2, setting.about(lens)
-    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um)
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
     wanted = Fisher(
         depths_mm=measured.depths_mm,
         pixel_um=measured.pixel_um * min(setting.binnings),

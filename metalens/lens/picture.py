@@ -30,6 +30,7 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.patches import Circle
 
     d = lens.diameters
     least = 2 if d.lattice.centred else 1  # every other site of the map is none of the lattice
@@ -38,6 +39,10 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
     colour[..., 3] = np.minimum(1, np.abs(field))
     edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
     axes.imshow(colour, extent=edge, interpolation="nearest")
+    if stop := lens.layers.stop:
+        hole = Circle((0, 0), stop.radius_um, fill=False, color="k", linestyle="--")
+        axes.add_patch(hole)
+        axes.legend([hole], [f"aperture stop, {stop.distance_um:g} µm before"], loc="upper right")
     scale = ScalarMappable(Normalize(0, 2 * np.pi), "twilight")
     figure.colorbar(scale, ax=axes, label="phase / rad, faded where it turns in a pixel", shrink=0.85)
     axes.set(title=f"{lens.profile} lens, {lens.wavelength_um * 1e3:.0f} nm", xlabel="x / µm", ylabel="y / µm")

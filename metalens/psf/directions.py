@@ -147,7 +147,9 @@ def _behind(lens: Lens, angle_rad: tuple[float, float], source_um: float, wavele
         rows = slice(start, start + _ROWS)
         path = source_path(d.x_um, d.y_um[rows][:, None], tangents, 1 / source_um)
         phase = np.remainder(lens.rows_phase_rad(rows, wavelength_um, seen) + k * path, 2 * math.pi)
-        found[rows] = level[rows] * np.exp(1j * phase)
+        places = d.x_um, d.y_um[rows][:, None]
+        shadow = lens.layers.shadow((tangents[0], tangents[1]), source_um, wavelength_um, places, d.pitch_um)
+        found[rows] = level[rows] * shadow * np.exp(1j * phase)
     return found
 
 

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.commands.evaluate_optics import tuned_like
 from codesign.evaluate import optics as evaluate
 from codesign.evaluate.optics import Scenes, Setting
 from codesign.evaluate.tables import ratio
 from codesign.eye import dataset
 from metalens import design
-from metalens.cell.record import Cell, Index
+from metalens.cell.record import Cell, Film, Index
 from metalens.design.profiles import DoubleHelix, Focus
 from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
 from metalens.image.pupil import Pupil
+from metalens.lens import Layers, Stop
 from metalens.pillars.proxy import Proxy
 
 RADIUS_UM = 150.0
@@ -103,3 +105,14 @@ def test_bootstrap_interval_covers_the_true_ratio():
 def test_nothing_to_evaluate_is_refused():
     with pytest.raises(ValueError, match="at least one"):
         evaluate.scene_energies([], dataset.states_at(torch.arange(1), 0))
+
+
+def test_simple_lenses_stand_in_the_surroundings_of_the_lens_that_they_are_compared_with():
+    layers = Layers(front=(Film(Index(1.5), 60.0),), behind=(Film(Index(1.4), 90.0),), stop=Stop(40.0, 60.0))
+    focus = Focus(0.85, 300.0, 2000.0, layers)
+    phase = design.phase_of(None, focus, radius_um=45.0)
+    made, _ = design.make(phase, focus, aperture_um=90.0, cell=CELL, proxy=IDEAL)
+    setting = Setting(depths_mm=(1.6, 2.6), count=3, angles_deg=(0.0,), binnings=(1,), window_um=40.0)
+    simple = tuned_like(made, setting)
+    assert [one.layers for _, one in simple] == [made.layers, made.layers]
+    assert made.layers.stop == layers.stop

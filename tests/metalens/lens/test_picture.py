@@ -1,11 +1,14 @@
 """The picture of a lens shows what a microscope of its resolution would: no lens where there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from metalens.cell import Cell
-from metalens.lens import DiameterMap, Lens
-from metalens.lens.picture import mean_field, picture
+from metalens.ground import report
+from metalens.lens import DiameterMap, Layers, Lens, Stop
+from metalens.lens.picture import _phase, mean_field, picture
 from metalens.proxy import Proxy
 
 LINEAR = Proxy(
@@ -32,6 +35,15 @@ def test_a_slope_fades_as_the_mean_of_its_phases():
     assert np.abs(found[2, 0]) == pytest.approx(want / 5, rel=1e-12)  # one row of five
     four = np.sin(4 * delta / 2) / (5 * np.sin(delta / 2))
     assert np.abs(found[0, 2]) == pytest.approx(four, rel=1e-12)
+
+
+def test_a_stop_is_drawn_at_its_radius():
+    stopped = replace(lens(np.full((40, 40), 0.2)), layers=Layers(stop=Stop(5.5, 30.0)))
+    for one, radii in ((stopped, [5.5]), (lens(np.full((40, 40), 0.2)), [])):
+        figure, axes = report.canvas(1, 2)
+        _phase(figure, axes[0], one)
+        assert [patch.get_radius() for patch in axes[0].patches] == radii
+        report.png(figure)
 
 
 def test_a_phase_that_turns_within_a_pixel_is_not_drawn_as_a_slow_one():

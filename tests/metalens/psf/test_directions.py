@@ -10,7 +10,7 @@ from scipy import special
 from metalens import lens as lenses
 from metalens.cell import Cell, Film, Index, Lattice
 from metalens.ground.errors import PropagationError
-from metalens.lens import DiameterMap, Layers, Lens
+from metalens.lens import DiameterMap, Layers, Lens, Stop
 from metalens.pillars import Proxy
 from metalens.psf import directions, far_field
 from tests.referees import plain_sum
@@ -53,6 +53,20 @@ def test_a_wave_that_comes_at_an_angle_leaves_a_flat_lens_at_it():
     tx, ty = math.tan(math.radians(11)), math.tan(math.radians(-6))
     norm = math.sqrt(1 + tx**2 + ty**2)
     assert (found.beams[0].sine_x, found.beams[0].sine_y) == pytest.approx((tx / norm, ty / norm), abs=5e-5)
+
+
+def test_a_stop_leaves_the_light_of_its_hole_where_it_falls_on_the_pillars():
+    """20 um on a square of 87 um: the whole hole; at 40 degrees of so much glass half of it falls beside the square."""
+    hole, whole = math.pi * 20.0**2, (300 * PITCH) ** 2
+    inside = math.tan(math.asin(math.sin(math.radians(40)) / 1.5))
+    for angle, thick, share in ((11, 30.0, 1.0), (40, 150 * PITCH / inside, 0.5)):
+        layers = Layers(front=(Film(Index(1.5), thick),), stop=Stop(20.0, thick))
+        tilted = {"angle_rad": (0.0, math.radians(angle)), "samples": 201}
+        found = far_field(lens(np.zeros((300, 300)), layers=layers), **tilted)
+        assert found.transmitted == pytest.approx(
+            0.83**2 * share * hole / whole, rel=0.03
+        )  # ripples finer than pillars
+        assert found.beams[0].sine_y == pytest.approx(math.sin(math.radians(angle)), abs=1e-3)
 
 
 def test_a_rectangle_shows_its_sinc():
