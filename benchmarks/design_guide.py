@@ -27,8 +27,9 @@ from benchmarks import design_guide_network as network
 from benchmarks import keep_line, kept_lines
 from benchmarks.codesign_study import fitted, oblique
 from benchmarks.design_guide_bound import bound_mm
-from benchmarks.design_guide_cells import FIELDS, LENS, Cell, cell_of, run_of
+from benchmarks.design_guide_cells import FIELDS, LENS, Cell, cell_of, corner_rad, run_of
 from benchmarks.design_guide_image import forms
+from benchmarks.design_guide_stop import asphere, behind_stop
 from codesign.evaluate import reader
 from codesign.evaluate.reader import ReaderConfig, Scenery
 from codesign.evaluate.reader_lens import LensTraining, kept, trained
@@ -40,6 +41,7 @@ LINES, DESIGNS, BOUNDS = "runs.jsonl", "designs.jsonl", "bounds.jsonl"
 RESULT = Path(__file__).parent / "results" / "design_guide.json"
 CHOICE, DESIGN = 5, 77  # seeds of the runs that choose among lenses, and of the scenes that lenses are trained on
 SEEDS = range(5)
+RADIALS = ("quadratic", "stop")  # lenses that are radial terms to begin with
 FREE, RADIAL = 63, 6  # terms of a free form and of an asphere
 TRAINING = LensTraining()
 LOOKS = (1.0,)  # shares of the training after which a lens is read, as its start is; the best is kept
@@ -59,9 +61,11 @@ def optics_of(cell: Cell) -> OpticsConfig:
         settings = replace(settings, focus_mm=40.0, parts=2, apart_um=float(number))
     else:
         settings = replace(settings, focus_mm=float(number))
+    if kind == "stop":
+        settings = behind_stop(settings)
     if family == "free-" or kind == "oblique":
         return replace(settings, polynomials=FREE)
-    return replace(settings, polynomials=RADIAL, family="radial") if family or kind == "quadratic" else settings
+    return replace(settings, polynomials=RADIAL, family="radial") if family or kind in RADIALS else settings
 
 
 def start_of(cell: Cell) -> Tensor:
@@ -71,6 +75,8 @@ def start_of(cell: Cell) -> Tensor:
         return oblique(settings)
     if kind == "quadratic":
         return fitted(settings, flat_field(settings))
+    if kind == "stop":
+        return asphere(settings, corner_rad(FIELDS[cell.field]))
     return torch.zeros(settings.polynomials, dtype=torch.float64)
 
 
@@ -178,9 +184,10 @@ def bounded(work: Path, name: str) -> dict[str, Any]:
 SAME: dict[str, Any] = {"frames": Cell().frames, "fwhm_nm": 0.0, "electrons": 2000.0}  # knobs that no scene knows of
 FOCI = ("focus40", "focus70", "focus150", "focus1000")
 DESIGNERS = ("quadratic40", "quadratic150", "oblique40", "oblique150")
+STOPS = ("stop150",)
 DEVICE = tuple(f"field={place},fwhm={width}" for width in (30, 10) for place in ("oblique", "ring"))
 LADDER = ("field=angle,fwhm=30", "field=line,fwhm=30", DEVICE[0])  # from one field angle to the whole field
-ASPHERES = DEVICE[:2]  # where six radial terms are trained too
+ASPHERES = DEVICE[:2]  # where six radial terms are trained too, and stand behind a stop
 WATCHED, NETWORK_FRAMES = DEVICE[0], 6400  # where the network reads too, and the frames that it sees once each
 KNOBS = ("base", "lens=focus20", "lens=focus70", "fwhm=10", "fwhm=30", "field=oblique", "field=ring", "electrons=500",
          "electrons=8000", "frames=1600", "frames=6400", "pitch=9", "lens=helix2", "lens=split60")  # fmt: skip
@@ -188,7 +195,8 @@ KNOBS = ("base", "lens=focus20", "lens=focus70", "fwhm=10", "fwhm=30", "field=ob
 
 def candidates(device: str, family: str) -> list[str]:
     """Cells of the field and light of a device, one a lens; a ring has no one angle that a lens could be made for."""
-    lenses = FOCI if family == "focus" else [n for n in DESIGNERS if "ring" not in device or "oblique" not in n]
+    standing = {"focus": FOCI, "stop": STOPS, "designer": DESIGNERS}[family]
+    lenses = [n for n in standing if "ring" not in device or "oblique" not in n]
     return [replace(cell_of(device), lens=lens).name for lens in lenses]
 
 
@@ -208,6 +216,8 @@ def compared(lines: dict[str, dict[str, Any]], device: str) -> dict[str, str]:
     if "focus" in found and device in ASPHERES:
         focus = cell_of(found["focus"])
         found["asphere"] = replace(focus, lens=f"radial-{focus.lens}").name
+    if device in ASPHERES and (stopped := chosen(lines, device, "stop")):
+        found["stop"] = stopped
     if {"focus", "designer"} <= set(found):
         best = cell_of(min(found["focus"], found["designer"], key=lambda cell: lines[f"{cell}/{CHOICE}"]["axial_mm"]))
         found["trained"] = replace(best, lens=f"free-{best.lens}").name
@@ -216,7 +226,7 @@ def compared(lines: dict[str, dict[str, Any]], device: str) -> dict[str, str]:
 
 def watched(lines: dict[str, dict[str, Any]]) -> dict[str, str]:
     """{role: cell} that the network reads."""
-    roles = {role: cell for role, cell in compared(lines, WATCHED).items() if role != "asphere"}
+    roles = {role: cell for role, cell in compared(lines, WATCHED).items() if role not in ("asphere", "stop")}
     return {r: replace(cell_of(c), frames=NETWORK_FRAMES, reader="network").name for r, c in roles.items()}
 
 
@@ -225,6 +235,7 @@ def plan(lines: dict[str, dict[str, Any]]) -> list[str]:
     found: list[str] = []
     for device in dict.fromkeys(LADDER + DEVICE):
         found += [f"{cell}/{CHOICE}" for family in ("focus", "designer") for cell in candidates(device, family)]
+        found += [f"{cell}/{CHOICE}" for cell in candidates(device, "stop") if device in ASPHERES]
         found += [f"{cell}/{seed}" for seed in SEEDS for cell in compared(lines, device).values()]
     found += [f"{cell}/{seed}" for seed in SEEDS for cell in watched(lines).values()]
     return found + [f"{cell_of(knob).name}/{seed}" for seed in SEEDS for knob in KNOBS]

@@ -1,5 +1,6 @@
 """Names of the design guide's cells: what each knob may be, and what a reader sees of it."""
 
+import math
 import re
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -8,7 +9,7 @@ from benchmarks.design_guide_image import HELD
 from codesign.evaluate.reader import ReaderConfig
 
 READERS = ("reference", "network")
-LENS = re.compile(r"(free-|radial-)?(focus|quadratic|(?<!radial-)oblique|(?<!-)helix|(?<!-)split)(\d+)")
+LENS = re.compile(r"(free-|radial-)?(focus|quadratic|(?<!free-)stop|(?<!radial-)oblique|(?<!-)helix|(?<!-)split)(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,12 @@ FIELDS = {
 }
 
 
+def corner_rad(place: Place, distance_um: float = 2000.0) -> float:
+    """Field angle of the farthest corner of what a camera sees."""
+    half, aside = place.width_um / 2, distance_um * math.tan(math.radians(place.angle_deg))
+    return math.atan(math.hypot(abs(aside) + half, half) / distance_um)
+
+
 @dataclass(frozen=True, slots=True)
 class Cell:
     """Values of all knobs; the defaults are the base.
@@ -39,7 +46,8 @@ class Cell:
     lens: ``focusF``, hyperbolic, for sources at F mm. ``quadraticF``: r² alone, whose blur is the same over the field,
         in six radial terms. ``obliqueF``: free of aberrations at the middle of the field. ``helixN``: double helix of N
         rings. ``splitA``: two halves whose images lie A um apart. ``free-`` before one of the first three, ``radial-``
-        before one of the first two: 63 or 6 terms trained with the reader from there.
+        before one of the first two: 63 or 6 terms trained with the reader from there. ``stopF``: six radial terms
+        behind a stop on the other face of the substrate (:mod:`benchmarks.design_guide_stop`); ``radial-`` too.
     field: of :data:`FIELDS`. fwhm: of the light, nm. pitch: of the pixels, um. electrons: from white in 9 um.
     frames: that the reader learns from. reader: the ``reference``, or the elastic ``network``.
     """
@@ -97,8 +105,8 @@ def cell_of(name: str) -> Cell:
     if cell.field not in FIELDS or not LENS.fullmatch(cell.lens):
         raise SystemExit(
             f"cell {name!r}: field = {cell.field!r}, lens = {cell.lens!r}: need one of {', '.join(FIELDS)} and a lens: "
-            "focusF, quadraticF, obliqueF, helixN, splitA; free- before one of the first three, "
-            "radial- of the first two"
+            "focusF, quadraticF, obliqueF, helixN, splitA, stopF; free- before one of the first three, "
+            "radial- of the first two and of stopF"
         )
     if cell.reader not in READERS:
         raise SystemExit(f"cell {name!r}: reader = {cell.reader!r}: need one of {', '.join(READERS)}")

@@ -25,6 +25,7 @@ from benchmarks.design_guide import (
     LOOKS,
     NETWORK_FRAMES,
     RESULT,
+    STOPS,
     TRAINED,
     TRAINING,
     compared,
@@ -175,10 +176,11 @@ gradient of the likelihood of the windows' depths, as far as its running mean is
 ({turns} turns, {hold} steps of the reader's branch to each, 32 frames a step; the lens stands for the first
 {still:.0f} %), trained once, on an image to {coarse:g} of the contrast. The start and the lenses after {looks} % of the
 turns are read on frames that trained nothing, the one of least axial error is kept, and every seed reads it. `asphere`:
-six radial terms, from the best focus, likewise. `bound`: what the blur of one window alone can tell, the least standard
-deviation of its depth, mean over the windows of the field and the depths, for a patch of unknown 1/f texture of
-contrast 0.2, its contrast and fall unknown too, in the photons' noise, where depths spread by 3 mm beforehand; that
-less light falls towards the rim is left out.
+six radial terms, from the best focus, likewise. `stop`: six radial terms behind a hole of 1 mm on the other face of
+0.5 mm of fused silica, of least wave-front error over the field, in focus at {stops} mm, as it stands. `bound`: what
+the blur of one window alone can tell, the least standard deviation of its depth, mean over the windows of the field
+and the depths, for a patch of unknown 1/f texture of contrast 0.2, its contrast and fall unknown too, in the photons'
+noise, where depths spread by 3 mm beforehand; that less light falls towards the rim is left out.
 Readers see edges and neighbouring windows as well, and may do better.
 """
 RUNGS = """\
@@ -210,6 +212,7 @@ def page(
         ", ".join(dict.fromkeys(n.lstrip("abcdefghijklmnopqrstuvwxyz") for n in names)) for names in (FOCI, DESIGNERS)
     )
     told = {"coarse": TRAINED, "turns": TRAINING.turns, "hold": TRAINING.hold, "foci": foci, "designers": designers}
+    told["stops"] = ", ".join(n.removeprefix("stop") for n in STOPS)
     told |= {"still": 100 * TRAINING.phase.start, "looks": " and ".join(f"{100 * share:g}" for share in LOOKS)}
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,11 +13,13 @@ from benchmarks import design_guide_bound as bound
 from benchmarks import design_guide_network as network
 from benchmarks import design_guide_report as told
 from benchmarks import keep_line, kept_lines
-from benchmarks.design_guide_cells import FIELDS, Cell, cell_of, run_of
+from benchmarks.design_guide_cells import FIELDS, Cell, cell_of, corner_rad, run_of
 from benchmarks.design_guide_image import forms
+from benchmarks.design_guide_stop import asphere
 from codesign.evaluate.reader import ReaderConfig
 from codesign.evaluate.reader_lens import LensTraining
-from codesign.optics.stack import added_phase
+from codesign.optics.stack import added_phase, phase_at
+from metalens.field import SmoothWave
 from metalens.image.pupil import coordinates
 
 
@@ -45,6 +48,7 @@ def test_every_name_of_the_plan_is_that_of_its_cell():
         ("lens=fresnel40/1", "and a lens: focusF"),
         ("lens=free-helix2/1", "and a lens: focusF"),
         ("lens=radial-oblique40/1", "radial- of the first two"),
+        ("lens=free-stop40/1", "and of stopF"),
         ("reader=oracle/1", "one of reference, network"),
         ("field=line,reader=network/0", "a field that is not held"),
         ("base", "need CELL/SEED"),
@@ -101,6 +105,44 @@ def _scanned(device=None):
             best = "focus70" in cell or "oblique150" in cell
             lines |= _line(f"{cell}/{guide.CHOICE}", 0.9 if best else 1.2 + 0.1 * k)
     return device, lines
+
+
+def test_asphere_for_a_stop_is_the_hyperbolic_lens_on_axis_and_of_least_variance_over_a_field():
+    settings = guide.optics_of(cell := cell_of("lens=stop40,field=oblique"))
+    assert float(asphere(settings, 1e-7).abs().max()) < 2e-3  # rad; what six terms leave is none
+    best = guide.start_of(cell)
+    widest = corner_rad(FIELDS["oblique"])
+    assert math.tan(widest) == pytest.approx(math.hypot(math.tan(math.radians(17)) + 0.252, 0.252))
+    least = _mean_variance(settings, best, widest)
+    assert least < 0.5 * _mean_variance(settings, 0 * best, widest)
+    for number in range(len(best)):
+        for change in (-3.0, 3.0):  # rad rms over the pillars
+            moved = best + change * torch.eye(len(best), dtype=torch.float64)[number]
+            assert _mean_variance(settings, moved, widest) > least
+
+
+def _mean_variance(settings, place, widest):
+    """rad² of wave fronts through the hole: rays straight from sources through glass, on places drawn in the stop."""
+    draw = np.random.default_rng(4)
+    total = []
+    for share in (np.arange(9) + 0.5) / 9:
+        tangent = math.tan(widest) * math.sqrt(share)
+        sine = tangent / math.hypot(1, tangent)
+        glass = 1.4525  # silica at 0.85 um
+        inside = 500.0 * sine / math.sqrt(glass**2 - sine**2)
+        polar = 500.0 * np.sqrt(draw.random(1500)), 2 * np.pi * draw.random(1500)
+        x, y = inside + polar[0] * np.cos(polar[1]), polar[0] * np.sin(polar[1])
+        there = torch.from_numpy(x)[None], torch.from_numpy(y)[None]
+        carrier = SmoothWave(settings.focus, settings.aperture_mm * 500).carrier_rad(*there)
+        phase = (carrier + phase_at(settings, place, *there))[0].numpy()
+        # collimated but for 40 mm: its vergence is a sphere about the source, 39.8 mm away in reduced distance
+        reduced = 40000.0 - 500.0 * (1 - 1 / glass)
+        far = np.sqrt((x + reduced * tangent) ** 2 + y**2 + reduced**2)
+        near = np.sqrt((x - 2000.0 * tangent) ** 2 + y**2 + 2000.0**2)
+        phase = phase + 2 * np.pi / 0.85 * (far + near)
+        plane = np.stack([np.ones_like(x), x, y], 1)
+        total.append((phase - plane @ np.linalg.lstsq(plane, phase, rcond=None)[0]).var())
+    return float(np.mean(total))
 
 
 def test_what_is_chosen_is_least_in_the_runs_that_choose_and_then_planned():
