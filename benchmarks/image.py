@@ -85,7 +85,7 @@ def pillar_lens(focus: Focus, radius_um: float) -> Lens:
     wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus), 2 * math.pi)
     wanted += 2 * math.pi * np.ceil((low - wanted) / (2 * math.pi))
     diameter = np.where(np.hypot(x, x[:, None]) <= radius_um, 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi), 0.0)
-    flat = Proxy(np.array([[6.0, 3.2 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.78, 0.92), 1e-6, 1e-6)
+    flat = Proxy(np.array([[6.0, 3.2 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.7, 1.0), 1e-6, 1e-6)
     cell = Cell(pitch_um=pitch, pillar=Index(3.6), substrate=Index(1.45))
     distance, source = focus.sensor_distance_um, focus.source_distance_um
     return Lens(DiameterMap(diameter, pitch), cell, flat, focus.wavelength_um, distance, source, "hyperbolic")

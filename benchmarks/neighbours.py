@@ -38,8 +38,8 @@ def rows() -> Iterator[Row]:
         found = neighbours(lens, counts=counts, harmonics=HARMONICS)
         for place, (polarization, along) in enumerate((("x", "along"), ("y", "across"))):
             start = time.perf_counter()
-            cut = _whole(lens, polarization)
-            told, power, plain = _judged(lens, cut, _factor(lens, found, place))
+            cut = solved_whole(lens, polarization)
+            told, power, plain = judged(lens, cut, factor(lens, found, place))
             yield Row(
                 f"TiO2, NA {na}, 20 um, 62 pillars, light {along} the cut: {told} "
                 f"(efficiency {abs(cut.one_by_one) ** 2:.3f})",
@@ -106,7 +106,7 @@ class Cut:
         return np.asarray(spot / spot.sum())
 
 
-def _judged(lens: Lens, cut: Cut, factor: Array) -> tuple[str, float, float]:
+def judged(lens: Lens, cut: Cut, factor: Array) -> tuple[str, float, float]:
     """In words; error of the power in the focus over that of pillars one by one with the factor of every pillar, and
     without."""
     predicted = cut.to_orders @ (cut.alone * factor)
@@ -118,7 +118,7 @@ def _judged(lens: Lens, cut: Cut, factor: Array) -> tuple[str, float, float]:
     return words, abs(abs(solved) ** 2 - abs(said) ** 2), abs(abs(solved) ** 2 - 1)
 
 
-def _whole(lens: Lens, polarization: str) -> Cut:
+def solved_whole(lens: Lens, polarization: str) -> Cut:
     """The cut solved as one cell of RCWA."""
     cell, wave = lens.cell, lens.wavelength_um
     place, x = _places(lens)
@@ -144,7 +144,7 @@ def _phase(lens: Lens) -> Array:
     return np.asarray(-2 * np.pi / lens.wavelength_um * (np.hypot(x, distance) - distance))
 
 
-def _factor(lens: Lens, found: Neighbours, place: int) -> Array:
+def factor(lens: Lens, found: Neighbours, place: int) -> Array:
     """C at every pillar as PSFs take it from maps, of the field along (0) or across (1) the cut."""
     phase = torch.as_tensor(np.tile(_phase(lens), (9, 1)))
     made = among.jones(phase, torch.ones_like(phase), found, lens.cell.pitch_um)

@@ -1,5 +1,6 @@
 """A pool of rendered eyes that training draws from again and again, each time at another scale."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,12 +94,18 @@ class PoolScenes:
     Every pass over the pool has an order of its own, and every frame a new scale each time it is drawn.
 
     seed: of orders and scales. margin: samples around the frames. spread: of the scale, see :func:`decoupled`.
+    pool: or what gives it whenever a batch is asked for, so that many runs need not hold theirs at once.
     """
 
-    pool: Pool
+    pool: Pool | Callable[[], Pool]
     margin: int
     spread: float
     seed: int
+
+    @property
+    def held(self) -> Pool:
+        """The frames."""
+        return self.pool if isinstance(self.pool, Pool) else self.pool()
 
     def batch(self, step: int, size: int) -> Batch:
         """``size`` frames of a step.
@@ -106,18 +113,19 @@ class PoolScenes:
         Raises:
             TrainingError: the pool holds less than a batch.
         """
-        a_pass = len(self.pool) // size
+        count = len(self.held)
+        a_pass = count // size
         if a_pass == 0:
-            raise TrainingError(f"a pool of {len(self.pool)} frames is smaller than a batch of {size}: raise the pool")
-        order = np.random.default_rng([self.seed, step // a_pass, 5]).permutation(len(self.pool))
+            raise TrainingError(f"a pool of {count} frames is smaller than a batch of {size}: raise the pool")
+        order = np.random.default_rng([self.seed, step // a_pass, 5]).permutation(count)
         first = step % a_pass * size
         return self.rows(np.sort(order[first : first + size]), np.random.default_rng([self.seed, step, 6]))
 
     def rows(self, rows: Array, generator: np.random.Generator) -> Batch:
         """The frames of these numbers, at scales drawn from ``generator``."""
-        pool = self.pool
+        pool = self.held
         here, place = torch.from_numpy(pool.here_um), torch.from_numpy(pool.place_um[rows])
-        low, high = self.pool.depths_um
+        low, high = pool.depths_um
         scale = decoupled(place[:, 2], (float(low), float(high)), self.spread, generator)
         slip, shift = ((scale[:, None] * p - here) * 1e-3 for p in (place, torch.from_numpy(pool.seen_um[rows])))
         pose = Pose(shift.float(), torch.from_numpy(pool.axis[rows]), torch.from_numpy(pool.points[rows]))

@@ -150,7 +150,7 @@ class Run:
 
 
 def start(settings: RunConfig) -> Run:
-    """A fresh run; renders the pool of frames where there is one.
+    """A fresh run; its pool of frames, where there is one, is rendered when the first batch is asked for.
 
     Raises:
         TrainingError: a budget is below the smallest network at the pitch that the run begins with.
@@ -165,7 +165,7 @@ def start(settings: RunConfig) -> Run:
     fresh = EyeScenes(settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, seed)
     scenes: Scenes = fresh
     if settings.scenes.pool:
-        pool = _pool(settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed)
+        pool = functools.partial(_pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed)
         scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
     if parallel.ranks() > 1 and settings.network != "supernet":
         raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
@@ -187,7 +187,8 @@ def start(settings: RunConfig) -> Run:
 
 @functools.lru_cache(maxsize=1)
 def _pool(scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int) -> Pool:
-    """The rendered frames of a run; kept for whoever goes on with it in this process, as its retraining does."""
+    """The rendered frames of a run; kept for whoever goes on with it in this process, as its retraining does, until
+    another run asks for its own: an experiment over nine runs held nine of a gigabyte each."""
     return fill(EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool)
 
 

@@ -10,9 +10,14 @@ import numpy as np
 
 
 class Stack:
-    """films: (index, thickness) from pillars to sensor, the first fills the gap; lattice of ``count`` points."""
+    """films: (index, thickness) from pillars to sensor, the first fills the gap; lattice of ``count`` points.
 
-    def __init__(self, films, *, wavelength, step, count):
+    near: um, where light of the lens can fall on what is looked at (radius and half window): plane waves that fall
+    further aside are faded out, where they would come back over the lattice's edge. None: all are kept.
+    """
+
+    def __init__(self, films, *, wavelength, step, count, near=None):
+        self.near = near
         self.films, self.k, self.step, self.count = films, 2 * np.pi / wavelength, step, count
         f = np.fft.fftfreq(count, step) * wavelength
         self.px, self.py = np.meshgrid(f, f)
@@ -30,7 +35,15 @@ class Stack:
             share = b * cb / (a * ca)
             both[0] *= 2 * a * ca / (a * ca + b * cb) * np.sqrt(share)
             both[1] *= 2 * a * ca / (b * ca + a * cb) * np.sqrt(share)
-        return both * np.exp(1j * self.k * phase) * runs
+        return both * np.exp(1j * self.k * phase) * runs * self._lands(p2)
+
+    def _lands(self, p2):
+        """1 for plane waves whose rays fall near the axis, 0 for those that wrap."""
+        if self.near is None:
+            return 1.0
+        beside = sum(t * np.sqrt(p2 / (n * n - p2)) for n, t in self.films)
+        u = np.clip((beside - self.near) / (self.count * self.step - 2 * self.near), 0, 1)
+        return 1 - u**3 * (10 - 15 * u + 6 * u**2)
 
     def fields(self, light, at=(0.0, 0.0)):
         """(2, y, x) fields of s and p light on the lattice about ``at``; light: (rows, columns) of the pillars."""

@@ -17,8 +17,13 @@ def _rotated(e, start, end):
 class Referee:
     """lens: radius, sensor distance, focus of the source, all um; films behind as (index, thickness), air the rest."""
 
-    def __init__(self, *, radius, distance, focus, design_wavelength, films=(), fine=0.4, count=384, extra=None):
+    def __init__(
+        self, *, radius, distance, focus, design_wavelength, films=(), fine=0.4, count=384, extra=None, looked_at=None
+    ):
+        """looked_at: half width, um, of what is wanted about a place: plane waves that no ray takes from the lens there
+        are faded out, where they would come back over the lattice's edge."""
         self.radius, self.distance, self.focus, self.films = radius, distance, focus, films
+        self.looked_at = looked_at
         self.k0, self.fine, self.count, self.extra = 2 * np.pi / design_wavelength, fine, count, extra
         axis = (np.arange(count) - count // 2) * fine
         self.x, self.y = np.meshgrid(axis, axis)
@@ -34,6 +39,15 @@ class Referee:
         phase = -self.k0 * (np.sqrt(r2 + self.distance**2) + np.sqrt(r2 + self.focus**2))
         return phase if self.extra is None else phase + self.extra(self.x, self.y)
 
+    def _lands(self, p, q, s, place):
+        """1 for plane waves (in air) whose rays fall from the lens on what is looked at, 0 for those that wrap."""
+        if self.looked_at is None:
+            return 1.0
+        beside = np.hypot(self.distance * p / s - place[0], self.distance * q / s - place[1])
+        near = self.radius + self.looked_at
+        u = np.clip((beside - near) / (self.count * self.fine - 2 * near), 0, 1)
+        return 1 - u**3 * (10 - 15 * u + 6 * u**2)
+
     def intensity(self, place, depth, wavelength):
         """|U|² on the fine lattice about `place` (x, y on the sensor) for a source seen in the direction of `place`."""
         k = 2 * np.pi / wavelength
@@ -47,6 +61,7 @@ class Referee:
         air = self.distance - sum(t for _, t in self.films)
         path = air * np.sqrt(np.maximum(1 - p2, 0)) + sum(t * np.sqrt(np.maximum(n**2 - p2, 0)) for n, t in self.films)
         move = np.exp(1j * k * path + 2j * np.pi * (fx * place[0] + fy * place[1])) * (p2 < 1)
+        move = move * self._lands(wavelength * fx, wavelength * fy, np.sqrt(np.maximum(1 - p2, 1e-6)), place)
         out = np.fft.ifft2(np.fft.fft2(np.fft.ifftshift(wave)) * move)
         # the wave reaches the sensor of a lattice that wraps: the caller keeps the window well inside
         return np.abs(np.fft.fftshift(out)) ** 2 / self.open.sum()
@@ -88,6 +103,7 @@ class Referee:
         runs = p**2 + q**2 < 0.998
         s = np.sqrt(np.where(runs, 1 - p**2 - q**2, 1))
         move = runs * np.exp(1j * k * self.distance * s + 2j * np.pi * (fx * place[0] + fy * place[1]))
+        move = move * self._lands(p, q, s, place)
         scalar = self.open * np.exp(1j * (k * source + self.lens_phase()))
         electric, magnetic = [], []
         straight = np.zeros_like(a)

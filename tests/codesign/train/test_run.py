@@ -1,5 +1,6 @@
 """A whole run at the smallest size: presets, stop and resume bit for bit, search within budgets, refusals by name."""
 
+import gc
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from codesign.batches import Pool
 from codesign.commands import codesign as command_codesign
 from codesign.network.architecture import smallest
 from codesign.train import run
@@ -52,6 +54,17 @@ window_samples = 9
 def settings(tmp_path):
     (tmp_path / "run.toml").write_text(TINY)
     return run.load(tmp_path / "run.toml")
+
+
+def test_runs_of_several_seeds_hold_one_pool_of_frames_between_them(settings):
+    """Nine runs of an experiment held nine pools of a gigabyte; a pool that went is rendered again, the same."""
+    going = [run.start(replace(settings, inner=replace(settings.inner, seed=seed))) for seed in (31, 32)]
+    first, other, again = (going[i].trainer.scenes.batch(1, 2) for i in (0, 1, 0))
+    gc.collect()
+    assert sum(isinstance(held, Pool) for held in gc.get_objects()) <= 1
+    assert torch.equal(first.slip_mm, again.slip_mm)
+    assert torch.equal(first.mask, again.mask)
+    assert not torch.equal(first.slip_mm, other.slip_mm)
 
 
 def _end(going, path):
