@@ -1,6 +1,7 @@
 """Rigorous coupled-wave analysis of one pillar cell.
 
-``jones`` gives both polarisations of a cell of any shape, lattice and layers, ``near_field`` the fields in it.
+``jones`` gives both polarisations of a cell of any shape, lattice and layers, ``jones_derivatives`` also their exact
+derivatives by every number of it, ``near_field`` the fields in it.
 ``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares the work over diameters,
 ``derivatives`` differentiates it exactly (round pillars). Light comes from the substrate.
 """
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from metalens.rcwa.near import NearField as NearField
     from metalens.rcwa.near import near_field as near_field
     from metalens.rcwa.near import near_fields as near_fields
+    from metalens.rcwa.rates.verb import JonesDerivatives as JonesDerivatives
+    from metalens.rcwa.rates.verb import Rate as Rate
+    from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
     from metalens.rcwa.verbs import derivatives as derivatives
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
@@ -32,6 +36,9 @@ __getattr__, __dir__, __all__ = attach(
         "anchored": "",
         "derivatives": "verbs",
         "jones": "any_shape",
+        "jones_derivatives": "metalens.rcwa.rates.verb",
+        "JonesDerivatives": "metalens.rcwa.rates.verb",
+        "Rate": "metalens.rcwa.rates.verb",
         "NearField": "near",
         "most_harmonics": "any_shape",
         "near_field": "near",

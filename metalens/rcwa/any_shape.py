@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -86,24 +87,8 @@ def jones(
     check_tolerance(tolerance)
     this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
     climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
-    stages, cut = 0, 0.0
-    if cell.sidewall_rad:
-        coarse = min(climb.reaches[-1], _COARSE)
-        stages, cut = wall.enough(lambda count: _both(_truncated(this, coarse, count)), tolerance)
-    before = climb.before
-    history: list[Array] = []
-    for reach in climb.reaches:
-        found = _truncated(this, reach, stages)
-        history.append(_both(found))
-        error = climb.crowded * _moved(history, reach, before) + cut
-        if len(history) > before and error <= tolerance:
-            break
-    error = min(error, 2.0)
-    met = error <= tolerance
-    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    looked_at = [both[0] for both in history[-1 - before : -1]]
-    earlier = np.array(looked_at[:1] * (MOST_COMPARED - before) + looked_at).reshape(-1, 2, 2)
-    return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
+    stages, cut = collocation(this, climb, tolerance)
+    return climbed(climb, cut, tolerance, lambda reach: _truncated(this, reach, stages))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +128,38 @@ def ladder(this: Problem, harmonics: int | None, *, collocated: bool = False) ->
     return Ladder(range(first, last + 1), before, max(thin, float(crowding(gap, cell.pitch_um))))
 
 
+def climbed(climb: Ladder, cut: float, tolerance: float, at: Callable[[int], Jones]) -> Jones:
+    """The result of the least truncation that meets the tolerance, or of the last; cut: what its collocation leaves."""
+    before = climb.before
+    history: list[Array] = []
+    for reach in climb.reaches:
+        found = at(reach)
+        history.append(_both(found))
+        error = climb.crowded * moved(history, reach, before) + cut
+        if len(history) > before and error <= tolerance:
+            break
+    error = min(error, 2.0)
+    met = error <= tolerance
+    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
+    looked_at = [both[0] for both in history[-1 - before : -1]]
+    earlier = np.array(looked_at[:1] * (MOST_COMPARED - before) + looked_at).reshape(-1, 2, 2)
+    return dataclasses.replace(found, t_error=error, converged=met, reason=reason, earlier=earlier)
+
+
+def collocation(this: Problem, climb: Ladder, tolerance: float) -> tuple[int, float]:
+    """Stages of a tilted wall and what they leave of t; (0, 0) for an upright one."""
+    if not this.cell.sidewall_rad:
+        return 0, 0.0
+    coarse = min(climb.reaches[-1], _COARSE)
+    return wall.enough(lambda count: _both(_truncated(this, coarse, count)), tolerance)
+
+
 def _both(found: Jones) -> Array:
     """(2, 2, 2) t and r."""
     return np.stack([found.t, found.r])
 
 
-def _moved(history: list[Array], reach: int, before: int) -> float:
+def moved(history: list[Array], reach: int, before: int) -> float:
     """Error of the last truncation: :func:`metalens.rcwa.solver.safety` times the farthest of those before it, of each
     what it tells of the last (:func:`_told`)."""
     earlier = history[-1 - before : -1][::-1]
@@ -214,6 +225,11 @@ def _truncated(this: Problem, reach: int, stages: int) -> Jones:
             for row, leave in places.items():
                 sign = come[1] * leave[1]
                 t[row, column], r[row, column] = sign * found.t[leave[0]], sign * found.r[leave[0]]
-    names = ("x", "y") if light.normal else ("s", "p")
+    return unjudged(this, reach, np.stack([t, r]), energy)
+
+
+def unjudged(this: Problem, reach: int, both: Array, energy: Array) -> Jones:
+    """One truncation as a record, before its error is known."""
+    names = ("x", "y") if this.light.normal else ("s", "p")
     count = int(np.count_nonzero(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach))
-    return Jones(names, t, r, math.inf, energy, count, False, "")
+    return Jones(names, both[0], both[1], math.inf, energy, count, False, "")

@@ -165,17 +165,18 @@ def _returned(pair: tuple[Array, Array], fields: Fields, unit: Array) -> Array:
 def _regions(this: Case, ways: Waves, diameter_um: float, steps: int) -> list[_Region]:
     def films(stack: tuple[Film, ...], indices: tuple[tuple[complex, float], ...]) -> list[_Region]:
         pairs = zip(stack, indices, strict=True)
-        return [_Region(_film(ways, index), height, film.material, None) for film, (index, height) in pairs]
+        return [_Region(film_layer(ways, index), height, film.material, None) for film, (index, height) in pairs]
 
     pillar = []
     for section in sections(steps):
         flat = bool(homogeneous(this, np.array(diameter_um)))
-        part = _film(ways, this.between) if flat else layer(*mixed(this, ways, np.array(diameter_um), section))
+        part = film_layer(ways, this.between) if flat else layer(*mixed(this, ways, np.array(diameter_um), section))
         pillar.append(_Region(part, section.share * this.cell.height_um * this.k0, None, section))
     return films(this.cell.under, this.media.under) + pillar + films(this.cell.over, this.media.over)
 
 
-def _film(ways: Waves, index: complex) -> Layer:
+def film_layer(ways: Waves, index: complex) -> Layer:
+    """A homogeneous layer, its plane waves as modes."""
     kz = normal_component(ways.kappa, index)
     kz = np.where(np.abs(kz) < _GRAZING, _GRAZING, kz)
     is_p = np.arange(len(kz)) < ways.p_count

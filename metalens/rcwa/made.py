@@ -23,19 +23,27 @@ def walls(cell: Cell, size_um: float, wavelength_um: float, operators: Operators
     return [Wall(interpolated(part.sample), part.reduced_height) for part in made] if cell.sidewall_rad else made
 
 
+def nodes() -> Array:
+    """(k,) shares of the height whose cross-sections stand for a tilted wall: Chebyshev points."""
+    return np.asarray((1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2)
+
+
+def weights(share: float | Array) -> Array:
+    """(*shape, k) of the nodes, in the polynomial through their values."""
+    vandermonde = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes() - 1, _NODES - 1))
+    return np.asarray(np.polynomial.chebyshev.chebvander(2 * np.asarray(share) - 1, _NODES - 1) @ vandermonde)
+
+
 def interpolated(sample: Sample) -> Sample:
     """P and Q from polynomials through their values at Chebyshev points of the height, worked out when first asked."""
-    nodes = (1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2
-    vandermonde = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes - 1, _NODES - 1))
 
     @functools.cache
     def values() -> tuple[Array, Array]:
-        P, Q = zip(*(sample(float(node)) for node in nodes), strict=True)
+        P, Q = zip(*(sample(float(node)) for node in nodes()), strict=True)
         return np.stack(P), np.stack(Q)
 
     def at(share: float) -> tuple[Array, Array]:
-        weights = np.polynomial.chebyshev.chebvander(2 * share - 1, _NODES - 1) @ vandermonde
-        P, Q = (np.tensordot(weights.ravel(), part, 1) for part in values())
+        P, Q = (np.tensordot(weights(share).ravel(), part, 1) for part in values())
         return P, Q
 
     return at
@@ -43,7 +51,7 @@ def interpolated(sample: Sample) -> Sample:
 
 def _wall(cell: Cell, layer: Layer, grow_um: float, size_um: float, wavelength_um: float, operators: Operators) -> Wall:
     def sample(share: float) -> tuple[Array, Array]:
-        wide = grow_um + (share - 0.5) * widening(cell) * layer.height_um
+        wide = grow_um + lift(cell, layer, share)
         return operators(pattern.slab(cell, layer, size_um, wavelength_um, grow_um=wide))
 
     return Wall(sample, layer.height_um * 2 * math.pi / wavelength_um)
@@ -57,8 +65,8 @@ def check_size(cell: Cell, size_um: float) -> None:
     """
     if not (math.isfinite(size_um) and size_um > 0):
         raise CellError(f"size = {size_um} um: need a finite length above 0")
-    for (layer, grow), lift in itertools.product(spread(cell), (-0.5, 0.5)):
-        wide = layer.grow_um + grow + lift * widening(cell) * layer.height_um + 2 * layer.coat_um
+    for (layer, grow), end in itertools.product(spread(cell), (0.0, 1.0)):
+        wide = layer.grow_um + grow + lift(cell, layer, end) + 2 * layer.coat_um
         if cell.gap_um(size_um, grow_um=wide) <= 0:
             raise CellError(
                 f"{cell.described}, size {size_um:g} um: a section {wide:+.4g} um wider touches its neighbour on a "
@@ -69,6 +77,11 @@ def check_size(cell: Cell, size_um: float) -> None:
 def widening(cell: Cell) -> float:
     """Change of width for each um of height above the middle."""
     return -2 * math.tan(cell.sidewall_rad)
+
+
+def lift(cell: Cell, layer: Layer, share: float) -> float:
+    """Change of width from the middle of a section to this share of its height."""
+    return (share - 0.5) * widening(cell) * layer.height_um
 
 
 def spread(cell: Cell) -> list[tuple[Layer, float]]:

@@ -74,9 +74,9 @@ def respond(ways: Waves, media: Media, layers: list[Layer], zero: int, *, betwee
     source = np.zeros(len(ways.kappa), complex)
     source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
     found = between(top, foot, source) if between else match(layers, media.heights, top, foot, source)
-    incident = _flux(below)[zero]
-    t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(_flux(above) / incident)
-    r = _reflected(ways, media, foot, drop, found, zero) * np.sqrt(_flux(below) / incident)
+    incident = flux(below)[zero]
+    t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(flux(above) / incident)
+    r = _reflected(ways, media, foot, drop, found, zero) * np.sqrt(flux(below) / incident)
     return Amplitudes(t, r)
 
 
@@ -92,9 +92,9 @@ def match(layers: list[Layer], heights: tuple[float, ...], top: Pair, foot: Pair
         return Fields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
     pair, returns = top, []
     for part, height in zip(reversed(layers), reversed(heights), strict=True):
-        back, kept, fade = _reflection(part, height, pair)
+        back, kept, fade = reflection(part, height, pair)
         returns.append((back, kept, fade))
-        pair = _foot_pair(part, back, kept, fade)
+        pair = foot_pair(part, back, kept, fade)
     a = _solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
     u, w = _times(pair[0], a), _times(pair[1], a)
     u_top, w_top, ups, downs = u, w, [], []
@@ -109,7 +109,7 @@ def match(layers: list[Layer], heights: tuple[float, ...], top: Pair, foot: Pair
     return Fields(u, w, u_top, w_top, ups, downs)
 
 
-def _reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Array]:
+def reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Array]:
     """Downward amplitudes at the top for each upward one at the foot, for the modes that reach the top at all."""
     exponent = part.q * height
     kept = int(np.count_nonzero(exponent.imag < _FADED, axis=-1).max())
@@ -125,7 +125,8 @@ def _reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Arr
 _FADED = 41.0  # exp(-41) = 1.6e-18
 
 
-def _foot_pair(part: Layer, back: Array, kept: int, fade: Array) -> Pair:
+def foot_pair(part: Layer, back: Array, kept: int, fade: Array) -> Pair:
+    """The upward-radiating pair at the foot of a layer, its columns the upward modes there."""
     U, V = part.W.astype(complex), part.V.astype(complex)
     trip = fade[..., :, None] * back[..., :kept, :]
     U[..., :kept] += part.W[..., :kept] @ trip
@@ -165,10 +166,10 @@ def _reflected(ways: Waves, media: Media, foot: Pair, drop: Array, fields: Field
     return np.asarray(back)
 
 
-def _flux(pair: Pair) -> Array:
+def flux(pair: Pair) -> Array:
     """Power along z of outgoing waves of unit amplitude, Re(u w*); 0 for waves that decay."""
-    flux = (pair[0] * np.conj(pair[1])).real
-    return np.where(flux > 1e-12 * np.abs(pair[0] * pair[1]), flux, 0.0)
+    power = (pair[0] * np.conj(pair[1])).real
+    return np.where(power > 1e-12 * np.abs(pair[0] * pair[1]), power, 0.0)
 
 
 def _across(left: Array, matrix: Array) -> Array:

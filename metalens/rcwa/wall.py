@@ -43,13 +43,38 @@ class Wall:
     reduced_height: float
 
 
-def downwards(this: Wall, low: float, high: float, stages: int) -> Array:
-    """(2 n, 2 n) matrix from the fields (u, w) at the upper end of a panel to those at its lower end.
+@dataclass(frozen=True, eq=False, slots=True)
+class Panel:
+    """A part of a wall, its unknowns put in: fields at the Gauss points from those at its upper end.
 
-    low, high: shares of the height.
+    share: (m,) of the height. step: -i times its reduced height. weights: (m,). P, Q: (m, n, n).
+    u, w: (m n, 2 n) from (u, w) at the upper end.
     """
+
+    share: Array
+    step: complex
+    weights: Array
+    P: Array
+    Q: Array
+    u: Array
+    w: Array
+
+    @property
+    def downwards(self) -> Array:
+        """(2 n, 2 n) matrix from the fields (u, w) at the upper end to those at the lower end."""
+        stages, n = self.P.shape[:2]
+        both = np.eye(2 * n, dtype=complex)
+        for half, part, field in ((slice(n), self.P, self.w), (slice(n, None), self.Q, self.u)):
+            inner = field.reshape(stages, n, -1)
+            both[half] += self.step * np.einsum("k,kij,kjl->il", self.weights, part, inner, optimize=True)
+        return both
+
+
+def panel(this: Wall, low: float, high: float, stages: int) -> Panel:
+    """The part of a wall between two shares of its height."""
     c, b, a = gauss(stages)
-    P, Q = (np.stack(part) for part in zip(*(this.sample(high - share * (high - low)) for share in c), strict=True))
+    share = high - c * (high - low)
+    P, Q = (np.stack(part) for part in zip(*(this.sample(float(s)) for s in share), strict=True))
     step = -1j * this.reduced_height * (high - low)
     n = P.shape[-1]
 
@@ -61,10 +86,7 @@ def downwards(this: Wall, low: float, high: float, stages: int) -> Array:
     given = np.concatenate([start, step * (p @ start)], axis=1)
     u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), given)  # u = u0 + step p w, with w put in
     w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
-    both = np.eye(2 * n, dtype=complex)
-    both[:n] += step * np.einsum("k,kij,kjl->il", b, P, w.reshape(stages, n, -1), optimize=True)
-    both[n:] += step * np.einsum("k,kij,kjl->il", b, Q, u.reshape(stages, n, -1), optimize=True)
-    return both
+    return Panel(share, step, b, P, Q, u, w)
 
 
 def match(walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages: int) -> Fields:
@@ -77,7 +99,7 @@ def match(walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages
     scales = []
     for this in reversed(walls):
         for low, high in zip(EDGES[-2::-1], EDGES[:0:-1], strict=True):
-            pair, scale = np.linalg.qr(downwards(this, low, high, stages) @ pair)
+            pair, scale = np.linalg.qr(panel(this, low, high, stages).downwards @ pair)
             scales.append(scale)
     U, V = pair[:n], pair[n:]
     a = np.linalg.solve(foot[1][:, None] * U + foot[0][:, None] * V, source)

@@ -72,7 +72,7 @@ def orders(harmonics: int, frame: Frame) -> Orders:
     m, n = m[keep], n[keep]
     ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
     pairs = ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
-    first, second, third, fourth = (_link(rows, columns, frame.operations, reach) for rows, columns in pairs)
+    first, second, third, fourth = (link(rows, columns, frame.operations, reach) for rows, columns in pairs)
     return Orders(ex, ey, ez, hz, reach, (first, second, third, fourth))
 
 
@@ -87,7 +87,12 @@ def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) 
     return Set(m[keep], n[keep], size, signs)
 
 
-def _link(rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]) -> Link:
+def link(rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]) -> Link:
+    """How a function couples two sets; it must turn the fields of the columns into those of the rows.
+
+    Rows and columns of one class take functions that all operations leave as they are. Of classes that differ by the
+    sign s(g) of each operation, functions with f(g r) = s(g) f(r).
+    """
     dm = np.stack([rows.m[:, None] - sx * columns.m for sx, _, _ in operations], axis=-1)
     dn = np.stack([rows.n[:, None] - sy * columns.n for _, sy, _ in operations], axis=-1)
     share = np.sqrt(rows.size[:, None] * columns.size) / len(operations)

@@ -38,10 +38,10 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
     both = [np.array([[a, 0.1], [0.2j, b]]) for a, b in t]
     two = 49 / (81 - 49) * 0.02  # of nine orders, seven leave 1.5: whole; six 0.8, five 0.45, four 0.25 of the way
     assert two > 0.02
-    assert any_shape._moved(both, 9, 4) == pytest.approx(5.4 * 36 / 45 * 0.04, rel=1e-9)
-    assert any_shape._moved(both, 9, 5) == pytest.approx(5.4 * 16 / 65 * (9.0 - 0.31), rel=1e-9)
-    assert any_shape._moved(both, 15, 4) == pytest.approx(3 * 0.04, rel=1e-9)
-    assert any_shape._moved(both[:1], 9, 4) == pytest.approx(5.4)
+    assert any_shape.moved(both, 9, 4) == pytest.approx(5.4 * 36 / 45 * 0.04, rel=1e-9)
+    assert any_shape.moved(both, 9, 5) == pytest.approx(5.4 * 16 / 65 * (9.0 - 0.31), rel=1e-9)
+    assert any_shape.moved(both, 15, 4) == pytest.approx(3 * 0.04, rel=1e-9)
+    assert any_shape.moved(both[:1], 9, 4) == pytest.approx(5.4)
 
 
 @pytest.mark.parametrize(("gap_um", "times"), [(0.0, 6.0), (0.0019, 4.75), (0.0057, 2.25), (0.0076, 1.0), (0.1, 1.0)])

@@ -1,0 +1,186 @@
+"""Every number of a pillar by its name, as a cell file has it, and how sections, permittivities and heights follow it.
+
+Rims and permittivities follow by elementary functions, whose derivatives are differences of sixth order: 1e-11.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from metalens.cell import Cell, Index, Material, materials
+from metalens.cell.shapes.motion import difference
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+from metalens.rcwa import made
+from metalens.rcwa.rates.tables import numbers
+from metalens.rcwa.rates.truncated import Rates, slab_at
+
+_STEP = 1e-4  # of a number; of 1 where it is an angle or a coordinate, of the size where it is a change of width
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A pillar whose number has changed: the cell, its size, and what all widths have grown by."""
+
+    cell: Cell
+    size_um: float
+    grow_um: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A number of a pillar: what the pillar is when it changes by an amount, and a step for differences."""
+
+    name: str
+    moved: Callable[[float], Moved]
+    step: float
+
+
+def parameters(cell: Cell, size_um: float, wavelength_um: float) -> dict[str, Parameter]:
+    """All of them, by name."""
+    found = [
+        Parameter("size_um", lambda x: Moved(cell, size_um + x), _STEP * size_um),
+        Parameter("grow_um", lambda x: Moved(cell, size_um, x), _STEP * size_um),
+        Parameter("sidewall_rad", _of(cell, size_um, "sidewall_rad"), _STEP),
+        *_of_shape(cell, size_um),
+        *_of_heights(cell, size_um),
+        *_of_indices(cell, size_um, wavelength_um),
+    ]
+    return {one.name: one for one in found}
+
+
+def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], Moved]:
+    return lambda x: Moved(dataclasses.replace(cell, **{name: getattr(cell, name) + x}), size_um)
+
+
+def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parameter]:
+    """Real parts of the indices of pillar and surroundings, and of layers that have their own."""
+
+    def beside(material: Material, x: float) -> Index:
+        now = materials.index(material, wavelength_um)
+        return Index(now.real + x, now.imag)
+
+    def of_cell(name: str, x: float) -> Moved:
+        return Moved(dataclasses.replace(cell, **{name: beside(getattr(cell, name), x)}), size_um)
+
+    def of_layer(i: int, name: str, x: float) -> Moved:
+        changed = dataclasses.replace(cell.layers[i], **{name: beside(getattr(cell.layers[i], name), x)})
+        return Moved(dataclasses.replace(cell, layers=(*cell.layers[:i], changed, *cell.layers[i + 1 :])), size_um)
+
+    found = [Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP) for name in ("pillar", "between")]
+    for i, layer in enumerate(cell.layers):
+        own = [name for name in ("material", "between", "coat") if getattr(layer, name) is not None]
+        found += [Parameter(f"layers.{i}.{name}.n", functools.partial(of_layer, i, name), _STEP) for name in own]
+    return found
+
+
+def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
+    """Ratios, the in-plane angle, corners: every number that the record of the shape has."""
+    shape, found = cell.shape, []
+
+    def changed(name: str, value: Callable[[float], Any]) -> Callable[[float], Moved]:
+        return lambda x: Moved(
+            dataclasses.replace(cell, shape=dataclasses.replace(shape, **{name: value(x)})), size_um
+        )
+
+    for name in (part.name for part in dataclasses.fields(shape)):
+        now: Any = getattr(shape, name)
+        if isinstance(now, float):
+            step = _STEP if name.endswith("_rad") else _STEP * now
+            found.append(Parameter(f"shape.{name}", changed(name, lambda x, now=now: now + x), step))
+        elif isinstance(now, tuple):
+            for i, axis in np.ndindex(len(now), 2):
+                corner = changed(name, lambda x, now=now, i=i, axis=axis: _shifted(now, i, axis, x))
+                found.append(Parameter(f"shape.{name}.{i}.{'xy'[axis]}", corner, _STEP))
+    return found
+
+
+def _shifted(corners: tuple[tuple[float, float], ...], i: int, axis: int, x: float) -> tuple[tuple[float, float], ...]:
+    moved = np.array(corners, float)
+    moved[i, axis] += x
+    return tuple((float(a), float(b)) for a, b in moved)
+
+
+def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
+    """Heights of the pillar or of its layers, their growth and coats, thicknesses of films."""
+    found = []
+    if not cell.layers:
+        found.append(Parameter("height_um", _of(cell, size_um, "height_um"), _STEP * cell.height_um))
+    for i, layer in enumerate(cell.layers):
+        for name in ("height_um", "grow_um", *(("coat_um",) if layer.coat is not None else ())):
+            step = _STEP * (size_um if name == "grow_um" else getattr(layer, name))
+            found.append(Parameter(f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step))
+    for side in ("under", "over"):
+        for i, film in enumerate(getattr(cell, side)):
+            step = _STEP * film.thickness_um
+            found.append(Parameter(f"{side}.{i}.thickness_um", _of_film(cell, size_um, side, i), step))
+    return found
+
+
+def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float], Moved]:
+    def moved(x: float) -> Moved:
+        changed = dataclasses.replace(cell.layers[i], **{name: getattr(cell.layers[i], name) + x})
+        layers = (*cell.layers[:i], changed, *cell.layers[i + 1 :])
+        return Moved(
+            dataclasses.replace(cell, layers=layers, height_um=sum(layer.height_um for layer in layers)), size_um
+        )
+
+    return moved
+
+
+def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float], Moved]:
+    def moved(x: float) -> Moved:
+        films = list(getattr(cell, side))
+        films[i] = dataclasses.replace(films[i], thickness_um=films[i].thickness_um + x)
+        return Moved(dataclasses.replace(cell, **{side: tuple(films)}), size_um)
+
+    return moved
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Motion:
+    """What a number moves, per unit of it. heights: (regions,); numbers: for every section, share -> (k,) numbers."""
+
+    heights: Array
+    numbers: tuple[dict[float, Array], ...]
+
+    def rate(self, found: Rates) -> Array:
+        """(2, 2, 2) derivative of t and r."""
+        total = np.tensordot(self.heights, found.by_height, 1)
+        for section, by in zip(self.numbers, found.by_numbers, strict=True):
+            for share, weight in by.items():
+                total = total + weight @ section[share]
+        return np.asarray(total)
+
+
+def motion(this: Parameter, wavelength_um: float, found: Rates) -> Motion:
+    """At the shares of the heights that a truncation was differentiated at.
+
+    Raises:
+        CellError: a pillar that is at an end of where it may be, or just losing or gaining a part.
+    """
+
+    def at(i: int, share: float, x: float) -> Array:
+        now = this.moved(x)
+        layer, grow = made.spread(now.cell)[i]
+        return numbers(slab_at(now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share))
+
+    try:
+        heights = difference(lambda x: _heights(this.moved(x).cell), this.step)
+        by = tuple(
+            {share: difference(functools.partial(at, i, share), this.step) for share in section}
+            for i, section in enumerate(found.by_numbers)
+        )
+    except CellError as error:
+        raise CellError(f"no derivative by {this.name}: {error} (or ask for others alone, by = ...)") from None
+    return Motion(heights, by)
+
+
+def _heights(cell: Cell) -> Array:
+    """(regions,) um, foot first."""
+    under, over = ([film.thickness_um for film in side] for side in (cell.under, cell.over))
+    return np.array([*under, *(layer.height_um for layer in cell.sections), *over])

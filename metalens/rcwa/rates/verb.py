@@ -1,0 +1,104 @@
+"""The public derivatives of a cell of any shape, each with an estimate of its error."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.cell import Cell, check_tolerance
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError
+from metalens.rcwa.any_shape import Jones, climbed, collocation, ladder, moved, unjudged
+from metalens.rcwa.problem import Problem, problem
+from metalens.rcwa.rates.parameters import Motion, Parameter, motion, parameters
+from metalens.rcwa.rates.truncated import Rates, truncated
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rate:
+    """Derivative by one number, per um, rad or 1 as its name says.
+
+    t, r: (2, 2) as of :class:`metalens.rcwa.Jones`. error: estimate of the largest |rate - exact| of both.
+    """
+
+    t: Array
+    r: Array
+    error: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JonesDerivatives:
+    """jones: the value. by: name of a number -> its derivative, see :func:`jones_derivatives`."""
+
+    jones: Jones
+    by: dict[str, Rate]
+
+
+def jones_derivatives(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    tolerance: float = 1e-3,
+    harmonics: int | None = None,
+    by: Iterable[str] | None = None,
+) -> JonesDerivatives:
+    """The result of :func:`metalens.rcwa.jones` and its derivatives by every number of shape, section and material.
+
+    Args:
+        by: which numbers, None: all. They are named as in a cell file: size_um, height_um (of a pillar without
+            layers), sidewall_rad, shape.ratio, shape.angle_rad, shape.corners.2.y (the third corner),
+            layers.0.height_um (also grow_um, coat_um), under.0.thickness_um, over.0.thickness_um, pillar.n, between.n,
+            layers.0.material.n (also between.n, coat.n), and grow_um, by which every section is wider along every
+            pair of edges, whatever its shape. The rest as for ``jones``.
+
+    Accuracy: the exact derivatives of the truncation that ``jones`` gives (1e-9 of the largest), with its field of
+        normals held: it is sampled, and any gives the same limit. By k: 1j times that by n. ``error`` follows from how
+        the derivative moves between truncations as ``t_error`` does from t.
+
+    Raises:
+        CellError, MaterialError: as ``jones``; a number that the cell does not have, or at which it has no derivative
+            (the hole of a ring is just closing, a ratio at its end).
+    """
+    check_tolerance(tolerance)
+    this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
+    wanted = _wanted(parameters(cell, size_um, wavelength_um), by)
+    climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
+    stages, cut = collocation(this, climb, tolerance)
+    sloped = not stages and any(one.name == "sidewall_rad" for one in wanted)
+    reaches: list[int] = []
+    found: list[Rates] = []
+
+    def at(reach: int) -> Jones:
+        reaches.append(reach)
+        found.append(truncated(this, reach, stages, sloped=sloped))
+        return unjudged(this, reach, found[-1].both, found[-1].energy)
+
+    value = climbed(climb, cut, tolerance, at)
+    motions = {one.name: motion(one, wavelength_um, found[0]) for one in wanted}
+    left = _left_by_collocation(this, motions, stages, reaches[0])
+    rates = {}
+    for name, move in motions.items():
+        history = [move.rate(one) for one in found]
+        error = climb.crowded * moved(history, reaches[-1], climb.before) if len(history) > 1 else math.inf
+        rates[name] = Rate(history[-1][0], history[-1][1], error + left[name])
+    return JonesDerivatives(value, rates)
+
+
+def _wanted(known: dict[str, Parameter], by: Iterable[str] | None) -> list[Parameter]:
+    names = list(known) if by is None else list(by)
+    for name in names:
+        if name not in known:
+            raise CellError(f"no number {name!r} in this cell; it has {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def _left_by_collocation(this: Problem, motions: dict[str, Motion], stages: int, reach: int) -> dict[str, float]:
+    """What one stage more changes at a coarse truncation; 0 for upright walls."""
+    if not stages:
+        return dict.fromkeys(motions, 0.0)
+    few, more = (truncated(this, reach, count, sloped=False) for count in (stages - 1, stages))
+    return {name: float(np.abs(move.rate(more) - move.rate(few)).max()) for name, move in motions.items()}
