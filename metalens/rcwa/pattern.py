@@ -72,7 +72,7 @@ def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array
         factor = outline.fourier(gx[:, None], gy) / area
         direct += (inner - outer) * factor
         inverse += (1 / inner - 1 / outer) * factor
-    return _real(direct), _real(inverse)
+    return real(direct), real(inverse)
 
 
 def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array, Array]:
@@ -80,7 +80,7 @@ def normal_tables(outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, i
     most = (_HELD * math.ceil(2 * reach[0] / _HELD), _HELD * math.ceil(2 * reach[1] / _HELD))
     rows, columns = (slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True))
     first, second, third = (whole[rows, columns] for whole in _normals(outlines, cell, most))
-    return _real(first), _real(second), _real(third)
+    return real(first), real(second), real(third)
 
 
 @lru_cache(maxsize=64)
@@ -154,7 +154,8 @@ def permittivity(this: Slab, cell: Cell, x_um: Array, y_um: Array) -> Array:
     return eps
 
 
-def _real(values: Array) -> Array:
+def real(values: Array) -> Array:
+    """Without the imaginary part where it is rounding."""
     return np.asarray(values.real if np.abs(values.imag).max() <= 1e-12 * np.abs(values).max() else values)
 
 

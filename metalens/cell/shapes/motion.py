@@ -23,10 +23,16 @@ def numbers(outline: Outline) -> Array:
     return np.concatenate([_numbers(part) for part in outline.parts])
 
 
-def pulled(outline: Outline, gx: Array, gy: Array, weight: Array) -> Array:
-    """(k,) derivatives of the sum of weight x Fourier factor over the (n,) wave vectors, by every number."""
-    g = np.stack([gx, gy], axis=-1)
-    return np.concatenate([(_conic if isinstance(p, Conic) else _loop)(p, g, weight) for p in outline.parts])
+def pushed(outline: Outline, gx: Array, gy: Array, rates: Array) -> Array:
+    """(n,) derivatives of the Fourier factor at the wave vectors (n,), as the (k,) numbers change at these rates."""
+    g, start = np.stack([gx, gy], axis=-1), 0
+    total = np.zeros(len(g), complex)
+    for part in outline.parts:
+        count = len(_numbers(part))
+        of = _conic if isinstance(part, Conic) else _loop
+        total += of(part, g, rates[start : start + count].real)  # type: ignore[arg-type]
+        start += count
+    return total
 
 
 def difference(of: Callable[[float], Array], step: float) -> Array:
@@ -47,32 +53,33 @@ def _numbers(part: Conic | Loop) -> Array:
     return np.array(part.corners_um, float).ravel()
 
 
-def _conic(part: Conic, g: Array, weight: Array) -> Array:
+def _conic(part: Conic, g: Array, rates: Array) -> Array:
     """From F = pi a b 2 J1(s) / s, s = |(a X, b Y)|, with d(2 J1(s) / s) / ds = -2 J2(s) / s."""
     from scipy.special import jv
 
     a, b = part.half_x_um, part.half_y_um
     c, s = math.cos(part.angle_rad), math.sin(part.angle_rad)
-    x, y = c * g[..., 0] + s * g[..., 1], c * g[..., 1] - s * g[..., 0]
+    x, y = c * g[:, 0] + s * g[:, 1], c * g[:, 1] - s * g[:, 0]
     reach = np.hypot(a * x, b * y)
     small = reach < 1e-3
     safe = np.where(small, 1.0, reach)
     value = np.where(small, 1 - reach**2 / 8, 2 * jv(1, safe) / safe)
-    slope = np.where(small, -0.25 + reach**2 / 48, -2 * jv(2, safe) / safe**2)  # of value, by s, over s
-    rates = (b * (value + slope * (a * x) ** 2), a * (value + slope * (b * y) ** 2), a * b * slope * (a * a - b * b) * x * y)
-    return np.array([part.sign * math.pi * (weight * rate).sum() for rate in rates])
+    slope = np.where(small, -0.25 + reach**2 / 48, -2 * jv(2, safe) / safe**2)  # of the value, by s, over s
+    along, across = b * (value + slope * (a * x) ** 2), a * (value + slope * (b * y) ** 2)
+    turn = a * b * slope * (a - b) * (a + b) * x * y
+    return np.asarray(part.sign * math.pi * (rates[0] * along + rates[1] * across + rates[2] * turn))
 
 
-def _loop(part: Loop, g: Array, weight: Array) -> Array:
-    points = np.array(part.corners_um, float)
-    edge = np.roll(points, -1, axis=0) - points
-    turn = part.sign * math.copysign(1.0, float((points[:, 0] * np.roll(points[:, 1], -1)).sum() - (points[:, 1] * np.roll(points[:, 0], -1)).sum()))
-    half = g @ edge.T / 2
-    wave = weight[:, None] * np.exp(-1j * (g @ (points + edge / 2).T))
-    even, odd = (wave * np.sinc(half / np.pi)).sum(axis=0) / 2, 1j * (wave * _j1(half)).sum(axis=0) / 2
+def _loop(part: Loop, g: Array, rates: Array) -> Array:
+    points, speed = np.array(part.corners_um, float), rates.reshape(-1, 2)
+    after = np.roll(points, -1, axis=0)
+    edge = after - points
+    turn = part.sign * math.copysign(1.0, float((points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]).sum()))
     normal = turn * np.stack([edge[:, 1], -edge[:, 0]], axis=1)
-    starts, ends = normal * (even + odd)[:, None], normal * (even - odd)[:, None]
-    return np.asarray(starts + np.roll(ends, 1, axis=0)).ravel()
+    start, end = ((normal * v).sum(axis=1) for v in (speed, np.roll(speed, -1, axis=0)))
+    half = g @ edge.T / 2
+    moment = np.sinc(half / np.pi) * (start + end) / 2 + 0.5j * _j1(half) * (start - end)
+    return np.asarray((np.exp(-1j * (g @ (points + edge / 2).T)) * moment).sum(axis=1))
 
 
 def _j1(x: Array) -> Array:

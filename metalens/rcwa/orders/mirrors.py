@@ -100,7 +100,11 @@ def link(rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tupl
     return Link(place, share[..., None] * np.array(columns.signs, float))
 
 
-def product(space: Orders, table: Array, link: int) -> Array:
+def product(space: Orders, table: Array, pair: int) -> Array:
     """(k, l) matrix of the product with a function of these coefficients ((2 m reach) x (2 n reach) table)."""
-    pair = space.links[link]
+    return product_by(space.links[pair], table)
+
+
+def product_by(pair: Link, table: Array) -> Array:
+    """The same for any two sets."""
     return np.asarray(np.einsum("ijg,ijg->ij", table.ravel()[pair.place], pair.weight))

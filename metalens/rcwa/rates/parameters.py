@@ -5,6 +5,7 @@ Rims and permittivities follow by elementary functions, whose derivatives are di
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +18,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import made
 from metalens.rcwa.rates.tables import numbers
-from metalens.rcwa.rates.truncated import Rates, slab_at
+from metalens.rcwa.rates.truncated import Motion, shares, slab_at
 
 _STEP = 1e-4  # of a number; of 1 where it is an angle or a coordinate, of the size where it is a change of width
 
@@ -53,8 +54,13 @@ def parameters(cell: Cell, size_um: float, wavelength_um: float) -> dict[str, Pa
     return {one.name: one for one in found}
 
 
+def _with(record: Any, name: str, value: object) -> Any:
+    """A record with one field changed."""
+    return dataclasses.replace(record, **{name: value})
+
+
 def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], Moved]:
-    return lambda x: Moved(dataclasses.replace(cell, **{name: getattr(cell, name) + x}), size_um)
+    return lambda x: Moved(_with(cell, name, getattr(cell, name) + x), size_um)
 
 
 def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parameter]:
@@ -65,10 +71,10 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
         return Index(now.real + x, now.imag)
 
     def of_cell(name: str, x: float) -> Moved:
-        return Moved(dataclasses.replace(cell, **{name: beside(getattr(cell, name), x)}), size_um)
+        return Moved(_with(cell, name, beside(getattr(cell, name), x)), size_um)
 
     def of_layer(i: int, name: str, x: float) -> Moved:
-        changed = dataclasses.replace(cell.layers[i], **{name: beside(getattr(cell.layers[i], name), x)})
+        changed = _with(cell.layers[i], name, beside(getattr(cell.layers[i], name), x))
         return Moved(dataclasses.replace(cell, layers=(*cell.layers[:i], changed, *cell.layers[i + 1 :])), size_um)
 
     found = [Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP) for name in ("pillar", "between")]
@@ -83,18 +89,16 @@ def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
     shape, found = cell.shape, []
 
     def changed(name: str, value: Callable[[float], Any]) -> Callable[[float], Moved]:
-        return lambda x: Moved(
-            dataclasses.replace(cell, shape=dataclasses.replace(shape, **{name: value(x)})), size_um
-        )
+        return lambda x: Moved(dataclasses.replace(cell, shape=_with(shape, name, value(x))), size_um)
 
     for name in (part.name for part in dataclasses.fields(shape)):
         now: Any = getattr(shape, name)
         if isinstance(now, float):
             step = _STEP if name.endswith("_rad") else _STEP * now
-            found.append(Parameter(f"shape.{name}", changed(name, lambda x, now=now: now + x), step))
+            found.append(Parameter(f"shape.{name}", changed(name, functools.partial(operator.add, now)), step))
         elif isinstance(now, tuple):
             for i, axis in np.ndindex(len(now), 2):
-                corner = changed(name, lambda x, now=now, i=i, axis=axis: _shifted(now, i, axis, x))
+                corner = changed(name, functools.partial(_shifted, now, i, axis))
                 found.append(Parameter(f"shape.{name}.{i}.{'xy'[axis]}", corner, _STEP))
     return found
 
@@ -123,7 +127,7 @@ def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
 
 def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float], Moved]:
     def moved(x: float) -> Moved:
-        changed = dataclasses.replace(cell.layers[i], **{name: getattr(cell.layers[i], name) + x})
+        changed = _with(cell.layers[i], name, getattr(cell.layers[i], name) + x)
         layers = (*cell.layers[:i], changed, *cell.layers[i + 1 :])
         return Moved(
             dataclasses.replace(cell, layers=layers, height_um=sum(layer.height_um for layer in layers)), size_um
@@ -136,48 +140,36 @@ def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float],
     def moved(x: float) -> Moved:
         films = list(getattr(cell, side))
         films[i] = dataclasses.replace(films[i], thickness_um=films[i].thickness_um + x)
-        return Moved(dataclasses.replace(cell, **{side: tuple(films)}), size_um)
+        return Moved(_with(cell, side, tuple(films)), size_um)
 
     return moved
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Motion:
-    """What a number moves, per unit of it. heights: (regions,); numbers: for every section, share -> (k,) numbers."""
-
-    heights: Array
-    numbers: tuple[dict[float, Array], ...]
-
-    def rate(self, found: Rates) -> Array:
-        """(2, 2, 2) derivative of t and r."""
-        total = np.tensordot(self.heights, found.by_height, 1)
-        for section, by in zip(self.numbers, found.by_numbers, strict=True):
-            for share, weight in by.items():
-                total = total + weight @ section[share]
-        return np.asarray(total)
-
-
-def motion(this: Parameter, wavelength_um: float, found: Rates) -> Motion:
-    """At the shares of the heights that a truncation was differentiated at.
+def motion(this: Parameter, wavelength_um: float) -> Motion:
+    """What it moves.
 
     Raises:
         CellError: a pillar that is at an end of where it may be, or just losing or gaining a part.
     """
-
-    def at(i: int, share: float, x: float) -> Array:
-        now = this.moved(x)
-        layer, grow = made.spread(now.cell)[i]
-        return numbers(slab_at(now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share))
-
     try:
+        cell = this.moved(0.0).cell
         heights = difference(lambda x: _heights(this.moved(x).cell), this.step)
         by = tuple(
-            {share: difference(functools.partial(at, i, share), this.step) for share in section}
-            for i, section in enumerate(found.by_numbers)
+            np.stack(
+                [difference(functools.partial(_numbers, this, wavelength_um, i, s), this.step) for s in shares(cell)]
+            )
+            for i in range(len(cell.sections))
         )
     except CellError as error:
         raise CellError(f"no derivative by {this.name}: {error} (or ask for others alone, by = ...)") from None
     return Motion(heights, by)
+
+
+def _numbers(this: Parameter, wavelength_um: float, i: int, share: float, x: float) -> Array:
+    """Of section i at a share of its height, where the number has changed by x."""
+    now = this.moved(x)
+    layer, grow = made.spread(now.cell)[i]
+    return numbers(slab_at(now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share))
 
 
 def _heights(cell: Cell) -> Array:

@@ -6,6 +6,7 @@ The transposed modes are the inverses of the modes, V^-T and W^-T; a step of Gau
 the same identity holds from one end of it to the other, and for the values at its points, to rounding.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -41,9 +42,10 @@ class Fields:
     down: Array
     ends: Array
 
-    def one(self, k: int) -> "Fields":
-        """The fields of one wave, without their last axis."""
-        return Fields(self.up[..., k], self.down[..., k], self.ends[..., k])
+    def beside(self, other: "Fields") -> "Fields":
+        """These waves and others."""
+        pairs = ((self.up, other.up), (self.down, other.down), (self.ends, other.ends))
+        return Fields(*(np.concatenate(pair, axis=-1) for pair in pairs))
 
     @property
     def upside_down(self) -> "Fields":
@@ -85,7 +87,7 @@ def of_wall(this: Wall, stages: int, *, symmetric: bool) -> Region:
         return P.T, Q.T
 
     def panels(wall: Wall) -> tuple[Panel, ...]:
-        return tuple(panel(wall, low, high, stages) for low, high in zip(EDGES[:-1], EDGES[1:], strict=True))
+        return tuple(panel(wall, low, high, stages) for low, high in itertools.pairwise(EDGES))
 
     plain = panels(this)
     turned = plain if symmetric else panels(Wall(transposed, this.reduced_height))
@@ -142,7 +144,9 @@ def _up(region: Modes | Steps, state: tuple[Array, ...], here: Array) -> tuple[F
         down = back @ up[: len(fade)]
         late = np.zeros_like(up)
         late[: len(fade)] = fade[:, None] * up[: len(fade)]
-        return Fields(up, down, np.zeros((1, 0, here.shape[1]))), np.concatenate([part.W @ (late + down), part.V @ (late - down)])
+        return Fields(up, down, np.zeros((1, 0, here.shape[1]))), np.concatenate(
+            [part.W @ (late + down), part.V @ (late - down)]
+        )
     a, ends = state[-1].conj().T @ here, [here]
     for scale, both in zip(state[-2::-2], state[-3::-2], strict=True):
         a = np.linalg.solve(scale, a)

@@ -11,8 +11,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa.any_shape import Jones, climbed, collocation, ladder, moved, unjudged
 from metalens.rcwa.problem import Problem, problem
-from metalens.rcwa.rates.parameters import Motion, Parameter, motion, parameters
-from metalens.rcwa.rates.truncated import Rates, truncated
+from metalens.rcwa.rates.parameters import Parameter, motion, parameters
+from metalens.rcwa.rates.truncated import Motion, Rates, truncated
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,28 +62,33 @@ def jones_derivatives(
     Raises:
         CellError, MaterialError: as ``jones``; a number that the cell does not have, or at which it has no derivative
             (the hole of a ring is just closing, a ratio at its end).
+
+    >>> from metalens.cell import Cell, Index
+    >>> from metalens.cell.shapes import Rectangle
+    >>> cell = Cell(0.4, pillar=Index(2.4), shape=Rectangle(0.6))
+    >>> found = jones_derivatives(cell, 0.2, 0.85, harmonics=2, by=["height_um", "shape.angle_rad"])
+    >>> bool(abs(found.by["height_um"].t[0, 0]) > 1), bool(abs(found.by["shape.angle_rad"].t[0, 0]) < 1e-9)
+    (True, True)
     """
     check_tolerance(tolerance)
     this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
     wanted = _wanted(parameters(cell, size_um, wavelength_um), by)
+    motions = {one.name: motion(one, wavelength_um) for one in wanted}
     climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
     stages, cut = collocation(this, climb, tolerance)
-    sloped = not stages and any(one.name == "sidewall_rad" for one in wanted)
-    reaches: list[int] = []
     found: list[Rates] = []
 
     def at(reach: int) -> Jones:
-        reaches.append(reach)
-        found.append(truncated(this, reach, stages, sloped=sloped))
+        found.append(truncated(this, reach, stages, motions))
         return unjudged(this, reach, found[-1].both, found[-1].energy)
 
     value = climbed(climb, cut, tolerance, at)
-    motions = {one.name: motion(one, wavelength_um, found[0]) for one in wanted}
-    left = _left_by_collocation(this, motions, stages, reaches[0])
+    last = climb.reaches[len(found) - 1]
+    left = _left_by_collocation(this, motions, stages, climb.reaches[0])
     rates = {}
-    for name, move in motions.items():
-        history = [move.rate(one) for one in found]
-        error = climb.crowded * moved(history, reaches[-1], climb.before) if len(history) > 1 else math.inf
+    for name in motions:
+        history = [one.by[name] for one in found]
+        error = climb.crowded * moved(history, last, climb.before) if len(history) > 1 else math.inf
         rates[name] = Rate(history[-1][0], history[-1][1], error + left[name])
     return JonesDerivatives(value, rates)
 
@@ -100,5 +105,5 @@ def _left_by_collocation(this: Problem, motions: dict[str, Motion], stages: int,
     """What one stage more changes at a coarse truncation; 0 for upright walls."""
     if not stages:
         return dict.fromkeys(motions, 0.0)
-    few, more = (truncated(this, reach, count, sloped=False) for count in (stages - 1, stages))
-    return {name: float(np.abs(move.rate(more) - move.rate(few)).max()) for name, move in motions.items()}
+    few, more = (truncated(this, reach, count, motions).by for count in (stages - 1, stages))
+    return {name: float(np.abs(more[name] - few[name]).max()) for name in motions}

@@ -11,7 +11,7 @@ from metalens.cell.shapes import Rectangle
 from metalens.rcwa import wall
 from metalens.rcwa.conditions import case
 from metalens.rcwa.solver import truncated, wall_stages
-from metalens.rcwa.wall import EDGES, Wall, downwards, gauss
+from metalens.rcwa.wall import EDGES, Wall, gauss, panel
 
 TILTED = Cell(0.31, 0.63, Index(3.5), Index(1.47), Index(1.03), sidewall_rad=0.034)
 
@@ -31,7 +31,7 @@ def test_uniform_wall_is_an_exponential():
     """P = 1, Q = q²: u'' = -q² u, over a panel of 0.4 rad; five stages leave 1e-13."""
     q, height = 1.7, 2.3
     this = Wall(lambda share: (np.eye(1), q**2 * np.eye(1)), height)
-    got = downwards(this, 0.4, 0.5, 5)
+    got = panel(this, 0.4, 0.5, 5).downwards
     phase = q * height * 0.1
     want = np.array([[math.cos(phase), -1j * math.sin(phase) / q], [-1j * q * math.sin(phase), math.cos(phase)]])
     assert np.abs(got - want).max() < 1e-12
