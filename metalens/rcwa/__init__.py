@@ -12,6 +12,14 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from metalens.rcwa import anchored as anchored
+    from metalens.rcwa import any_shape as any_shape
+    from metalens.rcwa import derivative as derivative
+    from metalens.rcwa import layer as layer
+    from metalens.rcwa import made as made
+    from metalens.rcwa import pattern as pattern
+    from metalens.rcwa import problem as problem
+    from metalens.rcwa import stack as stack
+    from metalens.rcwa import wall as wall
     from metalens.rcwa.any_shape import SAFETY as SAFETY
     from metalens.rcwa.any_shape import Jones as Jones
     from metalens.rcwa.any_shape import jones as jones
@@ -34,6 +42,14 @@ __getattr__, __dir__, __all__ = attach(
         "SAFETY": "any_shape",
         "Jones": "any_shape",
         "anchored": "",
+        "any_shape": "",
+        "derivative": "",
+        "layer": "",
+        "made": "",
+        "pattern": "",
+        "problem": "",
+        "stack": "",
+        "wall": "",
         "derivatives": "verbs",
         "jones": "any_shape",
         "jones_derivatives": "metalens.rcwa.rates.verb",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.cell.shapes import motion as motion
     from metalens.cell.shapes.every import Shape as Shape
     from metalens.cell.shapes.outline import Conic as Conic
     from metalens.cell.shapes.outline import Loop as Loop
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "Ring": "round",
         "Shape": "every",
         "Square": "straight",
+        "motion": "",
         "turned": "outline",
     },
 )
