@@ -59,6 +59,11 @@ def _with(record: Any, name: str, value: object) -> Any:
     return dataclasses.replace(record, **{name: value})
 
 
+def _in_place(records: tuple[Any, ...], i: int, changed: object) -> tuple[Any, ...]:
+    """Records with another one as their i-th."""
+    return (*records[:i], changed, *records[i + 1 :])
+
+
 def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], Moved]:
     return lambda x: Moved(_with(cell, name, getattr(cell, name) + x), size_um)
 
@@ -75,7 +80,7 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
 
     def of_layer(i: int, name: str, x: float) -> Moved:
         changed = _with(cell.layers[i], name, beside(getattr(cell.layers[i], name), x))
-        return Moved(dataclasses.replace(cell, layers=(*cell.layers[:i], changed, *cell.layers[i + 1 :])), size_um)
+        return Moved(_with(cell, "layers", _in_place(cell.layers, i, changed)), size_um)
 
     found = [Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP) for name in ("pillar", "between")]
     for i, layer in enumerate(cell.layers):
@@ -128,7 +133,7 @@ def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
 def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float], Moved]:
     def moved(x: float) -> Moved:
         changed = _with(cell.layers[i], name, getattr(cell.layers[i], name) + x)
-        layers = (*cell.layers[:i], changed, *cell.layers[i + 1 :])
+        layers = _in_place(cell.layers, i, changed)
         return Moved(
             dataclasses.replace(cell, layers=layers, height_um=sum(layer.height_um for layer in layers)), size_um
         )
@@ -138,9 +143,9 @@ def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float]
 
 def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float], Moved]:
     def moved(x: float) -> Moved:
-        films = list(getattr(cell, side))
-        films[i] = dataclasses.replace(films[i], thickness_um=films[i].thickness_um + x)
-        return Moved(_with(cell, side, tuple(films)), size_um)
+        films = getattr(cell, side)
+        changed = _with(films[i], "thickness_um", films[i].thickness_um + x)
+        return Moved(_with(cell, side, _in_place(films, i, changed)), size_um)
 
     return moved
 
