@@ -73,6 +73,9 @@ class ReaderConfig:
                 f"reader: pixels = {self.pixels}, pitch_um = {self.pitch_um}, electrons = {self.electrons}, fwhm_nm = "
                 f"{self.fwhm_nm}: need 32 to 512 pixels, pitch and electrons above 0, a width of 0 or more"
             )
+        near, far = self.depths_mm
+        if not 0 < near < far < math.inf:
+            raise ConfigError(f"reader: depths_mm = {self.depths_mm}: need 0 < least < largest")
 
     @property
     def margin(self) -> int:
@@ -162,8 +165,17 @@ class Scenery:
 
 
 def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
-    """Render what all lenses of this sensor distance are judged on; size tells no depth."""
+    """Render what all lenses of this sensor distance are judged on; size tells no depth.
+
+    Raises:
+        ConfigError: eyes out of the depths of the PSFs.
+    """
     scenes = SceneConfig(pixels=config.pixels, margin=config.margin)
+    near, far = (1e-3 * depth for depth in scenes.pupil_depths_um)
+    if not config.depths_mm[0] <= near <= far <= config.depths_mm[1]:
+        raise ConfigError(
+            f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {near:g} to {far:g} mm before the lens"
+        )
     of = {
         stream: EyeScenes(scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream)
         for stream in (EXPERIMENT, VALIDATION, TEST)

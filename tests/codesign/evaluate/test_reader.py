@@ -69,6 +69,12 @@ def test_learning_and_judging_frames_differ_and_repeat():
     assert torch.equal(again.slip_mm, batches[2].slip_mm)
 
 
+def test_eyes_out_of_the_depths_of_the_psfs_are_refused():
+    """Pupils stand 17.5 to 24.5 mm before the lens."""
+    with pytest.raises(ConfigError, match=r"depths_mm = \(18.0, 40.0\) do not hold the eyes"):
+        reader.scenery(replace(TINY, depths_mm=(18.0, 40.0)), sensor_distance_um=2000.0)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -76,6 +82,7 @@ def test_learning_and_judging_frames_differ_and_repeat():
         ({"test": 0}, "32 or more"),
         ({"pixels": 8}, "32 to 512 pixels"),
         ({"fwhm_nm": -2.0}, "a width of 0 or more"),
+        ({"depths_mm": (31.0, 12.0)}, "0 < least < largest"),
     ],
 )
 def test_impossible_readers_are_refused(change, message):
