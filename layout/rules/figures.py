@@ -6,6 +6,7 @@ from layout.mask import UNDRAWN, MaskPlan, tone
 from layout.process import Rules
 from layout.rules import edges as facing
 from layout.rules.entered import entered
+from layout.rules.layer import plain
 from layout.rules.report import DrcReport
 from layout.shapes import region
 from metalens.ground.arrays import Array
@@ -46,7 +47,8 @@ def _facing(
     rules: tuple[str, str] = ("feature", "gap"),
 ) -> None:
     """Widths and spaces of contours below their limits, as violations of the two rules."""
-    lines = [np.hstack([c, np.roll(c, -1, axis=0)]) for c in contours]
+    whole = [plain(c) for c in contours]  # an edge is one, of however many pieces it is made
+    lines = [np.hstack([c, np.roll(c, -1, axis=0)]) for c in whole]
     if not lines:
         return
     edge, unit = np.concatenate(lines), report.unit_nm
