@@ -192,3 +192,40 @@ def test_what_a_jacobian_did_not_foresee_is_a_share_of_the_change_in_sigma_of_pi
     state = leastsquares._state(data, (np.zeros(1), image, slopes), free, Settings())
     got = leastsquares._missed(state, np.array([2.0]), image + np.array([[[5.0, 3.0, -70.0]]]))
     assert got == pytest.approx((3 / 2) / math.hypot(5 / 2, 3 / 3), rel=1e-12)
+
+
+@pytest.mark.parametrize(("tolerance", "settled"), [(5.1e-5, True), (4.9e-5, False)])
+def test_where_no_step_lowers_the_misfit_one_of_ten_tolerances_is_settled(tolerance, settled):
+    """Slopes that promise five sigma, images that are only ever worse: ten tries, the last damped by 1e-3 6^9 to
+    5 / 10078.7 = 4.961e-4 sigma."""
+    shape = np.full((1, 1, 5), 1 / math.sqrt(5))
+    everywhere = np.ones(shape.shape, bool)
+    data = Data(5 * shape, everywhere, ~everywhere, np.ones(shape.shape), np.full(shape.shape, 1e15))
+
+    def model(x, slopes):
+        return -x[0] * shape, shape[None] if slopes else None
+
+    found = fit(model, data, np.zeros(1), settings=Settings(step_tolerance=tolerance))
+    assert found.converged is settled
+    assert found.reason == ("last step moved 0.0005 sigma" if settled else "no step lowers the misfit")
+    assert found.value == [0.0]
+    assert found.iterations == 1
+
+
+def test_what_bounds_hold_back_is_told_in_sigma():
+    """Least at 7 and 2.5, the first held at 4: the second gives way, by normal equations."""
+    shapes = np.array([[2.0, 0.0, 0.3], [0.4, 1.5, 0.0]])[:, None, None]
+    everywhere = np.ones((1, 1, 3), bool)
+    data = Data(
+        np.tensordot([7.0, 2.5], shapes, 1), everywhere, ~everywhere, np.full((1, 1, 3), 1.3), everywhere * 1e15
+    )
+    wide = np.full(2, np.inf)
+    bounds = Prior(np.zeros(2), wide, -wide, np.array([4.0, np.inf]))
+    found = fit(lambda x, slopes: (np.tensordot(x, shapes, 1), shapes if slopes else None), data, np.zeros(2),
+                prior=bounds, settings=Settings(step_tolerance=1e-9))  # fmt: skip
+    flat = shapes.reshape(2, -1)
+    covariance = 1.3 * np.linalg.inv(flat @ flat.T)
+    held = 2.5 + (flat[0] @ flat[1]) / (flat[1] @ flat[1]) * 3.0
+    assert found.value == pytest.approx([4.0, held], rel=1e-6)
+    want = (np.array([7.0, 2.5]) - [4.0, held]) / np.sqrt(np.diag(covariance))
+    assert found.beyond == pytest.approx(want, rel=1e-5)

@@ -1,5 +1,6 @@
 """The PSFs of a lens as built are asked for at its own wavelength and distance, window and angle."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.model import made, state, vector
+from characterize.model import made, state, thinplate, vector
 from metalens import psf
 from metalens.made import transmission
 
@@ -58,3 +59,33 @@ def test_every_pillar_passes_the_light_of_its_own_diameter_with_the_phase_of_its
     t = transmission(lens.proxy, b.RESPONSE, grown, lens.wavelength_um + 0.4e-3, known.answers())
     assert np.abs(got[stands] - t * np.exp(1j * known.phase_rad(u, v)[stands])).max() < 1e-8
     assert not got[~stands].any()
+
+
+def test_a_residual_phase_lies_on_the_lens_over_its_radius():
+    """Modes that nothing mirrors: each pillar with and without them, by the basis at its own place."""
+    lens, x, modes = b.lens(), vector(b.VALUES), np.array([0.4, -0.3, 0.25, 0.5, -0.2])
+    d = lens.diameters
+    u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
+    plain, bent = (made.pillars(lens, b.RESPONSE, x, modes=m) for m in (None, modes))
+    stands = d.diameter_um > 0
+    want = np.tensordot(modes, thinplate.basis(u, v, 5), 1)[stands]
+    assert np.abs(bent[stands] - plain[stands] * np.exp(1j * want)).max() < 1e-4  # 1e-5 of some radians
+    assert np.ptp(want) > 1
+
+
+def test_a_lens_as_built_has_its_diameters_wavelength_and_distance():
+    """Pillar by pillar, clipped to what the proxy knows; the bias varies over the lens."""
+    lens = b.lens()
+    d, x = lens.diameters, vector({"wavelength_nm": 1.7, "distance_um": -3.1, "bias_nm": 9.0, "bias_y_nm": 23.0})
+    made_lens = made.built_lens(lens, x)
+    assert made_lens.wavelength_um == pytest.approx(lens.wavelength_um + 1.7e-3, rel=1e-12)
+    assert made_lens.sensor_distance_um == pytest.approx(lens.sensor_distance_um - 3.1, rel=1e-12)
+    v = (d.y_um / d.radius_um)[:, None]
+    grown = np.clip(d.diameter_um + 9e-3 + 23e-3 * v, 0.09, 0.26)
+    want = np.where(d.diameter_um > 0, grown, 0)
+    assert np.abs(made_lens.diameters.diameter_um - want).max() < 1e-7  # single precision
+    assert (want == 0.09).any()
+    assert (want == 0.26).any()
+    wide = made.built_lens(dataclasses.replace(lens, proxy=dataclasses.replace(b.proxy(), domain_um=(0.09, 0.5))),
+                           vector({"bias_nm": 200.0}))  # fmt: skip
+    assert wide.diameters.diameter_um.max() == pytest.approx(0.999 * 0.4, rel=1e-6)  # what stands does not touch

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.signal import correlate
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
 from characterize.model.parameters import NAMES, vector
 from codesign.optics import built
-from metalens.image import Pupil, coordinates
+from metalens.image import Pupil, amplitude, coordinates
 from metalens.lens import DiameterMap
 
 GATHER = getattr(built._gather, "py_func", built._gather)  # as written: a place beyond the table is an error
@@ -102,6 +103,7 @@ def test_a_wave_of_another_distance_is_the_design_s_defocused():
     assert (r[inside] < 62).all()
     assert inside.sum() == pytest.approx(math.pi / 4 * inside.size, rel=0.05)  # nodes across the aperture
     assert abs(plain.sum()) > 0.97 * np.abs(plain).sum()  # of the design itself all focusing phase is off
+    assert np.median(np.abs(plain[inside])) == pytest.approx(0.9, abs=0.05)  # the level of the pillars
     paths = np.hypot(r, 307.0) - 307.0 - np.hypot(r, 300.0) + 300.0
     turned = plain[inside] * np.exp(2j * np.pi / 0.85 * paths[inside])
     assert moved[inside] == pytest.approx(turned, abs=1e-6)
@@ -154,3 +156,35 @@ def test_every_row_of_a_lens_has_the_phase_of_its_focus_off():
     path = np.sqrt(r2 + 300.0**2) - 300.0 + np.sqrt(r2 + 3000.0**2) - 3000.0
     turn = lens._carrier * np.exp(-2j * np.pi / 0.85 * path)
     assert turn == pytest.approx(np.full(turn.shape, turn[150, 150]), abs=2e-4)  # complex64 of some 100 rad
+
+
+def test_psfs_are_harmonics_of_the_aperture_with_itself():
+    """Sums over pairs of nodes so many apart, of an uneven field, in place of transforms: over the light on it."""
+    lens = built.MadeLens(m.small(), m.OPTICS)
+    pupil = lens._pupil(300.0)
+    rng, shape = np.random.default_rng(11), (pupil.nodes, pupil.nodes)
+    field = rng.uniform(0.5, 1.0, shape) * np.exp(1j * rng.normal(0, 0.4, shape))
+    x, y = (c.numpy() for c in coordinates(pupil))
+    phase = 1e-3 * x**2 - 2e-2 * y - 2 * np.pi / 0.85 * (np.hypot(np.hypot(x, y), 300.0) - 300.0)
+    got = lens._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil).numpy()
+    weight = amplitude(pupil).numpy()
+    r2 = x**2 + y**2
+    harmonics, columns = lens._samples(pupil)
+    apart = np.arange(-harmonics + 1, harmonics)
+    for light, depth in zip(got, lens.settings.depths_um.tolist(), strict=True):
+        inward = phase + 2 * np.pi / 0.85 * (np.hypot(np.sqrt(r2), 300.0) - 300.0 + np.sqrt(r2 + depth**2) - depth)
+        wave = weight * field * np.exp(1j * inward)
+        pairs = correlate(wave, wave, method="direct" if pupil.nodes < 40 else "fft")
+        middle = pupil.nodes - 1
+        of = pairs[np.ix_(middle - apart, middle - apart)]
+        want = (columns.numpy() @ of @ columns.numpy().T).real
+        want *= (lens.settings.sample_um / pupil.period_um) ** 2 / (weight**2).sum()
+        assert light == pytest.approx(want, abs=1e-4 * want.max())  # single precision of 400 harmonics
+
+
+def test_without_parameters_a_lens_is_the_design():
+    lens = built.MadeLens(m.small(), m.OPTICS)
+    known = vector({"bias_nm": 9.0, "distance_um": 5.0, "spherical_rad": 0.3})
+    plain = lens.stack().intensity
+    assert torch.equal(plain, lens.stack(vector()).intensity)
+    assert built.psf_error(lens.stack(known), lens.stack()) > 0.01

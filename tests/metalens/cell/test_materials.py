@@ -195,6 +195,17 @@ def test_every_formula_of_the_database_and_its_slope(tmp_path: Path, number, coe
         materials.index(str(page), 0.95)
 
 
+@pytest.mark.parametrize("count", [5, 9])
+def test_a_rational_formula_ends_after_a_term_and_holds_where_an_absent_pole_would_lie(tmp_path: Path, count):
+    """c^0 = 1 of a term that is not there is no pole at 1 um."""
+    c = (2.25, 0.4, 0.3, 0.2, 2.0, 0.01, 0.5, 0.3, 3.0)[:count]
+    page = tmp_path / "page.yml"
+    words = " ".join(map(str, c))
+    page.write_text(f"DATA:\n  - type: formula 4\n    wavelength_range: 0.8 1.2\n    coefficients: {words}\n")
+    square = 2.25 + 0.4 / (1 - 0.2**2) + (0.01 / (1 - 0.3**3) if count > 5 else 0)
+    assert materials.index(str(page), 1.0) == pytest.approx(math.sqrt(square), rel=1e-12)
+
+
 def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
     page = tmp_path / "page.yaml"
     page.write_text(

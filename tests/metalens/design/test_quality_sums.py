@@ -7,6 +7,7 @@ import pytest
 
 from metalens.design import of_phase
 from metalens.design.profiles import Focus
+from metalens.lens import Layers, Stop
 
 RNG = np.random.default_rng(6)
 
@@ -35,3 +36,11 @@ def test_quality_is_that_of_the_sum_of_all_pillars():
     assert made.sampled_aperture == pytest.approx(0.79 / 0.52, rel=1e-12)
     steepest = 310 / math.hypot(310, 1700) + 310 / math.hypot(310, 23e3)  # rays at the rim
     assert made.steepest == pytest.approx(steepest, rel=1e-12)
+
+
+def test_thirty_places_of_the_lens_are_light_enough_for_a_wave_front():
+    """Places 20 um apart: a hole of 61.6 um about one holds 29 of them, one of 62.3 um about a middle of two holds 30;
+    light at 0.1 rad comes from half a step aside."""
+    few, enough = (Focus(0.79, 1700.0, math.inf, Layers(stop=Stop(r, 100.0))) for r in (61.6, 62.3))
+    assert of_phase._wavefront_variance(few, 600.0, 0.0) == math.inf
+    assert of_phase._wavefront_variance(enough, 600.0, math.atan(0.1)) < 1e-3

@@ -12,6 +12,7 @@ from metalens.field import Layers, Optics, SmoothWave, Window, compiled, points,
 from metalens.field.patches import relative
 from metalens.field.plan import spectral
 from metalens.field.rays import rays, source_paths
+from metalens.lens import Stop
 from metalens.psf import Nodes
 
 
@@ -97,3 +98,14 @@ def test_what_wraps_round_in_a_transform_is_nothing_of_the_sharpest_image(monkey
         found.append(psfs(optics, at, depths_um=depth, wavelength_um=0.85, window=window)[0, 0])
     assert sizes[0] < sizes[1]
     assert 0 < float(relative(*found)) < 3e-4
+
+
+def test_a_sharp_rim_bends_light_beyond_the_window_by_its_aperture_and_the_window_s_width():
+    """4√2 / (π² k p h): p = 50 / √(50² + 240²) of the rim, 0.4 of it behind a hole of 20 um, h = 67.5 um."""
+    wave, window = SmoothWave(Focus(0.85, 240.0, 6e3), 50.0), Window(15, 9.0)
+    k, p = 2 * math.pi / 0.85, 50 / math.hypot(50, 240)
+    want = 4 * math.sqrt(2) / (math.pi**2 * k * p * 67.5)
+    for stop, share in ((None, 1.0), (Stop(20.0, 3.0), 0.4), (Stop(51.0, 3.0), 1.0)):
+        found = points.sampling(Optics(wave, Layers(stop=stop), 240.0), window, 0.85)
+        assert found.beyond == pytest.approx(want / share, rel=1e-12)
+    assert points.sampling(Optics(wave, Layers(stop=Stop(0.02, 3.0)), 240.0), window, 0.85).beyond == 0.5

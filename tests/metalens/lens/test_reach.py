@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Film, Index
-from metalens.lens import DiameterMap, Layers, Lens, reach
+from metalens.lens import DiameterMap, Layers, Lens, Stop, reach
 from metalens.pillars import Proxy
 
 PROXY = Proxy(np.array([[3.0, 2.8, 0.3]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
@@ -77,3 +77,29 @@ def test_samples_show_the_finest_detail_of_any_lens():
         limit = 0.633 / (4 * radius / np.hypot(radius, sensor))
         assert found <= min(limit, 1.05 * 4.3 / 4)
         assert found >= 0.8 * min(limit, 4.3 / 4)
+
+
+def test_a_stop_in_front_leaves_the_part_of_a_lens_that_it_lights():
+    """A hole of 200 um, 1200 um before the pillars: a source at 20 mm lights 200 · 20 / 18.8 um; one of 700 um: all."""
+    made = lens(layers=Layers(stop=Stop(200.0, 1200.0)))
+    lit = 200 * 20 / 18.8
+    airy = 0.85 * 3000 / lit
+    assert reach.diffraction_um(made) == pytest.approx(airy, rel=1e-12)
+    assert reach.blur_um(made, 15e3) == pytest.approx(lit * 3000 * (1 / 15e3 - 1 / 20e3), rel=1e-12)
+    assert reach.disc_um(made) == float(f"{5.3 * airy:.2g}")
+    assert reach.pixel_um(made) == float(f"{0.88 * airy:.2g}")
+    assert reach.depth_step_um(made, 2e3) == 17.0  # 0.23 · 0.85 (2000 / 212.77)² = 17.27
+    assert reach.depth_step_um(made, 9e3) == 180.0  # a fiftieth of the depth; 349.8
+    near, far = reach.depth_range_um(made, digits=9)
+    assert 1 / near - 1 / 20e3 == pytest.approx(2 * 1.75 * 0.85 / lit**2, rel=1e-7)
+    assert far == pytest.approx(10 * near, rel=1e-7)  # 1/20e3 is less than that
+    whole = lens(layers=Layers(stop=Stop(700.0, 1200.0)))
+    assert reach.diffraction_um(whole) == reach.diffraction_um(lens()) == pytest.approx(0.85 * 3000 / 500)
+    assert reach.blur_um(whole, 15e3) == reach.blur_um(lens(), 15e3)
+
+
+def test_a_window_holds_the_worst_blur_or_the_rings():
+    made = lens()
+    assert reach.window_um(made, (19e3, 25e3, 21e3), airy=9.0) == float(f"{8 * 500 * 3000 * (1 / 20e3 - 1 / 25e3):.3g}")
+    assert reach.window_um(made, (19.9e3, 20.1e3), airy=9.0) == float(f"{9 * 0.85 * 6:.3g}")
+    assert reach.diffraction_um(lens(sites=1)) == pytest.approx(0.85 * 3000 / 0.4)  # a pitch
