@@ -25,6 +25,13 @@ class Ball:
         """Whether the limit holds."""
         return float(np.linalg.norm(x[self.index])) <= self.radius * (1 + 1e-9)
 
+    def share(self, x: Array, step: Array) -> float:
+        """Of a step from x, inside, to where the limit no longer holds: the larger t with |x + t step| = radius."""
+        at, way = x[self.index], step[self.index]
+        along, long = float(at @ way), float(way @ way)
+        room = max(self.radius**2 - float(at @ at), 0.0)
+        return (math.sqrt(along**2 + long * room) - along) / long
+
 
 def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
     """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those that stop it (Stark, Parker 1995).

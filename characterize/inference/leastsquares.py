@@ -275,7 +275,9 @@ def _inside(state: _State, step: Array, damped: Array | None, prior: Prior, sett
     size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
     matrix = state.curvature if damped is None else damped * np.outer(size, size)
     found = constrained.step(matrix, state.gradient, state.x, low=prior.low, high=prior.high, ball=settings.ball)
-    return found if found.any() else clipped
+    if found.any():
+        return found
+    return clipped if held or settings.ball is None else settings.ball.share(state.x, clipped) * clipped
 
 
 def _merit(data: Data, image: Array, x: Array, noise: Array, prior: Prior, settings: Settings) -> float:

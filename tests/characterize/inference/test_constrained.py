@@ -1,6 +1,7 @@
 """Steps inside limits: against an independent solver, a closed form, and a fit that clipping cannot finish."""
 
 import numpy as np
+import pytest
 from scipy import optimize
 
 from characterize.inference import constrained, leastsquares
@@ -34,6 +35,19 @@ def test_step_into_a_ball_of_equal_curvature_is_the_projection():
     found = constrained.step(np.eye(4), -goal, np.zeros(4), low=-FREE, high=FREE, ball=ball, tolerance=1e-8)
     assert np.abs(found - [0.6, 0.8, 0.5, 0.0]).max() < 1e-6
     assert ball.inside(found)
+
+
+def test_a_step_goes_as_far_as_the_ball():
+    """Of numbers 0 and 2 alone, from inside and from the rim: outwards no farther, across its own way."""
+    ball = Ball(np.array([0, 2]), 1.5)
+    x, step = np.array([0.4, 9.0, -0.7]), np.array([2.0, -3.0, -1.1])
+    share = ball.share(x, step)
+    assert 0 < share < 1
+    assert np.linalg.norm((x + share * step)[[0, 2]]) == pytest.approx(1.5, rel=1e-12)
+    rim = np.array([0.9, 2.0, -1.2])
+    assert ball.share(rim, step) == pytest.approx(0.0, abs=1e-12)
+    across = ball.share(rim, np.array([-4.0, 0.0, 0.3]))
+    assert across == pytest.approx(2 * (0.9 * 4.0 + 1.2 * 0.3) / (4.0**2 + 0.3**2), rel=1e-12)  # a chord
 
 
 def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():

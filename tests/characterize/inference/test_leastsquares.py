@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from characterize.inference import leastsquares
+from characterize.inference import constrained, leastsquares
 from characterize.inference.leastsquares import Data, Prior, Settings, fit, invert
 
 
@@ -229,3 +229,33 @@ def test_what_bounds_hold_back_is_told_in_sigma():
     assert found.value == pytest.approx([4.0, held], rel=1e-6)
     want = (np.array([7.0, 2.5]) - [4.0, held]) / np.sqrt(np.diag(covariance))
     assert found.beyond == pytest.approx(want, rel=1e-5)
+
+
+def test_a_step_that_leaves_the_ball_ends_on_it():
+    """Equal curvature: the least is at (3, 4.5), the nearest point of the ball of radius 2 about 0 on the way there."""
+    shapes = np.eye(2)[:, None, None]
+    everywhere = np.ones((1, 1, 2), bool)
+    data = Data(np.array([[[3.0, 4.5]]]), everywhere, ~everywhere, np.ones((1, 1, 2)), np.full((1, 1, 2), 1e15))
+    settings = Settings(step_tolerance=1e-6, bounded=True, ball=constrained.Ball(np.arange(2), 2.0))
+    found = fit(lambda x, slopes: (x[None, None], shapes if slopes else None), data, np.array([0.3, -0.2]),
+                settings=settings)  # fmt: skip
+    assert found.value == pytest.approx(np.array([3.0, 4.5]) * 2 / math.hypot(3.0, 4.5), rel=1e-4)
+
+
+def test_exact_slopes_are_made_where_a_step_ended():
+    """Every place but the first has been tried without slopes before, and the last lowers the misfit of all."""
+    shape = np.random.default_rng(2).uniform(0.5, 1.5, (1, 6, 5))
+    everywhere = np.ones(shape.shape, bool)
+    light = np.full(shape.shape, 1e-4), np.full(shape.shape, 1e15)
+    data = Data(np.exp(0.9) * shape, everywhere, ~everywhere, *light)
+    tried, exact = [], []
+
+    def model(x, slopes):
+        (exact if slopes else tried).append(float(x[0]))
+        return np.exp(x[0]) * shape, np.exp(x)[:, None, None, None] * shape if slopes else None
+
+    found = fit(model, data, np.array([0.6]), settings=Settings(secant=True))
+    assert len(exact) > 1
+    assert exact[0] == 0.6
+    assert set(exact[1:]) <= set(tried)
+    assert found.value == pytest.approx([0.9], abs=1e-4)
