@@ -252,5 +252,5 @@ def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
         r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
         beside[i] = np.linalg.norm(r)
         q = r / beside[i] if beside[i] > 0 else r
-    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
+    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], -1))  # by its lower triangle
     return values, vectors[0] ** 2 * share.sum()

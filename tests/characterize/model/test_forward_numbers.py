@@ -13,8 +13,9 @@ import bench_lens as b
 
 from characterize.inference.leastsquares import Data
 from characterize.inference.prepare import quick_enough
-from characterize.model import ForwardModel, Setting, thinplate
+from characterize.model import ForwardModel, Setting, made, thinplate
 from characterize.model.forward import spectrum, true_depth
+from characterize.model.glass import extra_path
 from characterize.model.moments import WHOLE
 from characterize.model.parameters import PLACE, vector
 
@@ -110,6 +111,35 @@ def small():
     return ForwardModel(b.lens(), SMALL, b.RESPONSE)
 
 
+def test_frames_hold_the_light_of_the_lens(small):
+    """e^1.3 electrons for what falls on the pillars at the mean depth, by its square and the exposure; of that the
+    pillars pass three quarters and the window, of three Airy radii to each side, nine tenths."""
+    light = small.images(vector({"log_gain": 1.3}))[0].sum((1, 2))
+    mean = 2 / (1 / 480.0 + 1 / 800.0)
+    want = math.exp(1.3) * np.array([1.0 * (mean / 480.0) ** 2, 1.7 * (mean / 800.0) ** 2])
+    t = made.pillars(b.lens(), b.RESPONSE, vector({}))
+    passed = (np.abs(t) ** 2).sum() / (t != 0).sum()
+    assert passed == pytest.approx(0.75, abs=0.03)
+    assert light / want / passed == pytest.approx([0.92, 0.92], abs=0.06)
+
+
+def test_some_frames_of_several_angles_are_those_of_all():
+    """Angles take turns, so that neither the frames nor their groups stand in order."""
+    angles = np.array([[0.05, -0.02], [0.0, 0.03]])[[0, 1, 0, 1, 0]]
+    model = ForwardModel(b.lens(), Setting(np.array(b.DEPTHS), angles, np.linspace(1, 2, 5), 1.5, 10, 10), b.RESPONSE)
+    x = vector(b.VALUES)
+    every = model.images(x)[0]
+    for some in ([1, 2, 4], [3], [0, 4]):
+        assert model.only(np.array(some)).images(x)[0] == pytest.approx(every[some], rel=1e-6)
+
+
+def test_windows_far_off_along_one_axis_alone_have_directions_of_their_own(small):
+    """As far as 5 um, those of the middle serve."""
+    assert small.about((4.0, -4.9)).groups[0].reduced is small.groups[0].reduced
+    for middle in ((9.0, 0.0), (0.0, -9.0)):
+        assert small.about(middle).groups[0].reduced is not small.groups[0].reduced
+
+
 def test_a_background_rises_from_minus_one_to_one_across_the_frame(small):
     """In electrons: its level, and its slopes along x and y by (column - 8) / 8 and (row - 6) / 6."""
     dark = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}
@@ -142,6 +172,7 @@ def test_derivatives_by_the_bench_are_differences_with_a_wide_source(small):
     x = vector(b.VALUES | {"pinhole_um": 14.0, "log_gain": 10.0})
     steps = {"distance_um": 0.03, "stage_zero_um": 0.3, "stage_scale": 1e-3, "pinhole_um": 0.05, "log_gain": 1e-4}
     steps |= {"background_e": 1.0, "background_x_e": 1.0, "background_y_e": 1.0, "wavelength_nm": 0.3}
+    steps |= {"bias_nm": 0.5, "bias_y_nm": 0.5, "height_nm": 2.0, "crosstalk_px": 0.01}
     slopes = small.images(x, list(steps))[1]
     for one, (name, step) in zip(slopes, steps.items(), strict=True):
         way = step * (np.arange(len(x)) == PLACE[name])
@@ -164,3 +195,9 @@ def test_smooth_phases_are_those_of_the_paths_from_a_point_of_the_bench_to_a_win
         leave = np.sqrt((near_x - d * tx - 0.8) ** 2 + (near_y - d * ty + 0.4) ** 2 + d**2)
         off = got - 2 * math.pi / 0.8513 * (enter + leave)
         assert np.ptp(off) < 1e-9 * np.abs(got).max()
+    plate = x + vector({"glass_um": 70.0, "glass_tilt_x_deg": 1.1}) - vector({})
+    for got, z in zip(model._phase(plate, group) - model._phase(x, group), (489.0, 809.0), strict=True):
+        tangents = tx - 3.0 / z, ty
+        added = extra_path(near_x, near_y, tangents=tangents, depth_um=z, values=plate)
+        assert got == pytest.approx(2 * math.pi / 0.8513 * added, abs=1e-6)
+        assert np.ptp(got) > 0.5

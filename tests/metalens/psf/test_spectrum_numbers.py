@@ -217,6 +217,24 @@ def test_as_many_wavelengths_as_the_tolerance_needs():
         spectrum.nodes(source, path_um=3000.0, tolerance=1e-6)
 
 
+def test_sixty_four_wavelengths_are_the_most():
+    """As many lines as that are told exactly, by themselves; one more is refused."""
+    share = np.random.default_rng(4).uniform(0.5, 2, 65)
+    lines = np.linspace(0.8, 0.9, 64)
+    found = spectrum.nodes(spectrum.Measured(lines, share[:64] / share[:64].sum()), path_um=3000.0, tolerance=1e-7)
+    assert np.sort(found.wavelengths_um) == pytest.approx(lines, rel=1e-9)
+    more = spectrum.Measured(np.linspace(0.8, 0.9, 65), share / share.sum())
+    with pytest.raises(PropagationError, match="more than 64 wavelengths"):
+        spectrum.nodes(more, path_um=3000.0, tolerance=1e-7)
+
+
+def test_a_bad_row_is_told_by_its_line(tmp_path):
+    file = tmp_path / "led.csv"
+    file.write_text("# nm, value\n840,1\n850,2\n860 nm?,3\n")
+    with pytest.raises(PropagationError, match="line 4 is '860 nm"):
+        spectrum.measured([file], within_um=(0.8, 0.9))
+
+
 def test_thin_silicon_sees_what_its_absorption_leaves():
     """17 um of silicon at 800 and 900 nm, half-width either side of the peak: 850 and 306 per cm (Green 2008)."""
     um, share = spectrum.weight(spectrum.Source(850.0, 100.0, silicon_um=17.0))
