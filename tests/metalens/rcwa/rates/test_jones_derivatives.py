@@ -10,7 +10,10 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
 from metalens.ground.errors import CellError
-from metalens.rcwa import pattern
+from metalens.rcwa import any_shape, pattern
+from metalens.rcwa.problem import problem
+from metalens.rcwa.rates.parameters import motion, parameters
+from metalens.rcwa.rates.truncated import truncated
 
 WAVE = 0.73
 ABOUT = {"height_um": 0.53, "pillar": Index(2.7), "substrate": Index(1.45), "cover": Index(1.0), "between": Index(1.1)}
@@ -194,6 +197,30 @@ def test_errors_hold_what_finer_truncations_change():
             left = max(np.abs(rate.t - fine[name].t).max(), np.abs(rate.r - fine[name].r).max())
             assert left < rate.error, name
     assert rcwa.jones_derivatives(cell, 0.3, WAVE, harmonics=1).by["size_um"].error == math.inf  # nothing to compare
+
+
+def test_an_error_is_what_truncations_moved_as_that_of_t_and_what_a_stage_fewer_changes():
+    """Each truncation asked for by itself; of a tilted wall with and without the last stage, at the least of them."""
+    upright = CASES["square at normal incidence"][0]
+    tilted = dataclasses.replace(upright, sidewall_rad=0.05)
+    for cell, most, names in ((upright, 4, ("size_um", "pillar.n")), (tilted, 2, ("height_um",))):
+        this = problem(cell, 0.3, WAVE, 0.0, 0.0)
+        climb = any_shape.ladder(this, most, collocated=cell is tilted)
+        about = {"by": names, "tolerance": 1e-2}
+        parts = [rcwa.jones_derivatives(cell, 0.3, WAVE, **about, harmonics=reach).by for reach in climb.reaches]
+        assert len(parts) > 1
+        stages = any_shape.collocation(this, climb, 1e-2)[0]
+        assert (stages > 0) is (cell is tilted)
+        for name in names:
+            history = [np.stack([one[name].t, one[name].r]) for one in parts]
+            want = climb.crowded * any_shape.moved(history, most, climb.before)
+            if stages:
+                moves = {name: motion(parameters(cell, 0.3, WAVE)[name], WAVE)}
+                ends = [truncated(this, climb.reaches[0], count, moves).by[name] for count in (stages - 1, stages)]
+                left = np.abs(ends[1] - ends[0]).max()
+                assert left > 0
+                want += left
+            assert parts[-1][name].error == pytest.approx(want, rel=1e-9)
 
 
 def test_what_has_no_derivative_is_told_by_its_name():
