@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "benchmarks" / "results" / "mutants.json"
 REASONS = ROOT / "benchmarks" / "mutation" / "equivalent.json"  # path -> line's words -> change -> why none can tell
 PROMISED = "tests/test_defaults.py"  # reads defaults off the source
-LONGEST_S = 120.0  # of test files whose usual time is not known
+LONGEST_S = 120.0  # of processor time, of test files whose usual time is not known
 SEEN = ROOT / "build" / "mutants" / "reach.json"  # which tests run which lines, as seen before the first mutant
 
 
@@ -82,13 +82,22 @@ class Worker:
     graph: Graph
     reach: Reach
     near: int
+    longest_s: float
 
     @classmethod
-    def begin(cls, trees: list[str], reach: Reach, tests: str, near: int = 0, files: tuple[str, ...] = ()) -> None:
+    def begin(
+        cls,
+        trees: list[str],
+        reach: Reach,
+        tests: str,
+        near: int = 0,
+        files: tuple[str, ...] = (),
+        longest_s: float = LONGEST_S,
+    ) -> None:
         at = multiprocessing.current_process()._identity[0] - 1
         tree = Path(trees[at % len(trees)])
         cls.bench, cls.server = Bench(tree), Server(tree, files or (tests,))
-        cls.graph, cls.reach, cls.near = Graph(ROOT, tests), reach, near
+        cls.graph, cls.reach, cls.near, cls.longest_s = Graph(ROOT, tests), reach, near, longest_s
 
     @classmethod
     def measure(cls, test: str) -> tuple[str, Seen]:
@@ -127,11 +136,11 @@ class Worker:
         Where no function in memory changes it may be a default, of which the list of promised ones is asked first.
         """
         tests = _near(cls.graph, module, cls.near)
-        answer = None if loops else cls.server.outcome(mutant.path, source, tests, LONGEST_S)
+        answer = None if loops else cls.server.outcome(mutant.path, source, tests, cls.longest_s)
         if answer is None and not loops:
             tests = [PROMISED, *tests]
         fresh = module in cls.graph.compiled
-        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, LONGEST_S / 3, fresh=fresh)
+        outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, cls.longest_s / 3, fresh=fresh)
         said = "killed" if outcome == "failed" else "survived"
         return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
 
@@ -156,6 +165,9 @@ def main(words: list[str]) -> int:
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mutant")
     parser.add_argument("--near", type=int, default=0, help="ask so many nearest test files, measure nothing first")
+    parser.add_argument(
+        "--longest", type=float, default=LONGEST_S, help="processor seconds of these files, with --near"
+    )
     parser.add_argument("--trust", action="store_true", help="take what tests ran at the last measurement")
     parser.add_argument("--tests", default="tests", help="ask the tests of this folder alone")
     parser.add_argument("--result", type=Path, default=RESULT, help="file that keeps the table")
@@ -171,7 +183,7 @@ def main(words: list[str]) -> int:
         elif not asked.near:
             reach = _measured(trees, asked.tests)
         files = _files(chosen, asked.tests, asked.near) if asked.near else ()
-        begun = trees, reach, asked.tests, asked.near, files
+        begun = trees, reach, asked.tests, asked.near, files, asked.longest
         rows = []
         with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, begun) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):

@@ -15,7 +15,7 @@ from metalens.field import Optics, SmoothWave, Window
 from metalens.field.points import psfs
 from metalens.ground.errors import ConfigError, PropagationError
 from metalens.lens import Layers, Stop, media
-from metalens.psf import psf_stack
+from metalens.psf import blur_um, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
 K = 2 * math.pi / WAVE
@@ -204,6 +204,23 @@ def test_image_engine_and_every_pillar_see_the_same_stop() -> None:
         # the light on the stop is the whole: 3 % are bent beyond 63 um, faces take nothing here
         assert light.sum() == pytest.approx(1.0, abs=0.05)
         assert stack.energy_um2[0] == pytest.approx(math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03)
+
+
+def test_the_error_of_a_stack_is_that_of_its_worst_shadow() -> None:
+    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray; zones by the blur over the way of the ray."""
+    layers, (tx, ty) = Layers(stop=Stop(19.0, 90.0)), (math.tan(0.2), math.tan(-0.1))
+    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "layers": layers, **WINDOW}
+    angles, depths = [[0.0, 0.0], [0.2, -0.1]], [220.0, 1500.0]
+    stack = psf_stack(PHASE[90:190, 80:200], LEVEL[90:190, 80:200], depths_um=depths, angle_rad=angles, **about)
+    blurs, found = blur_um(stack.intensity, stack.step_um), {}
+    for i, slope in enumerate((0.0, math.hypot(tx, ty))):
+        for j, z in enumerate(depths):
+            number = 19.0**2 / math.hypot(1, slope) ** 3 / (WAVE * 90 * (z - 90) / z)
+            zones = 19.0 * blurs[i, j] / (SENSOR * math.hypot(1, slope)) / WAVE
+            found[i, j] = (0.005 + 0.055 * zones) / number
+    assert stack.budget is not None
+    assert stack.budget.stop == pytest.approx(max(found.values()), rel=1e-6)
+    assert len({round(value, 6) for value in found.values()}) == 4
 
 
 def test_light_that_the_stop_sends_beside_the_lens_is_lost() -> None:
