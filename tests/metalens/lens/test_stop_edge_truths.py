@@ -102,6 +102,26 @@ def test_fresnel_lengths_are_how_rays_from_a_place_of_the_stop_spread():
     assert want[0] > 1.05 * want[1]
 
 
+def test_a_shadow_lies_where_rays_cross_and_is_as_soft_as_light_spreads_from_the_stop():
+    """Places are a row and a column, across which the plane of the light is askew."""
+    tangents, hole, x, y = (
+        (0.27, 0.36),
+        Stop(300.0, 150.0),
+        np.array([10.0, 301.0, -280.0]),
+        np.array([[-95.0], [57.0]]),
+    )
+    got = stop.shadow(hole, (BEFORE, BETWEEN), tangents, WAVE, (x, y), 0.7)
+    at = np.broadcast_arrays(*stop.crossing(BEFORE, BETWEEN, tangents, x, y))
+    lengths = stop.fresnel_um(BEFORE, BETWEEN, tangents)
+    assert got == pytest.approx(edge.behind((at[0], at[1]), 0.7, (0.6, 0.8), lengths, 300.0, WAVE), rel=1e-12)
+    assert got.shape == (2, 3)
+    on_axis = stop.shadow(hole, (None, BETWEEN), (0.0, 0.0), WAVE, (x, y), 0.7)
+    length = BETWEEN.reduced_um
+    assert on_axis == pytest.approx(
+        edge.behind(np.broadcast_arrays(x, y), 0.7, (0.0, 1.0), (length, length), 300.0, WAVE)
+    )
+
+
 def test_what_a_shadow_leaves_out_goes_by_its_fresnel_number():
     """N = 90² / (0.79 · 250): half a per cent over N at the edge, 5.5 % for each zone of blur about the axis."""
     air = Media((1.0,), (250.0,))
