@@ -21,6 +21,7 @@ from metalens.rcwa.rates.tables import numbers
 from metalens.rcwa.rates.truncated import Motion, shares, slab_at
 
 _STEP = 1e-4  # of a number; of 1 where it is an angle or a coordinate, of the size where it is a change of width
+_FILM_UM = 0.1  # thickness of a film at least, about which its change is looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +97,9 @@ def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
     def changed(name: str, value: Callable[[float], Any]) -> Callable[[float], Moved]:
         return lambda x: Moved(dataclasses.replace(cell, shape=_with(shape, name, value(x))), size_um)
 
-    for name in (part.name for part in dataclasses.fields(shape)):
-        now: Any = getattr(shape, name)
-        if isinstance(now, float):
+    for part in dataclasses.fields(shape):
+        name, now = part.name, getattr(shape, part.name)
+        if part.type is float:  # a whole number too, but no count of sides
             step = _STEP if name.endswith("_rad") else _STEP * now
             found.append(Parameter(f"shape.{name}", changed(name, functools.partial(operator.add, now)), step))
         elif isinstance(now, tuple):
@@ -125,7 +126,7 @@ def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
             found.append(Parameter(f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step))
     for side in ("under", "over"):
         for i, film in enumerate(getattr(cell, side)):
-            step = _STEP * film.thickness_um
+            step = _STEP * max(film.thickness_um, _FILM_UM)
             found.append(Parameter(f"{side}.{i}.thickness_um", _of_film(cell, size_um, side, i), step))
     return found
 
@@ -142,9 +143,11 @@ def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float]
 
 
 def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float], Moved]:
+    """Heights change alike at any thickness; a film of none cannot have less."""
+
     def moved(x: float) -> Moved:
         films = getattr(cell, side)
-        changed = _with(films[i], "thickness_um", films[i].thickness_um + x)
+        changed = _with(films[i], "thickness_um", max(films[i].thickness_um, _FILM_UM) + x)
         return Moved(_with(cell, side, _in_place(films, i, changed)), size_um)
 
     return moved

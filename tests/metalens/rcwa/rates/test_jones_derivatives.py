@@ -223,6 +223,30 @@ def test_an_error_is_what_truncations_moved_as_that_of_t_and_what_a_stage_fewer_
             assert parts[-1][name].error == pytest.approx(want, rel=1e-9)
 
 
+def test_a_film_of_no_thickness_can_have_some():
+    """One-sided differences of fourth order over 1 nm: 1e-8 and their own order."""
+
+    def at(thickness_um):
+        cell = Cell(0.41, shape=Square(), under=(Film(Index(1.9), 0.07), Film(Index(2.2), thickness_um)), **ABOUT)
+        found = rcwa.jones(cell, 0.25, WAVE, harmonics=1)
+        return cell, np.stack([found.t, found.r])
+
+    rate = rcwa.jones_derivatives(at(0.0)[0], 0.25, WAVE, harmonics=1, by=["under.1.thickness_um"]).by
+    rate = rate["under.1.thickness_um"]
+    parts = [weight * at(1e-3 * k)[1] for k, weight in enumerate((-25, 48, -36, 16, -3))]
+    assert np.abs(np.stack([rate.t, rate.r]) - sum(parts) / 12e-3).max() < 1e-6 * np.abs(rate.t).max()
+    assert np.abs(rate.t).max() > 1
+
+
+def test_a_number_without_a_point_is_a_number_and_a_count_of_sides_is_none():
+    whole, plain = (parameters(Cell(0.41, shape=shape, **ABOUT), 0.15, WAVE) for shape in
+                    (Rectangle(2, 0), Rectangle(2.0, 0.0)))  # fmt: skip
+    assert set(whole) == set(plain) > {"shape.ratio", "shape.angle_rad"}
+    assert whole["shape.ratio"].moved(1e-3).cell.shape == Rectangle(2.001)
+    pentagon = parameters(Cell(0.41, shape=RegularPolygon(5), **ABOUT), 0.15, WAVE)
+    assert {name for name in pentagon if name.startswith("shape.")} == {"shape.angle_rad"}
+
+
 def test_what_has_no_derivative_is_told_by_its_name():
     cell = Cell(0.41, shape=Ring(0.4), **ABOUT)
     with pytest.raises(CellError, match=r"no number 'ratio' in this cell; it has size_um, .*shape.ratio"):
