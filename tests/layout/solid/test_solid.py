@@ -212,6 +212,14 @@ def test_the_module_is_3_5_mm_and_comes_back_with_labels_colours_and_places(tmp_
     assert len(checked) == 7 * 6 / 2
 
 
+def test_a_cut_takes_a_quarter_out_and_leaves_out_what_stands_in_it():
+    build123d = pytest.importorskip("build123d")
+    whole = build123d.Box(2, 3, 1)
+    assert module._without_quarter(whole).volume == pytest.approx(0.75 * 6)
+    assert module._without_quarter(build123d.Pos(2, -1, 0) * build123d.Box(1, 1, 1)) is None  # to +x, -y
+    assert module._without_quarter(build123d.Pos(2, 1, 0) * build123d.Box(1, 1, 1)).volume == pytest.approx(1)
+
+
 def test_colliding_parts_are_refused():
     build123d = pytest.importorskip("build123d")
     a, b = build123d.Box(1, 1, 1), build123d.Pos(0.9, 0, 0) * build123d.Box(1, 1, 1)
