@@ -1,5 +1,5 @@
-"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth`` times the frames in one pass), and
-the light on the nodes of a pupil."""
+"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth`` times the frames in one pass), the
+light on the nodes of a pupil, and pillars gathered over cells."""
 
 import numba
 import numpy as np
@@ -9,7 +9,10 @@ from torch.autograd import forward_ad
 
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
+from metalens.lens import answers
 from metalens.propagate import turns32
+
+PART, put = answers.PART, answers.answers  # compiled loops know names of their own module
 
 
 def plain(a: Tensor) -> bool:
@@ -114,3 +117,42 @@ def power(field: Array) -> Array:
 def _power(field, out):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
         out[i] = field[i].real * field[i].real + field[i].imag * field[i].imag
+
+
+def cells(diameter_um: Array, ideal_rad: Array, polynomials: answers.Polynomials, block: tuple[int, int, int]) -> Array:
+    """(3, cells y, cells x) float32 means over square cells of |T| cos(φ - ideal), |T| sin(φ - ideal), and of pillars.
+
+    Args:
+        ideal_rad: (y, x) float32. polynomials: of the diameters, by :func:`metalens.lens.answers.polynomials`.
+        block: pillars along a cell, and rows and columns of the first one that lie before the map.
+    """
+    side, *before = block
+    shape = [-(-(n + b) // side) for n, b in zip(diameter_um.shape, before, strict=True)]
+    out = np.zeros((3, *shape), np.float32)
+    split(shape[0], lambda a, b: _cells(diameter_um, ideal_rad, polynomials, block, out[:, a:b], a))
+    return out
+
+
+@numba.njit(cache=True, fastmath=answers.FASTMATH, nogil=True, error_model="numpy")
+def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped-def]
+    """Some rows of cells; sums of a row of them are held in float64."""
+    side, top, left = block
+    x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
+    for row in range(out.shape[1]):
+        sums = np.zeros((3, out.shape[2]))
+        for i in range(max((first + row) * side - top, 0), min((first + row + 1) * side - top, d.shape[0])):
+            for start in range(0, d.shape[1], PART):
+                some = d[i, start : start + PART]
+                n = some.size
+                put(some, polynomials, x[:n], phase[:n], level[:n])
+                for j in range(n):
+                    t = (phase[j] - ideal[i, start + j]) / (2 * np.pi)
+                    c, s = turns32(t - np.rint(t))
+                    x[j], phase[j] = level[j] * c, level[j] * s
+                for j in range(n):
+                    if some[j] > 0:
+                        cell = (start + j + left) // side
+                        sums[0, cell] += x[j]
+                        sums[1, cell] += phase[j]
+                        sums[2, cell] += 1
+        out[:, row] = sums / (side * side)

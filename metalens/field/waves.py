@@ -4,6 +4,7 @@ The focusing phase runs through thousands of radians; it is formed in float64 at
 before anything is rounded. What is left (polynomials of a design, pillars less the ideal phase) fits single precision.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,10 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from metalens.design import Focus
+from metalens.field import compiled
 from metalens.ground.errors import SceneError
-from metalens.lens import Lens, Media, media
+from metalens.lens import Lens, Media, answers, media
 from metalens.psf import among
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
@@ -137,6 +140,13 @@ class PillarWave:
         t, ideal, open_ = self._pillars(wavelength_um, 0.0)
         return {m: float((t * torch.polar(open_, -m * ideal)).sum().abs() / open_.sum()) ** 2 for m in orders}
 
+    @functools.cached_property
+    def _ideal(self) -> Tensor:
+        """(y, x) carrier of every pillar, whole turns off, in single precision."""
+        d, device = self.lens.diameters, self.diameter_um.device
+        x, y = (torch.as_tensor(a, device=device) for a in (d.x_um, d.y_um))
+        return torch.remainder(self.carrier_rad(x, y[:, None]), 2 * math.pi).to(torch.float32)
+
     def _pillars(self, wavelength_um: float, tilt: float) -> tuple[Tensor, Tensor, Tensor]:
         """(complex t, carrier, 1 where a pillar stands) of every pillar, in single precision."""
         d, proxy = self.diameter_um, self.lens.proxy
@@ -144,21 +154,35 @@ class PillarWave:
         inside = torch.where(d > 0, d, torch.full_like(d, proxy.domain_um[0]))
         phase: Any = proxy.phase_rad(inside, wavelength_um, tilt)
         level: Any = proxy.transmission(inside, wavelength_um, tilt)
-        x, y = (torch.as_tensor(a, device=d.device) for a in (self.lens.diameters.x_um, self.lens.diameters.y_um))
-        ideal = torch.remainder(self.carrier_rad(x, y[:, None]), 2 * math.pi).to(torch.float32)
-        return torch.polar(level.to(torch.float32) * open_, phase.to(torch.float32)), ideal, open_
+        return torch.polar(level.to(torch.float32) * open_, phase.to(torch.float32)), self._ideal, open_
 
     def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
         """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
-        t, ideal, open_ = self._pillars(wavelength_um, tilt)
-        rest = torch.view_as_real(self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
-        layers = torch.cat([rest, open_[None]])
-        spare = [padded - n for padded, n in zip(self._padded, layers.shape[-2:], strict=True)]
-        pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
-        mean = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
+        d = self.diameter_um
+        spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
+        if self.lens.neighbours is None and d.device.type == "cpu" and not _differentiable(d):
+            sizes, at = d.detach().numpy(), (wavelength_um, tilt)
+            block = self._block, spare[0] // 2, spare[1] // 2
+            known = answers.polynomials(self.lens.proxy, sizes, at)
+            mean = torch.from_numpy(compiled.cells(sizes, self._ideal.numpy(), known, block))
+        else:
+            mean = self._means(wavelength_um, tilt, spare)
         near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
         filled = torch.where(mean[2] > 0, mean[:2], near[:2])
         return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
+
+    def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
+        """As :func:`metalens.field.compiled.cells`, with derivatives and the factor of neighbours."""
+        t, ideal, open_ = self._pillars(wavelength_um, tilt)
+        rest = torch.view_as_real(self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
+        layers = torch.cat([rest, open_[None]])
+        pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
+        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
+
+
+def _differentiable(a: Tensor) -> bool:
+    """Whether it carries derivatives, backward or forward."""
+    return a.requires_grad or forward_ad.unpack_dual(a).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from metalens.lens import answers as answers
     from metalens.lens import export as export
     from metalens.lens import media as media
     from metalens.lens import picture as picture
@@ -41,6 +42,7 @@ __getattr__, __dir__, __all__ = attach(
         "Neighbours": "neighbours",
         "Pairs": "pairs",
         "Stop": "stop",
+        "answers": "",
         "check_gaps": "layers",
         "export": "",
         "from_parts": "record",

@@ -60,8 +60,7 @@ class Proxy:
 
     def transmission(self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0) -> Values:
         """Magnitude |T| in [0, 1]; otherwise as :meth:`phase_rad`."""
-        curve = self._curve(self.transmission_coefficients, wavelength_um, angle_rad, ceiling=1.0)
-        return self._verb("value", curve, diameter_um)
+        return self._verb("value", self.level_at(wavelength_um, angle_rad), diameter_um)
 
     def dphase_ddiameter(self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0) -> Values:
         """Slope of the phase, rad/um; otherwise as :meth:`phase_rad`."""
@@ -112,6 +111,10 @@ class Proxy:
     def at(self, wavelength_um: float, angle_rad: float = 0.0) -> polynomial.Curve:
         """The phase as a curve of the diameter alone."""
         return self._curve(self.phase_coefficients, wavelength_um, angle_rad)
+
+    def level_at(self, wavelength_um: float, angle_rad: float = 0.0) -> polynomial.Curve:
+        """|T| as a curve of the diameter alone."""
+        return self._curve(self.transmission_coefficients, wavelength_um, angle_rad, ceiling=1.0)
 
     def _curve(
         self, coefficients: Array, wavelength_um: float, angle_rad: float, ceiling: float = math.inf

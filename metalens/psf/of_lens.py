@@ -12,7 +12,7 @@ from metalens import propagate
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.store import Provenance
-from metalens.lens import Lens, media
+from metalens.lens import Lens, answers, media
 from metalens.propagate import paths
 from metalens.psf import among
 from metalens.psf import spectrum as spectra
@@ -26,6 +26,8 @@ from metalens.psf.stack import psf_stack
 PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
 ROWS, NEARBY = 64, 1e-4  # rows of pillars whose delays are taken, and how far apart their wavelengths are
 TRIES = 3  # at a spectrum: the light of one tells the paths for the next
+PILOT, PILOT_ERROR = 5, 1e-3  # wavelengths, and their tolerance, by which the light of a whole spectrum is foreseen
+SPARE = 0.7  # of the tolerance that is asked for by that light, so that one try does
 RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
@@ -98,22 +100,30 @@ def from_lens(
 
 
 def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any) -> PsfStack:
-    """PSFs of a spectrum: wavelengths for paths to the middle of the window, then for those to where the light fell."""
+    """PSFs of a spectrum: wavelengths for the paths to where few of them say that its light falls, in the window; more
+    where the light of all of them says so."""
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
     middle = max(float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans)
     nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
+    if len(nodes.weights) > 2 * PILOT:
+        few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
+        pilot = _of_nodes(lens, view, few, tolerance=max(tolerance, PILOT_ERROR), **how | {"polarisation": "scalar"})
+        nodes = _asked(source, spans, pilot, tolerance / 2 * SPARE)
     for last in range(TRIES):
         stack = _of_nodes(lens, view, nodes, tolerance=tolerance, **how)
         if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
             break
-        asked = [
-            spectra.nodes(
-                source, path_um=span.ravel(), light=lit(light, span.shape[1:]).ravel(), tolerance=tolerance / 2
-            )
-            for span, light in zip(spans, stack.intensity, strict=True)
-        ]
-        nodes = max(asked, key=lambda one: len(one.weights))
+        nodes = _asked(source, spans, stack, tolerance / 2)
     return stack
+
+
+def _asked(source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float) -> Nodes:
+    """Wavelengths for the paths of every direction (:func:`paths_um`) to where the light of PSFs lies."""
+    found = [
+        spectra.nodes(source, path_um=span.ravel(), light=lit(light, span.shape[1:]).ravel(), tolerance=tolerance)
+        for span, light in zip(spans, stack.intensity, strict=True)
+    ]
+    return max(found, key=lambda one: len(one.weights))
 
 
 def paths_um(lens: Lens, view: View, angle_rad: tuple[float, float], source: Source | Measured) -> Array:
@@ -308,8 +318,10 @@ def _all_maps(
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], Jones | None]:
     """(wavelength, y, x) phase and transmission of every pillar for light from a direction, with the mean factor of
     unlike neighbours; or that factor on both fields beside them."""
-    found = [pillar_maps(lens, float(w), angle_rad) for w in nodes.wavelengths_um]
-    phase, level = (torch.stack([torch.as_tensor(m[i]).to(dtype) for m in found]) for i in (0, 1))
+    shape = len(nodes.weights), *lens.diameters.diameter_um.shape
+    phase, level = torch.empty(shape, dtype=dtype), torch.empty(shape, dtype=dtype)
+    for wave, one, other in zip(nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True):
+        answers.fill(lens, (float(wave), incidence(lens, angle_rad)), one, other)
     if lens.neighbours is None:
         return (phase, level), None
     if scalar:
@@ -319,9 +331,9 @@ def _all_maps(
 
 def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:
     """(phase wrapped to ±π, transmission) of every pillar for light from a direction; 0 where there is no pillar."""
-    tilt = incidence(lens, angle_rad)
-    turns = lens.phase_rad(wavelength_um, tilt) / (2 * np.pi)
-    return (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(wavelength_um, tilt)
+    phase, level = (np.empty(lens.diameters.diameter_um.shape) for _ in range(2))
+    answers.fill(lens, (wavelength_um, incidence(lens, angle_rad)), phase, level)
+    return phase, level
 
 
 def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:

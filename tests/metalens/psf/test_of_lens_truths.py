@@ -76,15 +76,6 @@ def test_pillars_are_asked_at_the_angle_of_both_slopes_where_they_know_angles():
     assert of_lens.incidence(lens(), (0.2, -0.15)) == 0.0
 
 
-def test_phases_of_pillars_are_wrapped_to_half_a_turn_either_way():
-    made = lens()
-    made.phase_rad = lambda wavelength, tilt: np.array([0.3, 4.0, -9.0, 100.0])
-    made.transmission = lambda wavelength, tilt: np.array([0.9, 0.8, 0.7, 0.0])
-    phase, level = of_lens.pillar_maps(made, 0.85, (0.1, 0.0))
-    assert phase == pytest.approx([0.3, 4 - 2 * math.pi, -9 + 2 * math.pi, 100 - 32 * math.pi])
-    assert level.tolist() == [0.9, 0.8, 0.7, 0.0]
-
-
 def test_directions_are_joined_in_their_order_with_the_worst_error_and_its_reason():
     parts = [
         stack((0.0, 0.1), 2e-4, (1.0, 2.0)),

@@ -189,28 +189,25 @@ def test_polychromatic_psf_converges_with_the_nodes():
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens
+    from metalens.pillars import Proxy
     from metalens.psf.of_lens import pillar_maps
 
-    class Tilted:
-        max_angle_rad, domain_um = 0.5, (0.1, 0.3)
-
-        def phase_rad(self, d, wavelength_um, tilt):
-            return 40 * d * tilt / wavelength_um
-
-        def transmission(self, d, wavelength_um, tilt):
-            return d * 3 - tilt
-
+    angled = np.array([[[1.3, 4.0]], [[0.4, 0.0]]]), np.array([[[0.6, 0.3]], [[-0.05, 0.0]]])  # of sin² of the angle
+    proxy = Proxy(*angled, (0.1, 0.3), (0.9, 0.98), 0.0, 0.0, max_angle_rad=0.5)
     sizes = np.array([[0.1, 0.0], [0.3, 0.22]])
-    lens = Lens(DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), Tilted(), 0.85, 120.0, 1300.0, "map")
+    lens = Lens(DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map")
     phase, level = pillar_maps(lens, 0.94, (0.17, -0.31))
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
     tilt = np.arccos(1 / np.linalg.norm(direction))
-    want = np.where(sizes > 0, 40 * sizes * tilt / 0.94, 0)
+    share = 2 * (np.sin(tilt) / np.sin(0.5)) ** 2 - 1
+    want = np.where(sizes > 0, 1.3 + 4.0 * (10 * sizes - 2) + 0.4 * share, 0)
     assert np.exp(1j * phase) == pytest.approx(np.exp(1j * want), abs=1e-12)
     assert np.abs(phase).max() <= np.pi
-    assert level == pytest.approx(np.where(sizes > 0, sizes * 3 - tilt, 0), abs=1e-12)
-    Tilted.max_angle_rad = 0.0  # a library of normal incidence alone
-    assert pillar_maps(lens, 0.94, (0.17, -0.31))[1] == pytest.approx(sizes * 3, abs=1e-12)
+    assert level == pytest.approx(np.where(sizes > 0, 3 * sizes - 0.05 * share, 0), abs=1e-12)
+    upright = Proxy(
+        angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
+    )  # a library of normal incidence alone
+    assert pillar_maps(dataclasses.replace(lens, proxy=upright), 0.94, (0.17, -0.31))[1] == pytest.approx(3 * sizes)
 
 
 def test_metrics_of_an_oblong_spot_off_the_middle():

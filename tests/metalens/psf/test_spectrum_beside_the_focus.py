@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import DiameterMap, Lens, answers
 from metalens.pillars import Proxy
 from metalens.psf import Nodes, View, from_lens, spectrum
-from metalens.psf.of_lens import lit
+from metalens.psf.of_lens import PILOT, lit
 
 PHASE = np.array([[0.0, 1.15 * math.pi], [-0.4, -1.9]])  # of diameter and wavelength: delays of 0.9 to 4.3 um
 PROXY = Proxy(PHASE, np.array([[0.85, 0.05]]), (0.08, 0.22), (0.80, 0.90), 0.0, 0.0)
@@ -85,3 +85,20 @@ def test_light_is_shared_out_to_the_nearest_places():
     want[0, 0, 2], want[1, 2, 4], want[1, 1, 2] = 1.0, 4.0, 9.0  # 3 lies half-way between 2 and 4
     assert found == pytest.approx(want)
     assert lit(light[:, :1, :1] + 1, (1, 1)).sum() == pytest.approx(1.0)
+
+
+def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light(monkeypatch):
+    """Paths of some 20 um ask for more wavelengths than twice the pilot's; no second try of nearly as many."""
+    made, waves = lens(241, 42.0), []
+    plain = answers.fill
+    monkeypatch.setattr(answers, "fill", lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)))
+    um = np.linspace(0.805, 0.895, 25)
+    share = np.exp(-4 * np.log(2) * ((um - 0.849) / 0.031) ** 2)
+    source = spectrum.Measured(um, share / share.sum())
+    found = from_lens(made, View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15), tolerance=1e-4, spectrum=source)
+    assert len(found.wavelengths_um) > 2 * PILOT
+    assert found.budget.spectrum <= 5e-5
+    assert len(waves) == PILOT + len(found.wavelengths_um)
+    fine = Nodes(um, source.share, 0.0)
+    want = from_lens(made, View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15), tolerance=1e-5, spectrum=fine)
+    assert np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(want.intensity) <= found.error

@@ -1,0 +1,94 @@
+"""Answers of all pillars to light of one wavelength and angle, by compiled loops that read each diameter once.
+
+    φ(D) = φ_0 + x(φ_1 + x(φ_2 + …)),  |T|(D) alike,  x = scale D^power + shift        paper Eq. 2, at one (λ, θ)
+
+Polynomials are taken in float64 over a part of a row that stays in the nearest cache, and whole turns come off before
+the cast to the dtype of the result.
+"""
+
+import numba
+import numpy as np
+
+from metalens.ground.arrays import Array
+from metalens.ground.threads import split
+from metalens.lens.record import Lens
+from metalens.pillars import Proxy
+
+Polynomials = tuple[float, float, int, float, Array, Array]  # scale, shift, power, ceiling, monomials of φ and |T|
+PART = 512  # pillars of a row at a time
+FASTMATH = {"contract", "nsz", "reassoc"}
+
+
+def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> None:
+    """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in their dtype; 0 where there is
+    none.
+
+    Args:
+        at: wavelength in um, angle of incidence in rad.
+
+    Raises:
+        DomainError: a diameter, the wavelength or the angle lies outside the proxy's domain.
+    """
+    if lens.pairs is not None:
+        turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
+        phase[:], level[:] = (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(at[0], at[1])
+        return
+    d, numbers, loop = (
+        np.asarray(lens.diameters.diameter_um),
+        polynomials(lens.proxy, lens.diameters.diameter_um, at),
+        _fill,
+    )
+    turned = lens.diameters.angle_rad
+    turn = np.zeros((len(d), 0)) if turned is None else np.asarray(lens.geometric_rad(slice(None)))
+    split(len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b]))
+
+
+def polynomials(proxy: Proxy, diameter_um: Array, at: tuple[float, float]) -> Polynomials:
+    """What :func:`answers` takes of these diameters, for a wavelength in um and an angle in rad; raises as
+    :func:`fill`."""
+    phase, level = proxy.at(*at), proxy.level_at(*at)
+    most = float(np.max(diameter_um, initial=0.0))
+    if most > 0:
+        proxy.phase_rad(np.array([np.min(diameter_um, where=diameter_um > 0, initial=most), most]), *at)  # or refused
+    inner = phase.scale, phase.shift, phase.power, level.ceiling
+    return (*inner, np.array(phase.monomials), np.array(level.monomials))
+
+
+@numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True)
+def answers(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
+    """Phase in rad and |T| of a part of a row; x: work."""
+    scale, shift, power, ceiling, in_phase, in_level = numbers
+    for j in range(d.size):
+        x[j] = scale * d[j]
+    for _ in range(power - 1):
+        for j in range(d.size):
+            x[j] *= d[j]
+    for j in range(d.size):
+        x[j] += shift
+        phase[j], level[j] = in_phase[-1], in_level[-1]
+    for k in range(in_phase.size - 2, -1, -1):
+        for j in range(d.size):
+            phase[j] = phase[j] * x[j] + in_phase[k]
+    for k in range(in_level.size - 2, -1, -1):
+        for j in range(d.size):
+            level[j] = level[j] * x[j] + in_level[k]
+    for j in range(d.size):
+        level[j] = min(level[j], ceiling) if d[j] > 0 else 0.0
+
+
+@numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True)
+def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
+    """Some rows of :func:`fill`."""
+    x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
+    for i in range(d.shape[0]):
+        for start in range(0, d.shape[1], PART):
+            row = d[i, start : start + PART]
+            n = row.size
+            answers(row, numbers, x[:n], phase[:n], level[:n])
+            if turned.shape[1] > 0:
+                for j in range(n):
+                    phase[j] += turned[i, start + j]
+            for j in range(n):
+                t = phase[j] / (2 * np.pi)
+                out_phase[i, start + j] = (t - np.rint(t)) * (2 * np.pi) if row[j] > 0 else 0.0
+                out_level[i, start + j] = level[j]

@@ -1,0 +1,94 @@
+"""What all pillars answer, by compiled loops: against the series of the proxy summed by numpy, and cells by means."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.polynomial import chebyshev
+
+from metalens.cell import Cell, Index
+from metalens.cell.shapes.straight import Rectangle
+from metalens.field import compiled
+from metalens.ground.errors import DomainError
+from metalens.lens import DiameterMap, Lens, answers
+from metalens.pillars import Proxy
+
+DRAW = np.random.default_rng(17)
+SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array([5.0, 3.0, 1.5, 0.7, 0.2])  # angle, wavelength, diameter
+LEVEL = np.array([[[0.72, 0.1, -0.05]], [[-0.06, 0.03, 0.02]]])
+PROXY = Proxy(SERIES, LEVEL, (0.09, 0.31), (0.80, 0.93), 0.0, 0.0, power=3, max_angle_rad=0.4)
+WAVE, TILT = 0.871, 0.23
+
+
+def lens(rows=7, columns=1100, proxy=PROXY):  # more columns than a loop takes at once, and no whole number of parts
+    sizes = DRAW.uniform(0.09, 0.31, (rows, columns)) * (DRAW.random((rows, columns)) > 0.2)
+    return Lens(DiameterMap(sizes, 0.4), Cell(0.4, 0.7, Index(3.6), "SiO2"), proxy, 0.85, 300.0, math.inf, "map")
+
+
+def series(coefficients, d):
+    """Eq. 2 at WAVE and TILT, by numpy's own sums."""
+    a, b = PROXY.domain_um
+    x = (2 * d**3 - a**3 - b**3) / (b**3 - a**3)
+    angle = 2 * (math.sin(TILT) / math.sin(0.4)) ** 2 - 1
+    wave = (2 * WAVE - 0.80 - 0.93) / (0.93 - 0.80)
+    return chebyshev.chebval(x, chebyshev.chebval(wave, chebyshev.chebval(angle, np.asarray(coefficients))))
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(np.float32, 4e-7), (np.float64, 1e-13)])  # a few digits of π
+def test_phase_and_transmission_are_the_series_wrapped(dtype, most):
+    made = lens()
+    d = made.diameters.diameter_um
+    phase, level = (np.full(d.shape, 7.7, dtype) for _ in range(2))
+    answers.fill(made, (WAVE, TILT), phase, level)
+    lit = d > 0
+    want = np.exp(1j * series(SERIES, d))
+    assert np.abs(np.exp(1j * phase.astype(float)) - want)[lit].max() < most
+    assert np.abs(phase).max() <= np.pi * (1 + 1e-7)
+    assert np.abs(level - series(LEVEL, d))[lit].max() < most
+    assert not phase[~lit].any()
+    assert not level[~lit].any()
+
+
+def test_turned_pillars_add_twice_their_turn():
+    sizes = np.array([[0.12, 0.0, 0.27], [0.2, 0.21, 0.14]])
+    turn = np.array([[0.3, 0.2, -1.4], [1.1, 0.0, 0.6]])
+    cell = Cell(0.4, 0.7, Index(3.6), "SiO2", shape=Rectangle(0.5))
+    made = Lens(DiameterMap(sizes, 0.4, angle_rad=turn), cell, PROXY, 0.85, 300.0, math.inf, "map", hand="left")
+    phase, level = np.empty(sizes.shape), np.empty(sizes.shape)
+    answers.fill(made, (WAVE, TILT), phase, level)
+    want = np.where(sizes > 0, np.exp(1j * (series(SERIES, sizes) - 2 * turn)), 1)
+    assert np.exp(1j * phase) == pytest.approx(want, abs=1e-13)
+
+
+def test_what_a_proxy_does_not_know_is_refused_by_name():
+    made, out = lens(2, 3), [np.empty((2, 3)) for _ in range(2)]
+    for at, word in (((0.79, TILT), "wavelength"), ((WAVE, 0.41), "angle")):
+        with pytest.raises(DomainError, match=word):
+            answers.fill(made, at, *out)
+    thin = made.diameters.diameter_um.copy()
+    thin[1, 2] = 0.085
+    with pytest.raises(DomainError, match=r"diameters run from 0\.085"):
+        answers.fill(replace(made, diameters=replace(made.diameters, diameter_um=thin)), (WAVE, TILT), *out)
+
+
+def test_a_transmission_that_rounding_takes_above_1_is_1():
+    bright = Proxy(np.array([[1.0, 2.0]]), np.array([[1 - 1e-9, 0.9e-9]]), (0.09, 0.31), (0.8, 0.93), 0.0, 0.0)
+    made = lens(proxy=bright)
+    phase, level = (np.empty(made.diameters.diameter_um.shape, np.float32) for _ in range(2))
+    answers.fill(made, (WAVE, 0.0), phase, level)
+    assert level.max() <= 1
+
+
+def test_cells_hold_the_mean_of_their_pillars_less_the_carrier():
+    """Cells of 3 x 3 that begin a row and two columns before the map, and end beyond it: means over nine sites."""
+    made, side, top, left = lens(10, 1200), 3, 1, 2
+    d = made.diameters.diameter_um
+    ideal = DRAW.uniform(0, 2 * np.pi, d.shape).astype(np.float32)
+    found = compiled.cells(d, ideal, answers.polynomials(PROXY, d, (WAVE, TILT)), (side, top, left))
+    t = np.where(d > 0, series(LEVEL, d) * np.exp(1j * (series(SERIES, d) - ideal)), 0)
+    want = np.zeros((3, 4, 401))
+    for i, j in np.ndindex(d.shape):
+        want[:, (i + top) // side, (j + left) // side] += np.array([t[i, j].real, t[i, j].imag, d[i, j] > 0]) / side**2
+    assert found.shape == want.shape
+    assert np.abs(found - want).max() < 5e-7  # sines and cosines in single precision
