@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.mutation import rules, table
 from benchmarks.mutation.graph import Graph
 from benchmarks.mutation.reach import PACKAGES, Reach, Seen, at_import, compiled, digest, home
-from benchmarks.mutation.runner import Bench, copy_of, load_libraries
+from benchmarks.mutation.runner import SLACK_S, Bench, copy_of, load_libraries
 from benchmarks.mutation.server import Server
 
 ROOT = Path(__file__).parents[2]
@@ -131,7 +131,8 @@ class Worker:
 
     @classmethod
     def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
-        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them.
+        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them, unless
+        they answer the plain source in that time.
 
         Where no function in memory changes it may be a default, of which the list of promised ones is asked first.
         """
@@ -142,6 +143,8 @@ class Worker:
         fresh = module in cls.graph.compiled
         outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, cls.longest_s / 3, fresh=fresh)
         said = "killed" if outcome == "failed" else "survived"
+        if outcome == "time" and cls.bench.run(tests, max(cls.longest_s - SLACK_S, 0) / 3, fresh=False)[0] == "passed":
+            said = "killed by time"
         return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
 
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import torch
 
-from codesign.train.placement import place
+from codesign.train.placement import attend, place
 
 
 def test_on_the_processor_nothing_is_taken_to_a_device():
@@ -17,3 +17,15 @@ def test_on_the_processor_nothing_is_taken_to_a_device():
     assert not net._forward_pre_hooks
     assert not net._forward_hooks
     assert torch.backends.cudnn.deterministic is was
+
+
+def test_frames_on_the_processor_are_taken_to_the_device_and_what_else_is_given_stays():
+    """A device without numbers stands for a GPU."""
+    net, there = torch.nn.Linear(3, 2).to("meta"), torch.device("meta")
+    attend(net, there)
+    (enter,) = net._forward_pre_hooks.values()
+    here, moved = torch.ones(4, 3), torch.ones(2, 3, device="meta")
+    given = enter(net, (here, moved, "subnet", None))
+    assert [given[0].device, given[0].shape] == [there, (4, 3)]
+    assert given[1] is moved
+    assert given[2:] == ("subnet", None)

@@ -16,8 +16,9 @@ ASKED = Fisher().about(Focus(0.85, 2000.0, 20e3), PUPIL.radius_um)
 
 
 def test_the_hyperbolic_lens_is_best_focused_in_mid_range():
-    """Best of a fine scan of foci, itself within 2 % of the value measured apart in a paraxial model (0.24)."""
-    found = baselines.tuned(PUPIL, ASKED, foci_mm=(16.0, 26.0), count=5)
+    """Best of a scan of foci within 2 % of the value measured apart in a paraxial model (0.24); the first three, at 14,
+    16.8 and 21 mm, are not."""
+    found = baselines.tuned(PUPIL, ASKED, foci_mm=(14.0, 21.0), count=3)
     assert found.information == pytest.approx(0.24, rel=0.02)
     assert 17.5e3 < found.focus_um < 21e3
     for focus in (17e3, 22e3):
