@@ -39,7 +39,7 @@ def survey(
     away from corners, which round off.
 
     Raises:
-        ProcessError: no double or triple Gaussian is given, no round pillar has a dose, or a class is not round.
+        ProcessError: no double or triple Gaussian is given, no pillar has a dose, or a class is not one outline.
     """
     terms = _terms(process)
     scene = on_lattices(content, plan, doses, _fixed(process))
@@ -77,7 +77,7 @@ def _surveyed(scene: Exposed, process: Process, terms: Terms, height_um: float, 
     points = outlines.samples(scene.others, max((a for a, _ in terms if a < WIDE_UM), default=0.0))
     simulation = Simulation(scene, process, terms, points.at_um)
     total, box, judged = Tally.empty(), scene.places.box_um, _judged(scene, process)
-    drawn = (scene.kinds.size_um / nm).astype(np.float32)
+    drawn = (scene.kinds.drawn_um / nm).astype(np.float32)
     for band in simulation.bands():
         values = (band.exposure, drawn[band.kind], band.resist_nm, band.made_nm)
         total.take((band.x_um, band.y_um), judged[band.kind], values, box)

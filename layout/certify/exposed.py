@@ -2,7 +2,8 @@
 
 Threshold model: the edge of a shape comes out where the exposure is half of what a wide area of dose 1 receives. The
 diameter of a pillar in the resist follows from the exposure across the edge of its own disc and its background; the
-etch adds the bias of the process, for how alone the pillar stands, and its tilted walls.
+etch adds the bias of the process, for how alone the pillar stands, and its tilted walls. Of any other shape the area
+follows in the same way from the areas on which its own exposure exceeds a level, and all edges are taken to move alike.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,10 +14,13 @@ import numpy as np
 
 from layout.certify import neighbours, outlines
 from layout.certify.background import Raster
-from layout.certify.gathered import Exposed
+from layout.certify.gathered import Exposed, Kinds
 from layout.certify.places import OnLattices, strip_of
+from layout.certify.raster import Contours, own_levels
+from layout.certify.shaped import Beside, Pillars, Shapes
 from layout.process import Process, compiled
 from metalens.ground.arrays import Array
+from metalens.ground.units import nm
 
 THRESHOLD = 0.5
 WIDE_UM = 2.0  # Gaussians from here on are summed on pixels
@@ -64,7 +68,10 @@ class Wide:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Band:
-    """What comes out in some strips: places, kinds, (n,) float32 exposure, resist and made diameters (nm)."""
+    """What comes out in some strips: places, kinds, (n,) float32 exposure, resist and made diameters (nm).
+
+    Of shapes the diameters are the sizes that they go by, all edges moved alike.
+    """
 
     first: int
     x_um: Array
@@ -89,10 +96,11 @@ class Simulation:
     _full: float = field(init=False, default=0.0)
     _edges: "_EdgeTable" = field(init=False)
     _pairs: dict[float, neighbours.Pairs] = field(init=False, default_factory=dict)
+    _shaped: dict[float, Beside] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         kinds, box = self.scene.kinds, self._box()
-        self._edges = _EdgeTable.of(kinds.size_um, self.terms)
+        self._edges = _EdgeTable.of(kinds, self.terms)
         carried = kinds.area_um2 * kinds.dose
         self._wide = [
             (w, Wide(Raster.over(box, a), carried, outlines.spots(self.scene.others, a / _SPOTS)))
@@ -150,6 +158,11 @@ class Simulation:
         exposure, resist = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
         e = self._edges
         _develop(kind, e.row, self.scene.kinds.dose, far, e.radius_um, e.own, THRESHOLD, exposure, resist)
+        kinds = self.scene.kinds
+        if kinds.shapes is not None:
+            drawn = kinds.drawn_um[kind] / nm
+            resist = (drawn + (resist - kinds.size_um[kind] / nm) / kinds.share[kind]).astype(np.float32)
+            return Band(first, x, y, kind, exposure, resist, self.process.bias.made_nm(resist).astype(np.float32))
         alone = self._isolation(self._alone, (first, end), (x, y))
         made = self.process.made_diameter_nm(resist, alone).astype(np.float32)
         return Band(first, x, y, kind, exposure, resist, made)
@@ -167,7 +180,9 @@ class Simulation:
             points = self.at_um[here]
             self.far_of_points[here] += weight * raster.take(points[:, 0], points[:, 1], image)
         for range_um, weight in self.terms:
-            if 0.05 * float(kinds.size_um.max()) < range_um < WIDE_UM:
+            if kinds.shapes is not None and range_um < WIDE_UM:
+                far += weight * self._beside_shapes(strips, pillars, range_um, kinds.shapes)
+            elif 0.05 * float(kinds.size_um.max()) < range_um < WIDE_UM:
                 far += weight * self._beside(strips, pillars, range_um)
         return far
 
@@ -180,6 +195,20 @@ class Simulation:
         if range_um not in self._pairs:
             self._pairs[range_um] = neighbours.Pairs.of(size / 2, range_um)
         return self._pairs[range_um](self._discs(pillars), self._discs(around))
+
+    def _beside_shapes(
+        self, strips: tuple[int, int], pillars: tuple[Array, Array, Array], range_um: float, shapes: Shapes
+    ) -> Array:
+        """(n,) exposure of the edges of each pillar by its neighbours through a narrow Gaussian."""
+        if range_um not in self._shaped:
+            self._shaped[range_um] = Beside.of(shapes, range_um)
+        beside, places = self._shaped[range_um], self.scene.places
+        more = int(np.ceil(beside.reach_um / places.height_um))
+        return beside(self._dosed(pillars), self._dosed(places.part(strips[0] - more, strips[1] + more)))
+
+    def _dosed(self, pillars: tuple[Array, Array, Array]) -> Pillars:
+        (x, y, kind), kinds = pillars, self.scene.kinds
+        return x, y, kinds.dose[kind], np.asarray(kinds.shape)[kind]
 
     def _discs(self, pillars: tuple[Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         x, y, kind = pillars
@@ -209,15 +238,24 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _EdgeTable:
-    """Exposure across the edge of a disc of unit dose: row (kinds,) in radius_um, own (sizes, levels)."""
+    """Exposure across the edge of a pillar of unit dose: row (kinds,) in radius_um, own (rows, levels).
+
+    radius_um: of the circle of the area on which the pillar by itself exposes more than ``own``.
+    """
 
     row: Array
     radius_um: Array
     own: Array
 
     @classmethod
-    def of(cls, size_um: Array, terms: Terms) -> "_EdgeTable":
-        sizes, row = np.unique(size_um, return_inverse=True)
+    def of(cls, kinds: Kinds, terms: Terms) -> "_EdgeTable":
+        if kinds.shapes is not None:
+            tables = [
+                _shape_profile(contours, 2 * np.sqrt(area / np.pi), terms)
+                for contours, area in zip(kinds.shapes.contours, kinds.shapes.area_um2.tolist(), strict=True)
+            ]
+            return cls(np.asarray(kinds.shape, np.int64), *(np.array([t[k] for t in tables]) for k in (0, 1)))
+        sizes, row = np.unique(kinds.size_um, return_inverse=True)
         tables = [_profile(size, terms) for size in sizes.tolist()]
         return cls(row.astype(np.int64), *(np.array([table[k] for table in tables]) for k in (0, 1)))
 
@@ -253,12 +291,22 @@ def _develop(
         made_nm[n] = 2e3 * (radius[s, low] + share * (radius[s, low + 1] - radius[s, low]))
 
 
+def _radii(size_um: float, terms: Terms) -> Array:
+    """About the edge, which is the middle one."""
+    span = min(size_um / 2 * 0.9, 4 * min(a for a, _ in terms))
+    return np.linspace(size_um / 2 - span, size_um / 2 + span, 2 * _LEVELS + 1)
+
+
+def _shape_profile(contours: Contours, size_um: float, terms: Terms) -> tuple[Array, Array]:
+    """As :func:`_profile`, of any shape with the area of a disc of that size."""
+    radius = _radii(size_um, terms)
+    return radius, own_levels(contours, terms, radius)
+
+
 def _profile(size_um: float, terms: Terms) -> tuple[Array, Array]:
     """(radii, exposure) of a disc of unit dose about its edge: the non-central chi-square of two degrees."""
     from scipy.special import chndtr
 
-    core = min(a for a, _ in terms)
-    span = min(size_um / 2 * 0.9, 4 * core)
-    radius = np.linspace(size_um / 2 - span, size_um / 2 + span, 2 * _LEVELS + 1)
+    radius = _radii(size_um, terms)
     own = sum(w * chndtr(2 * (size_um / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
     return radius, np.asarray(own)

@@ -10,13 +10,13 @@ from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import Lens
 
 _OFF = 0.01  # pitches that a pillar may stand off its site
 
 
 class MadeRows:
-    """Diameters at half height of the lens of a plan, filled in band by band.
+    """Diameters at half height of the lens of a plan, filled in band by band; of shapes the sizes that they go by.
 
     plan: that was written; its first lattice is the lens, on the layer numbers of its pillars.
     """
@@ -39,7 +39,7 @@ class MadeRows:
         l = self._lattice
         lens = np.zeros(1 << 16, bool)
         lens[self._layers] = True
-        site = l.x0, l.y0, l.pitch, self._unit
+        site = l.x0, l.y0, l.pitch, l.down, self._unit
         if _fill(x_um, y_um, made_nm, layer, lens, *site, self._diameter_um):
             raise ProcessError("pillars of the written file do not stand on the lattice of the lens")
 
@@ -49,10 +49,14 @@ class MadeRows:
         Raises:
             ProcessError: a predicted pillar as wide as the pitch.
         """
-        made, pitch = self._diameter_um, designed.diameters.pitch_um
-        if made.max() >= pitch:
+        made, was = self._diameter_um, designed.diameters
+        if was.plain and made.max() >= was.pitch_um:
             raise ProcessError(f"a pillar is predicted {made.max():.3f} um wide, as wide as the pitch; check the doses")
-        return dataclasses.replace(designed, diameters=DiameterMap(made, pitch), profile="as-written")
+        long = was.length_um
+        if long is not None:  # all edges move alike
+            long = np.where(made > 0, long + (made - was.diameter_um), 0).astype(np.float32)
+        found = dataclasses.replace(was, diameter_um=made, length_um=long)
+        return dataclasses.replace(designed, diameters=found, profile="as-written")
 
 
 @compiled
@@ -65,6 +69,7 @@ def _fill(
     x0: int,
     y0: int,
     pitch: int,
+    down: int,
     unit: float,
     diameter_um: Array,
 ) -> int:
@@ -73,7 +78,7 @@ def _fill(
     for n in range(x.shape[0]):
         if not lens[layer[n]]:
             continue
-        column, row = (x[n] / unit - x0) / pitch, (y[n] / unit - y0) / pitch + rows - 1
+        column, row = (x[n] / unit - x0) / pitch, (y[n] / unit - y0) / down + rows - 1
         i, j = int(np.rint(row)), int(np.rint(column))
         if 0 <= i < rows and 0 <= j < columns and abs(row - i) <= _OFF and abs(column - j) <= _OFF:
             diameter_um[i, j] = made_nm[n] * 1e-3

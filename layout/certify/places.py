@@ -1,4 +1,4 @@
-"""Where the round pillars stand, strip by strip from bottom to top: lattices in bands of rows."""
+"""Where the pillars stand, strip by strip from bottom to top: lattices in bands of rows."""
 
 import math
 from collections.abc import Sequence
@@ -42,13 +42,13 @@ class OnLattices:
         cls, lattices: Sequence[Lattice], kinds: Array, centre_um: Array, *, unit_nm: float, count: int
     ) -> "OnLattices":
         """With strips of some 130 000 sites."""
-        pitch, columns = max(l.pitch for l in lattices), max(l.columns for l in lattices)
-        return cls(lattices, kinds, centre_um, unit_nm, count, pitch * max(_LEAST_ROWS, _SITES // columns))
+        down, columns = max(l.down for l in lattices), max(l.columns for l in lattices)
+        return cls(lattices, kinds, centre_um, unit_nm, count, down * max(_LEAST_ROWS, _SITES // columns))
 
     @property
     def _ends(self) -> tuple[int, int]:
         """Bottom and top row, database units."""
-        return min(l.y0 - (l.rows - 1) * l.pitch for l in self.lattices), max(l.y0 for l in self.lattices)
+        return min(l.y0 - (l.rows - 1) * l.down for l in self.lattices), max(l.y0 for l in self.lattices)
 
     @property
     def box_um(self) -> Box:
@@ -78,13 +78,13 @@ class OnLattices:
 
     def _of(self, lattice: Lattice, low: int, high: int) -> tuple[Array, Array, Array]:
         """Pillars of a lattice whose sites have low <= y < high."""
-        top = max(0, math.floor((lattice.y0 - high) / lattice.pitch) + 1)
-        end = min(lattice.rows, math.floor((lattice.y0 - low) / lattice.pitch) + 1)
+        top = max(0, math.floor((lattice.y0 - high) / lattice.down) + 1)
+        end = min(lattice.rows, math.floor((lattice.y0 - low) / lattice.down) + 1)
         if end <= top:
             return np.empty(0), np.empty(0), np.empty(0, np.int32)
         block, unit = np.ascontiguousarray(lattice.source(top, end)), self.unit_nm * nm
         x, y, kind = np.empty(block.size), np.empty(block.size), np.empty(block.size, np.int32)
-        at = lattice.x0, lattice.y0 - top * lattice.pitch, lattice.pitch
+        at = lattice.x0, lattice.y0 - top * lattice.down, lattice.pitch, lattice.down
         count = _sites(block, self.kinds, self.centre_um, *at, unit, x, y, kind)
         return x[:count], y[:count], kind[:count]
 
@@ -97,6 +97,7 @@ def _sites(
     x0: int,
     y0: int,
     pitch: int,
+    down: int,
     unit: float,
     x: Array,
     y: Array,
@@ -109,7 +110,7 @@ def _sites(
             k = kinds[block[row, column]]
             if k >= 0:
                 x[count] = (x0 + column * pitch) * unit + centre[k, 0]
-                y[count] = (y0 - row * pitch) * unit + centre[k, 1]
+                y[count] = (y0 - row * down) * unit + centre[k, 1]
                 kind[count] = k
                 count += 1
     return count

@@ -16,7 +16,7 @@ _WIDEST_NM, _BIN_NM = 8.0, 1 / 16  # of the histogram; what is beyond counts in 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Edges:
-    """Edges of marks, labels and other shapes that are no round pillars.
+    """Edges of marks, labels and other shapes that are no pillars.
 
     x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,) how far outside the drawn edge it
     comes out in the resist. layer: (n,) layer numbers.
@@ -61,7 +61,7 @@ class Tally:
 class Survey:
     """The verdict over everything that is written.
 
-    pillars: round ones, the dose test too. tally: sums over those that are judged. box_um: left, bottom, right, top of
+    pillars: the dose test too. tally: sums over those that are judged. box_um: left, bottom, right, top of
     the map. edges: of the other shapes. lean_nm: foot less half-height diameter. undosed: layers with shapes and no
     dose.
     """

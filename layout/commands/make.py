@@ -145,10 +145,9 @@ def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
 
 
 def _certifiable(job: Job) -> bool:
-    """Whether the simulator knows the point exposure (Gaussians), the tone, and the pillars (round, square lattice)."""
+    """Whether the simulator knows the point exposure (Gaussians) and the tone."""
     exposure = job.process.exposure
-    plain = job.source.diameters.plain and job.plan.classes[0].round
-    return exposure.known and exposure.csv is None and job.process.tone == "positive" and plain
+    return exposure.known and exposure.csv is None and job.process.tone == "positive"
 
 
 def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float]) -> Survey:

@@ -11,13 +11,19 @@ if TYPE_CHECKING:
     from layout.dose.bodies import Rects as Rects
     from layout.dose.correct import DoseResult as DoseResult
     from layout.dose.correct import Solution as Solution
+    from layout.dose.drawn import Discs as Discs
+    from layout.dose.drawn import Drawn as Drawn
+    from layout.dose.drawn import Outlines as Outlines
     from layout.dose.uniformity import Uniformity as Uniformity
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Body": "bodies",
+        "Discs": "drawn",
         "DoseResult": "correct",
+        "Drawn": "drawn",
+        "Outlines": "drawn",
         "Rects": "bodies",
         "Solution": "correct",
         "Uniformity": "uniformity",

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.exposure import PointExposure, disc, rim_of_own_disc, slope_at_rim
+from layout.dose.drawn import Drawn
+from layout.dose.exposure import PointExposure
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
@@ -13,7 +14,7 @@ NONE = 255  # dose class of a site without pillar
 _BLOCK_SITES = 1 << 20
 _FAINT = 0.02  # least exposure of its own edge at which a pillar can be corrected
 _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
-_COARSE = 6  # pitches: a Gaussian that wide needs no node at each site
+_COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -22,6 +23,8 @@ class Body:
 
     source: (first row, end row) -> (rows, columns) entries of the table, 0 for none.
     x_um: of the first column; y_um: of the first row; rows run towards -y.
+    row_um: from row to row, 0 for the pitch of the columns. centred: every other site stays empty (a hexagonal
+    lattice).
     """
 
     rows: int
@@ -30,6 +33,8 @@ class Body:
     x_um: float
     y_um: float
     source: Callable[[int, int], Array]
+    row_um: float = 0.0
+    centred: bool = False
 
     @classmethod
     def of(cls, index: Array, pitch_um: float) -> "Body":
@@ -43,18 +48,37 @@ class Body:
             yield first, np.ascontiguousarray(self.source(first, min(first + size, self.rows)))
 
     @property
+    def down_um(self) -> float:
+        """From row to row."""
+        return self.row_um or self.pitch_um
+
+    @property
+    def steps_um(self) -> Array:
+        """(n, 2) from a site to its neighbours."""
+        x, y = self.pitch_um, self.down_um
+        straight = [(x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)]
+        if not self.centred:
+            return np.array(straight)
+        return np.array([(2 * i, 2 * j) for i, j in straight] + [(i, j) for i in (x, -x) for j in (y, -y)])
+
+    @property
+    def apart_um(self) -> float:
+        """From a site to the nearest."""
+        return float(np.hypot(*self.steps_um.T).min())
+
+    @property
     def columns_um(self) -> Array:
         """(columns,) x of the sites."""
         return self.x_um + np.arange(self.columns) * self.pitch_um
 
     def rows_um(self, first: int, count: int) -> Array:
         """(count,) y of rows from ``first`` on."""
-        return self.y_um - np.arange(first, first + count) * self.pitch_um
+        return self.y_um - np.arange(first, first + count) * self.down_um
 
     @property
     def box_um(self) -> tuple[float, float, float, float]:
         """Left, bottom, right, top."""
-        right, bottom = self.x_um + (self.columns - 1) * self.pitch_um, self.y_um - (self.rows - 1) * self.pitch_um
+        right, bottom = self.x_um + (self.columns - 1) * self.pitch_um, self.y_um - (self.rows - 1) * self.down_um
         return self.x_um, bottom, right, self.y_um
 
 
@@ -84,12 +108,13 @@ class Rects:
 class Table:
     """What each entry exposes at unit dose; entry 0 is no pillar.
 
-    diameter_um, area_um2: (entries,). goal: (entries,) wanted exposure of the edge, in units of what clears.
+    drawn: the kinds. area_um2: (entries,), 0 for those that do not occur.
+    goal: (entries,) wanted exposure of the edge, in units of what clears.
     own: (entries,) exposure at the edge by the pillar itself, less what the far field counts for it.
-    slope: (entries,) its fall per um of radius. count: (entries,) pillars of each.
+    slope: (entries,) its fall per um that the edges move out. count: (entries,) pillars of each.
     """
 
-    diameter_um: Array
+    drawn: Drawn
     area_um2: Array
     goal: Array
     own: Array
@@ -106,9 +131,10 @@ class Table:
 class Ranges:
     """The point exposure split by how far its Gaussians reach.
 
-    far: at least six pitches wide, summed on nodes over the whole die. middle: reach neighbours only, summed on the
-    sites of each lattice. near: reach no neighbour. Widths of far and middle are widened by the mean pillar: a disc
-    adds R^2 / 2 to the squared width of a Gaussian, the ring on which it is seen R^2.
+    far: at least six times as wide as neighbours are apart, summed on nodes over the whole die. middle: reach
+    neighbours only, summed on the sites of each lattice. near: reach no neighbour. Widths of far and middle are widened
+    by the mean pillar: a disc adds R^2 / 2 to the squared width of a Gaussian, the ring on which it is seen R^2; any
+    other shape the mean squared distances from its centre of its area and of its edges.
     """
 
     far: PointExposure
@@ -126,31 +152,35 @@ def count(bodies: Sequence[Body], entries: int) -> Array:
     return total
 
 
-def split(point: PointExposure, diameter_um: Array, number: Array, pitch_um: float) -> Ranges:
-    """Which Gaussians reach how far, for pillars of these diameters."""
-    area = np.pi / 4 * diameter_um**2
-    total = float((number * area).sum())
-    mean_square = float((number * area * diameter_um**2).sum() / total) if total else 0.0
-    widest = float(diameter_um[number > 0].max(initial=0.0))
-    angle = 2 * np.pi * (np.arange(24) + 0.5) / 24
-    distance = np.hypot(pitch_um - widest / 2 * np.cos(angle), widest / 2 * np.sin(angle))
-    reach = np.array([4 * disc(distance, widest, width).mean() for width in point.widths_um])
-    far = point.widths_um >= _COARSE * pitch_um
-    middle = ~far & ((reach * point.weights > _NEGLIGIBLE) | (point.widths_um > pitch_um))
+def split(point: PointExposure, drawn: Drawn, number: Array, body: Body) -> Ranges:
+    """Which Gaussians reach how far, for these pillars on the densest of the lattices."""
+    mass = number * drawn.area_um2
+    total = float(mass.sum())
+    wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
+    reach = np.array([_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um])
+    far = point.widths_um >= _COARSE * body.apart_um
+    middle = ~far & ((reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.apart_um))
 
     def some(chosen: Array, wider: float) -> PointExposure:
         return PointExposure(np.sqrt(point.widths_um[chosen] ** 2 + wider), point.weights[chosen])
 
-    return Ranges(some(far, 1.5 * mean_square / 4), some(middle, 1.5 * mean_square / 4), some(~far & ~middle, 0.0))
+    return Ranges(some(far, wider), some(middle, wider), some(~far & ~middle, 0.0))
 
 
-def table(
-    diameter_um: Array, goal: Array, number: Array, *, point: PointExposure, ranges: Ranges, pitch_um: float
-) -> Table:
+def _given(drawn: Drawn, used: Array, steps_um: Array, width_um: float) -> float:
+    """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind that receives most."""
+    found = [0.0]
+    for entry in drawn.widest(used, steps_um) if used.any() else []:
+        at = drawn.edge_um(entry)[:, None] - steps_um
+        found.append(float(drawn.given(entry, at, width_um).sum(1).mean()))
+    return max(found)
+
+
+def table(drawn: Drawn, goal: Array, number: Array, *, point: PointExposure, ranges: Ranges, body: Body) -> Table:
     """The table of a mask.
 
     Args:
-        pitch_um: the least of the lattices.
+        body: the densest of the lattices.
 
     Raises:
         ProcessError: no pillar, or pillars so much finer than the point exposure that their own dose hardly tells.
@@ -158,27 +188,27 @@ def table(
     used = number > 0
     if not used.any():
         raise ProcessError("no pillar is drawn: there is nothing to expose")
-    diameter = np.where(used, diameter_um, 0.0)
-    area = np.pi / 4 * diameter**2
-    whole = sum(w * rim_of_own_disc(diameter, a) for a, w in zip(point.widths_um, point.weights, strict=True))
+    area = np.where(used, drawn.area_um2, 0.0)
+    whole, slope = drawn.edges(used, point)
     own = np.where(used, whole - area * float(ranges.far.density(np.array(0.0))), 0.0)
-    beside = area * _beside(ranges.middle, pitch_um)
+    beside = area * _beside(ranges.middle, body)
     if own[used].min() < _FAINT or (beside >= 0.9 * own)[used].any():
-        thin = 1e3 * float(diameter[used][own[used].argmin()])
+        thin = 1e3 * float(drawn.diameter_um[used][own[used].argmin()])
         raise ProcessError(
             f"a pillar of {thin:.0f} nm gives its own edge an exposure of {own[used].min():.3f} only, less than its "
             "neighbours do: the core of the point exposure (alpha_um) is too wide for these pillars"
         )
-    slope = sum(w * slope_at_rim(diameter, a) for a, w in zip(point.widths_um, point.weights, strict=True))
-    return Table(diameter, area, goal, own, np.where(used, slope, 0), number)
+    return Table(drawn, area, goal, own, slope, number)
 
 
-def _beside(middle: PointExposure, pitch_um: float) -> float:
-    """Bound of the eigenvalues of what the sites of a square lattice, unit masses, give to each other, per um^2.
+def _beside(middle: PointExposure, body: Body) -> float:
+    """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to each other, per um^2.
 
     The sum over all other sites; or, as the whole kernel has no negative ones, what a site would give to itself.
     """
-    far = int(np.ceil(5 * float(middle.widths_um.max(initial=0.0)) / pitch_um))
-    apart = np.arange(-far, far + 1) * pitch_um
+    reach = 5 * float(middle.widths_um.max(initial=0.0))
+    i, j = (np.arange(-n, n + 1) for n in (int(np.ceil(reach / step)) for step in (body.pitch_um, body.down_um)))
+    apart = np.hypot(i * body.pitch_um, (j * body.down_um)[:, None])
+    sites = apart[(i + j[:, None]) % 2 == 0] if body.centred else apart
     itself = float(middle.density(np.array(0.0)))
-    return min(itself, float(middle.density(np.hypot(apart[:, None], apart)).sum()) - itself)
+    return min(itself, float(middle.density(sites).sum()) - itself)

@@ -1,10 +1,11 @@
 """Proximity correction: a dose for each shape, so that all edges receive the exposure that clears the resist.
 
-The exposure at the edge of pillar i is d_i s(D_i) + B_i: its own disc, and the background B = K * (A d) of all other
-shapes of the die. Setting it to g_i / 2 (1/2: the edge of a wide area of dose 1; g: the goal, 1 but for a dose test)
-gives d = (g / 2 - B) / s, and for the background the linear equation B = K * [(g / 2 - B) A / s], solved on a coarse
-grid of nodes over the die. What varies from pillar to pillar is then the product of a number per diameter and a
-smooth function of place. Gaussians too narrow for coarse nodes are solved on the sites of each lattice.
+The exposure at the edge of pillar i is d_i s_i + B_i: by itself (:mod:`layout.dose.drawn`: s(D) of a disc), and the
+background B = K * (A d) of all other shapes of the die. Setting it to g_i / 2 (1/2: the edge of a wide area of dose 1;
+g: the goal, 1 but for a dose test) gives d = (g / 2 - B) / s, and for the background the linear equation
+B = K * [(g / 2 - B) A / s], solved on a coarse grid of nodes over the die. What varies from pillar to pillar is then a
+product of a number per kind and a smooth function of place. Gaussians too narrow for coarse nodes are solved on the
+sites of each lattice.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from layout.dose import assign, bodies, exposure, rects
 from layout.dose.assign import Ladder
 from layout.dose.bodies import Body, Ranges, Rects, Table
+from layout.dose.drawn import Discs, Drawn
 from layout.dose.exposure import CLEARS, PointExposure
 from layout.dose.nodes import Convolution, Grid, convolution, gather, spread
 from layout.dose.pieces import cut as cut_pieces
@@ -80,7 +82,7 @@ class Solution:
 
 def solve(
     parts: Sequence[Body],
-    diameter_um: Array,
+    kinds: Drawn,
     goal: Array,
     settings: Exposure,
     *,
@@ -91,17 +93,17 @@ def solve(
 
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
-        diameter_um, goal: (entries,) of the table, entry 0 for none.
+        kinds, goal: (entries,) of the table, entry 0 for none.
         cut: rectangles along whose outer sides the background hardly changes (:func:`pieces`).
 
     Raises:
         ProcessError: as :func:`correct`.
     """
     point = exposure.point_exposure(settings)
-    number = bodies.count(parts, len(diameter_um))
-    pitch = min(body.pitch_um for body in parts)
-    ranges = bodies.split(point, diameter_um, number, pitch)
-    drawn = bodies.table(diameter_um, goal, number, point=point, ranges=ranges, pitch_um=pitch)
+    number = bodies.count(parts, len(goal))
+    densest = min(parts, key=lambda body: body.apart_um)
+    ranges = bodies.split(point, kinds, number, densest)
+    drawn = bodies.table(kinds, goal, number, point=point, ranges=ranges, body=densest)
     fields = _fields(parts, drawn, ranges, cut or Rects.none())
     ladder, needed = assign.ladder(fields, settings)
     pairs, rect_class, after = assign.assign(fields, ladder)
@@ -136,7 +138,7 @@ def correct_table(
     """As :func:`correct`, for pillars given as (y, x) ``index`` into a table of diameters, entry 0 for none."""
     refuse_negative(process)
     body = Body.of(index, pitch_um)
-    found = solve([body], diameter_um, np.ones(len(diameter_um)), process.exposure, samples=samples)
+    found = solve([body], Discs(diameter_um), np.ones(len(diameter_um)), process.exposure, samples=samples)
     classes = np.empty(index.shape, np.uint8)
     for first, block in body.blocks():
         classes[first : first + len(block)] = found.classes(0, first, block)
@@ -191,7 +193,7 @@ def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> 
     pads = _Pads(cut, own, (points, piece), rects.samples(cut, width / _SPOTS), grid)
     plain, wanted, goal = _masses(parts, drawn, grid)
     plain += pads.deposited(np.ones(len(own)))
-    reach = convolution(grid.shape, grid.x.spacing_um, point=ranges.far, hollow=False)
+    reach = convolution(grid.shape, (grid.y.spacing_um, grid.x.spacing_um), point=ranges.far, hollow=False)
     middles = [_middle(body, ranges) for body in parts] if len(ranges.middle.widths_um) else []
     alone = [_times(body, drawn.area_um2, middle) for body, middle in zip(parts, middles, strict=False)]
     field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles, pads)
@@ -264,7 +266,7 @@ def _middle(body: Body, ranges: Ranges) -> Convolution:
             f"{np.array2string(ranges.middle.widths_um, precision=3)} um: such middle ranges are corrected on at most "
             f"{_MOST_SITES:,} sites; give a point exposure of core and backscatter alone"
         )
-    return convolution((body.rows, body.columns), body.pitch_um, point=ranges.middle, hollow=True)
+    return convolution((body.rows, body.columns), (body.down_um, body.pitch_um), point=ranges.middle, hollow=True)
 
 
 def _times(body: Body, value: Array, middle: Convolution) -> Array:

@@ -161,16 +161,19 @@ class Convolution:
         return np.asarray(field[: self.shape[0], : self.shape[1]])
 
 
-def convolution(shape: tuple[int, int], spacing_um: float, *, point: PointExposure, hollow: bool) -> Convolution:
-    """Convolution with a sum of Gaussians on nodes ``spacing_um`` apart, cut 5 widths out (exp(-25)).
+def convolution(
+    shape: tuple[int, int], spacing_um: tuple[float, float], *, point: PointExposure, hollow: bool
+) -> Convolution:
+    """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5 widths out (exp(-25)).
 
     hollow: leave out what a node gives to itself.
     """
     from scipy import fft
 
-    far = int(np.ceil(5 * float(point.widths_um.max(initial=0.0)) / spacing_um))
-    ny, nx = (fft.next_fast_len(n + min(n, far), real=True) for n in shape)
-    y, x = (np.minimum(np.arange(n), n - np.arange(n)) * spacing_um for n in (ny, nx))
+    reach = 5 * float(point.widths_um.max(initial=0.0))
+    far = (int(np.ceil(reach / step)) for step in spacing_um)
+    ny, nx = (fft.next_fast_len(n + min(n, m), real=True) for n, m in zip(shape, far, strict=True))
+    y, x = (np.minimum(np.arange(n), n - np.arange(n)) * step for n, step in zip((ny, nx), spacing_um, strict=True))
     kernel = np.zeros((ny, nx))
     for width, weight in zip(point.widths_um, point.weights, strict=True):
         kernel += weight / (np.pi * width**2) * np.outer(np.exp(-((y / width) ** 2)), np.exp(-((x / width) ** 2)))

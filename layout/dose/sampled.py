@@ -1,21 +1,20 @@
-"""How far the fast sum is from exact discs, at sample pillars."""
+"""How far the fast sum is from exact shapes, at sample pillars."""
 
 import numpy as np
 
 from layout.dose.assign import Assigned, Fields, Ladder, classes
 from layout.dose.bodies import NONE, Body
-from layout.dose.exposure import CLEARS, PointExposure, disc, rim_of_own_disc
+from layout.dose.exposure import CLEARS, PointExposure
 from metalens.ground.arrays import Array
 
-_NEIGHBOURS = 5  # sites on each side whose discs are taken exactly
-_RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
+_NEIGHBOURS = 5  # sites on each side whose shapes are taken exactly
 
 
 def sampled_error(fields: Fields, steps: Ladder, found: Assigned, *, point: PointExposure, samples: int) -> float:
     """Largest |fast - exact| / wanted exposure at pillars of the first body, evenly drawn.
 
-    Exact: whole discs of all pillars within 5 sites, seen round the rim, and the direct sum over every other
-    pillar (and piece of a rectangle) of Gaussians whose second moment is that of its disc.
+    Exact: whole shapes of all pillars within 5 sites, seen along the edges, and the direct sum over every other
+    pillar (and piece of a rectangle) of Gaussians whose second moment is that of its shape.
     """
     lens = fields.bodies[0]
     rows, columns = _some(lens, samples)
@@ -103,17 +102,17 @@ def _own_block(mass: Array, first: int, sites: tuple[Array, Array], wx: Array, w
 
 
 def _close(fields: Fields, block: tuple[Array, Array], site: tuple[int, int], point: PointExposure) -> float:
-    """Exposure at the rim of one pillar by itself and by the discs within 5 sites, exact."""
-    (index, given), (row, column), p = block, site, fields.bodies[0].pitch_um
-    y = (np.arange(index.shape[0]) - row)[:, None] * p
-    x = (np.arange(index.shape[1]) - column) * p
-    others = (index > 0) & ((y != 0) | (x != 0))
-    own = fields.table.diameter_um[index[row, column]]
-    ring_y, ring_x = own / 2 * np.sin(_RIM)[:, None, None], own / 2 * np.cos(_RIM)[:, None, None]
-    distance = np.hypot(y - ring_y, x - ring_x)[:, others]
-    diameters, doses = fields.table.diameter_um[index[others]], given[others]
-    total = 0.0
-    for width, weight in zip(point.widths_um, point.weights, strict=True):
-        total += weight * float((disc(distance, diameters, width) * doses).sum(-1).mean())
-        total += weight * float(given[row, column] * rim_of_own_disc(own, width))
+    """Exposure of the edges of one pillar by itself and by the shapes within 5 sites, exact."""
+    (index, given), (row, column), body, drawn = block, site, fields.bodies[0], fields.table.drawn
+    y = (row - np.arange(index.shape[0])) * body.down_um  # rows run towards -y
+    x = (np.arange(index.shape[1]) - column) * body.pitch_um
+    mine = int(index[row, column])
+    edge, others = drawn.edge_um(mine), index > 0
+    others[row, column] = False
+    total = float(given[row, column] * drawn.edges(np.arange(len(drawn.area_um2)) == mine, point)[0][mine])
+    for entry in np.unique(index[others]).tolist():
+        i, j = np.nonzero(others & (index == entry))
+        at = edge[:, None] - np.stack([x[j], y[i]], -1)
+        for width, weight in zip(point.widths_um, point.weights, strict=True):
+            total += weight * float((drawn.given(entry, at, float(width)) * given[i, j]).sum(-1).mean())
     return total

@@ -61,8 +61,6 @@ def prepare(
     diameters = source.diameters if isinstance(source, Lens) else source
     steps = pitch_units(diameters.steps_um[0], process), pitch_units(diameters.steps_um[1], process)
     found, classes = _drawn(source, process)
-    if with_doses and not (diameters.plain and classes[0].round):
-        _refuse_doses_beyond_plain(process)
     x0, y0, axis = _origin(found.sites.shape, steps, process.rules.grid_nm)
     lattice = found.sites.lattice("LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True)
     lattice = dataclasses.replace(lattice, row_pitch=steps[1], centred=diameters.lattice.centred)
@@ -136,8 +134,6 @@ def wafer_mark(source: Lens | DiameterMap, process: Process, *, name: str, mark_
 
 def _dosed(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
     """A plan without its lens, corrected where the process asks for it."""
-    if not all(each.round for each in bare.classes):
-        _refuse_doses_beyond_plain(process)
     solution = None
     if process.exposure.corrected:
         bare, solution = dosed.corrected(bare, process)
@@ -155,15 +151,6 @@ def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, t
             raise ProcessError("bias.isolated_nm is known for square lattices; need 0 for another lattice")
     found = cells.quantise(source.diameters if isinstance(source, Lens) else source, process)
     return found, _plain_classes(found.diameters_nm, process)
-
-
-def _refuse_doses_beyond_plain(process: Process) -> None:
-    """Raises: ProcessError: a dose correction of what is only known for round pillars on a square lattice."""
-    if process.exposure.corrected:
-        raise ProcessError(
-            "exposure: doses are corrected for round pillars on a square lattice alone; leave the correction to the "
-            "writer (--no-dose) or set exposure.correct = false"
-        )
 
 
 def pitch_units(pitch_um: float, process: Process) -> int:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from layout.dose import Body, Rects, Solution
+from layout.dose import Body, Discs, Drawn, Outlines, Rects, Solution
 from layout.dose import correct as dose
 from layout.mask.held import hold
 from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
@@ -26,12 +26,11 @@ def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
     """
     dose.refuse_negative(process)
     unit = plan.unit_nm * nm
-    parts = [Body(l.rows, l.columns, l.pitch * unit, l.x0 * unit, l.y0 * unit, l.source) for l in plan.lattices]
-    diameters = np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
+    parts = [_body(lattice, unit) for lattice in plan.lattices]
     goals = np.array([1.0, *(made.goal for made in plan.classes)])
     boxes, of, group = _pieces(plan, parts, process)
     cut = Rects(boxes * unit, group, np.ones(len(boxes)))
-    found = dose.solve(parts, diameters, goals, process.exposure, cut=cut)
+    found = dose.solve(parts, _drawn(plan, unit), goals, process.exposure, cut=cut)
     classes, lookup, names = _classes(plan, found, process)
     lattices = tuple(_redrawn(l, n, found, lookup) for n, l in enumerate(plan.lattices))
     figures, more = _figures(plan, found, (boxes, of))
@@ -46,6 +45,20 @@ def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
         plan.replace(classes=classes, lattices=lattices, figures=figures, doses={**kept, **doses}, layer_names=titled),
         found,
     )
+
+
+def _body(lattice: Lattice, unit: float) -> Body:
+    """Sites in um."""
+    place = lattice.pitch * unit, lattice.x0 * unit, lattice.y0 * unit
+    rows = lattice.row_pitch * unit, lattice.centred
+    return Body(lattice.rows, lattice.columns, *place, lattice.source, *rows)
+
+
+def _drawn(plan: MaskPlan, unit: float) -> Drawn:
+    """The classes as discs where all stand for one, else as polygons."""
+    if all(made.round for made in plan.classes):
+        return Discs(np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)]))
+    return Outlines([(), *([c * unit for c in made.contours] for made in plan.classes)])
 
 
 def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
@@ -136,7 +149,8 @@ def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> L
             yield first, lookup[whole, found.classes(number, first, whole)]
 
     kept = hold((lattice.rows, lattice.columns), lookup.dtype, rows())
-    return kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
+    made = kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
+    return dataclasses.replace(made, row_pitch=lattice.row_pitch, centred=lattice.centred)
 
 
 def _figures(

@@ -91,6 +91,17 @@ class Resist:
         edge = radii[cleared - 1] + (high - 0.5) / (high - low) * (radii[1] - radii[0])
         return float(value[20].mean() / 0.5), float(2 * np.sqrt((edge**2).mean()))
 
+    def cleared_um2(self, site_um: Array, half_um: float, pixel_um: float) -> float:
+        """Area within a square about a place where the exposure is above the threshold.
+
+        Counted on sixths of the pixels, in which it is straight: shares of those along the edge by its slope.
+        """
+        image, _ = self._image(site_um, half_um, pixel_um)
+        fine = np.arange(0, len(image) - 1 + 1e-9, 1 / 6)
+        value = map_coordinates(image, np.meshgrid(fine, fine, indexing="ij"), order=3)
+        slope = np.maximum(np.hypot(*np.gradient(value)), 1e-9)
+        return float(np.clip(0.5 + (value - 0.5) / slope, 0, 1).sum() * (pixel_um / 6) ** 2)
+
     def edge(self, at_um: Array, outward: Array, pixel_um: float) -> tuple[float, float]:
         """Exposure of a point on a straight edge over dose-to-size, and how far outside it, in um, the resist ends.
 

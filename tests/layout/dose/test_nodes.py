@@ -57,9 +57,9 @@ def test_rows_of_a_lattice_are_deposits_at_its_sites(grid):
 def test_convolution_is_the_plain_sum_of_gaussians(hollow):
     point = PointExposure(np.array([0.9, 4.0]), np.array([0.7, 0.3]))
     mass = RNG.uniform(size=(17, 23))
-    field = convolution((17, 23), 0.5, point=point, hollow=hollow)(mass)
+    field = convolution((17, 23), (0.7, 0.5), point=point, hollow=hollow)(mass)
     assert field.shape == (17, 23)
-    y, x = np.mgrid[:17, :23] * 0.5
+    y, x = np.meshgrid(np.arange(17) * 0.7, np.arange(23) * 0.5, indexing="ij")
     for row, column in ((0, 0), (16, 22), (8, 3)):
         weight = point.density(np.hypot(y - y[row, column], x - x[row, column]))
         if hollow:
@@ -71,7 +71,7 @@ def test_a_narrow_gaussian_does_not_reach_round_to_the_other_border():
     """Five of its widths, 4.5 um, are added to 40 and 31 nodes."""
     point, mass = PointExposure(np.array([0.9]), np.array([1.0])), np.zeros((40, 31))
     mass[0, 0] = mass[-1, 7] = 1.0
-    field = convolution((40, 31), 0.5, point=point, hollow=False)(mass)
+    field = convolution((40, 31), (0.5, 0.5), point=point, hollow=False)(mass)
     y, x = np.mgrid[:40, :31] * 0.5
     want = point.density(np.hypot(y, x)) + point.density(np.hypot(y - 19.5, x - 3.5))
     assert field == pytest.approx(want, abs=1e-9 * want.max())  # exp(-25)

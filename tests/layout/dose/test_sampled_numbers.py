@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from layout.dose import bodies, sampled
 from layout.dose.assign import Ladder
 from layout.dose.bodies import NONE, Body
+from layout.dose.drawn import Discs
 from layout.dose.exposure import CLEARS, PointExposure, disc, rim_of_own_disc
 from metalens.ground.errors import ProcessError
 
@@ -30,7 +31,7 @@ def lens():
 
 def table():
     own = np.array([0.0, 0.31, 0.36, 0.28])
-    return SimpleNamespace(diameter_um=DIAMETER, area_um2=math.pi / 4 * DIAMETER**2, goal=GOAL, own=own)
+    return SimpleNamespace(drawn=Discs(DIAMETER), area_um2=math.pi / 4 * DIAMETER**2, goal=GOAL, own=own)
 
 
 def rim(row, column, rows, columns, far):
@@ -153,7 +154,7 @@ def test_gaussians_are_sorted_by_reach_and_widened_by_the_pillars():
     """Six pitches and more are far; what four neighbours see above 5e-4 or is wider than a pitch is middle."""
     number = np.array([0, 30, 5, 0])
     point = PointExposure(np.array([0.02, 0.11, 0.5, 2.5799, 2.5801]), np.array([0.4, 0.1, 1e-4, 0.2, 0.3]))
-    ranges = bodies.split(point, DIAMETER, number, PITCH)
+    ranges = bodies.split(point, Discs(DIAMETER), number, lens())
     area = number * DIAMETER**2
     square = (area * DIAMETER**2).sum() / area.sum()
     more = 1.5 * square / 4  # R² / 2 of the disc that gives and R² of the ring that sees
@@ -167,13 +168,13 @@ def test_gaussians_are_sorted_by_reach_and_widened_by_the_pillars():
     seen = disc(np.hypot(PITCH - 0.165 * np.cos(turn), 0.165 * np.sin(turn)), 0.33, 0.11).mean()
     for factor, middle in ((1.001, 1), (0.999, 0)):
         faint = PointExposure(np.array([0.11]), np.array([factor * 5e-4 / (4 * seen)]))
-        assert len(bodies.split(faint, DIAMETER, number, PITCH).middle.widths_um) == middle
+        assert len(bodies.split(faint, Discs(DIAMETER), number, lens()).middle.widths_um) == middle
 
 
 def test_the_table_takes_from_each_pillar_what_the_far_field_counts_for_it():
     number = np.array([0, 30, 5, 0])
-    ranges = bodies.split(POINT, DIAMETER, number, PITCH)
-    made = bodies.table(DIAMETER, GOAL, number, point=POINT, ranges=ranges, pitch_um=PITCH)
+    ranges = bodies.split(POINT, Discs(DIAMETER), number, lens())
+    made = bodies.table(Discs(DIAMETER), GOAL, number, point=POINT, ranges=ranges, body=lens())
     assert ranges.far.weights.tolist() == [0.25]
     for k in (1, 2):
         area = math.pi / 4 * DIAMETER[k] ** 2
@@ -207,11 +208,11 @@ def test_pillars_that_their_own_dose_hardly_reaches_are_refused(own, refused):
     number = np.array([0, 5, 0, 0])
     if refused:
         with pytest.raises(ProcessError, match=r"a pillar of 210 nm gives its own edge an exposure of 0\.019 only"):
-            bodies.table(DIAMETER, GOAL, number, point=point, ranges=near, pitch_um=PITCH)
+            bodies.table(Discs(DIAMETER), GOAL, number, point=point, ranges=near, body=lens())
     else:
-        assert bodies.table(DIAMETER, GOAL, number, point=point, ranges=near, pitch_um=PITCH).own[1] == pytest.approx(
-            own
-        )
+        assert bodies.table(Discs(DIAMETER), GOAL, number, point=point, ranges=near, body=lens()).own[
+            1
+        ] == pytest.approx(own)
 
 
 def others(width, pitch):
@@ -228,7 +229,7 @@ def test_what_neighbours_give_is_bounded_by_their_sum_or_by_what_a_site_would_gi
     total = sum(s * others(w, PITCH) for s, w in zip(scale, middle.widths_um, strict=True))
     assert (total < scale.sum()) == by_sum
     # sites beyond five widths: exp(-25) each
-    assert bodies._beside(middle, PITCH) == pytest.approx(min(total, scale.sum()), rel=1e-9)
+    assert bodies._beside(middle, lens()) == pytest.approx(min(total, scale.sum()), rel=1e-9)
 
 
 @pytest.mark.parametrize(("share", "refused"), [(0.88, False), (0.92, True)])
@@ -243,9 +244,9 @@ def test_pillars_to_whom_neighbours_give_nine_tenths_of_their_own_are_refused(sh
     width = 2.0 * PITCH
     weight = share / worst * math.pi * width**2  # a wide one: bounded by what a site would give itself
     ranges = bodies.Ranges(nothing, PointExposure(np.array([width]), np.array([weight])), core)
-    about = dict(point=core, ranges=ranges, pitch_um=PITCH)
+    about = dict(point=core, ranges=ranges, body=lens())
     if refused:
         with pytest.raises(ProcessError, match="less than its neighbours do"):
-            bodies.table(DIAMETER, GOAL, number, **about)
+            bodies.table(Discs(DIAMETER), GOAL, number, **about)
     else:
-        assert bodies.table(DIAMETER, GOAL, number, **about).own[1:3] == pytest.approx(own[1:3], rel=1e-9)
+        assert bodies.table(Discs(DIAMETER), GOAL, number, **about).own[1:3] == pytest.approx(own[1:3], rel=1e-9)

@@ -8,6 +8,7 @@ import pytest
 from layout.dose import sampled
 from layout.dose.assign import Ladder
 from layout.dose.bodies import NONE, Body
+from layout.dose.drawn import Discs
 from layout.dose.exposure import CLEARS, PointExposure, disc, rim_of_own_disc
 
 PITCH, SHAPE = 0.37, (17, 21)
@@ -36,7 +37,7 @@ def test_discs_within_five_sites_to_either_side_are_exact(monkeypatch, site):
     monkeypatch.setattr(sampled, "_some", lambda body, samples: (np.array([row]), np.array([column])))
     monkeypatch.setattr(sampled, "_distant", lambda *_: np.array([0.013]))
     fields = SimpleNamespace(
-        bodies=[lens], table=SimpleNamespace(diameter_um=DIAMETER, goal=GOAL, own=OWN),
+        bodies=[lens], table=SimpleNamespace(drawn=Discs(DIAMETER), goal=GOAL, own=OWN),
         at=lambda *asked: {("far", 0, row, 1, "near"): np.full((1, SHAPE[1]), 0.071)}[asked],
     )  # fmt: skip
     found = SimpleNamespace(far="far", near="near")

@@ -180,7 +180,6 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
     [
         (lens(Ring(0.01), turned=False), {}, "four steps of the grid"),
         (lens(Ring(0.05), turned=False), {"bias": Bias(table_nm=((80.0, -30.0), (300.0, -30.0)))}, "no hole"),
-        (hexagonal(), {"exposure": processes.Exposure(alpha_um=0.02, beta_um=10.0, eta=0.6)}, "--no-dose"),
         (hexagonal(), {"bias": dataclasses.replace(PROCESS.bias, isolated_nm=4.0)}, "isolated_nm"),
         (hexagonal(row_um=0.0), {}, "no multiple of the grid"),
     ],

@@ -1,0 +1,225 @@
+"""What each kind of pillar exposes at unit dose: discs in closed form, any other shape by its polygons.
+
+The edge that counts is the one in the resist. At dose d on a background B it is where d E(x) + B = 1/2, E the exposure
+by the pillar itself at unit dose; the pillar keeps its area A where E's level set of area A lies there:
+
+    d own + B = 1/2,   own: the level that E exceeds on the area A.
+
+Of a disc that is the exposure of its rim; rounded corners are made up for by the straight edges. Turns about the site
+leave ``own`` as it is, so that the table is smooth in turn and size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from layout.dose.exposure import PointExposure, disc, rim_of_own_disc, slope_at_rim
+from metalens.ground.arrays import Array
+
+Contours = Sequence[Array]  # (n, 2) um each; outlines counter-clockwise, holes clockwise
+_RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
+_SEEN = 48  # points along the edges that neighbours are seen from
+_PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
+_PIXEL = 1 / 6  # of it, of the raster on which the level is found
+_MOST_PIXELS = 1200  # along a side
+_HALVINGS = 34
+
+
+class Drawn(Protocol):
+    """Kinds of pillars, entry 0 for none."""
+
+    @property
+    def diameter_um(self) -> Array:
+        """(entries,) of the circle of equal area."""
+
+    @property
+    def area_um2(self) -> Array:
+        """(entries,) areas."""
+
+    @property
+    def wider_um2(self) -> Array:
+        """(entries,) added to the squared width of a Gaussian: mean squared distances from the middle, over the area of
+        the pillar that gives plus over the edge that sees.
+        """
+
+    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
+        """(entries,) ``own`` at unit dose, and its fall per um that all edges move out; 0 where not ``used``."""
+
+    def edge_um(self, entry: int) -> Array:
+        """(n, 2) places along the edges, from the site."""
+
+    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
+        """(...) exposure at (..., 2) places from the site, by one Gaussian, at unit dose."""
+
+    def widest(self, used: Array, steps_um: Array) -> list[int]:
+        """Entries that come nearest to others at these (n, 2) steps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Discs:
+    """Round pillars. diameter_um: (entries,)."""
+
+    diameter_um: Array
+
+    @property
+    def area_um2(self) -> Array:
+        """pi D^2 / 4."""
+        return np.asarray(np.pi / 4 * self.diameter_um**2)
+
+    @property
+    def wider_um2(self) -> Array:
+        """R^2 / 2 of the disc and R^2 of the ring on which it is seen."""
+        return np.asarray(1.5 * self.diameter_um**2 / 4)
+
+    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
+        """As in :class:`Drawn`, exact."""
+        d, terms = np.where(used, self.diameter_um, 0.0), list(zip(point.widths_um, point.weights, strict=True))
+        own, slope = (sum(w * f(d, a) for a, w in terms) for f in (rim_of_own_disc, slope_at_rim))
+        return np.asarray(own), np.where(used, slope, 0)
+
+    def edge_um(self, entry: int) -> Array:
+        """As in :class:`Drawn`."""
+        return np.asarray(self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1))
+
+    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
+        """As in :class:`Drawn`, exact."""
+        return disc(np.hypot(at_um[..., 0], at_um[..., 1]), self.diameter_um[entry], width_um)
+
+    def widest(self, used: Array, steps_um: Array) -> list[int]:
+        """The thickest."""
+        return [int(np.where(used, self.diameter_um, 0.0).argmax())]
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Pillars of any shape. contours: of each entry, those of entry 0 empty."""
+
+    contours: Sequence[Contours]
+
+    @cached_property
+    def area_um2(self) -> Array:
+        """By Green's theorem."""
+        return np.array([sum(_moments(c)[0] for c in each) for each in self.contours])
+
+    @property
+    def diameter_um(self) -> Array:
+        """Of the circle of equal area."""
+        return np.asarray(2 * np.sqrt(self.area_um2 / np.pi))
+
+    @cached_property
+    def wider_um2(self) -> Array:
+        """Mean squared distance from the centroid, over the area and over the edges."""
+        return np.array([_wider(each) if each else 0.0 for each in self.contours])
+
+    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
+        """As in :class:`Drawn`; to 2e-3 of itself (pixels of a sixth of the narrowest Gaussian)."""
+        found = np.zeros((2, len(self.contours)))
+        for k in np.flatnonzero(used).tolist():
+            found[:, k] = _level(self.contours[k], float(self.area_um2[k]), point)
+        return found[0], found[1]
+
+    def edge_um(self, entry: int) -> Array:
+        """As in :class:`Drawn`, evenly spaced."""
+        return _along(self.contours[entry], _SEEN)
+
+    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
+        """As in :class:`Drawn`; four Gauss points to 0.8 widths, 1e-6."""
+        places = at_um.reshape(-1, 2)
+        y, weight, crossing = _lines(self.contours[entry], width_um)
+        bell = weight * np.exp(-(((places[:, 1:] - y) / width_um) ** 2)) / (np.sqrt(np.pi) * width_um)
+        return np.asarray((bell * _erf((crossing - places[:, :1]) / width_um)).sum(1) / 2).reshape(at_um.shape[:-1])
+
+    def widest(self, used: Array, steps_um: Array) -> list[int]:
+        """The one that reaches farthest along each of the steps."""
+        some = np.flatnonzero(used).tolist()
+        far = np.array([(np.concatenate(list(self.contours[k])) @ steps_um.T).max(0) for k in some])
+        return sorted({some[k] for k in far.argmax(0).tolist()})
+
+
+def _moments(c: Array) -> tuple[float, Array, float]:
+    """Area, first moments and integral of r^2 over a contour, with its sign."""
+    a, b = c, np.roll(c, -1, axis=0)
+    cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    square = (a * a + a * b + b * b).sum(1)
+    return float(cross.sum() / 2), ((a + b) * cross[:, None]).sum(0) / 6, float((cross * square).sum() / 12)
+
+
+def _wider(contours: Contours) -> float:
+    parts = [_moments(c) for c in contours]
+    area, second = sum(part[0] for part in parts), sum(part[2] for part in parts)
+    centre = np.sum([part[1] for part in parts], axis=0) / area
+    points = _along(contours, 4 * _SEEN) - centre
+    return float(second / area - centre @ centre + (points**2).sum(1).mean())
+
+
+def _along(contours: Contours, count: int) -> Array:
+    """(count, 2) places evenly along all edges."""
+    start = np.concatenate(list(contours))
+    edge = np.concatenate([np.roll(c, -1, axis=0) for c in contours]) - start
+    ends = np.cumsum(np.hypot(*edge.T))
+    at = (np.arange(count) + 0.5) / count * ends[-1]
+    k = np.searchsorted(ends, at)
+    share = 1 - (ends[k] - at) / np.hypot(*edge.T)[k]
+    return np.asarray(start[k] + share[:, None] * edge[k])
+
+
+def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
+    """Crossings of level lines with edges: (n,) heights, Gauss weights (below 0 where the edge runs down), and places.
+
+    The integral over the shape of f(x) g(y) is the sum of weight g(y) F(place), F' = f.
+    """
+    start = np.concatenate(list(contours))
+    end = np.concatenate([np.roll(c, -1, axis=0) for c in contours])
+    stops = np.unique(start[:, 1])
+    counts = np.maximum(np.ceil(np.diff(stops) / (_PANEL * narrow_um)).astype(int), 1)
+    left = np.concatenate([a + (b - a) / n * np.arange(n) for a, b, n in zip(stops, stops[1:], counts, strict=False)])
+    wide = np.repeat(np.diff(stops) / counts, counts)
+    node, share = np.polynomial.legendre.leggauss(4)
+    y = (left[:, None] + wide[:, None] * (node + 1) / 2).ravel()
+    weight = (wide[:, None] * share / 2).ravel()
+    low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+    edge, line = np.nonzero((low[:, None] < y) & (y < high[:, None]))
+    rise = (end - start)[edge]
+    place = start[edge, 0] + (y[line] - start[edge, 1]) / rise[:, 1] * rise[:, 0]
+    return y[line], weight[line] * np.sign(rise[:, 1]), place
+
+
+def _level(contours: Contours, area_um2: float, point: PointExposure) -> tuple[float, float]:
+    """Level that the exposure of a shape by itself exceeds on its own area, and its fall per um that edges move out."""
+    corners = np.concatenate(list(contours))
+    core = float(point.widths_um.min())
+    size = float(np.ptp(corners, axis=0).max())
+    pixel = max(_PIXEL * core, size / _MOST_PIXELS)
+    margin = min(2 * core, size)
+    x, y = (np.arange(low - margin, high + margin + pixel, pixel) for low, high in zip(*_box(corners), strict=True))
+    height, weight, place = _lines(contours, core)
+    image = np.zeros((len(y), len(x)))
+    for width, share in zip(point.widths_um, point.weights, strict=True):
+        bell = weight * np.exp(-(((y[:, None] - height) / width) ** 2)) / (np.sqrt(np.pi) * width)
+        image += share / 2 * (bell @ _erf((place[:, None] - x) / width))
+    steep = np.maximum(np.hypot(*np.gradient(image)), 1e-12)  # per pixel
+
+    def larger(level: float) -> float:
+        return float(np.clip(0.5 + (image - level) / steep, 0, 1).sum()) * pixel**2
+
+    low, high = 0.0, float(image.max())
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if larger(middle) > area_um2 else (low, middle)
+    level = (low + high) / 2
+    around = sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
+    off = 0.15 * level  # a few pixels, so that their places do not tell
+    return level, around / max((larger(level - off) - larger(level + off)) / (2 * off), 1e-12)
+
+
+def _box(corners: Array) -> tuple[Array, Array]:
+    return corners.min(0), corners.max(0)
+
+
+def _erf(x: Array) -> Array:
+    from scipy.special import erf
+
+    return np.asarray(erf(x))

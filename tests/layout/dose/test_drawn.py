@@ -1,0 +1,73 @@
+"""What shapes expose by themselves: polygons of circles against closed forms, rectangles against error functions."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import chndtr, erf
+
+from layout.certify import raster
+from layout.dose.drawn import Discs, Outlines
+from layout.dose.exposure import PointExposure
+
+POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))
+D, ONE, OFF = 0.231, np.array([False, True]), np.array([0.0017, -0.0009])
+
+
+def round_ones(count=256):
+    """The polygon of a circle's area, off the middle, and the circle."""
+    turn = 2 * math.pi * np.arange(count) / count
+    swell = math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
+    corners = swell * D / 2 * np.stack([np.cos(turn), np.sin(turn)], -1)
+    return Outlines([(), [corners + OFF]]), Discs(np.array([0.0, D]))
+
+
+def test_the_polygon_of_a_circle_exposes_as_the_disc_does():
+    """Level and slope on pixels of a sixth of the core: 2e-3 and 1 %; moments of 256 corners: 1e-4."""
+    polygon, disc = round_ones()
+    (own, slope), (want, fall) = polygon.edges(ONE, POINT), disc.edges(ONE, POINT)
+    assert own[1] == pytest.approx(want[1], rel=2e-3)
+    assert slope[1] == pytest.approx(fall[1], rel=1e-2)
+    assert polygon.area_um2[1] == pytest.approx(disc.area_um2[1], rel=1e-9)
+    assert polygon.wider_um2[1] == pytest.approx(disc.wider_um2[1], rel=1e-4)
+    at = np.array([[0.13, 0.04], [0.02, -0.1], [-0.4, 0.2]])
+    for width in POINT.widths_um:
+        assert polygon.given(1, at + OFF, width) == pytest.approx(disc.given(1, at, width), abs=1e-4)
+
+
+def test_a_rectangle_and_its_hole_are_products_of_error_functions():
+    def box(a, b):
+        return np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
+
+    shape = Outlines([(), [box(0.13, 0.06), box(0.05, 0.021)[::-1]]])
+    at, width = np.array([[0.13, 0.03], [0.01, 0.02], [0.2, -0.07]]), 0.03
+
+    def plain(a, b):
+        x, y = at.T
+        return np.prod([(erf((s + v) / width) + erf((s - v) / width)) / 2 for s, v in ((a, x), (b, y))], axis=0)
+
+    want = plain(0.13, 0.06) - plain(0.05, 0.021)
+    assert shape.given(1, at, width) == pytest.approx(want, abs=1e-6)  # four Gauss points on 0.8 widths
+    seen = raster.image(shape.contours[1], width)
+    j, i = (np.rint(at[:, k] / seen.pixel_um).astype(int) + len(seen.value) // 2 for k in (1, 0))
+    at = np.column_stack([seen.axis_um[i], seen.axis_um[j]])
+    assert seen.value[j, i] == pytest.approx(plain(0.13, 0.06) - plain(0.05, 0.021), abs=1e-6)
+
+
+def test_a_turn_leaves_the_level_of_a_shape_as_it_is():
+    """A long rectangle at four turns: pixels of a sixth of the core, 2e-3."""
+    corners, found = np.array([[-0.12, -0.05], [0.12, -0.05], [0.12, 0.05], [-0.12, 0.05]]), []
+    for turn in (0.0, 0.3, 1.1, math.pi / 2):
+        c, s = math.cos(turn), math.sin(turn)
+        found.append(Outlines([(), [corners @ np.array([[c, s], [-s, c]])]]).edges(ONE, POINT)[0][1])
+    assert np.ptp(found) < 2e-3 * found[0]
+
+
+def test_levels_of_a_certificate_are_those_of_a_disc():
+    """Exposure at any radius about the rim: pixels of a tenth of the core, 2e-3 of the rim's."""
+    polygon, _ = round_ones()
+    radius = np.linspace(D / 2 - 0.012, D / 2 + 0.012, 9)
+    terms = list(zip(POINT.widths_um.tolist(), POINT.weights.tolist(), strict=True))
+    want = sum(w * chndtr(2 * (D / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
+    contours = [polygon.contours[1][0] - OFF]
+    assert raster.own_levels(contours, terms, radius) == pytest.approx(want, abs=2e-3 * want[4])
