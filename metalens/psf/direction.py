@@ -7,8 +7,9 @@ from typing import Any
 
 import torch
 
+from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
-from metalens.lens import media
+from metalens.lens import Layers, media
 from metalens.propagate import Case, Moving
 from metalens.psf import extended
 from metalens.psf.among import Jones
@@ -49,17 +50,35 @@ class Wanted:
 @dataclass(frozen=True, eq=False, slots=True)
 class Light:
     """Maps (wavelength, y, x) of one lens, and the cases and weights of the wavelengths; with ``mixing`` both
-    polarisations of so many maps a wavelength."""
+    polarisations of so many maps a wavelength. layers: whose stop lays its shadow on the maps."""
 
     maps: tuple[torch.Tensor, torch.Tensor]
     cases: list[Case]
     weights: list[float]
     mixing: Mixing | None
+    layers: Layers | None = None
 
     def at(self, like: Case) -> list[Case]:
         """The cases with the direction, depths and window of another."""
         alike = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
         return [replace(c, **{name: getattr(like, name) for name in alike}) for c in self.cases]
+
+    def shaded(self, cases: list[Case]) -> tuple[torch.Tensor, torch.Tensor]:
+        """The maps as the light of these cases meets them, each of their first depth."""
+        if self.layers is None or self.layers.stop is None:
+            return self.maps
+        count = 1 if self.mixing is None else self.mixing.maps
+        shadow = torch.stack([torch.from_numpy(_shadow(case, self.layers)) for case in cases for _ in range(count)])
+        return self.maps[0] + shadow.angle().to(self.maps[0]), self.maps[1] * shadow.abs().to(self.maps[1])
+
+
+def _shadow(case: Case, layers: Layers) -> Array:
+    """(y, x) complex amplitude of the light of a case's first depth at each pillar, over that without the stop."""
+    y, x = case.pillars_um
+    inverse = case.inverse_depths_per_um[0]
+    depth = 1 / inverse if inverse else math.inf
+    places = x, y[:, None]
+    return layers.shadow(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2))
 
 
 def direction(
@@ -68,11 +87,13 @@ def direction(
     weights: list[float],
     wanted: Wanted,
     moving: Moving | None,
+    layers: Layers | None = None,
 ) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
     """(…, depth, y, x) intensity of every lens, the results it is made of, and (…) the sum of squares of what its
     pillars let through the faces behind them.
 
-    maps: (…, wavelength, y, x); cases, weights: of the wavelengths.
+    maps: (…, wavelength, y, x); cases, weights: of the wavelengths. layers: whose stop shades the pillars, alike for
+    all depths of the cases.
     """
     if wanted.source is not None and moving is not None:
         raise PropagationError("a source of finite size has no derivatives in the geometry: give numbers, or a point")
@@ -82,7 +103,7 @@ def direction(
         maps = maps if wanted.fields is None else apart_maps(maps, wanted.fields)
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
-    found = [_lens(Light(pair, cases, weights, mixing), wanted, moving) for pair in lenses]
+    found = [_lens(Light(pair, cases, weights, mixing, layers), wanted, moving) for pair in lenses]
     light, results = _stacked([one for one, _ in found]), [result for _, result in found]
     power = torch.tensor([result.power for result in results], dtype=torch.float64).view(shape[:-3])
     return light.view(*shape[:-3], *light.shape[1:]), results, power * _passed(cases[0])
@@ -145,7 +166,8 @@ def _depths(
 
 def _intensity(given: Light, case: Case, tolerance: float, moving: Moving | None) -> Result:
     about: dict[str, Any] = {"tolerance": tolerance, "moving": moving, "mixing": given.mixing}
-    return intensity(*given.maps, given.at(case), given.weights, **about)
+    cases = given.at(case)
+    return intensity(*given.shaded(cases), cases, given.weights, **about)
 
 
 def _blurred(given: Light, fine: Cells, some: Case, source: Extent, tolerance: float) -> tuple[torch.Tensor, Result]:

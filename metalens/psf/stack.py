@@ -117,39 +117,22 @@ _Found = tuple[torch.Tensor, list[Result], torch.Tensor]
 
 
 def _seen(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None) -> _Found:
-    return _free(maps, given) if layers is None or layers.stop is None else _stopped(maps, given, layers)
-
-
-def _free(maps: tuple[torch.Tensor, torch.Tensor], given: _Given) -> _Found:
-    """:func:`direction`, the sum of squares (…, 1) for all depths alike."""
-    light, results, power = direction(maps, *given)
-    return light, results, power[..., None]
-
-
-def _stopped(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers) -> _Found:
-    """As :func:`_free` behind a stop: its shadow on the pillars is another at every depth, if it lies before them."""
+    """:func:`direction`, the sum of squares (…, depth), of 1 where it is that of all; behind a stop each depth alone,
+    whose shadow on the pillars is another at every depth, if it lies before them."""
     cases, weights, wanted, moving = given
-    if moving is not None:
-        raise PropagationError("a stop has no derivatives in the geometry: give numbers")
     inverse = cases[0].inverse_depths_per_um
-    on_pillars = layers.stop is not None and layers.stop.distance_um == 0
-    parts = []
-    for depths in [inverse] if on_pillars else [(one,) for one in inverse]:
+    shares = [inverse]
+    if layers is not None and layers.stop is not None:
+        if moving is not None:
+            raise PropagationError("a stop has no derivatives in the geometry: give numbers")
+        shares = [inverse] if layers.stop.distance_um == 0 else [(one,) for one in inverse]
+    found = []
+    for depths in shares:
         seen = [dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases]
-        shadow = torch.stack([torch.from_numpy(_shadow(case, layers)) for case in seen])
-        shaded = maps[0] + shadow.angle().to(maps[0]), maps[1] * shadow.abs().to(maps[1])
-        parts.append(_free(shaded, (seen, weights, wanted, None)))
-    results = [result for _, found, _ in parts for result in found]
-    return torch.cat([light for light, _, _ in parts], -3), results, torch.cat([power for _, _, power in parts], -1)
-
-
-def _shadow(case: Case, layers: Layers) -> Array:
-    """(y, x) complex amplitude of the light of a case's first depth at each pillar, over that without the stop."""
-    y, x = case.pillars_um
-    inverse = case.inverse_depths_per_um[0]
-    depth = 1 / inverse if inverse else math.inf
-    places = x, y[:, None]
-    return layers.shadow(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2))
+        found.append(direction(maps, seen, weights, wanted, moving, layers))
+    light = found[0][0] if len(found) == 1 else torch.cat([light for light, _, _ in found], -3)
+    results = [result for _, some, _ in found for result in some]
+    return light, results, torch.stack([power for _, _, power in found], -1)
 
 
 def _directions(angle_rad: Any) -> tuple[bool, Any]:

@@ -26,7 +26,7 @@ def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
         return 0.004
 
     monkeypatch.setattr(direction.extended, "unlike", unlike)
-    given = SimpleNamespace(maps=(None, None), at=lambda case: case, weights=None, mixing=None)
+    given = SimpleNamespace(shaded=lambda cases: (None, None), at=lambda case: case, weights=None, mixing=None)
     case = SimpleNamespace(samples=(9, 9))
     made = direction._blurred(given, SimpleNamespace(case=case), case, Extent(size_um=40.0), 1e-2)[1]
     assert len(asked) == 2
