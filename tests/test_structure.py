@@ -26,14 +26,6 @@ MAY_IMPORT = {
 }
 
 
-def _imports(path):
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield node.module or ""
-
-
 MODULES = {
     path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__"): path
     for package in PACKAGES
@@ -51,15 +43,33 @@ def _folder(module):
     return module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
 
 
+@functools.cache
 def _tree(module):
     return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _nodes(module):
+    return list(ast.walk(_tree(module)))
+
+
+def _of(package):
+    return [module for module in MODULES if module.split(".")[0] == package]
+
+
+def _imports(module):
+    for node in _nodes(module):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
 
 
 @functools.cache
 def _face(package):
     """{public name: (module, name there)} of a folder, and the same as its TYPE_CHECKING block has it."""
     table, typed = {}, {}
-    for node in ast.walk(_tree(package)):
+    for node in _nodes(package):
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "attach":
             for key, value in zip(node.args[1].keys, node.args[1].values, strict=True):
                 module, _, there = value.value.partition(":")
@@ -77,7 +87,7 @@ FACES = [name for name in MODULES if _face(name)[0]]
 def _uses(module):
     """(where the import points, module that defines it, name) of what one module takes from the project."""
     found = []
-    for node in ast.walk(_tree(module)):
+    for node in _nodes(module):
         if isinstance(node, ast.Import):
             found += [(alias.name, alias.name, "") for alias in node.names if alias.name in MODULES]
         elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
@@ -106,12 +116,12 @@ def test_nothing_imports_in_a_circle(of):
 @pytest.mark.parametrize("package", PACKAGES)
 def test_imports_run_one_way(package):
     found = {
-        (path.relative_to(ROOT).as_posix(), name)
-        for path in (ROOT / package).rglob("*.py")
-        for name in _imports(path)
+        (module, name)
+        for module in _of(package)
+        for name in _imports(module)
         if name.split(".")[0] in PACKAGES and name.split(".")[0] != package
     }
-    wrong = {(path, name) for path, name in found if name.split(".")[0] not in MAY_IMPORT[package]}
+    wrong = {(module, name) for module, name in found if name.split(".")[0] not in MAY_IMPORT[package]}
     assert not wrong
 
 
@@ -119,7 +129,7 @@ def test_no_string_names_a_module_of_a_package_above():
     up = {
         (module, node.value)
         for module in MODULES.keys() - TABLES
-        for node in ast.walk(_tree(module))
+        for node in _nodes(module)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
         for name in re.findall(r"\b(?:metalens|layout|characterize|codesign)(?:\.\w+)+", node.value)
         if name in MODULES
@@ -146,7 +156,7 @@ def _lengths():
         lines = len(path.read_text(encoding="utf-8").splitlines())
         if lines > MOST_LINES:
             yield module, lines
-        for node in ast.walk(_tree(module)):
+        for node in _nodes(module):
             if isinstance(node, ast.FunctionDef) and _length(node) > MOST_LINES_OF_A_FUNCTION:
                 yield f"{module}:{node.name}", _length(node)
 
@@ -177,7 +187,7 @@ def _public(tree, names):
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_what_is_public_is_documented(package):
-    modules = [module for module in MODULES if module.split(".")[0] == package]
+    modules = _of(package)
     assert not [module for module in modules if not ast.get_docstring(_tree(module))]
     public = [pair for module in modules for pair in _public(_tree(module), module)]
     assert not [name for name, node in public if not ast.get_docstring(node)]
@@ -218,7 +228,7 @@ def test_a_face_shows_what_is_public_and_nothing_else(package):
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_shipped_code_never_imports_gdstk_or_klayout(package):
-    names = {name.split(".")[0] for path in (ROOT / package).rglob("*.py") for name in _imports(path)}
+    names = {name.split(".")[0] for module in _of(package) for name in _imports(module)}
     assert not names & {"gdstk", "klayout", "gdspy", "pickle"}
 
 
@@ -247,9 +257,8 @@ def test_every_dependency_is_declared_and_every_declared_one_is_used():
     extras = _declared(entry for table in project["optional-dependencies"].values() for entry in table)
     outside = {
         name.split(".")[0]
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*.py")
-        for name in _imports(path)
+        for module in MODULES
+        for name in _imports(module)
         if name and name.split(".")[0] not in {*sys.stdlib_module_names, *PACKAGES}
     }
     used = {IMPORTED_AS.get(name, name).lower().replace("_", "-") for name in outside}
