@@ -4,24 +4,21 @@ import importlib
 import inspect
 import json
 import os
-import subprocess
 import sys
 import textwrap
 from importlib import resources
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from command_line import process, run
 
 from metalens import cli
 
 
-def run(*words, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "metalens", *map(str, words)], capture_output=True, text=True, cwd=cwd, check=False
-    )
-
-
 def test_help_lists_every_verb():
-    done = run("--help")
+    done = process("--help")
     assert done.returncode == cli.SUCCESS
     for verb in cli.VERBS:
         assert f"  {verb}" in done.stdout
@@ -54,7 +51,7 @@ def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
 
 def test_no_command_and_unknown_command_are_bad_input():
     assert run().returncode == cli.BAD_INPUT
-    done = run("desing")
+    done = process("desing")
     assert done.returncode == cli.BAD_INPUT
     assert "did you mean 'design'?" in done.stderr
 
@@ -83,12 +80,12 @@ def test_evaluate_takes_lens_files_and_run_folders_as_they_are(tmp_path):
 
 
 def test_version():
-    assert run("--version").stdout.startswith("metalens ")
+    assert process("--version").stdout.startswith("metalens ")
 
 
 def test_misspelt_key_names_the_nearest_and_writes_nothing(tmp_path):
     (tmp_path / "d.toml").write_text('profil = "cubic"\n')
-    done = run("design", "d.toml", "-o", "lens.h5", cwd=tmp_path)
+    done = process("design", "d.toml", "-o", "lens.h5", cwd=tmp_path)
     assert done.returncode == cli.BAD_INPUT
     assert "unknown key 'profil'; did you mean 'profile'?" in done.stderr
     assert "Traceback" not in done.stderr
@@ -134,8 +131,8 @@ CHAIN = {
         preset = "smoke"
         test_batches = 2
         validation_batches = 2
-        scenes = { pixels = 48, margin = 4, pool = 96 }
-        inner = { steps = 30 }
+        scenes = { pixels = 48, margin = 4, pool = 48 }
+        inner = { steps = 12, batch = 2 }
         search = { population = 2, tournament = 1, rounds = 2 }
         run = { pitch_um = 12.0, budgets_mmacs = [4.0] }
 
@@ -152,7 +149,13 @@ CHAIN = {
         widths = [0.25]
         expansions = [3]
         kernels = [3]
-        resolution = [1.0, 1.0]
+        resolution = [0.5, 0.5]
+    """,
+    "psf.toml": """
+        depths_mm = [18.0, 23.0, 5.0]
+        angles_deg = [0.0, 4.0]
+        samples = 32
+        tolerance = 0.01
     """,
     "truth.toml": """
         depths_um = [2500.0, 3200.0, 4200.0, 6000.0, 10000.0, 20000.0]
@@ -164,6 +167,7 @@ CHAIN = {
         cell = "cell.toml"
         design = "design.toml"
         process = "process.toml"
+        psf = "psf.toml"
         run = "run.toml"
         bench_truth = "truth.toml"
         budget = false
@@ -179,7 +183,7 @@ def demo(tmp_path_factory):
         (folder / name).write_text(resources.files("metalens").joinpath("data", "demo", name).read_text())
     for name, text in CHAIN.items():
         (folder / name).write_text(textwrap.dedent(text))
-    done = run("demo", folder / "out", "--config", folder / "chain.toml", "--aperture-mm", 0.02, "--json")
+    done = process("demo", folder / "out", "--config", folder / "chain.toml", "--aperture-mm", 0.02, "--json")
     return folder / "out", done
 
 
