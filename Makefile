@@ -5,6 +5,9 @@ BIN     = $(VENV)/bin
 READY   = $(VENV)/.ready
 OUT    ?= demo
 
+# Without byte code on the disk every worker and every command that a test starts would compile all modules again.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow mutants check bench peers bench-peers test-peers notebooks site clean
 setup: $(READY)
 

@@ -1,4 +1,4 @@
-"""The command line as a user types it: in this process, which has its libraries loaded already, or in one of its own."""
+"""The command line as a user types it: in this process, which has its libraries loaded, or in one of its own."""
 
 import contextlib
 import io

@@ -80,7 +80,7 @@ def _face(package):
     return table, typed
 
 
-FACES = [name for name in MODULES if _face(name)[0]]
+FACES = [name for name, path in MODULES.items() if "attach(" in path.read_text(encoding="utf-8") and _face(name)[0]]
 
 
 @functools.cache

@@ -73,7 +73,7 @@ def test_encircled_energy_is_that_of_the_best_circle(size):
 def test_scene_energies_tell_lenses_apart():
     states = dataset.states_at(torch.arange(2), 2)
     lenses = [_lens(20e3), _lens(20e3, zones=3)]
-    plain, helix = evaluate.scene_energies(lenses, states, Scenes(pixels=64, pitch_um=24.0, window_um=96.0))
+    plain, helix = evaluate.scene_energies(lenses, states, Scenes(pixels=48, pitch_um=24.0, window_um=96.0))
     assert 0 < plain.image_error < 0.2  # of the true image: its own estimate
     assert ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
     assert not torch.allclose(helix.gaze, plain.gaze, rtol=1e-3)

@@ -178,10 +178,10 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
         "--subjects",
         "2",
         "--grid",
-        "4",
         "3",
+        "2",
         "--share",
-        "0.3",
+        "0.5",
         "--people",
         "3",
     ]

@@ -68,25 +68,32 @@ MOVING = InnerConfig(
 )
 
 
-def test_two_runs_from_one_seed_are_bit_identical():
-    one, two = _trainer(MOVING), _trainer(MOVING)
-    assert list(one.run()) == list(two.run())
+@pytest.fixture(scope="module")
+def whole():
+    """A run that nobody stopped, and what it said."""
+    trainer = _trainer(MOVING)
+    return trainer, list(trainer.run())
+
+
+def test_two_runs_from_one_seed_are_bit_identical(whole):
+    one, lines = whole
+    two = _trainer(MOVING)
+    assert list(two.run()) == lines
     assert _equal(one, two)
 
 
 @pytest.mark.parametrize("stop", [1, 4])
-def test_a_stopped_run_goes_on_bit_for_bit(stop, tmp_path):
+def test_a_stopped_run_goes_on_bit_for_bit(whole, stop, tmp_path):
     from codesign.train import checkpoint
 
-    whole = _trainer(MOVING)
-    lines = list(whole.run())
+    one, lines = whole
     first = _trainer(MOVING)
     list(first.run(until=stop))
     checkpoint.save(tmp_path / "c", first.state(), settings=MOVING)
     second = _trainer(MOVING)
     second.restore(checkpoint.load(tmp_path / "c", settings=MOVING))
     assert list(second.run()) == lines[stop:]
-    assert _equal(whole, second)
+    assert _equal(one, second)
 
 
 def test_optics_and_pitch_move_only_inside_their_schedules():

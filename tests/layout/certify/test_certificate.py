@@ -86,7 +86,7 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     assert not less.ok
 
 
-@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
+@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.03}])
 def test_the_edges_of_marks_and_labels_are_judged(third):
     process = Process(exposure=Exposure(**BEAM, **third))
     _, content, table = written(process)
@@ -121,7 +121,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 40_000
 
 
-@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.12}])
+@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.03}])
 def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(third, monkeypatch):
     process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
     plan, content, table = written(process)

@@ -1,13 +1,14 @@
 """Tolerance: the reduced model against the plain sum with every pillar changed, limits, and the tolerant choice."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
 from layout.mask import fields
 from layout.process.process import Process, WriteField
-from layout.study import focus, tolerance, tolerant
+from layout.study import focus, stitching, tolerance, tolerant
 from layout.study import page as study_page
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import missed, reduce
@@ -174,9 +175,16 @@ def test_an_impossible_phase_tolerance_is_refused(bad):
         tolerant.choose(hyperbolic(41), Process(), tolerance_rad=bad)
 
 
-def test_the_report_sections_say_what_was_found():
-    lens = hyperbolic(101)
-    process = Process(write_field=WriteField(size_um=20.0))
+def _drawn(study, most, *given, **more):
+    """A study of few draws."""
+    return study(*given, **more | {"draws": most})
+
+
+def test_the_report_sections_say_what_was_found(monkeypatch):
+    for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
+        monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
+    lens = hyperbolic(51)
+    process = Process(write_field=WriteField(size_um=10.0))
     made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
     assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
     tables = [item for section in made for item in section.items if isinstance(item, Table)]
