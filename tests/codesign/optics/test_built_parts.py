@@ -13,10 +13,12 @@ from scipy.signal import correlate
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
+from characterize.model import state
 from characterize.model.parameters import NAMES, vector
 from codesign.optics import built
 from metalens.image import Pupil, amplitude, coordinates
 from metalens.lens import DiameterMap
+from metalens.made import Sensitivity, transmission
 
 GATHER = getattr(built._gather, "py_func", built._gather)  # as written: a place beyond the table is an error
 
@@ -116,6 +118,26 @@ def oblong():
     sizes[20:30, :3] = 0.2
     lens = dataclasses.replace(m.small(), diameters=DiameterMap(sizes, 0.4))
     return built.MadeLens(lens, m.OPTICS)
+
+
+def test_cells_hold_the_pillars_as_made_by_the_response_that_is_given():
+    """Pillar by pillar: bias at its own place over the rim, heights by a response that is not the one of the index.
+    Half a step of the table is 5e-6 um of some 60 rad/um."""
+    design, response = oblong().design, Sensitivity(np.array([[-0.2 + 9j, 50j], [3j, 12j], [1.5j, 6j]]), 0.17)
+    lens = built.MadeLens(design, m.OPTICS, response=response)
+    known = state(vector({"bias_nm": 4.0, "bias_x_nm": 3.0, "bias_y_nm": -17.0, "height_nm": -8.0}))
+    d = design.diameters
+    rim = d.radius_um
+    u, v = np.meshgrid(d.x_um / rim, d.y_um / rim)
+    grown = d.diameter_um + 4e-3 + 3e-3 * u - 17e-3 * v
+    t = transmission(design.proxy, response, grown.ravel(), design.wavelength_um, known.answers()).reshape(grown.shape)
+    light = np.where(d.diameter_um > 0, t * lens._carrier, 0)
+    got = lens._gathered(known)
+    assert got.shape == (9, 13)
+    for row, column in np.ndindex(9, 13):
+        cell = np.s_[6 * row : 6 * row + 6, 6 * column : 6 * column + 6]
+        stands = max(int((d.diameter_um[cell] > 0).sum()), 1)
+        assert got[row, column] == pytest.approx(light[cell].sum() / stands, abs=5e-4)
 
 
 CELL_Y, CELL_X = (np.arange(9)[:, None] * 6 + 2.5 - 25.0) * 0.4, (np.arange(13) * 6 + 2.5 - 38.5) * 0.4
