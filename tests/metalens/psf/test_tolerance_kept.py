@@ -34,14 +34,14 @@ KINDS = ("scalar", "flux", "vector")
 
 def test_random_stacks_in_single_precision_keep_the_tolerance_or_say_why_not():
     rng, said = np.random.default_rng(31), 0
-    for _ in range(40):
+    for _ in range(24):
         maps, about = drawn(rng)
         made = psf.psf_stack(*maps, **about)
         assert made.converged != (ABOVE in made.reason), (made.error, about)
         said += ABOVE in made.reason
         if "source" not in about:
             assert made.converged
-    assert 0 < said < 12  # sources of finite size: their own points are unlike
+    assert 0 < said < 8  # sources of finite size: their own points are unlike
 
 
 @pytest.mark.parametrize(("seen", "tries"), [(9.05e-7, 2), (9.8e-7, 2), (8.9e-7, 1)])
