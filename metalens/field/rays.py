@@ -80,10 +80,14 @@ def rays(
 def through_stop(
     layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float
 ) -> Tensor:
-    """(depths, *shape) complex64 amplitude of each source's light behind the stop at (x, y), over that without."""
-    x, y, width = (part.cpu().numpy() for part in (seen.x_um, seen.y_um, seen.width_um))
-    each = [layers.shadow(tangents, depth, wavelength_um, (x, y), width) for depth in depths_um]
-    return torch.from_numpy(np.stack(each).astype(np.complex64)).to(seen.x_um.device)
+    """(depths, *shape) complex64 amplitude of each source's light behind the stop at (x, y), over that without; 0
+    beyond the rim of the lens."""
+    lit = seen.whole.cpu().numpy() > 0
+    x, y, width = (part.cpu().numpy()[lit] for part in (seen.x_um, seen.y_um, seen.width_um))
+    out = np.zeros((len(depths_um), *lit.shape), np.complex64)
+    for one, depth in zip(out, depths_um, strict=True):
+        one[lit] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
+    return torch.from_numpy(out).to(seen.x_um.device)
 
 
 def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:

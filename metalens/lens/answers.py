@@ -33,11 +33,8 @@ def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> Non
         turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
         phase[:], level[:] = (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(at[0], at[1])
         return
-    d, numbers, loop = (
-        np.asarray(lens.diameters.diameter_um),
-        polynomials(lens.proxy, lens.diameters.diameter_um, at),
-        _fill,
-    )
+    d, loop = np.asarray(lens.diameters.diameter_um), _fill
+    numbers = polynomials(lens.proxy, d, at)
     turned = lens.diameters.angle_rad
     turn = np.zeros((len(d), 0)) if turned is None else np.asarray(lens.geometric_rad(slice(None)))
     split(len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b]))
