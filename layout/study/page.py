@@ -87,7 +87,7 @@ def _tolerance(lens: Lens, process: Process, answers: Sensitivities) -> Section:
     text = (
         "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
-        f"differences of the solver (known to {100 * answers.error:.0f} %), the diameter through the proxy; the "
+        f"derivatives of the solver (known to {100 * answers.error:.0f} %), the diameter through the proxy; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     )
     items: list[Figure | Table] = [

@@ -13,6 +13,7 @@ from metalens.made import Answers, of_kind
 
 Solver = Callable[[Cell, Array, float, bool], Array]
 _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
+_UPRIGHT, _TILTED = (6, 8), (5, 6)  # harmonics of the coarser and the finer truncation
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,7 +34,10 @@ class Sensitivities:
 
 
 def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) -> Sensitivities:
-    """Central differences of the solver at ``count`` diameters over the proxy's domain, by every answering cause.
+    """Derivatives of ln t at ``count`` diameters (of shapes: sizes) over the proxy's domain, by every answering cause.
+
+    Exact ones of RCWA at a fixed truncation, for the light that the proxy is of; central differences of a solver for a
+    section of layers, or where one is given.
 
     Args:
         solver: (cell, diameters, wavelength, finer) to t of each; left out: RCWA of a fixed truncation, whose error
@@ -44,9 +48,43 @@ def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) 
     Raises:
         CellError, MaterialError: from the solver.
     """
-    wave, diameters = lens.wavelength_um, np.linspace(*lens.proxy.domain_um, count)
+    diameters = np.linspace(*lens.proxy.domain_um, count)
+    if solver is None and not lens.cell.layers:
+        return _exact(lens, diameters[:: 2 if lens.cell.sidewall_rad else 1])
+    return _differences(lens, diameters, _rcwa if solver is None else solver)
+
+
+def _exact(lens: Lens, diameter_um: Array) -> Sensitivities:
+    """From the derivatives of the Jones matrices."""
+    reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
+    tasks = [(float(d), harmonics) for harmonics in reach for d in diameter_um]
+    some = list(executor.gather(_derived, (lens.cell, lens.wavelength_um, _seen(lens)), tasks))
+    coarse, fine = np.array(some).reshape(len(reach), len(diameter_um), -1).transpose(0, 2, 1)
+    off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
+    return Sensitivities(diameter_um, fine, float(off.max()))
+
+
+def _seen(lens: Lens) -> Array:
+    """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of."""
+    one = lens.one_light and lens.proxy.max_angle_rad == 0
+    return np.diag([1.0, 0.0] if one else [0.5, 0.5])
+
+
+def _derived(about: tuple[Cell, float, Array], task: tuple[float, int]) -> list[complex]:
+    """Derivatives of ln t by every answering cause."""
+    from metalens.rcwa.rates import jones_derivatives
+
+    (cell, wavelength_um, weight), (diameter_um, harmonics) = about, task
+    numbers = [acts.number for acts in _answering()]
+    found = jones_derivatives(cell, diameter_um, wavelength_um, harmonics=harmonics, by=numbers)
+    t = (weight * found.jones.t).sum()
+    return [complex((weight * found.by[name].t).sum() / t) for name in numbers]
+
+
+def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
+    """Central differences through a solver."""
     tasks = list(_tasks(lens, diameters))
-    solved = iter(executor.gather(_solved, (_rcwa if solver is None else solver, wave), tasks))
+    solved = iter(executor.gather(_solved, (solver, lens.wavelength_um), tasks))
     found, worst = [], 0.0
     for acts in _answering():
         rates = []

@@ -13,7 +13,7 @@ import numpy as np
 from layout.process import Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
-from metalens.lens import DiameterMap, Lens
+from metalens.lens import Lens
 
 _BINS = 2048  # phases that are told apart: 3 mrad
 _STARTS = np.linspace(0.02, 0.98, 13)  # quantiles of the slopes that are tried as the common one
@@ -63,7 +63,7 @@ def choose(
     level = np.bincount(bins[present], lens.transmission()[present], minlength=_BINS) / np.maximum(weight, 1)
     best = _assign(stock, weight, tolerance_rad, level - loss)
     chosen = np.where(present, stock.diameter_um[best][bins], 0.0)
-    made = replace(lens, diameters=DiameterMap(chosen, lens.diameters.pitch_um))
+    made = replace(lens, diameters=replace(lens.diameters, diameter_um=chosen))
     old, new = _statistics(lens, wanted, present), _statistics(made, wanted, present)
     moved = float((abs(chosen - lens.diameters.diameter_um) > 1e-6)[present].mean())
     return TolerantChoice(made, moved, old[0], new[0], new[1], old[2], new[2])
@@ -84,12 +84,23 @@ def _stock(lens: Lens, process: Process) -> _Stock:
     low = max(lens.proxy.domain_um[0] * 1e3, rules.minimum_feature_nm)
     high = min(lens.proxy.domain_um[1] * 1e3, lens.diameters.pitch_um * 1e3 - rules.minimum_gap_nm)
     sizes = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
+    sizes = sizes[[_fits(lens, float(size), process) for size in sizes]]
     if not sizes.size:
         raise ProcessError(f"no printable diameter between {low:.0f} and {high:.0f} nm in steps of {step} nm")
     d, at = sizes * 1e-3, lens.wavelength_um
     level = lens.proxy.transmission(d, at)
     slope = lens.proxy.dtransmission_ddiameter(d, at) / level + 1j * lens.proxy.dphase_ddiameter(d, at)
     return _Stock(d, lens.proxy.phase_rad(d, at), level, slope * 1e-3)
+
+
+def _fits(lens: Lens, size_nm: float, process: Process) -> bool:
+    """Whether walls, bars and gaps of a shape keep the rules, on its lattice."""
+    cell, rules = lens.cell, process.rules
+    if lens.diameters.plain and cell.shape.kind == "circle":
+        return True
+    outline = cell.outline(size_nm * 1e-3)
+    wide, gap = outline.spans_um[0], outline.gap_um(cell.lattice.steps_um(cell.pitch_um))
+    return wide * 1e3 >= rules.minimum_feature_nm - 1e-6 and gap * 1e3 >= rules.minimum_gap_nm - 1e-6
 
 
 def _assign(stock: _Stock, weight: Array, tolerance_rad: float, least: Array) -> Array:

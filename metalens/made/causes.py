@@ -55,12 +55,14 @@ class Answers:
 
     quick: from the effective index, (n,) complex for the diameters of a guide. changed: the cell with so much more of
     the cause. step: of differences through a solver. exact: where :class:`metalens.modal.Gradient` has dt/d(cause).
+    number: of the cell, as :func:`metalens.rcwa.jones_derivatives` names it, for a pillar without layers.
     """
 
     quick: Callable[[Guide], Array]
     changed: Callable[[Cell, float, float], Cell]
     step: float
     exact: Literal["height_um", "n", ""] = ""
+    number: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,15 +172,16 @@ CAUSES: tuple[Cause, ...] = (
     _widens("bias_o_nm", "oblique saddle of the diameter bias, 2xy over R²", 10.0, 15.0, ((2, 1, 1),), free=False),
     Cause(
         "height_nm", "pillar height minus design", 5.0, 10.0, -28.0, 28.0,
-        Answers(_by_height, _taller, 0.01, "height_um"), 1e-3, drawn=Drawn("height_nm", 7.0),
+        Answers(_by_height, _taller, 0.01, "height_um", "height_um"), 1e-3, drawn=Drawn("height_nm", 7.0),
     ),
     Cause(
         "index", "refractive index of the pillars minus design", 0.02, 0.02, -0.075, 0.075,
-        Answers(_by_index, _denser, 0.02, "n"), free=False, drawn=Drawn("index", 0.02),
+        Answers(_by_index, _denser, 0.02, "n", "pillar.n"), free=False, drawn=Drawn("index", 0.02),
     ),
     Cause(
         "sidewall_deg", "sidewall angle minus design", 0.3, 0.5, -1.6, 1.6,
-        Answers(_by_sidewall, _leaning, DEG / 2), DEG, free=False, drawn=Drawn("sidewall_deg", 0.5), plausible=2.0,
+        Answers(_by_sidewall, _leaning, DEG / 2, number="sidewall_rad"), DEG, free=False,
+        drawn=Drawn("sidewall_deg", 0.5), plausible=2.0,
     ),
     _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _bends("oblique_astigmatism", 6, ((2, 1, 1),)),

@@ -1,5 +1,7 @@
 """The Rayleigh-Sommerfeld sum over pillars in float64, one pillar and one point at a time; in one medium."""
 
+import math
+
 import numpy as np
 
 
@@ -14,11 +16,13 @@ def field(lens, amplitude, where, *, shift_um=None):
     if shift_um is not None:
         x, y = x + shift_um[0][rows, columns], y + shift_um[1][rows, columns]
     k, d = 2 * np.pi / where.wavelength_um, where.distance_um
+    step = (axis[1] - axis[0] for axis in (lens.diameters.x_um, lens.diameters.y_um))
+    site_um2 = math.prod(step) * (2 if lens.diameters.lattice.kind == "hexagonal" else 1)
     lit = [t * (np.exp(1j * k * (np.hypot(np.hypot(x, y), z) - z)) if np.isfinite(z) else 1.0) for z in where.depths_um]
     result = np.zeros((len(lit), len(where.y_um), len(where.x_um)), complex)
     for i, v in enumerate(where.y_um):
         for j, u in enumerate(where.x_um):
             r = np.sqrt((u - x) ** 2 + (v - y) ** 2 + d**2)
-            kernel = lens.diameters.pitch_um**2 * d / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * (r - d))
+            kernel = site_um2 * d / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * (r - d))
             result[:, i, j] = [(each * kernel).sum() for each in lit]
     return result

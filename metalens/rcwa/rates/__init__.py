@@ -1,1 +1,14 @@
 """Derivatives of the Jones matrices of any pillar by every number of its shape, section and material."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from metalens.rcwa.rates.verb import JonesDerivatives as JonesDerivatives
+    from metalens.rcwa.rates.verb import Rate as Rate
+    from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
+
+__getattr__, __dir__, __all__ = attach(
+    __name__, {"JonesDerivatives": "verb", "Rate": "verb", "jones_derivatives": "verb"}
+)

@@ -2,18 +2,23 @@
 
 import dataclasses
 import functools
+import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from layout.commands import make
 from layout.mask import fields
-from layout.process.process import Process, WriteField
+from layout.process.process import Process, Rules, WriteField
 from layout.study import focus, stitching, tolerance, tolerant
 from layout.study import page as study_page
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import missed, reduce
 from metalens import modal
+from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index
+from metalens.cell.shapes import Circle, Cross, Rectangle, Square
 from metalens.ground.errors import ProcessError
 from metalens.ground.report import Figure, Table
 from metalens.lens.record import DiameterMap, Lens
@@ -43,8 +48,17 @@ def hyperbolic(n=161, distance_um=150.0, source_um=1500.0):
     return Lens(diameters, Cell(0.4), PROXY, 0.85, distance_um, source_um, "hyperbolic")
 
 
-def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one():
-    lens = hyperbolic()
+def hexagonal():
+    """The hyperbolic lens with its pillars on the sites of a hexagonal lattice, squares."""
+    made, cell = hyperbolic(), Cell(0.44, lattice=Lattice("hexagonal"), shape=Square())
+    d = made.diameters.diameter_um.copy()
+    d[np.add.outer(*map(np.arange, d.shape)) % 2 == 1] = 0
+    return dataclasses.replace(made, cell=cell, diameters=DiameterMap(d, 0.44, cell.lattice))
+
+
+@pytest.mark.parametrize("made", [hyperbolic, hexagonal])
+def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
+    lens = made()
     where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0, 1200.0]))
     model = reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=0)
     lenses = draws(Spread(), 4, seed=9)
@@ -118,17 +132,26 @@ def test_beyond_the_domain_the_phase_goes_on_straight():
     assert np.diff(phase) == pytest.approx(0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9)
 
 
-def test_sensitivities_of_a_film_of_air_are_its_optical_path():
+@pytest.mark.parametrize(
+    ("shape", "lattice", "share"),
+    [
+        (Circle(), Lattice(), np.pi / 4),
+        (Rectangle(0.6), Lattice("hexagonal"), 0.6 / (math.sqrt(3) / 2)),
+        (Cross(0.4), Lattice("rectangular", 1.2), (0.8 - 0.16) / 1.2),
+    ],
+)
+def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, share):
+    """Of any shape on any lattice: an index change counts by the share of the area that the pillar covers."""
     # pillars of the index of what is between them do not exist: t = exp(ik n h) up to a constant
-    film = Cell(0.3, pillar="air", substrate="air")
+    film = Cell(0.3, pillar="air", substrate="air", shape=shape, lattice=lattice)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
     lens = dataclasses.replace(hyperbolic(), cell=film, proxy=narrow)
     found = sensitivities(lens, count=5)
     assert found.rates[0] == pytest.approx(np.full(5, 2j * np.pi / 0.85), abs=1e-6)
     assert found.rates[2] == pytest.approx(np.zeros(5), abs=1e-6)
     # an index change counts by the area of the pillar, to first order in the contrast (and no coupling)
-    share = np.pi / 4 * found.diameter_um**2 / 0.3**2
-    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.7 * share, rel=0.03)
+    filled = share * found.diameter_um**2 / 0.3**2
+    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.7 * filled, rel=0.03)
 
 
 def test_too_few_draws_are_refused():
@@ -196,6 +219,28 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
 
 
+@pytest.mark.parametrize(
+    ("changed", "words"), [({"hand": "left"}, "turned one by one"), ({"pairs": 1}, "of two sizes")]
+)
+def test_pillars_that_differ_in_more_than_a_size_are_refused_by_name(changed, words):
+    source = SimpleNamespace(**{"hand": "", "pairs": None} | changed)
+    with pytest.raises(ProcessError, match=words):
+        make._refuse_beyond_one_size(SimpleNamespace(study=True), source)
+    make._refuse_beyond_one_size(SimpleNamespace(study=False), source)
+    make._refuse_beyond_one_size(SimpleNamespace(study=True), SimpleNamespace(hand="", pairs=None))
+
+
+def test_the_tolerant_choice_keeps_the_lattice_and_what_a_shape_may_be():
+    """Squares on a hexagonal lattice of 440 nm: neighbours along a row are 440 nm less the side apart."""
+    lens = hexagonal()
+    rules = Rules(minimum_gap_nm=201.0, minimum_feature_nm=121.0)
+    made = tolerant.choose(lens, Process(rules=rules), tolerance_rad=0.4).lens
+    d = made.diameters.diameter_um
+    assert made.diameters.lattice == lens.diameters.lattice
+    assert ((d > 0) == (lens.diameters.diameter_um > 0)).all()
+    assert 0.121 <= d[d > 0].min() <= d.max() <= 0.239
+
+
 def test_sensitivities_agree_with_an_independent_solver():
     cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
@@ -207,6 +252,9 @@ def test_sensitivities_agree_with_an_independent_solver():
 
     height = rate(dataclasses.replace(cell, height_um=0.69), dataclasses.replace(cell, height_um=0.71), 0.01)
     index = rate(dataclasses.replace(cell, pillar=Index(3.58)), dataclasses.replace(cell, pillar=Index(3.62)), 0.02)
+    lean = 0.008  # a wall acts in second order, of a twentieth of the height's size at 8 mrad: differences are exact
+    wall = rate(dataclasses.replace(cell, sidewall_rad=-lean), dataclasses.replace(cell, sidewall_rad=lean), lean)
     assert abs(found.rates[0, 1] / height - 1) < 0.03  # truncation of the plane waves: 1 to 2 % here
     assert abs(found.rates[1, 1] / index - 1) < 0.05
+    assert abs(found.rates[2, 1] / wall - 1) < 0.08  # and 4 %; differences at four harmonics had the other sign
     assert 2 * np.pi / 0.85 < found.rates[0, 1].imag < 2 * np.pi / 0.85 * 3.6  # between air and bulk
