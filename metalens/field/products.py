@@ -116,22 +116,27 @@ def _add(
     """One patch of a few frames."""
     (top, below), (left, right) = patch.rows, patch.columns
     kernels, size = given
-    light, cover, place = (part[..., top:below, left:right] for part in frames)
-    beyond = out.shape[-2] - frames[0].shape[-2]  # the window less one
-    out = out[..., top : below + beyond, left : right + beyond]
     tables = patch.weights.numpy(), patch.energy.numpy()
     axes = bases(below - top, size[0]), bases(right - left, size[1])
-    for kind, content in enumerate((light, cover)[: out.shape[1]]):
-        held = [at for at in np.ndindex(content.shape[:2]) if _largest(content[at]) > least[kind]]
+    for kind, content in enumerate(frames[: out.shape[1]]):
+        inside = content[..., top:below, left:right]
+        held = [at for at in np.ndindex(inside.shape[:2]) if _largest(inside[at]) > least[kind]]
         if held:
             some = kernels[: patch.coverage] if kind else kernels
-            _convolved(content, place, np.array(held), tables, kind == 0, some, axes, room, out[:, kind])
+            window = patch.rows, patch.columns
+            _convolved(content, frames[2], np.array(held), tables, kind, some, axes, room, out, window)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def _convolved(content, place, held, tables, lit, kernels, axes, room, out):  # type: ignore[no-untyped-def]
-    """Add what the sheets ``held`` (frame, sheet) give: weighted, transformed, mixed, led back."""
-    high, wide = content.shape[2:]
+def _convolved(content, place, held, tables, kind, kernels, axes, room, out, window):  # type: ignore[no-untyped-def]
+    """Add what the sheets ``held`` (frame, sheet) give: weighted, transformed, mixed, led back.
+
+    Whole frames and the window of the patch in them: parts of arrays and whole ones would be compiled one by one.
+    """
+    (top, below), (left, right) = window
+    high, wide = below - top, right - left
+    part, depth = content[:, :, top:below, left:right], place[:, :, top:below, left:right]
+    beyond = out.shape[3] - content.shape[2]  # the window of a PSF less one
     y, x = axes
     count, rows, columns = len(held), y.across.shape[0], x.along.shape[1]
     mixed = room[4][: count * rows * columns].reshape(count, rows, columns)
@@ -140,7 +145,7 @@ def _convolved(content, place, held, tables, lit, kernels, axes, room, out):  # 
     for first in range(0, len(kernels), step):
         few = min(step, len(kernels) - first)
         source = room[0][: high * few * count * wide].reshape(high, few, count, wide)
-        weigh(content, place, held, tables, lit, first, source)
+        weigh(part, depth, held, tables, kind == 0, first, source)
         half = room[1][: high * few * count * columns].reshape(high * few * count, columns)
         np.dot(source.reshape(high * few * count, wide), x.along, half)
         whole = room[2][: rows * few * count * columns].reshape(rows, few * count * columns)
@@ -153,9 +158,9 @@ def _convolved(content, place, held, tables, lit, kernels, axes, room, out):  # 
     for job in range(count):
         np.dot(y.back_across, mixed[job], back)
         np.dot(back, x.back_along, image)
-        seen = out[held[job, 0], held[job, 1]]
-        for row in range(seen.shape[0]):
-            for column in range(seen.shape[1]):
+        seen = out[held[job, 0], kind, held[job, 1], top : below + beyond, left : right + beyond]
+        for row in range(high + beyond):
+            for column in range(wide + beyond):
                 seen[row, column] += image[row, column]
 
 
