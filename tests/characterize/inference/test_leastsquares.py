@@ -259,3 +259,19 @@ def test_exact_slopes_are_made_where_a_step_ended():
     assert exact[0] == 0.6
     assert set(exact[1:]) <= set(tried)
     assert found.value == pytest.approx([0.9], abs=1e-4)
+
+
+def test_pixels_beyond_the_outlier_limit_on_either_side_are_no_part_of_chi_square():
+    """One of 25 sigma above, one as far below: the estimate stays, and 38 of 40 pixels less one parameter count."""
+    rng = np.random.default_rng(5)
+    image = 7.0 + 1.3 * rng.standard_normal((1, 5, 8))
+    image[0, 1, 2] += 25 * 1.3
+    image[0, 3, 6] -= 25 * 1.3
+    everywhere = np.ones(image.shape, bool)
+    data = Data(image, everywhere, ~everywhere, np.full(image.shape, 1.69), np.full(image.shape, 1e15))
+    ones = np.ones((1, *image.shape))
+    found = fit(lambda x, slopes: (x[0] * ones[0], ones if slopes else None), data, np.array([6.0]))
+    left = (image - found.value[0]) / 1.3
+    inside = np.abs(left) < 6
+    assert inside.sum() == 38
+    assert found.chi2_per_dof == pytest.approx((left[inside] ** 2).sum() / 37, rel=1e-9)

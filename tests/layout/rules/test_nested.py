@@ -13,6 +13,7 @@ from layout.gdsii import assemble as gdsii_assemble
 from layout.oasis import assemble as oasis_assemble
 from layout.process import Rules
 from layout.rules import copies, foreign
+from layout.rules import nested as rules_nested
 from metalens import cli
 from metalens.ground.errors import MaskFileError
 
@@ -132,6 +133,14 @@ def test_a_wafer_of_millions_of_shapes_is_checked_in_the_memory_of_a_die(tmp_pat
 def counts_of(made, rules, **more):
     report = foreign.check(taken_apart(made), rules, **more)
     return {rule: count for rule, count in report.counts.items() if count}, report
+
+
+def test_a_mark_is_covered_by_its_pieces_and_one_that_overlaps_itself_by_the_box_around_it():
+    """An L in two boxes; a strip of 1250 units² that goes round and across its own start, 100 of them twice."""
+    bent = np.array([[0, 0], [30, 0], [30, 10], [10, 10], [10, 25], [0, 25]])
+    assert sorted(rules_nested._covering(bent).tolist()) == [[0, 0, 30, 10], [0, 10, 10, 25]]
+    crossed = [[0, 0], [40, 0], [40, 40], [5, 40], [5, -10], [15, -10], [15, 30], [30, 30], [30, 10], [0, 10]]
+    assert rules_nested._covering(np.array(crossed)).tolist() == [[0, -10, 40, 40]]
 
 
 def test_neighbouring_dies_that_come_too_near_are_measured_where_they_meet():
