@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import numpy as np
 import torch
 
 from codesign.budget import task
+from codesign.budget.response import between
 from codesign.budget.task import TaskSetting, Views
 from codesign.optics import Aperture, Device, Numerics, Window, device, gathered, kernels
 from metalens import design, library
@@ -121,8 +121,7 @@ class Chain:
     def __init__(self, config: PlanConfig, say: Callable[[str], None] = lambda text: None) -> None:
         config = replace(config, task=replace(config.task, sensor_distance_um=config.focus.sensor_distance_um))
         self.config, self.say = config, say
-        uniform = dict(LEVELS) if config.led_fwhm_nm else LEVELS | {"wavelength_count": (1.0,)}
-        self.levels = dict(TRUE_LEVELS) if self.true else uniform
+        self.levels = levels_of(config)
         self.around: Imaging = TRUE_PILOT if self.true else PILOT
         self._libraries: dict[float, tuple[library.PillarLibrary, float]] = {}
         self.states = config.task.states
@@ -159,10 +158,7 @@ class Chain:
     def table(self, tolerance: float) -> Array:
         """t of the aperture's diameters in the library of this tolerance."""
         made, _ = self.library(tolerance)
-        t = made.t[:, 0, 0].mean(0)
-        d = self.aperture.diameter_um
-        phase, level = np.unwrap(np.angle(t)), np.abs(t)
-        return np.asarray(np.interp(d, made.diameter_um, level) * np.exp(1j * np.interp(d, made.diameter_um, phase)))
+        return between(made.t[:, 0, 0].mean(0), made.diameter_um, self.aperture.diameter_um)
 
     def optics(self, table: Array, imaging: Imaging) -> Optics:
         """The lens with these pillars: the true image at a tolerance, or kernels of one PSF a depth."""
@@ -199,6 +195,13 @@ class Chain:
         return design.make(
             wanted, focus, aperture_um=aperture_um, cell=made.cell, proxy=library.proxy_of(made), profile="hyperbolic"
         )[0]
+
+
+def levels_of(config: PlanConfig) -> dict[str, tuple[float, ...]]:
+    """Settings of every knob of a run's optics; light of one wavelength has one number of them."""
+    if config.image == "true":
+        return dict(TRUE_LEVELS)
+    return dict(LEVELS) if config.led_fwhm_nm else LEVELS | {"wavelength_count": (1.0,)}
 
 
 def choice_of(names: list[str], values: list[float]) -> Choice | TrueChoice:

@@ -23,6 +23,11 @@ class Entry:
     counted: bool = True
 
 
+def more(error: float, before: float) -> float:
+    """What an error has more than before, in quadrature; 0 where it has less."""
+    return math.sqrt(max(error**2 - before**2, 0.0))
+
+
 def total(found: list[Entry]) -> Entry:
     """The root of the sum of squares of what counts."""
 

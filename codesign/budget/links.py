@@ -19,6 +19,7 @@ from codesign.budget.entry import MEASURED, NONE, Entry, total
 from codesign.budget.journal import Journal
 from codesign.budget.person import person
 from codesign.budget.prepared import Bench
+from codesign.budget.response import between, put_right, scatter_rad
 from codesign.evaluate import AXIAL
 from codesign.optics import gathered, psf_difference
 from metalens.cell import Light
@@ -47,17 +48,17 @@ def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
         for entry in about.reading.path():
             found.append(entry)
             yield entry
-    first = (_answer,) if about.reading is None else ()
-    for part in (*first, _optics, _pillars, _neighbours, _mask, _spread, _calibration, _numerics):
+    first = (answer,) if about.reading is None else ()
+    for part in (*first, device, pillars, neighbours, mask, process, calibration, numerics):
         done = journal.part(part.__name__, lambda part=part: [astuple(entry) for entry in part(about)])  # type: ignore[misc]
         links = [Entry(*values) for values in done]
         found += links
         yield from links
-    yield from _measured(about)
+    yield from measured(about)
     yield total(found)
 
 
-def _answer(about: Bench) -> Iterator[Entry]:
+def answer(about: Bench) -> Iterator[Entry]:
     """From the true pupil to the answer where no run was given: what no reader changes."""
     yield from person(about.given.frames, about.setting.rig)
     yield Entry("reader", NONE, NONE, NONE, "not known: no run was given (--run)")
@@ -74,7 +75,7 @@ def _answer(about: Bench) -> Iterator[Entry]:
         yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
 
 
-def _optics(about: Bench) -> Iterator[Entry]:
+def device(about: Bench) -> Iterator[Entry]:
     """Pillars in place of the smooth phase, films, both polarisations."""
     if about.reading is not None:
         said = "pillars of the lens file in place of the run's smooth phase without films"
@@ -90,7 +91,7 @@ def _optics(about: Bench) -> Iterator[Entry]:
     yield about.entry("polarisation", about.device.both_polarisations(), said)
 
 
-def _measured(about: Bench) -> Iterator[Entry]:
+def measured(about: Bench) -> Iterator[Entry]:
     """What the virtual experiment measures on the same frames."""
     if about.reading is None:
         return
@@ -103,17 +104,10 @@ def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
     """The entry of other pillars: a table t(D) against the designed one."""
     turn = np.angle(table / about.aperture.designed())
     optics = about.device.image(wave=gathered(about.lens, *about.aperture.maps(table)))
-    return about.entry(link, optics, method, phase_rad=_spread_of(turn, about.aperture.share))
+    return about.entry(link, optics, method, phase_rad=scatter_rad(turn, about.aperture.share))
 
 
-def _spread_of(turn_rad: Array, share: Array) -> float:
-    """Standard deviation of a phase over the pillars: a common phase is no error."""
-    mean = np.angle((np.exp(1j * turn_rad) * share).sum())
-    off = np.angle(np.exp(1j * (turn_rad - mean)))
-    return float(np.sqrt((off**2 * share).sum()))
-
-
-def _pillars(about: Bench) -> Iterator[Entry]:
+def pillars(about: Bench) -> Iterator[Entry]:
     """Solver and proxy, against the solver asked for thirty times the precision."""
     lens, given = about.lens, about.given
     low, high = supercell.printed(lens)
@@ -124,38 +118,29 @@ def _pillars(about: Bench) -> Iterator[Entry]:
     exact = np.array([solve(float(d)).t for d in at])
     proxy = lens.proxy.transmission(at, lens.wavelength_um) * np.exp(1j * lens.proxy.phase_rad(at, lens.wavelength_um))
     said = f"{engine} solver at {tolerance / FINER:.0e}, {SOLVED} diameters"
+    designed, d = about.aperture.designed(), about.aperture.diameter_um
     if given.library is None:
-        yield _changed(about, "pillar solver and proxy", _carried(about, at, exact / proxy), f"against the {said}")
+        table = put_right(designed, d, at, exact / proxy)
+        yield _changed(about, "pillar solver and proxy", table, f"against the {said}")
         return
     stored = _stored(given.library, at, lens.wavelength_um)
-    yield _changed(about, "pillar solver", _carried(about, at, exact / stored), f"library against the {said}")
-    yield _changed(about, "proxy", _carried(about, at, stored / proxy), f"against the library, {SOLVED} diameters")
-
-
-def _carried(about: Bench, at_um: Array, ratio: Array) -> Array:
-    """The designed table times a ratio that is known at some diameters."""
-    log = np.log(np.abs(ratio)) + 1j * np.unwrap(np.angle(ratio))
-    d = about.aperture.diameter_um
-    return np.asarray(
-        about.aperture.designed() * np.exp(np.interp(d, at_um, log.real) + 1j * np.interp(d, at_um, log.imag))
-    )
+    solved, read = (put_right(designed, d, at, ratio) for ratio in (exact / stored, stored / proxy))
+    yield _changed(about, "pillar solver", solved, f"library against the {said}")
+    yield _changed(about, "proxy", read, f"against the library, {SOLVED} diameters")
 
 
 def _stored(library: PillarLibrary, at_um: Array, wavelength_um: float) -> Array:
-    """t of the library's entries between its diameters, both polarisations averaged."""
+    """t of the library at the nearest of its wavelengths, both polarisations averaged, between its diameters."""
     near = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
-    t = library.t[:, 0, near].mean(0)
-    phase, level = np.unwrap(np.angle(t)), np.abs(t)
-    d = library.diameter_um
-    return np.asarray(np.interp(at_um, d, level) * np.exp(1j * np.interp(at_um, d, phase)))
+    return between(library.t[:, 0, near].mean(0), library.diameter_um, at_um)
 
 
-def _neighbours(about: Bench) -> Iterator[Entry]:
+def neighbours(about: Bench) -> Iterator[Entry]:
     """Local periodic approximation: rows of unlike pillars solved as one; what is open of them where the lens holds
     them."""
     held = about.lens.neighbours
     if held is not None:
-        found = [_among(about, other, "") for other in held.doubted(about.aperture.turn_sine())]
+        found = [among(about, other, "") for other in held.doubted(about.aperture.turn_sine())]
         rms = [math.hypot(*column) for column in zip(*((e.phase_rad, e.psf, e.gaze_rad) for e in found), strict=True)]
         said = "rows of the lens file, in the image: another truncation, a row left out, zones that get shorter"
         yield Entry("neighbours", rms[0], rms[1], rms[2], said)
@@ -164,13 +149,17 @@ def _neighbours(about: Bench) -> Iterator[Entry]:
         rows = supercell.neighbours(about.lens)
     except CellError:
         return  # films or tilted walls: rows of those are not solved
-    straight = about.lens.wavelength_um / rows.sine[~rows.diagonal] / about.lens.cell.pitch_um
-    counts = f"rows of {', '.join(str(round(s)) for s in straight)}"
+    counts = f"rows of {', '.join(map(str, lengths(rows, about.lens.cell.pitch_um)))}"
     said = f"{counts} unlike pillars solved as one cell; factor carried over the aperture by the angle of turning"
-    yield _among(about, rows, said)
+    yield among(about, rows, said)
 
 
-def _among(about: Bench, rows: Neighbours, said: str) -> Entry:
+def lengths(rows: Neighbours, pitch_um: float) -> list[int]:
+    """Pillars of every row along the lattice: it turns light by one wave over its length."""
+    return [round(n) for n in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um]
+
+
+def among(about: Bench, rows: Neighbours, said: str) -> Entry:
     """The entry of other rows than the lens holds."""
     built, sine = about.aperture.place >= 0, about.aperture.turn_sine()
     turn = np.angle(rows.mean(sine[built]))
@@ -181,7 +170,8 @@ def _among(about: Bench, rows: Neighbours, said: str) -> Entry:
     return about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
-def _mask(about: Bench) -> Iterator[Entry]:
+def mask(about: Bench) -> Iterator[Entry]:
+    """Diameters as the mask holds them, where one is given."""
     if about.given.mask is None:
         return
     step = about.given.mask.diameter_step_nm
@@ -189,12 +179,12 @@ def _mask(about: Bench) -> Iterator[Entry]:
     yield _changed(about, "mask grid", table, f"every diameter rounded to {step:g} nm")
 
 
-def _spread(about: Bench) -> Iterator[Entry]:
+def process(about: Bench) -> Iterator[Entry]:
     """Draws of the process; what a fit of the built lens would take out again."""
     if about.given.mask is None:
         return
     made = [Made(draw.state()) for draw in draws(about.given.mask.spread, about.given.draws, seed=5)]
-    yield _drawn(about, "process spread", made, f"{len(made)} draws of the process, lens not measured")
+    yield drawn(about, "process spread", made, f"{len(made)} draws of the process, lens not measured")
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +195,7 @@ class Made:
     shift_um: float = 0.0
 
 
-def _drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
+def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
     """Root mean square over made lenses."""
     aperture, d = about.aperture, about.lens.diameters
     response = sensitivity(about.lens)
@@ -221,13 +211,13 @@ def _drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
             phase = phase + torch.from_numpy(made.state.phase_rad(u, v).astype(np.float32) * built)
         turn = phase[torch.from_numpy(built)].numpy() - base
         optics = about.device.image(wave=gathered(about.lens, phase, level), shift_um=made.shift_um)
-        found = about.entry(link, optics, method, phase_rad=_spread_of(turn, np.full(turn.size, 1 / turn.size)))
+        found = about.entry(link, optics, method, phase_rad=scatter_rad(turn, np.full(turn.size, 1 / turn.size)))
         rows.append((found.phase_rad, found.psf, found.gaze_rad))
     rms = [math.sqrt(sum(v * v for v in column) / len(rows)) for column in zip(*rows, strict=True)]
     return Entry(link, rms[0], rms[1], rms[2], method)
 
 
-def _calibration(about: Bench) -> Iterator[Entry]:
+def calibration(about: Bench) -> Iterator[Entry]:
     """What the fit of the built lens leaves open: draws of its posterior against its best estimate."""
     fitted = about.given.asbuilt
     if fitted is None:
@@ -243,10 +233,10 @@ def _calibration(about: Bench) -> Iterator[Entry]:
         off = fitted.parameters(row) - best
         made.append(Made(state(off), float(off[PLACE["distance_um"]])))
     said = f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"
-    yield _drawn(about, "calibration of the lens", made, said)
+    yield drawn(about, "calibration of the lens", made, said)
 
 
-def _numerics(about: Bench) -> Iterator[Entry]:
+def numerics(about: Bench) -> Iterator[Entry]:
     """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its setting, the rest at its finest.
 
     Read by the linear estimator, run or not: they are the settings of ``metalens psf`` and of the planner.

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from codesign.batches import EXPERIMENT, EyeScenes, SceneConfig
-from codesign.budget.entry import NONE, Entry
+from codesign.budget.entry import NONE, Entry, more
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Camera, Rig, render
 from codesign.gaze import Readings, Sphere, angle_deg
@@ -43,4 +43,4 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
     people = f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
     yield Entry("subject and calibration", NONE, NONE, alone, f"true pupil and slippage; {people}")
     said = f"scatter of {config.fixation_deg:g} deg about the stimulus"
-    yield Entry("fixation", NONE, NONE, math.sqrt(max(whole**2 - alone**2, 0.0)), said)
+    yield Entry("fixation", NONE, NONE, more(whole, alone), said)

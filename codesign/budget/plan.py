@@ -36,6 +36,7 @@ from codesign.budget.chain import (
 from codesign.budget.entry import NONE, Entry, total
 from codesign.budget.floor import allowance_rad
 from codesign.budget.journal import Journal
+from codesign.budget.response import put_right
 from metalens.cell import Light
 from metalens.ground.arrays import Array
 from metalens.image import Imager
@@ -91,13 +92,13 @@ def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, .
         def measure(knob: str = knob) -> list[Any]:
             found: tuple[Array, ...]
             if knob == "library_tolerance":
-                found = _library_knob(chain, base, solving)
+                found = library_knob(chain, base, solving)
             elif knob == "diameter_step_nm":
-                found = _mask_knob(chain, base, exact)
+                found = mask_knob(chain, base, exact)
             elif knob == "image_tolerance":
-                found = _image_knob(chain, exact)
+                found = image_knob(chain, exact)
             else:
-                found = _optics_knob(chain, exact, knob)
+                found = optics_knob(chain, exact, knob)
             return [part.tolist() for part in found]
 
         parts = journal.part(knob, measure)
@@ -113,11 +114,11 @@ def pilot(chain: Chain, journal: Journal | None = None, *, floor: tuple[Entry, .
 
 def _listed(chain: Chain) -> list[Any]:
     """Real and imaginary parts of the exact table, and its seconds."""
-    table, seconds = _exact(chain)
+    table, seconds = exact_table(chain)
     return [table.real.tolist(), table.imag.tolist(), seconds]
 
 
-def _exact(chain: Chain) -> tuple[Array, float]:
+def exact_table(chain: Chain) -> tuple[Array, float]:
     """The designed table put right at a few diameters by the finest solver, and seconds of a whole sweep with it."""
     lens, tolerance = chain.lens, chain.levels["library_tolerance"][-1]
     low, high = lens.proxy.domain_um
@@ -130,28 +131,25 @@ def _exact(chain: Chain) -> tuple[Array, float]:
     coarse = chain.table(chain.levels["library_tolerance"][0])
     there = np.interp(at, chain.aperture.diameter_um, np.arange(len(coarse)))
     ratio = t / coarse[np.rint(there).astype(int)]
-    change = [
-        np.interp(chain.aperture.diameter_um, at, part) for part in (np.log(np.abs(ratio)), np.unwrap(np.angle(ratio)))
-    ]
     made, _ = chain.library(chain.levels["library_tolerance"][0])
-    return coarse * np.exp(change[0] + 1j * change[1]), each * 1.5 * made.solves
+    return put_right(coarse, chain.aperture.diameter_um, at, ratio), each * 1.5 * made.solves
 
 
-def _library_knob(chain: Chain, truth: Optics, finest_seconds: float) -> tuple[Array, Array]:
+def library_knob(chain: Chain, truth: Optics, finest_seconds: float) -> tuple[Array, Array]:
     """Whole sweeps at all but the finest tolerance."""
     coarse = chain.levels["library_tolerance"][:-1]
-    errors = [_misread(chain, truth, chain.optics(chain.table(tolerance), chain.around)) for tolerance in coarse]
+    errors = [misread(chain, truth, chain.optics(chain.table(tolerance), chain.around)) for tolerance in coarse]
     seconds = [*(chain.library(tolerance)[1] for tolerance in coarse), finest_seconds]
     return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
-def _mask_knob(chain: Chain, believed: Optics, exact: Array) -> tuple[Array, Array]:
+def mask_knob(chain: Chain, believed: Optics, exact: Array) -> tuple[Array, Array]:
     """Rounding of the diameters; the cost is that of the classes on the mask."""
     errors, seconds = [], []
     span = float(np.ptp(chain.aperture.diameter_um[np.flatnonzero(chain.aperture.share)]))
     for step in chain.levels["diameter_step_nm"]:
         truth = chain.optics(chain.aperture.rounded(exact, step * 1e-3), chain.around)
-        errors.append(_misread(chain, truth, believed))
+        errors.append(misread(chain, truth, believed))
         seconds.append(CLASS_SECONDS * (span * 1e3 / step + 1))
     return np.stack(errors), np.array(seconds)
 
@@ -160,7 +158,7 @@ FIELD = {"depth_count": "depth_count", "wavelength_count": "wavelength_count", "
          "kernel_tolerance": "basis_tolerance"}  # fmt: skip
 
 
-def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
+def optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
     """Settings of the optics, against the finest of this knob; seconds of a stack, or of an image for the kernels."""
     made, seconds = [], []
     around = replace(PILOT, depth_count=48) if knob == "kernel_tolerance" else PILOT
@@ -172,11 +170,11 @@ def _optics_knob(chain: Chain, table: Array, knob: str) -> tuple[Array, Array]:
             seconds.append(_fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes)
         else:
             seconds.append(_fastest(partial(chain.optics, table, numerics)))
-    errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
+    errors = [misread(chain, made[-1], optics) for optics in made[:-1]]
     return np.stack([*errors, np.zeros((chain.config.task.scenes, 2))]), np.maximum.accumulate(np.array(seconds))
 
 
-def _image_knob(chain: Chain, table: Array) -> tuple[Array, Array, Array]:
+def image_knob(chain: Chain, table: Array) -> tuple[Array, Array, Array]:
     """Tolerances of the true image, against the finest; seconds of all PSFs and images of the run, and the nodes."""
     made: list[Optics] = []
     seconds, nodes = [], []
@@ -186,7 +184,7 @@ def _image_knob(chain: Chain, table: Array) -> tuple[Array, Array, Array]:
         image = _fastest(partial(chain.electrons, made[-1])) / chain.config.task.scenes
         seconds.append(chain.config.stacks * stack + chain.config.frames * image)
         nodes.append(nodes_of(made[-1]))
-    errors = [_misread(chain, made[-1], optics) for optics in made[:-1]]
+    errors = [misread(chain, made[-1], optics) for optics in made[:-1]]
     none = np.zeros((chain.config.task.scenes, 2))
     return np.stack([*errors, none]), np.maximum.accumulate(np.array(seconds)), np.array(nodes)
 
@@ -209,7 +207,7 @@ def _fastest(work: Callable[[], object]) -> float:
     return min(spent)
 
 
-def _misread(chain: Chain, truth: Optics, believed: Optics) -> Array:
+def misread(chain: Chain, truth: Optics, believed: Optics) -> Array:
     """(scenes, 2) error of the gaze that an estimator reads from images through optics other than it believes in."""
     return np.asarray(chain.read(chain.electrons(truth), believed)[:, :2].numpy())
 
@@ -228,7 +226,7 @@ def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
     vector = (summed**2).sum(-1).mean(-1)
     apart = np.sum([(measured.errors[n] ** 2).sum(-1).mean(-1)[places[:, i]] for i, n in enumerate(names)], axis=0)
     error = np.sqrt(np.maximum(vector, apart))
-    cost = _cost(measured, places, names, config)
+    cost = cost_s(measured, places, names, config)
     good = np.flatnonzero(error <= allowed)
     best = int(good[cost[good].argmin()]) if len(good) else len(places) - 1
     choice = choice_of(names, [measured.levels[n][k] for n, k in zip(names, places[best], strict=True)])
@@ -236,7 +234,7 @@ def choose(measured: Pilot, goal_rad: float, config: PlanConfig) -> Plan:
     return Plan(goal_rad, choice, predicted, float(cost[best]), float(cost[-1]), bool(len(good)))
 
 
-def _cost(measured: Pilot, places: Array, names: list[str], config: PlanConfig) -> Array:
+def cost_s(measured: Pilot, places: Array, names: list[str], config: PlanConfig) -> Array:
     """Seconds of the run: a library, the stacks (times of the knobs multiply), the images, the mask."""
     column = {n: measured.seconds[n][places[:, i]] for i, n in enumerate(names)}
     if "image_tolerance" in column:

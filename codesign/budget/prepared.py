@@ -11,7 +11,17 @@ from codesign.budget.entry import NONE, Entry
 from codesign.budget.reading import Reading
 from codesign.budget.task import Linear, TaskSetting
 from codesign.evaluate import ExperimentConfig
-from codesign.optics import Aperture, Device, Numerics, Window, device, gathered, image_difference, kernels
+from codesign.optics import (
+    Aperture,
+    Device,
+    Numerics,
+    OpticsConfig,
+    Window,
+    device,
+    gathered,
+    image_difference,
+    kernels,
+)
 from metalens.ground.errors import LensError
 from metalens.image import Grid, Imager, PsfBasis
 from metalens.lens import Lens
@@ -85,16 +95,11 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
         LensError: the run's lens is another than the one given.
     """
     setting = replace(setting or TaskSetting(), sensor_distance_um=lens.reduced_um)  # as the true image maps directions
-    eyes, aperture, n = task.views(setting), Aperture(lens), given.numerics
-    finest = Numerics(
-        min(2 * n.depth_count, 64),
-        n.wavelength_count + 6 if given.fwhm_nm else 1,
-        min(n.psf_tolerance / 10, 1e-5),
-        min(n.basis_tolerance / 10, 1e-4),
-    )
+    eyes, aperture = task.views(setting), Aperture(lens)
+    finest = finest_of(given.numerics, fwhm_nm=given.fwhm_nm)
     window = Window(*eyes.depths_um, setting.pitch_um)
     if given.run is not None:
-        _same(lens, given.run)
+        same_lens(lens, given.run.settings.optics)
     wave = gathered(lens, *aperture.maps(aperture.designed()))
     reading, known = None, None
     if given.run is not None:
@@ -109,9 +114,23 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     return Bench(lens, given, setting, aperture, finest, window, eyes, seen, reader, reading)
 
 
-def _same(lens: Lens, run: Run) -> None:
-    """Refuse a reader that was trained before another lens."""
-    optics = run.settings.optics
+def finest_of(numerics: Numerics, *, fwhm_nm: float) -> Numerics:
+    """What settings are compared with: twice the depths (64 at most), six more wavelengths, a tenth of the tolerances
+    or 1e-5 and 1e-4."""
+    return Numerics(
+        min(2 * numerics.depth_count, 64),
+        numerics.wavelength_count + 6 if fwhm_nm else 1,
+        min(numerics.psf_tolerance / 10, 1e-5),
+        min(numerics.basis_tolerance / 10, 1e-4),
+    )
+
+
+def same_lens(lens: Lens, optics: OpticsConfig) -> None:
+    """Refuse a reader that was trained before another lens: one that differs by more than 2 %.
+
+    Raises:
+        LensError: sensor distance, wavelength or aperture differ.
+    """
     mine = lens.sensor_distance_um * 1e-3, lens.wavelength_um * 1e3, 2e-3 * lens.diameters.radius_um
     its = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
     if any(abs(a - b) > 0.02 * b for a, b in zip(mine, its, strict=True)):

@@ -13,7 +13,6 @@ they turn the answers: independent of the rest, that adds in quadrature too. Wha
 of its answer: the cause is then switched off to see what the reader makes of it, and does not count.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -22,7 +21,7 @@ import torch
 
 from codesign.adapt import Source
 from codesign.batches import EXPERIMENT
-from codesign.budget.entry import NONE, Entry
+from codesign.budget.entry import NONE, Entry, more
 from codesign.budget.person import told
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
 from codesign.eye import Rendered, render
@@ -129,8 +128,7 @@ class Reading:
     def _grown(self, link: str, error_rad: float, method: str) -> Entry:
         """The entry of one more cause: what the error has more than before, in quadrature; 0 where it has less."""
         before, self._error_rad = self._error_rad, error_rad
-        gap = self._error_rad**2 - before**2
-        return Entry(link, NONE, NONE, math.sqrt(max(gap, 0.0)), method)
+        return Entry(link, NONE, NONE, more(error_rad, before), method)
 
     def _unknown(self) -> Iterator[tuple[str, Imager, float, str]]:
         """What the reader's training left out of its image, one more in each."""

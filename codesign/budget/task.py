@@ -91,31 +91,37 @@ def views(setting: TaskSetting, states: States | None = None, *, exposed: States
     def frames(unknown: int, step: float) -> Frames:
         return _frames(shifted(still, unknown, step), lit, setting)
 
-    pairs = [(frames(k, step), frames(k, -step)) for k, step in enumerate(_steps())]
+    pairs = [(frames(k, step), frames(k, -step)) for k, step in enumerate(steps())]
     return Views(_frames(still, lit, setting), tuple(pairs))
 
 
 def _frames(states: States, exposed: States, setting: TaskSetting) -> Frames:
     """Renderings averaged over each pixel."""
     camera = Camera(FINE * setting.size, setting.pitch_um / FINE)
-    fine = render(states, rig=setting.rig, camera=camera, exposed=exposed).frames
+    return pixels_of(render(states, rig=setting.rig, camera=camera, exposed=exposed).frames)
+
+
+def pixels_of(fine: Frames) -> Frames:
+    """Means over FINE x FINE rays; a depth is that of what covers the pixel, or of nothing where nothing does."""
     radiance, coverage, deep, plain = (
         avg_pool2d(v, FINE) for v in (fine.radiance, fine.coverage, fine.coverage * fine.depth_um, fine.depth_um)
     )
     return Frames(radiance, coverage, torch.where(coverage > 0, deep / coverage.clamp_min(1e-9), plain))
 
 
-def _steps() -> tuple[float, ...]:
+def steps() -> tuple[float, ...]:
+    """Half the central difference of every unknown but the brightness."""
     return (*STEPS, *(TRAIT_STEP * POPULATION[name].sd for name in TRAITS))
 
 
-def _priors() -> tuple[float, ...]:
+def priors() -> tuple[float, ...]:
+    """Standard deviations of all unknowns before the image is seen."""
     return (*PRIOR, *(POPULATION[name].sd for name in TRAITS), BRIGHTNESS)
 
 
-def _precision() -> Tensor:
+def precision() -> Tensor:
     """(unknowns, unknowns) information before the image is seen."""
-    return torch.diag(1 / torch.tensor(_priors(), dtype=torch.float64) ** 2)
+    return torch.diag(1 / torch.tensor(priors(), dtype=torch.float64) ** 2)
 
 
 def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
@@ -174,13 +180,18 @@ def linear(seen: Views, optics: PsfBasis | Imager, setting: TaskSetting) -> Line
     image = electrons(seen.anchor, optics, setting)
     slopes = [
         (electrons(more, optics, setting) - electrons(less, optics, setting)) / (2 * step)
-        for (more, less), step in zip(seen.moved, _steps(), strict=True)
+        for (more, less), step in zip(seen.moved, steps(), strict=True)
     ]
-    derivative = torch.stack([*slopes, image], 1)
+    return estimator(image, torch.stack(slopes, 1), setting)
+
+
+def estimator(image: Tensor, slopes: Tensor, setting: TaskSetting) -> Linear:
+    """The estimator of eyes whose images (scenes, pixels) move by slopes (scenes, unknowns but brightness, pixels)."""
+    derivative = torch.cat([slopes, image[:, None]], 1)
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     noise = sensor.variance(image, sensor=chip) + (setting.mismatch * image) ** 2
     weighted = derivative / noise[:, None]
-    prior = _precision()
+    prior = precision()
     normal = weighted @ derivative.mT + prior
     unit = normal.diagonal(dim1=1, dim2=2).rsqrt()  # the unknowns differ by powers of ten in size
     inverse = torch.linalg.inv(normal * unit[:, :, None] * unit[:, None, :]) * unit[:, :, None] * unit[:, None, :]
@@ -204,7 +215,7 @@ def settle(
 
     Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen`` are those of the true states.
     """
-    prior = _precision()
+    prior = precision()
     found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
     for step in range(steps):
         if step:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from codesign.budget import Entry, Journal, links
+from codesign.budget import Journal
 from metalens.ground.errors import StoreError
 
 
@@ -45,34 +45,6 @@ def test_the_journal_of_other_work_and_damaged_lines_are_not_read(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         parts(path, "0.1 a", until=0)
     assert parts(path, "0.2 b")[1] == [0, 1, 2]
-
-
-def test_links_of_a_budget_are_computed_once(tmp_path, monkeypatch):
-    calls = []
-
-    def link(name, *, dies=False):
-        def part(about):
-            calls.append(name)
-            if dies:
-                raise KeyboardInterrupt
-            yield Entry(name, 0.25, math.nan, 1e-3 / 7, "by hand")
-
-        part.__name__ = name
-        return part
-
-    class About:
-        reading = None
-
-    names = ("_answer", "_optics", "_pillars", "_neighbours", "_mask", "_spread", "_calibration", "_numerics")
-    for name in names:
-        monkeypatch.setattr(links, name, link(name, dies=name == "_spread"))
-    with pytest.raises(KeyboardInterrupt):
-        list(links.entries(About, Journal(tmp_path / "j", "0.1")))
-    monkeypatch.setattr(links, "_spread", link("_spread"))
-    found = list(links.entries(About, Journal(tmp_path / "j", "0.1")))
-    assert calls == [*names[:6], *names[5:]]
-    assert [entry.link for entry in found] == [*names, "all links"]
-    assert found[-1].gaze_rad == pytest.approx(math.sqrt(8) * 1e-3 / 7, rel=1e-12)
 
 
 def test_a_file_of_the_user_is_no_journal_and_stays(tmp_path):

@@ -13,14 +13,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
 from codesign.adapt import train as retraining
-from codesign.budget import floor, total
-from codesign.budget.entry import Entry
+from codesign.budget import floor, links, total
+from codesign.budget.entry import MEASURED, Entry
 from codesign.budget.person import person
 from codesign.budget.prepared import Given, bench
 from codesign.budget.reading import Reading
+from codesign.budget.task import TaskSetting
 from codesign.evaluate import AXIAL, ExperimentConfig, experiment
 from codesign.eye.population import Rig
-from codesign.optics import Aperture, device, formed, gathered, image_difference
+from codesign.optics import Numerics, formed, image_difference
 from metalens.ground.errors import ConfigError, LensError
 
 FRAMES = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0)
@@ -34,11 +35,18 @@ def source(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def reading(source):
-    return Reading(source, FRAMES, fwhm_nm=0.0)
+def before(source):
+    """The run's own lens as a bench, read by its network."""
+    setting = TaskSetting(scenes=1, pixels=8, margin=2, pitch_um=3.0)
+    return bench(m.small(), Given(Numerics(2, 1, 1e-2, 1e-1), run=source, frames=FRAMES), setting)
 
 
-def test_the_links_add_up_to_what_the_experiment_measures(source, reading):
+@pytest.fixture(scope="module")
+def reading(before):
+    return before.reading
+
+
+def test_the_links_add_up_to_what_the_experiment_measures(source, before, reading):
     """A reader trained on one PSF before the whole field; the experiment is computed beside it, by its own loop."""
     rows = list(reading.path())
     names = [row.link for row in rows]
@@ -53,6 +61,13 @@ def test_the_links_add_up_to_what_the_experiment_measures(source, reading):
     change = reading.changed("nothing", reading.true.whole, reading.true.whole, "")
     assert change.gaze_rad < 1e-7
     assert change.psf == 0
+    (seen,) = links.measured(before)
+    assert (seen.link, seen.counted, seen.gaze_rad) == (MEASURED, False, pytest.approx(math.radians(found.gaze(AXIAL))))
+    assert f"{FRAMES.frames} frames" in seen.method
+    rows = {row.link: row for row in links.device(before)}
+    smooth = before.device.image(wave=reading.true.wave, layers=reading.true.layers)
+    assert rows["pillars on a lattice"].psf == pytest.approx(image_difference(before.device.whole, smooth), rel=1e-6)
+    assert rows["pillars on a lattice"].gaze_rad == reading.turned(before.device.whole, smooth) > 0
 
 
 def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
@@ -76,6 +91,9 @@ def test_fixation_alone_is_its_own_scatter():
     subject, fixation = person(frames, Rig())
     assert math.degrees(fixation.gaze_rad) == pytest.approx(0.6 * math.sqrt(math.pi / 2), rel=0.3)
     assert 0 < math.degrees(subject.gaze_rad) < 1.5
+    still, none = person(replace(frames, fixation_deg=0.0), Rig())
+    assert still.gaze_rad == subject.gaze_rad  # whoever calibrates looks where told, in both
+    assert none.gaze_rad == 0
 
 
 def test_a_goal_below_the_floor_is_refused_with_its_largest_link():
@@ -95,12 +113,9 @@ def test_the_reader_of_another_lens_is_refused(source):
         source.run.settings = kept
 
 
-def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(source):
+def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(source, before):
     """NA 0.2: both polarisations change the flux by some 1e-4; the lattice adds the noise of its cells."""
-    lens, settings = m.small(), source.run.settings.optics
-    maps = Aperture(lens).maps(Aperture(lens).designed())
-    grid = formed.grid_of(settings, 56, 4)
-    made = device(gathered(lens, *maps), grid, layers=lens.layers, distance_um=lens.sensor_distance_um, tolerance=0.1)
+    made, settings = before.device, source.run.settings.optics
     smooth = made.image(wave=formed.wave_of(settings, torch.zeros(0)))
     assert image_difference(made.whole, smooth) < 0.1
     assert 1e-7 < image_difference(made.both_polarisations(), made.whole) < 1e-3

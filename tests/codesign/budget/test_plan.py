@@ -104,6 +104,7 @@ def test_the_words_say_what_was_chosen(tmp_path):
     assert command_plan.values(best, measured)["met"] is True
 
 
+@pytest.mark.slow
 def test_a_run_at_one_wavelength_is_planned():
     """The pilot of a lens of 0.1 mm with few settings; one knob has a single one."""
     small = TaskSetting(scenes=1, pixels=32, margin=4)
@@ -195,7 +196,7 @@ def test_the_cost_of_a_run_is_a_library_its_stacks_its_images_and_its_mask():
     measured = Pilot(measured.levels, measured.errors, seconds, 1e-3, 5.0)
     names = list(measured.levels)
     places = np.array([[1, 0, 1, 0, 1, 0][: len(names)], [0, 1, 1, 1, 0, 1][: len(names)]])
-    got = plan._cost(measured, places, names, CONFIG)
+    got = plan.cost_s(measured, places, names, CONFIG)
     for found, place in zip(got, places, strict=True):
         cost = {n: seconds[n][i] for n, i in zip(names, place, strict=True)}
         pilot = {
