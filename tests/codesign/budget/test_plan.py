@@ -44,7 +44,8 @@ def test_an_impossible_goal_is_said_to_be_missed():
     errors = {name: np.full((2, 3, 2), 1e-3) for name in plan.LEVELS}
     best = plan.choose(_pilot(**errors), 1e-6, CONFIG)
     assert not best.met
-    assert best.choice.depth_count == 12
+    assert (best.choice.depth_count, best.choice.diameter_step_nm) == (12, 1)
+    assert best.seconds == best.finest_seconds
 
 
 def test_the_cheapest_combination_of_all_is_found():
