@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from characterize.model import detector, moments
-from characterize.model.glass import extra_path
+from characterize.model.glass import source_paths
 from characterize.model.kernel import real_of, turns
 from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
@@ -21,7 +21,7 @@ from characterize.model.setting import LIGHT, Setting, light_maps, spectrum, tru
 from characterize.model.window import Operators
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
-from metalens.ground.paths import sensor_path, source_path
+from metalens.ground.paths import sensor_path
 from metalens.lens import Lens
 from metalens.made import Answers, Bends, Sensitivity, Widens, maps, named, of_kind
 
@@ -72,7 +72,7 @@ class ForwardModel:
             )
         self.lens, self.setting = lens, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
-        over = detector.oversampling(lens, setting.pixel_um)
+        over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
         self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
@@ -130,10 +130,14 @@ class ForwardModel:
 
     def quick(self) -> "ForwardModel":
         """The same model by few terms of every field and on fewer samples: for differences to images of this one."""
-        part, over = self.rough(_FEW), detector.oversampling(self.lens, _FEWER * self.grid.pixel_um)
-        part._missed, part.grid = _SMOOTHER * moments.MISSED, dataclasses.replace(self.grid, oversample=over)
+        part = self.rough(_FEW)
+        part._missed, part.grid = _SMOOTHER * moments.MISSED, self._sparser()
         part.groups = [dataclasses.replace(group, reduced=group.reduced.quick()) for group in self.groups]
         return part
+
+    def _sparser(self) -> detector.Grid:
+        """Samples for differences of images: of derivatives they miss less than a third of ``_SLOPE_TOLERANCE``."""
+        return dataclasses.replace(self.grid, oversample=self._over)
 
     def with_walls(self, angle_rad: float) -> "ForwardModel":
         """The same lens with side walls that lean by an angle about half height; its derivatives are those without."""
@@ -224,7 +228,7 @@ class ForwardModel:
         light = self.grid.sample(intensity, transfer)
         by = {"bias": lens[1], **dict(zip(ANSWERING, lens[2], strict=False)), "wave": lens[3]}
         factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
-        out = self._quick((operators, coarse), group, transfer, bases, factors)
+        out = self._quick(x, (operators, coarse), group, bases, factors)
         conjugate, power, rough = field.conj(), np.vdot(lit, lit).real, max(self.cut, _SLOPE_TOLERANCE)
         for name in factors.keys() - out.keys():
             # the part of a change that is the light itself needs no sum, nor loses digits
@@ -245,23 +249,19 @@ class ForwardModel:
         return light, out
 
     def _quick(
-        self,
-        seen: tuple[Operators, Array],
-        group: _Group,
-        blur: detector.Blur,
-        bases: Bases,
-        factors: dict[str, Factor],
+        self, x: Array, seen: tuple[Operators, Array], group: _Group, bases: Bases, factors: dict[str, Factor]
     ) -> dict[str, Array]:
         """Derivatives that are had from those of the field: what smooth factors make of a point, on small pixels."""
-        (operators, coarse), turned = seen, seen[0].turned
-        small = bool(factors) and moments.fine_enough(self.grid, group.reduced.radius_um)
-        if turned is None or not isinstance(blur, detector.Sums) or not small:
+        (operators, coarse), turned, grid = seen, seen[0].turned, self._sparser()
+        small = bool(factors) and moments.fine_enough(grid, group.reduced.radius_um)
+        blur = self._transfer(x, group, [], grid)[0] if turned is not None and small else None
+        if turned is None or not isinstance(blur, detector.Sums):
             return {}
 
         def field(base: str, light: Array) -> Array:
             return coarse if base == LIT else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
 
-        return moments.rates(turned, self.grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
+        return moments.rates(turned, grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
 
     def _factors(self, x: Array, group: _Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
         """(name, what one unit does to the light on the nodes) of all parameters that change it."""
@@ -309,13 +309,10 @@ class ForwardModel:
         centre = d * tx + x[PLACE["decentre_x_um"]] - held[0], d * ty + x[PLACE["decentre_y_um"]] - held[1]
         exit_path = sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
-        lateral, out = [x[PLACE[f"source_{a}_um"]] for a in "xy"], np.empty((len(index), *here[0].shape))
-        for i, z in enumerate(depth):
-            tangents = tx - lateral[0] / z, ty - lateral[1] / z
-            path = source_path(*here, tangents, 1 / z) + exit_path
-            if x[PLACE["glass_um"]] != 0:
-                path = path + extra_path(*here, tangents=tangents, depth_um=float(z), values=x)
-            out[i] = k * path - reduced.known[cut]
+        out = source_paths(*here, depth_um=depth, tangents=(tx, ty), values=x)
+        out += exit_path
+        out *= k
+        out -= reduced.known[cut]
         out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending[every], 1)
         uneven = x[[PLACE[name] for name in LIGHT]]
         light = -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1) if uneven.any() else 0.0
@@ -334,6 +331,7 @@ class ForwardModel:
             distance_um=nominal.distance_um + x[PLACE["distance_um"]],
             axes_um=self.grid.axes_um(),
             edge_um=self.setting.margin * self.setting.pixel_um,
+            turned_um=self._sparser().axes_um(),
         )
 
     def _growth(self, x: Array, group: _Group) -> dict[str, Array]:
@@ -342,9 +340,11 @@ class ForwardModel:
         distance = np.full(len(depth), self.lens.sensor_distance_um + x[PLACE["distance_um"]])
         return {"distance_um": 1 / distance, "stage_zero_um": -1 / depth}
 
-    def _transfer(self, x: Array, group: _Group, names: list[str]) -> tuple[detector.Blur, dict[str, detector.Blur]]:
+    def _transfer(
+        self, x: Array, group: _Group, names: list[str], grid: detector.Grid | None = None
+    ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
         """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
         blur, sizes, kind = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]] * shrink, real_of(group.reduced.kind)
-        return detector.transfers(self.grid, blur, sizes, shrink, sized="pinhole_um" in names, kind=kind)
+        return detector.transfers(grid or self.grid, blur, sizes, shrink, sized="pinhole_um" in names, kind=kind)

@@ -1,4 +1,4 @@
-"""A plane plate of glass between source and lens: how much longer the path through it is, tilted or not."""
+"""From the source to the lens, off the axis or on it: in air, and through a plane plate of glass, tilted or not."""
 
 import math
 
@@ -7,8 +7,36 @@ import numpy as np
 from characterize.model.parameters import PLACE
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
+from metalens.ground.paths import source_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
+
+
+_TOGETHER = 20_000  # numbers of an array that stays in the cache
+
+
+def source_paths(x_um: Array, y_um: Array, *, depth_um: Array, tangents: tuple[float, float], values: Array) -> Array:
+    """(frames, *shape) path to (x, y) on the lens from sources at ``depth_um`` (frames,), um, less that to its centre.
+
+    Args:
+        tangents: (x, y) of the chief ray of a source on the axis.
+        values: all parameters, of which source_x_um, source_y_um, glass_um and the tilts of the glass are used.
+
+    Raises:
+        FitError: the plate does not fit between source and lens.
+    """
+    lateral = [values[PLACE[f"source_{a}_um"]] for a in "xy"]
+    out = np.empty((len(depth_um), *x_um.shape))
+    step = max(1, _TOGETHER // x_um.size)
+    for first in range(0, len(depth_um), step):
+        z = depth_um[first : first + step].reshape(-1, *(1,) * x_um.ndim)
+        leaning = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
+        out[first : first + step] = source_path(x_um, y_um, leaning, 1 / z)
+    if values[PLACE["glass_um"]] != 0:
+        for one, z in zip(out, depth_um.tolist(), strict=True):
+            leaning = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
+            one += extra_path(x_um, y_um, tangents=leaning, depth_um=z, values=values)
+    return out
 
 
 def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth_um: float, values: Array) -> Array:

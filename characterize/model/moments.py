@@ -7,7 +7,7 @@ parameters: d|E|² = 2 Re sum c_ab conj(E) E_ab. The coefficients change little 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -197,10 +197,10 @@ def _tables(
     places = np.repeat(axes[0], _PLACES)[:, None], np.tile(axes[1], _PLACES)[:, None]
     seen = _directions(turned, p, q, places)
     shapes = np.linalg.qr(np.stack([seen[0] ** a * seen[1] ** b for a, b in powers(_DEGREE)], -1))
-    out = {}
-    for name, factor in factors.items():
-        values = factor.values(cut)[:, keep].astype(complex)
-        found = _fitted(shapes, values, _moves(turned, factor, p, q, places), missed)
+    values = {name: factor.values(cut)[:, keep].astype(complex) for name, factor in factors.items()}
+    amounts, out = _amounts(shapes[0], list(values.values())), {}
+    for (name, factor), one in zip(factors.items(), amounts, strict=True):
+        found = _fitted(shapes, values[name], one, _moves(turned, factor, p, q, places), missed)
         if found is not None:
             degree, table = found
             square = np.moveaxis(table, 0, -1).reshape(*table.shape[1:], _PLACES, _PLACES)
@@ -229,14 +229,28 @@ def _logarithm(kernel: Kernel, p: Array, q: Array, places: tuple[Array, Array]) 
     return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.distance_um / r**2))
 
 
-def _fitted(shapes: tuple[Array, Array], values: Array, moved: Array, missed: float) -> tuple[int, Array] | None:
+def _amounts(basis: Array, values: Sequence[Array]) -> list[Array]:
+    """(places, powers, frames) products of orthonormal shapes (places, nodes, powers) with values (frames, nodes) each:
+    all in one, of real numbers."""
+    every = np.concatenate(values).T.copy().view(float)
+    flat = basis.transpose(0, 2, 1).reshape(-1, basis.shape[1]) @ every
+    found = flat.view(complex).reshape(len(basis), basis.shape[2], -1)
+    ends = np.cumsum([len(one) for one in values])
+    return np.split(found, ends[:-1], axis=2)
+
+
+def _fitted(
+    shapes: tuple[Array, Array], values: Array, amounts: Array, moved: Array, missed: float
+) -> tuple[int, Array] | None:
     """(degree, (places, powers, frames) coefficients) of the least degree that is close; None where none is.
 
-    shapes: orthonormal ones (places, nodes, powers), and the triangles that make them of the powers.
+    shapes: orthonormal ones (places, nodes, powers), and the triangles that make them of the powers. amounts: of them
+    in ``values`` (frames, nodes); ``moved`` (places or 1, nodes) comes to these.
     """
     basis, triangle = shapes
+    if moved.any():
+        amounts = amounts + np.einsum("knp,kn->kp", basis, moved)[..., None]
     wanted = (values + moved[:, None]).transpose(0, 2, 1)
-    amounts = basis.transpose(0, 2, 1) @ np.broadcast_to(wanted, (len(basis), *wanted.shape[1:]))
     repeats = len(basis) / len(wanted)
     size = repeats * float(np.linalg.norm(wanted - 1j * wanted.imag.mean(1, keepdims=True)) ** 2)
     left = repeats * float(np.linalg.norm(wanted) ** 2) - np.cumsum((np.abs(amounts) ** 2).sum((0, 2)))

@@ -29,6 +29,7 @@ from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path, source_path
 from metalens.lens import Lens
 
+Axes = tuple[Array, Array]
 _KEPT = 12  # operators: of a place that each of some threads is at
 _SPARE, _WIDER = 1.05, 1.25  # of bands over the nominal ones, and from there on: one serves all distances of a fit
 _BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when the low-rank terms are chosen
@@ -149,14 +150,17 @@ class Reduced:
         def some(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
-                path = self.path(x[None, :], y[rows, None], self.bench.distance_um, self.bench)
-                light = gather.lit(table, pillars.place(d.diameter_um[rows]), turns(self.k * path, self.kind))
-                halves = across.T @ light
-                sums[i] = (along[rows].T @ halves.reshape(len(halves), -1)).reshape(n, n, -1)
+                some = np.flatnonzero((d.diameter_um[rows] > 0).any(0))
+                built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
+                path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
+                place = pillars.place(d.diameter_um[rows, built])
+                light = gather.lit(table, place, turns(self.k * path, self.kind))
+                halves = across[built].T @ light.reshape(len(light), -1)
+                sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
         with threads.one_blas_thread():
             threads.split(len(parts), some)
-        whole = np.moveaxis(sums.sum(0, dtype=float), -1, 0)
+        whole = sums.sum(0, dtype=float).T
         return self._to_directions(whole[:r] + 1j * whole[r:], n)
 
     def _to_directions(self, fields: Array, n: int) -> Array:
@@ -178,17 +182,25 @@ class Reduced:
         return np.asarray(source_path(x, y, (tx, ty), 1 / bench.reference_um) + sensor_path(x, y, centre, distance_um))
 
     def operators(
-        self, *, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array], edge_um: float = 0.0
+        self,
+        *,
+        wavelength_um: float,
+        distance_um: float,
+        axes_um: tuple[Array, Array],
+        edge_um: float = 0.0,
+        turned_um: tuple[Array, Array] | None = None,
     ) -> Operators:
         """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x) of the window's samples.
 
+        turned_um: (y, x) of those where the field's derivatives are wanted, the same without.
         edge_um: width of a rim of the window where a tenfold error is allowed, since only its blur is seen.
         The last few are kept: an image is often followed by its derivatives.
         """
-        key = wavelength_um, distance_um, *_named(axes_um)
+        turned_um = axes_um if turned_um is None else turned_um
+        key = wavelength_um, distance_um, *_named(axes_um), *_named(turned_um)
         found = self._operators.get(key)
         if found is None:
-            found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
+            found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um, turned_um)
             with self._changing:
                 self._operators[key] = found
                 while len(self._operators) > _KEPT:
@@ -196,7 +208,7 @@ class Reduced:
         return found
 
     def _operators_of(
-        self, wavelength_um: float, distance_um: float, axes_um: tuple[Array, Array], edge_um: float
+        self, wavelength_um: float, distance_um: float, axes_um: Axes, edge_um: float, turned_um: Axes
     ) -> Operators:
         kernel = Kernel(
             2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
@@ -219,7 +231,7 @@ class Reduced:
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
         def bent(degree: int) -> tuple[Array, Array]:
-            down, across = (turned(*one, degree) for one in zip(axes_um, (y, x), bands, strict=True))
+            down, across = (turned(*one, degree) for one in zip(turned_um, (y, x), bands, strict=True))
             return down.astype(real_of(kind)), across.astype(real_of(kind))
 
         few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])

@@ -1,5 +1,6 @@
 """Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope and certified bounds."""
 
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -57,7 +58,13 @@ class Curve:
 
 def curve(coefficients: Array, domain: tuple[float, float], power: int, ceiling: float = math.inf) -> Curve:
     """The curve of 1-D Chebyshev ``coefficients`` on ``domain``."""
-    return Curve(tuple(float(c) for c in chebyshev.cheb2poly(coefficients)), *domain, power, ceiling)
+    return Curve(_monomials(tuple(coefficients.tolist())), *domain, power, ceiling)
+
+
+@functools.lru_cache(maxsize=256)
+def _monomials(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    """Of 1, x, x², ...: those of Chebyshev polynomials; value and slope at a wavelength ask for the same."""
+    return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
 def value(p: Curve, diameter: Array) -> Array:

@@ -121,7 +121,10 @@ def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
 def test_a_factor_that_is_no_polynomial_is_left_to_itself():
     t, s = np.random.default_rng(2).uniform(-1, 1, (2, 90))
     shapes = np.linalg.qr(np.stack([t**a * s**b for a, b in moments.powers(5)], -1)[None])
-    assert moments._fitted(shapes, (t > 0.13).astype(complex)[None], np.zeros((1, 1)), 5e-3) is None
-    degree, table = moments._fitted(shapes, (0.3 + 0.7j * s)[None], (0.2j * t)[None], 5e-3)
+    sharp, smooth = (t > 0.13).astype(complex)[None], (0.3 + 0.7j * s)[None]
+    amounts = moments._amounts(shapes[0], [sharp, smooth])
+    assert amounts[1] == pytest.approx(shapes[0].transpose(0, 2, 1) @ smooth.T, abs=1e-12)
+    assert moments._fitted(shapes, sharp, amounts[0], np.zeros((1, 1)), 5e-3) is None
+    degree, table = moments._fitted(shapes, smooth, amounts[1], (0.2j * t)[None], 5e-3)
     assert degree == 1
     assert table[0, :, 0] == pytest.approx([0.3, 0.2j, 0.7j], abs=1e-9)  # 1, t, s
