@@ -126,15 +126,15 @@ def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> Non
 
 def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solution]]:
     """The valleys of the usual parameters, or of more where these do not explain the frames."""
-    ends = search.search(task)
+    task, ends = search.search(task)
     if verdict.explained(ends[0], gain) or set(MORE) <= set(task.names):
         return task, ends
     more = dataclasses.replace(task, free=(*task.free, *MORE))
     wide = search.wider(more, task.all_of(ends[0].value))
-    if wide is None or wide[0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
+    if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
     cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
-    return more, wide
+    return wide
 
 
 def _with_what_is_there(
@@ -153,10 +153,10 @@ def _with_what_is_there(
             break
         more = dataclasses.replace(task, free=(*task.free, *first.frees))
         wide = search.wider(more, task.all_of(ends[0].value))
-        if wide is None or wide[0].merit > ends[0].merit - first.chi2 / 2:
+        if wide is None or wide[1][0].merit > ends[0].merit - first.chi2 / 2:
             break
         cautions.append(f"{first.cause} shows in the residuals: {', '.join(first.frees)} fitted too")
-        task, ends = more, wide
+        task, ends = wide
         looked = missing.look(task, ends[0])
     return task, ends, (ends[0], looked)
 

@@ -22,7 +22,7 @@ MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
 _LEANING_RAD = 0.3  # of the starts that look for a twin
 _ALONG_NM = 9.0  # bias by which starts are moved along the valley
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
-_PROMISING, _MOST, _ROUGH, _AGAIN = 40.0, 2, 5e-3, 3
+_PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
 _WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 
@@ -59,7 +59,7 @@ class Task:
         """Images of all frames, or roughly of some."""
         model = self.model if frames is None else self.model.only(frames)
         if self.left_out is None:
-            return residual.problem(model if frames is None else model.rough(_ROUGH), self.names, self.start)
+            return residual.problem(model if frames is None else model.quick(), self.names, self.start)
         some = slice(None) if frames is None else frames
         image, slopes = self.left_out
         return _added(residual.problem(model, self.names, self.start), image[some], slopes[:, some])
@@ -110,8 +110,9 @@ def oriented(tasks: Sequence[Task]) -> Task:
     )
 
 
-def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
-    """The valleys that explain the frames, best first, the others within ``MODES_WITHIN`` of it.
+def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solution]]:
+    """The valleys that explain the frames, best first, the others within ``MODES_WITHIN`` of it; and the task with its
+    windows held where the best has them.
 
     Short fits on a few frames from the nominal lens, the twins of its bias and leaning wave fronts, or from ``begins``;
     the best to the end. Then from what it found with even aberrations reversed and moved along its weakest valley:
@@ -120,12 +121,13 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> list[Solution]:
     few = few_frames(task.model.setting)
     plain = starts(task)
     first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
+    task = held(task, first[0].value)
     best = _long(task, first[0].value)
     tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
     floor = min(tries[0].merit, first[0].merit)
     promising = [t.value for t in tries if t.merit < floor + _PROMISING]
     about = anchored(task, best)
-    return mirrored(about, distinct([best, *followed(about, best, promising[: 2 * _MOST])]))
+    return task, mirrored(about, distinct([best, *followed(about, best, promising[: 2 * _MOST])]))
 
 
 def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
@@ -156,7 +158,7 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
             continue
         one = leastsquares.fit(task.problem(), task.data, begin, prior=task.prior, settings=settings)
         if one.merit < best.merit + MODES_WITHIN + _WORTH and all(_apart(one.value, e) > 2.0 for e in [best, *ends]):
-            ends.append(_long(task, one.value))
+            ends.append(_long(task, one.value, one.slopes))
     return ends
 
 
@@ -185,22 +187,29 @@ def refine(task: Task, value: Array) -> Solution:
     return _long(task, value)
 
 
-def placed(task: Task, ends: list[Solution]) -> tuple[Task, list[Solution]]:
-    """The task with its windows held where the best end has them, and the ends followed from there.
+def held(task: Task, value: Array) -> Task:
+    """The task with its windows held where values of the fitted parameters have them.
 
     Frames begin where the light lies, up to a pixel off the decentre (a prism of the bias moves light too): at NA 0.2
     and 6000 electrons half a pixel each way moves trefoil by 0.7 sigma.
     """
-    model, x = task.model, task.all_of(ends[0].value)
+    model, x = task.model, task.all_of(value)
     middle = float(x[PLACE["decentre_x_um"]]), float(x[PLACE["decentre_y_um"]])
     off = max(abs(a - b) for a, b in zip(middle, model.grid.middle_um, strict=True))
-    if off < _HELD_PX * model.setting.pixel_um:
+    return task if off < _HELD_PX * model.setting.pixel_um else dataclasses.replace(task, model=model.about(middle))
+
+
+def placed(task: Task, ends: list[Solution]) -> tuple[Task, list[Solution]]:
+    """The task with its windows held where the best end has them, and the ends followed there."""
+    there = held(task, ends[0].value)
+    if there is task:
         return task, ends
-    there = dataclasses.replace(task, model=model.about(middle))
-    return there, distinct([refine(there, end.value) for end in ends])
+    best = _long(there, ends[0].value, ends[0].slopes)
+    about = anchored(there, best)
+    return there, distinct([best, *(_long(about, end.value, end.slopes) for end in ends[1:])])
 
 
-def wider(task: Task, begin: Array) -> list[Solution] | None:
+def wider(task: Task, begin: Array) -> tuple[Task, list[Solution]] | None:
     """A search with more parameters from where the usual ones led; None where they lead out of the model's range."""
     try:
         return search(task, begins=[begin])
@@ -227,7 +236,9 @@ def _apart(value: Array, end: Solution) -> float:
 def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     place = [PLACE[name] for name in task.names]
     waves = Ball(np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]), WAVES_RAD)
-    short = Settings(iterations=4, step_tolerance=1.0, secant=True, finish=False, bounded=True, ball=waves)
+    short = Settings(
+        iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False, bounded=True, ball=waves
+    )
     part, seen = task.problem(few), task.data.planes(few)
 
     def one(begin: Array) -> Solution:
@@ -237,9 +248,10 @@ def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     return sorted(threads.each(one, begins), key=lambda t: t.merit)
 
 
-def _long(task: Task, value: Array) -> Solution:
+def _long(task: Task, value: Array, slopes: Array | None = None) -> Solution:
+    """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
     settings = Settings(iterations=80, secant=True)
-    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings)
+    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings, slopes=slopes)
 
 
 def _opened(task: Task, x: Array) -> dict[str, float]:

@@ -165,8 +165,8 @@ def test_the_lens_as_designed_is_seen_through_the_bench_that_was_fitted():
 def test_more_is_fitted_where_it_explains_the_frames_better_by_three_hundredths(monkeypatch, ratio, taken):
     """Of chi-square a pixel: 3 % are beyond chance (2 % of 5000 pixels)."""
     usual, wide = SimpleNamespace(chi2_per_dof=2.9, value="usual"), SimpleNamespace(chi2_per_dof=2.9 * ratio)
-    monkeypatch.setattr(estimate.search, "search", lambda task: [usual])
-    monkeypatch.setattr(estimate.search, "wider", lambda task, start: [wide] if start == "all of usual" else None)
+    monkeypatch.setattr(estimate.search, "search", lambda task: (task, [usual]))
+    monkeypatch.setattr(estimate.search, "wider", lambda task, at: (task, [wide]) if at == "all of usual" else None)
     monkeypatch.setattr(verdict, "explained", lambda end, gain: False)
 
     def task(free):

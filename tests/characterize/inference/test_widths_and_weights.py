@@ -147,7 +147,7 @@ def test_what_shows_in_the_residuals_is_fitted_where_that_explains_it(monkeypatc
     monkeypatch.setattr(missing, "look", lambda *_: next(looks))
     before = SimpleNamespace(merit=1000.0, value=np.zeros(2), converged=True)
     after = SimpleNamespace(merit=1000.0 - gained, value=np.zeros(4), converged=True)
-    monkeypatch.setattr(estimate.search, "wider", lambda *_: [after])
+    monkeypatch.setattr(estimate.search, "wider", lambda task, _: (task, [after]))
     cautions = []
     known = SimpleNamespace(known=True)
     task, ends, looked = estimate._with_what_is_there(Asked(), [before], known, cautions)
