@@ -101,7 +101,7 @@ def test_profiles_side_by_side_find_their_operators_again_and_older_places_let_g
     """An image and then its derivatives at each place: made once; of a few megabytes each at most sixteen are held."""
     reduced, made = object.__new__(Reduced), []
     reduced._operators, reduced._changing = {}, threading.Lock()
-    reduced._operators_of = lambda wavelength_um, distance_um, axes_um, edge_um: made.append(distance_um) or distance_um
+    reduced._operators_of = lambda _wave, distance_um, *_: made.append(distance_um) or distance_um
     places = [900.0 + 0.37 * k for k in range(explore._BESIDE)]
     for _ in range(2):
         for place in places:
