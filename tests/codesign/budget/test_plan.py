@@ -48,6 +48,14 @@ def test_an_impossible_goal_is_said_to_be_missed():
     assert best.seconds == best.finest_seconds
 
 
+def test_a_goal_that_is_just_met_is_met():
+    """Powers of two, whose squares and roots are exact."""
+    errors = {name: np.zeros((2, 3, 2)) for name in _pilot().levels}
+    errors["library_tolerance"][0, :, 0] = 2.0**-12
+    best = plan.choose(_pilot(**errors), 2.0**-12, CONFIG)
+    assert best.choice.library_tolerance == plan.LEVELS["library_tolerance"][0]
+
+
 def test_the_cheapest_combination_of_all_is_found():
     """Against a search by hand over every combination."""
     measured = _pilot()
