@@ -86,7 +86,7 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     assert not less.ok
 
 
-@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.03}])
+@pytest.mark.parametrize("third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)])
 def test_the_edges_of_marks_and_labels_are_judged(third):
     process = Process(exposure=Exposure(**BEAM, **third))
     _, content, table = written(process)
