@@ -100,7 +100,7 @@ def budget():
         device=SimpleNamespace(image=lambda **moved: None),
         entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
     )  # fmt: skip
-    (entry,) = links._spread(about)
+    (entry,) = links.process(about)
     built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     slope = lens.proxy.dphase_ddiameter(built, 0.85)
     want = 4e-3 * math.sqrt((slope**2).mean() / 8)

@@ -60,10 +60,10 @@ class Nodes:
     def __post_init__(self) -> None:
         waves, weights = np.asarray(self.wavelengths_um), np.asarray(self.weights)
         if waves.ndim != 1 or not len(waves) or not (np.isfinite(waves) & (waves > 0)).all():
-            raise PropagationError(f"wavelengths_um is {waves}, need one wavelength above 0 or more")
+            raise PropagationError(f"wavelengths_um is {waves.tolist()}, need one wavelength above 0 or more")
         if weights.shape != waves.shape or not (weights >= 0).all() or not abs(weights.sum() - 1) <= SUM_ERROR:
             raise PropagationError(
-                f"{len(waves)} wavelengths with weights {weights}, need one of 0 or more each, sum 1"
+                f"{len(waves)} wavelengths with weights {weights.tolist()}, need one of 0 or more each, sum 1"
             )
 
 

@@ -258,7 +258,7 @@ def _maps(
         raise PropagationError("wavelength_um is empty, need one wavelength or more")
     share = np.full(len(waves), 1 / len(waves)) if weights is None else np.asarray(weights, float)
     if share.shape != (len(waves),) or not (share >= 0).all() or not share.sum() > 0:
-        raise PropagationError(f"{len(waves)} wavelengths with weights {share}, need one weight >= 0 for each")
+        raise PropagationError(f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each")
     phase = torch.as_tensor(phase)
     if phase.dtype not in KEPT:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")

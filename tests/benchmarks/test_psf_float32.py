@@ -6,6 +6,7 @@ import numpy as np
 
 from benchmarks import psf_float32
 from benchmarks.rivals import plain_sum
+from metalens.cell.lattice import Lattice
 from tests.referees import plain_sum as other
 
 ABOUT = {"pitch_um": 0.37, "wavelength_um": 0.61, "sensor_distance_um": 23.0}
@@ -17,7 +18,7 @@ def test_the_plain_sum_is_that_of_the_tests():
     level[1, 2] = 0
     y, x = ((np.arange(n) - (n - 1) / 2) * 0.37 for n in phase.shape)
     depths, at = np.array([41.0, np.inf]), (np.array([-2.1, 0.4, 3.3]), np.array([1.7, -0.9]))
-    diameters = SimpleNamespace(diameter_um=level, x_um=x, y_um=y, pitch_um=0.37)
+    diameters = SimpleNamespace(diameter_um=level, x_um=x, y_um=y, pitch_um=0.37, lattice=Lattice())
     where = SimpleNamespace(x_um=at[0], y_um=at[1], distance_um=23.0, wavelength_um=0.61, depths_um=depths)
     want = np.abs(other.field(SimpleNamespace(diameters=diameters), level * np.exp(1j * phase), where)) ** 2
     points = np.stack(np.meshgrid(*at), -1).reshape(-1, 2)
