@@ -105,7 +105,7 @@ def written(kind):
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_damaged_artefacts_are_refused_or_read_as_they_were(tmp_path_factory, kind, data):
     path = tmp_path_factory.mktemp("fuzz") / "file.h5"

@@ -74,6 +74,7 @@ def test_files_report_and_rules_of_overwriting(folder, capsys):
     assert "settings.rate: 0.0015 -> 0.5" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the_same_bytes(folder, monkeypatch):
     words = ["retrain", str(folder / "run"), "--asbuilt", str(folder / "asbuilt.h5"), "-o", "out", *SHORT, "--quiet"]
     for name in ("whole", "killed"):

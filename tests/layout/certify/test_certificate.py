@@ -121,7 +121,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 40_000
 
 
-@pytest.mark.parametrize("third", [{}, {"gamma_um": 0.45, "nu": 0.03}])
+@pytest.mark.parametrize("third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)])
 def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(third, monkeypatch):
     process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
     plan, content, table = written(process)
