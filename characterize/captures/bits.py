@@ -8,6 +8,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 _DEPTHS = (8, 10, 12, 14, 16)
+_ROUNDING = 0.01  # counts: float32 keeps a share of 65535 to 0.004
 
 
 def right_align(
@@ -20,15 +21,36 @@ def right_align(
         beside: other images of the same camera (dark, flat). All tell of both together and are shifted alike: a dark
             frame by itself fits into the bits that its shift takes. Averages (real numbers) are divided.
 
+    Frames of real numbers that are whole are counts. Real numbers up to 1, where bits are stated or
+    other images lie beside, are shares of full scale: multiplied by the least of 2**b - 1 and 2**b that makes counts of
+    them.
+
     Returns:
         (counts, bits, note in words, counts of those beside).
 
     Raises:
-        CaptureError: the counts lie neither in the lowest of the stated bits nor in the highest of 16.
+        CaptureError: the counts lie neither in the lowest of the stated bits nor in the highest of 16, or are real and
+            above the stated bits; shares of full scale of which no counts can be made.
     """
+    scale = _full_scale(images, where) if bits is not None or beside else 1
+    images = _whole(images * scale if scale > 1 else images)
+    others = [a * scale if scale > 1 and a.dtype.kind == "f" and a.max() <= 1 else a for a in beside]
+    images, depth, note, rest = _aligned(images, bits, where, others)
+    return images, depth, f"shares of full scale multiplied by {scale}; {note}" if scale > 1 else note, rest
+
+
+def _aligned(
+    images: Array, bits: int | None, where: str, beside: Sequence[Array]
+) -> tuple[Array, int, str, tuple[Array, ...]]:
+    """As :func:`right_align`, of counts."""
     every = (images, *beside)
     whole = [a for a in every if a.dtype.kind != "f" and a.min() >= 0]
     if not whole or whole[0] is not images:
+        if bits is not None and images.max() >= 1 << bits:
+            raise CaptureError(
+                f"{where}: counts are real numbers up to {images.max():.6g}, the capture states {bits} bits (at most "
+                f"{(1 << bits) - 1}); correct bits, or divide by the shift"
+            )
         return images, bits or 16, "counts are real numbers: taken as they are", tuple(beside)
     used = int(np.bitwise_or.reduce([np.bitwise_or.reduce(a.astype(np.int64), axis=None) for a in whole]))
     back, depth, note = _alignment(used, bits, images.dtype.itemsize, where)
@@ -55,3 +77,26 @@ def _alignment(used: int, bits: int | None, item_bytes: int, where: str) -> tupl
         return shift, 16 - shift, f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
     depth = next((d for d in _DEPTHS if width <= d), 16) if item_bytes > 1 else 8
     return 0, depth, f"counts of {width} bits: taken as a {depth}-bit converter"
+
+
+def _whole(image: Array) -> Array:
+    """Real numbers as the whole counts of up to 16 bits that they are, to the digits of float32; else as they are."""
+    if image.dtype.kind != "f" or image.min() < -_ROUNDING or image.max() > 65_535 + _ROUNDING:
+        return image
+    counts = np.rint(image)
+    return counts.astype(np.uint16) if np.abs(image - counts).max() < _ROUNDING else image
+
+
+def _full_scale(images: Array, where: str) -> int:
+    """What shares of full scale are to be multiplied by; 1 for counts."""
+    if images.dtype.kind != "f" or not 0 < images.max() <= 1 or np.array_equal(images, np.rint(images)):
+        return 1
+    shares = np.asarray(images, float)
+    full = (scale for depth in _DEPTHS for scale in ((1 << depth) - 1, 1 << depth))
+    found = next((s for s in full if np.abs(shares * s - np.rint(shares * s)).max() < _ROUNDING), None)
+    if found is None:
+        raise CaptureError(
+            f"{where}: real numbers up to {images.max():.3g}, no counts over the full scale of a converter; save "
+            "counts as they come from the camera, or multiply frames, dark and flat by the full scale in counts"
+        )
+    return found

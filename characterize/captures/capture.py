@@ -5,25 +5,23 @@ import logging
 import math
 import re
 import struct
-import warnings
-import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from characterize.captures import colour, stage, tiff_tags
+from characterize.captures import colour, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
 from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
-_DENSEST, _MOST_BYTES = 1040, 1 << 34  # values' bytes for a byte of the file, at best; of all frames of a file
 _LEAST_PNG = 33  # bytes of a PNG's mark and head
 
 
@@ -99,24 +97,27 @@ def load(path: str | Path) -> Capture:
         raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
 
 
-def read_images(path: Path, channel: object = None) -> Array:
+def read_images(path: Path, channel: object = None, *, grey: bool = False) -> Array:
     """(n, y, x) images of one file, in its own number type.
 
     Args:
         channel: of colour images, "red", "green" or "blue"; what capture.toml says as ``channel``.
+        grey: whether images without colours are taken beside a channel (dark, flat).
 
     Raises:
-        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or an unknown one.
+        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, a channel without colour, or an
+            unknown one.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY:
         raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
-    readers = {TIFF: _read_tiff, PNG: _read_png, HDF5: _read_hdf5}
+    read_tiff = partial(tiff_pages.read, coloured=channel is not None)
+    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: _read_png, HDF5: _read_hdf5}
     reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
     if reader is None:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
     images = reader(path)
-    images = colour.pick(images[None] if images.ndim == 2 else images, channel, path)
+    images = colour.pick(images[None] if images.ndim == 2 else images, channel, path, grey=grey)
     if images.size == 0:
         raise CaptureError(f"{path}: images of shape {images.shape} are empty")
     _check_values(images, path)
@@ -155,12 +156,13 @@ def _load_folder(folder: Path) -> Capture:
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
     channel = about.pop("channel", None)
+    said = stage.left_out(files, rows) if rows else ()
     if rows is None:
         names, frames = _all_frames(files, folder, channel)
         rows = stage.Rows.unknown(names)
     else:
-        frames = _listed_frames(folder, rows, channel)
-    stacks = {name: read_images(p, channel) for name, p in special.items()}
+        frames = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, channel)
+    stacks = {name: read_images(p, channel, grey=True) for name, p in special.items()}
     bits = about.pop("bits", None)
     frames, depth, note, aligned = right_align(frames, bits, str(folder), beside=tuple(stacks.values()))
     extra = dict(zip(stacks, aligned, strict=True))
@@ -178,7 +180,7 @@ def _load_folder(folder: Path) -> Capture:
         dark=extra.get("dark"),
         flat=extra.get("flat"),
         about=about,
-        corrections=(note, *colour.notes(channel)),
+        corrections=(note, *colour.notes(channel), *said),
     )
 
 
@@ -194,13 +196,13 @@ def _all_frames(files: Sequence[Path], folder: Path, channel: object) -> tuple[t
     return tuple(map(reading.shown, names)), _join(stacks, files)
 
 
-def _listed_frames(folder: Path, rows: stage.Rows, channel: object) -> Array:
+def _listed_frames(there: Mapping[str, Path], folder: Path, rows: stage.Rows, channel: object) -> Array:
     """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn."""
     stacks: dict[str, Array] = {}
     images = []
     rows_of, met = Counter(rows.files), Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
-        path = folder / name
+        path = there.get(stage.spelt(name), folder / name)
         if not path.is_file():
             raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
         stack = stacks[name] if name in stacks else read_images(path, channel)
@@ -232,39 +234,6 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
     return np.concatenate(stacks)
 
 
-def _read_tiff(path: Path) -> Array:
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            size = path.stat().st_size
-            claimed, begun = 0, set[int]()
-            for number, page in enumerate(file.pages):
-                claimed += page.nbytes
-                if page.offset in begun:  # the library would go round for ever
-                    raise CaptureError(
-                        f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring"
-                    )
-                begun.add(page.offset)
-                if page.nbytes > _DENSEST * sum(page.databytecounts) + 65536 or claimed > _MOST_BYTES:
-                    raise CaptureError(f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes")
-                end = max((a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
-                if not 0 < end <= size:
-                    raise CaptureError(f"{path}: truncated in frame {number} ({size} bytes, need {end})")
-                if int(page.compression) in (6, 7, 33003, 33005, 34712):
-                    raise CaptureError(f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain")
-            images = np.stack([page.asarray() for page in file.pages])
-            planar = (
-                getattr(file.pages[0], "planarconfig", 1) == 2
-            )  # few frames that a writer took for separate colour planes
-            return np.asarray(images.reshape(-1, *images.shape[-2:]) if planar else images)
-    except CaptureError:
-        raise
-    except (tifffile.TiffFileError, *store.DAMAGE, IndexError, ArithmeticError, struct.error, zlib.error) as error:
-        raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
-
-
 def _read_png(path: Path) -> Array:
     import cv2
 
@@ -288,7 +257,9 @@ def _check_png(path: Path) -> None:
             file.seek(ends)
             head = file.read(24 if not begun else 8)
             length, name = int.from_bytes(head[:4], "big"), head[4:8]
-            if not begun and (name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > _DENSEST * 8 * size):
+            if not begun and (
+                name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > tiff_pages.DENSEST * 8 * size
+            ):
                 raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)")
             if begun and name == b"IHDR":
                 raise CaptureError(f"{path}: not a PNG file (a second head)")

@@ -6,7 +6,8 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Callable
+import unicodedata
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, nearest
 
-_LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3}
+_LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _POSITIONS = {f"{name}_{unit}": scale for name in ("depth", "z", "position") for unit, scale in _LENGTHS.items()}
 _ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
+_ANGLES_Y = ("angle_y_deg", "angle_y_rad")
 _ALIASES = {
     f"{name}_{unit}": (entry, scale)
     for entry, names in {
@@ -46,7 +48,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 }
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "window")
 _MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
-_COLUMNS = {"file", "page", "exposure_s", "angle_y_deg", "angle_y_rad"} | set(_POSITIONS) | set(_ANGLES)
+_COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_ANGLES)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,11 +77,12 @@ def read_stage(folder: Path) -> Rows | None:
     """The stage file of a capture folder; None where there is none.
 
     Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in turn), one of depth/z/position
-    with unit (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``. JSON: a list of
-    such objects.
+    with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``.
+    JSON: a list of such objects.
 
     Raises:
-        CaptureError: unknown column, no column ``file``, a value that is no number; file and row are named.
+        CaptureError: unknown column, two of depth or of one angle, no column ``file``, columns not parted by commas, a
+            value that is no number, a page that is not whole; file and row are named.
     """
     for path in (folder / "stage.csv", folder / "stage.json"):
         if path.is_file():
@@ -172,6 +175,9 @@ def _read_json(path: Path) -> list[dict[str, Any]]:
 def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
     if not table:
         raise CaptureError(f"{path}: no rows; need one a frame")
+    parted = next((mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None)
+    if parted:
+        raise CaptureError(f"{path}: columns parted by {parted!r}; save it with commas, and points in the numbers")
     for row, entries in enumerate(table, 2):
         for key in entries:
             if key not in _COLUMNS:
@@ -179,18 +185,51 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
         if not entries.get("file"):
             raise CaptureError(f"{path}, row {row}: no 'file'; name the image of every row")
     head = table[0].keys()
+    for kind in (_POSITIONS, _ANGLES, _ANGLES_Y):
+        if len(stated := [key for key in kind if key in head]) > 1:
+            raise CaptureError(f"{path}: columns {' and '.join(stated)} say the same; leave the one that holds")
     place = next((key for key in _POSITIONS if key in head), None)
-    angle = [next((k for k in names if k in head), None) for names in (_ANGLES, ("angle_y_deg", "angle_y_rad"))]
+    angle = [next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)]
     scales = [_ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle]
     columns = [_column(table, key, path) * s for key, s in zip(angle, scales, strict=True)]
     return Rows(
         files=tuple(str(entries["file"]) for entries in table),
-        page=tuple(int(v) for v in _column(table, "page", path)) if "page" in head else (None,) * len(table),
+        page=_pages(table, path) if "page" in head else (None,) * len(table),
         position_um=_column(table, place, path, np.nan) * _POSITIONS.get(place or "", 1.0),
         angle_rad=np.stack(columns, 1),
         exposure_s=_column(table, "exposure_s" if "exposure_s" in head else None, path, np.nan),
         source=str(path),
     )
+
+
+def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
+    """What to say of images in the folder that the stage file does not name.
+
+    Raises:
+        CaptureError: they are called as dark frames or flats, and would not be used.
+    """
+    named = {spelt(Path(name).name) for name in rows.files}
+    rest = [path.name for path in files if spelt(path.name) not in named]
+    for name in rest:
+        if kind := re.match(r"(dark|flat)s?(?![a-z])", name.lower()):
+            raise CaptureError(
+                f"{rows.source}: {name!r} is not named there and would not be used; put all {kind[1]} frames into one "
+                f"stack {kind[1]}.tif"
+            )
+    return (f"{len(rest)} images that {rows.source} does not name left out: {', '.join(rest[:5])}",) if rest else ()
+
+
+def spelt(name: str) -> str:
+    """A file name in one spelling: some systems write an umlaut as a letter and its dots."""
+    return unicodedata.normalize("NFC", name)
+
+
+def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
+    pages = _column(table, "page", path)
+    for row, page in enumerate(pages, 2):
+        if page != round(page):
+            raise CaptureError(f"{path}, row {row}: page is {page:g}, need a whole number from 0 on")
+    return tuple(int(page) for page in pages)
 
 
 def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0) -> Array:

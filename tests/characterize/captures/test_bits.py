@@ -73,7 +73,7 @@ def test_few_or_wide_words_are_not_shifted():
         assert bits == depth
 
 
-@pytest.mark.parametrize("given", [frames(900.0, float), frames(900, np.int32, least=-3)])
+@pytest.mark.parametrize("given", [frames(900.0, float) + 0.25, frames(900, np.int32, least=-3)])
 def test_real_and_negative_counts_are_taken_as_they_are(given):
     """Dark frames were taken off or averages made: no bits can be told, 16 unless stated."""
     dark = np.array([[16, 32]], np.uint16)
@@ -95,3 +95,35 @@ def test_stated_bits_hold_the_counts_at_one_end_or_the_other():
     for wrong, stated in ((given, 10), (given << 2, 12), (given.astype(np.uint32) << 6, 12)):
         with pytest.raises(CaptureError, match=f"the capture states {stated}"):
             right_align(wrong, stated, "a.tif")
+
+
+def test_whole_real_numbers_are_counts_with_their_shift():
+    """12-bit counts times 16 as float32: every one above 4095 was taken for saturated. Averages beside are divided."""
+    given, dark = frames(4095), np.array([[5.25, 63.5]])
+    for stated in (None, 12):
+        found, bits, _, beside = right_align((given * 16).astype(np.float32), stated, "a.tif", beside=[dark * 16])
+        assert found.tolist() == given.tolist()
+        assert bits == 12
+        assert beside[0].tolist() == dark.tolist()
+    with pytest.raises(CaptureError, match=r"real numbers up to .* states 12 bits"):
+        right_align(given * 16 + 0.25, 12, "a.tif")
+
+
+@pytest.mark.parametrize(("over", "shift"), [(4095, 1), (4096, 1), (65_535, 1), (65_535, 16)])
+def test_shares_of_full_scale_are_the_counts_that_they_were(over, shift):
+    """Rounding to a whole count is a millionth of a count there, not the well: it was a noise of 2300 electrons."""
+    given, dark = frames(4095), np.array([[5, 64]], np.uint16)
+    shares, dim = ((a * float(shift) / over).astype(np.float32) for a in (given, dark))
+    found, bits, note, beside = right_align(shares, 12, "a.tif", beside=[dim])
+    assert found.tolist() == given.tolist()
+    assert np.allclose(beside[0], dark, atol=0.01)
+    assert bits == 12
+    assert "multiplied by" in note
+
+
+def test_shares_of_which_no_counts_can_be_made_are_refused_where_counts_matter():
+    shares = np.sqrt(frames(4095) / 4095.0)
+    for told in ({"bits": 12}, {"bits": None, "beside": [shares]}):
+        with pytest.raises(CaptureError, match="multiply frames, dark and flat by the full scale"):
+            right_align(shares, where="a.tif", **told)
+    assert right_align(shares, None, "a.tif")[0] is shares  # a bead stack: nothing is said of its counts

@@ -12,7 +12,15 @@ from metalens.ground.errors import CaptureError
 
 @pytest.mark.parametrize(
     ("column", "scale"),
-    [("depth_um", 1.0), ("z_nm", 1e-3), ("position_mm", 1e3), ("depth_mm", 1e3), ("position_nm", 1e-3)],
+    [
+        ("depth_um", 1.0),
+        ("z_nm", 1e-3),
+        ("position_mm", 1e3),
+        ("depth_mm", 1e3),
+        ("position_nm", 1e-3),
+        ("z_cm", 1e4),
+        ("depth_m", 1e6),
+    ],
 )
 def test_positions_and_angles_carry_their_unit(tmp_path, column, scale):
     (tmp_path / "stage.csv").write_text(
@@ -52,6 +60,23 @@ def test_a_name_in_the_right_unit_goes_before_another(tmp_path):
     (tmp_path / "capture.json").write_text(json.dumps({"bits": True}))
     with pytest.raises(CaptureError, match="bits = True"):
         stage.read_about(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("file,depth_um,depth_mm\na.tif,730,0.9\n", "depth_um and depth_mm say the same"),
+        ("file,angle_deg,angle_rad\na.tif,7,0.3\n", "angle_deg and angle_rad say the same"),
+        ("file,angle_y_deg,angle_y_rad\na.tif,7,0.3\n", "angle_y_deg and angle_y_rad say the same"),
+        ("file;depth_mm\na.tif;0,73\n", "parted by ';'; save it with commas"),
+        ("file\tdepth_mm\na.tif\t0.73\n", "save it with commas"),
+        ("file,page\na.tif,1\na.tif,2.5\n", "row 3: page is 2.5, need a whole number"),
+    ],
+)
+def test_tables_that_could_be_read_in_two_ways_are_refused(tmp_path, table, words):
+    (tmp_path / "stage.csv").write_text(table)
+    with pytest.raises(CaptureError, match=words):
+        stage.read_stage(tmp_path)
 
 
 def test_rows_are_named_as_an_editor_counts_them(tmp_path):

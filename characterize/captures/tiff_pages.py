@@ -1,0 +1,79 @@
+"""The images of a TIFF file, refused where it is damaged, lossy or claims more than it holds."""
+
+import importlib.util
+import struct
+import warnings
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+
+DENSEST = 1040  # values' bytes for a byte of the file, at best
+_MOST_BYTES = 1 << 34  # of all frames of a file
+_LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
+_ELSEWHERE = {5: "LZW", 32773: "PackBits", 34925: "LZMA", 50000: "Zstandard"}  # need a package of their own
+
+
+def read(path: Path, *, coloured: bool = False) -> Array:
+    """(n, y, x) images of a file, or (n, y, x, colours).
+
+    Args:
+        coloured: separate planes are the colours of an image; else they are images, since some writers take a stack of
+            three or four for colours.
+
+    Raises:
+        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, pages of different size.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _check(path, file)
+            images = np.stack(_alike([page.asarray() for page in file.pages], path))
+            planar = getattr(file.pages[0], "planarconfig", 1) == 2
+            if planar and coloured and images.ndim == 4:
+                return np.moveaxis(images, 1, -1)
+            return np.asarray(images.reshape(-1, *images.shape[-2:]) if planar else images)
+    except CaptureError:
+        raise
+    except (tifffile.TiffFileError, *store.DAMAGE, IndexError, ArithmeticError, struct.error, zlib.error) as error:
+        raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
+
+
+def _check(path: Path, file: Any) -> None:
+    size = path.stat().st_size
+    claimed, begun = 0, set[int]()
+    for number, page in enumerate(file.pages):
+        claimed += page.nbytes
+        if page.offset in begun:  # the library would go round for ever
+            raise CaptureError(f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring")
+        begun.add(page.offset)
+        if page.nbytes > DENSEST * sum(page.databytecounts) + 65536 or claimed > _MOST_BYTES:
+            raise CaptureError(f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes")
+        end = max((a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
+        if not 0 < end <= size:
+            raise CaptureError(f"{path}: truncated in frame {number} ({size} bytes, need {end})")
+        packed = int(page.compression)
+        if packed in _LOSSY:
+            raise CaptureError(f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain")
+        if packed in _ELSEWHERE and importlib.util.find_spec("imagecodecs") is None:
+            raise CaptureError(
+                f"{path}: frame {number} is compressed ({_ELSEWHERE[packed]}); save it plain or deflated, or install "
+                "imagecodecs"
+            )
+
+
+def _alike(pages: Sequence[Array], path: Path) -> Sequence[Array]:
+    for number, page in enumerate(pages):
+        if page.shape != pages[0].shape:
+            raise CaptureError(
+                f"{path}: frame {number} is {page.shape}, frame 0 {pages[0].shape}; keep one size a file"
+            )
+    return pages
