@@ -88,9 +88,8 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     cautions = [*frames.corrections, *_arranged_words(task.found or found)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
-    task = dataclasses.replace(
-        task, model=quick_enough(task.model, task.data, search.starts(task, biases_nm=(0.0,))[0])
-    )
+    unbiased = search.starts(task, biases_nm=(0.0,))[0]
+    task = dataclasses.replace(task, model=quick_enough(task.model, task.data, unbiased))
     task, ends = search.placed(*_ends(task, frames.gain, cautions))
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
@@ -107,6 +106,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     posterior = explore.explore(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
+    cautions += verdict.quiet(posterior.best, frames.gain)
     result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
     _refuse(result.problems, options, leans)
     return result
@@ -272,7 +272,7 @@ def _nominal(task: Task, fitted: dict[str, float]) -> Array:
 
 def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
     known = verdict.process_verdict(task.names, found.low, found.high, _told(task, found), unstated)
-    return _psf_verdict(verdict.predicted_error(task, found), unseen), known
+    return _psf_verdict(verdict.predicted_error(task, found), unseen, len(task.model.groups)), known
 
 
 def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:
@@ -300,10 +300,11 @@ def _told(task: Task, found: Posterior) -> Array:
     return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
 
 
-def _psf_verdict(known: tuple[float, float], unseen: float) -> str:
+def _psf_verdict(known: tuple[float, float], unseen: float, angles: int) -> str:
     captured, between = known
     tested = "" if np.isnan(unseen) else f"; frames left out agree within {unseen:.2f} times their noise"
-    return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them{tested}"
+    at = "at one angle" if angles == 1 else f"at the {angles} captured angles"
+    return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
 
 
 def _problems(task: Task, solution: Solution, gain: Gain) -> list[str]:

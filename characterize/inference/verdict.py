@@ -27,8 +27,22 @@ _STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a th
 
 def explained(solution: Solution, gain: Gain) -> bool:
     """Whether chi-square is that of noise: within 15 %, or four of its own sigma where pixels or flats are few."""
+    return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
+
+
+def quiet(solution: Solution, gain: Gain) -> list[str]:
+    """What to say of frames with less noise than stated: chi-square as far below 1 as it may not be above."""
+    if not gain.known or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
+        return []
+    return [
+        f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, below 1: less noise than stated, so that "
+        "intervals are too wide; averaged or smoothed frames, dark frames of a longer exposure, a gain of other counts"
+    ]
+
+
+def _allowed(solution: Solution, gain: Gain) -> float:
     chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
-    return solution.chi2_per_dof <= 1 + max(MISFIT - 1, min(chance, 0.5))
+    return max(MISFIT - 1, min(chance, 0.5))
 
 
 def left_over(solution: Solution) -> bool:

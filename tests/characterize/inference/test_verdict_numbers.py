@@ -204,3 +204,23 @@ def test_expected_error_without_draws_is_that_of_the_covariance(monkeypatch):
     monkeypatch.setattr(verdict, "_SHOWN", 2000)
     got = verdict.predicted_error(task(Straight(bright, pictures)), found)
     assert got == pytest.approx((want, want), rel=0.06)  # of a mean of 2000 squares: three times 1.6 %, and C's square
+
+
+@pytest.mark.parametrize(
+    ("chi2", "pixels", "gain_sigma_e", "said"),
+    [
+        (0.84, 9000, 0.0, True),  # 15 % below, as 15 % above is no longer noise
+        (0.86, 9000, 0.0, False),
+        (0.72, 450, 0.0, True),  # four of sqrt(2 / 450) are 0.267
+        (0.72, 350, 0.0, False),
+        (0.84, 9000, 0.1, False),  # 0.1 of 2.1 e a count, four times: 0.19
+        (0.49, 9000, 0.9, True),
+    ],
+)
+def test_frames_with_less_noise_than_stated_are_told(chi2, pixels, gain_sigma_e, said):
+    """Averages of frames, or a gain of counts 16 times as large: chi-square 0.11 was passed over."""
+    solution = SimpleNamespace(chi2_per_dof=chi2, residual_sigma=np.ones(pixels))
+    words = verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7))
+    assert len(words) == said
+    assert not said or f"is {chi2:.2f}, below 1" in words[0]
+    assert not verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7, known=False))
