@@ -10,8 +10,6 @@ from metalens.ground.errors import FitError
 from metalens.ground.paths import source_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
-
-
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
 
 

@@ -16,9 +16,10 @@ from layout.certify import neighbours, outlines
 from layout.certify.background import Raster
 from layout.certify.gathered import Exposed, Kinds
 from layout.certify.places import OnLattices, strip_of
-from layout.certify.raster import Contours, own_levels
+from layout.certify.raster import own_levels
 from layout.certify.shaped import Beside, Pillars, Shapes
 from layout.process import Process, compiled
+from layout.shapes.moments import Contours
 from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.certify.places import OnLattices
-from layout.certify.raster import Contours
 from layout.certify.shaped import Shapes
 from layout.files import NOTHING, MaskContent, flat
 from layout.mask import MaskPlan
 from layout.process import LayerNumber
 from layout.shapes import region
+from layout.shapes.moments import Contours, moments, perimeter
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
@@ -128,8 +128,7 @@ class _Found:
     def _keep(self, area: float, dose: float, layer: int, contours: Contours, size_um: float = 0.0) -> None:
         """A kind of pillar, its contours about its middle; without a size it is a disc."""
         disc = 2 * math.sqrt(area / math.pi)
-        around = sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
-        share = around / (math.pi * disc) if size_um else 1.0
+        share = perimeter(contours) / (math.pi * disc) if size_um else 1.0
         self._pillars.append((area, dose, layer, size_um or disc, share))
         self._contours.append(contours)
         self._shaped |= size_um > 0
@@ -159,11 +158,11 @@ class _Found:
             return
         every = [c + np.array(at) for s in drawn for c in s.outlines for at in zip(s.x, s.y, strict=True)]
         contours = [np.asarray(c) * self._unit for c in region.union(every)]
-        outer = sum(_signed(c) > 0 for c in contours)
+        outer = sum(moments([c])[0] > 0 for c in contours)
         if outer != 1 or len({stack.layer for stack in drawn}) > 1:
             raise ProcessError(f"a class of pillars draws {outer} outlines; it is not certified as one")
-        area = sum(map(_signed, contours))
-        centre = np.sum([_first(c) for c in contours], axis=0) / area
+        area, first, _ = moments(contours)
+        centre = first / area
         self.x.append(centre[:1])
         self.y.append(centre[1:])
         self._keep(area, self._doses[drawn[0].layer], drawn[0].layer[0], [c - centre for c in contours], size_um)
@@ -200,16 +199,3 @@ def _measured(outlines: Array) -> tuple[Array, Array, Array]:
     centre = ((outlines + after) * cross[..., None]).sum(1) / (6 * area[:, None])
     around = np.hypot(*np.moveaxis(after - outlines, -1, 0)).sum(1)
     return area, centre, 4 * np.pi * area / around**2
-
-
-def _signed(contour: Array) -> float:
-    """Area, below 0 of a hole."""
-    after = np.roll(contour, -1, axis=0)
-    return float((contour[:, 0] * after[:, 1] - after[:, 0] * contour[:, 1]).sum()) / 2
-
-
-def _first(contour: Array) -> Array:
-    """(2,) integral of x and y."""
-    after = np.roll(contour, -1, axis=0)
-    cross = contour[:, 0] * after[:, 1] - after[:, 0] * contour[:, 1]
-    return np.asarray(((contour + after) * cross[:, None]).sum(0) / 6)

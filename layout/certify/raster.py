@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from layout.shapes.moments import Contours, moments
 from metalens.ground.arrays import Array
 
 _BESIDE = 5.0  # ranges around the shape: exp(-25)
 _HIGHEST = 9.5  # of wave number times range: exp(-22)
 _PIXEL = 1 / 10  # ranges
 _LEVELS = 48  # of the table of areas
-Contours = Sequence[Array]  # (n, 2) um each about the middle; outlines counter-clockwise, holes clockwise
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,7 +44,7 @@ def image(contours: Contours, range_um: float) -> Image:
     step = 2 * np.pi / side
     most = int(np.ceil(_HIGHEST / range_um / step))
     gx, gy = step * np.arange(most + 1), step * np.arange(-most, most + 1)[:, None]
-    factor = sum(_sign(c) * Loop(tuple(map(tuple, c.tolist()))).fourier(gx, gy) for c in contours)
+    factor = sum(np.sign(moments([c])[0]) * Loop(tuple(map(tuple, c.tolist()))).fourier(gx, gy) for c in contours)
     factor = factor * np.exp(-(gx**2 + gy**2) * range_um**2 / 4)
     count = max(2 * most + 1, int(np.ceil(side / (_PIXEL * range_um)))) | 1  # odd: a pixel in the middle
     spectrum = np.zeros((count, count // 2 + 1), complex)
@@ -71,9 +71,3 @@ def own_levels(contours: Contours, terms: Sequence[tuple[float, float]], radius_
     area = np.array([np.clip(0.5 + (total - level) / steep, 0, 1).sum() for level in levels]) * fine.pixel_um**2
     rising = np.maximum.accumulate(area + 1e-12 * np.arange(_LEVELS))
     return np.asarray(PchipInterpolator(rising, levels)(np.clip(np.pi * radius_um**2, rising[0], rising[-1])))
-
-
-def _sign(contour: Array) -> float:
-    """1 of outlines, -1 of holes."""
-    after = np.roll(contour, -1, axis=0)
-    return float(np.sign((contour[:, 0] * after[:, 1] - after[:, 0] * contour[:, 1]).sum()))

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.certify.raster import Contours, image, reach_um
+from layout.certify.raster import image, reach_um
 from layout.files.squares import Squares, first_from
 from layout.process import compiled
+from layout.shapes.moments import Contours, along, moments
 from metalens.ground.arrays import Array
 
 WIDER = 3.0  # half sides: in a Gaussian beyond, a shape is its second moment
@@ -43,7 +44,7 @@ class Shapes:
     def of(cls, contours: Sequence[Contours]) -> "Shapes":
         """Of contours about their middles."""
         edge = np.array([along(c, _SEEN) for c in contours])
-        area, given = np.array([_second(c) for c in contours]).T
+        area, given = np.array([(m[0], m[2]) for m in map(moments, contours)]).T
         return cls(contours, area, edge, given / area, (edge**2).sum(-1).mean(1), max(map(reach_um, contours)))
 
 
@@ -91,28 +92,6 @@ class Beside:
         near = x, y, dose, shape
         _sum(order, key, at, near, squares.key, squares.columns, self.images, s.edge_um, moments, steps, out)
         return np.asarray(out)
-
-
-def along(contours: Contours, count: int) -> Array:
-    """(count, 2) places evenly along all edges."""
-    points = np.concatenate(list(contours))
-    after = np.concatenate([np.roll(c, -1, axis=0) for c in contours])
-    long = np.hypot(*(after - points).T)
-    end = np.cumsum(long)
-    at = (np.arange(count) + 0.5) / count * end[-1]
-    k = np.searchsorted(end, at)
-    return np.asarray(after[k] + ((at - end[k]) / long[k])[:, None] * (after[k] - points[k]))
-
-
-def _second(contours: Contours) -> tuple[float, float]:
-    """Area and the integral of r^2 over it, edge by edge."""
-    area = second = 0.0
-    for a in contours:
-        b = np.roll(a, -1, axis=0)
-        cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-        area += float(cross.sum()) / 2
-        second += float((cross * (a * a + a * b + b * b).sum(1)).sum()) / 12
-    return area, second
 
 
 def _sampled(contours: Contours, range_um: float, count: int, pixel_um: float) -> Array:

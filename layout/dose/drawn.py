@@ -17,9 +17,9 @@ from typing import Protocol
 import numpy as np
 
 from layout.dose.exposure import PointExposure, disc, rim_of_own_disc, slope_at_rim
+from layout.shapes.moments import Contours, along, moments, perimeter
 from metalens.ground.arrays import Array
 
-Contours = Sequence[Array]  # (n, 2) um each; outlines counter-clockwise, holes clockwise
 _RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
 _SEEN = 48  # points along the edges that neighbours are seen from
 _PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
@@ -102,7 +102,7 @@ class Outlines:
     @cached_property
     def area_um2(self) -> Array:
         """By Green's theorem."""
-        return np.array([sum(_moments(c)[0] for c in each) for each in self.contours])
+        return np.array([moments(each)[0] for each in self.contours])
 
     @property
     def diameter_um(self) -> Array:
@@ -123,7 +123,7 @@ class Outlines:
 
     def edge_um(self, entry: int) -> Array:
         """As in :class:`Drawn`, evenly spaced."""
-        return _along(self.contours[entry], _SEEN)
+        return along(self.contours[entry], _SEEN)
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
         """As in :class:`Drawn`; four Gauss points to 0.8 widths, 1e-6."""
@@ -139,31 +139,11 @@ class Outlines:
         return sorted({some[k] for k in far.argmax(0).tolist()})
 
 
-def _moments(c: Array) -> tuple[float, Array, float]:
-    """Area, first moments and integral of r^2 over a contour, with its sign."""
-    a, b = c, np.roll(c, -1, axis=0)
-    cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    square = (a * a + a * b + b * b).sum(1)
-    return float(cross.sum() / 2), ((a + b) * cross[:, None]).sum(0) / 6, float((cross * square).sum() / 12)
-
-
 def _wider(contours: Contours) -> float:
-    parts = [_moments(c) for c in contours]
-    area, second = sum(part[0] for part in parts), sum(part[2] for part in parts)
-    centre = np.sum([part[1] for part in parts], axis=0) / area
-    points = _along(contours, 4 * _SEEN) - centre
+    area, first, second = moments(contours)
+    centre = first / area
+    points = along(contours, 4 * _SEEN) - centre
     return float(second / area - centre @ centre + (points**2).sum(1).mean())
-
-
-def _along(contours: Contours, count: int) -> Array:
-    """(count, 2) places evenly along all edges."""
-    start = np.concatenate(list(contours))
-    edge = np.concatenate([np.roll(c, -1, axis=0) for c in contours]) - start
-    ends = np.cumsum(np.hypot(*edge.T))
-    at = (np.arange(count) + 0.5) / count * ends[-1]
-    k = np.searchsorted(ends, at)
-    share = 1 - (ends[k] - at) / np.hypot(*edge.T)[k]
-    return np.asarray(start[k] + share[:, None] * edge[k])
 
 
 def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
@@ -210,9 +190,8 @@ def _level(contours: Contours, area_um2: float, point: PointExposure) -> tuple[f
         middle = (low + high) / 2
         low, high = (middle, high) if larger(middle) > area_um2 else (low, middle)
     level = (low + high) / 2
-    around = sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
     off = 0.15 * level  # a few pixels, so that their places do not tell
-    return level, around / max((larger(level - off) - larger(level + off)) / (2 * off), 1e-12)
+    return level, perimeter(contours) / max((larger(level - off) - larger(level + off)) / (2 * off), 1e-12)
 
 
 def _box(corners: Array) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.shapes import convex as convex
+    from layout.shapes import moments as moments
     from layout.shapes import polygon as polygon
     from layout.shapes import rectilinear as rectilinear
     from layout.shapes import region as region
@@ -14,6 +15,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "convex": "",
+        "moments": "",
         "rectilinear": "",
         "region": "",
         "polygon": "",

@@ -98,8 +98,7 @@ def _fits(lens: Lens, size_nm: float, process: Process) -> bool:
     cell, rules = lens.cell, process.rules
     if lens.diameters.plain and cell.shape.kind == "circle":
         return True
-    outline = cell.outline(size_nm * 1e-3)
-    wide, gap = outline.spans_um[0], outline.gap_um(cell.lattice.steps_um(cell.pitch_um))
+    wide, gap = cell.outline(size_nm * 1e-3).spans_um[0], cell.gap_um(size_nm * 1e-3)
     return wide * 1e3 >= rules.minimum_feature_nm - 1e-6 and gap * 1e3 >= rules.minimum_gap_nm - 1e-6
 
 

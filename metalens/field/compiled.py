@@ -17,7 +17,12 @@ PART, put = answers.PART, answers.answers  # compiled loops know names of their 
 
 def plain(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
-    if a.dtype not in (torch.float32, torch.complex64) or a.device.type != "cpu" or a.requires_grad:
+    return a.dtype in (torch.float32, torch.complex64) and values(a)
+
+
+def values(a: Tensor) -> bool:
+    """Whether it lies in main memory and carries no derivatives, backward or forward."""
+    if a.device.type != "cpu" or a.requires_grad:
         return False
     return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 

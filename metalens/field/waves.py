@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from metalens.design import Focus
 from metalens.field import compiled
@@ -160,7 +159,7 @@ class PillarWave:
         """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
-        if self.lens.neighbours is None and d.device.type == "cpu" and not _differentiable(d):
+        if self.lens.neighbours is None and compiled.values(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
             known = answers.polynomials(self.lens.proxy, sizes, at)
@@ -178,11 +177,6 @@ class PillarWave:
         layers = torch.cat([rest, open_[None]])
         pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
         return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
-
-
-def _differentiable(a: Tensor) -> bool:
-    """Whether it carries derivatives, backward or forward."""
-    return a.requires_grad or forward_ad.unpack_dual(a).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
