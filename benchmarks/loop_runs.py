@@ -72,7 +72,8 @@ class Recipe:
     and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss. steps: of ``batch``
     frames.
     seed: of weights, frames and noise. image, fwhm_nm: see :class:`codesign.optics.stack.OpticsConfig`.
-    asphere_rad: coefficients of radial terms of a lens that stands; none for the hyperbolic one.
+    asphere_rad: coefficients of the radial terms that a lens starts from; none for the hyperbolic one, which moves in
+    35 terms of free form.
     """
 
     focus_mm: float
@@ -102,7 +103,7 @@ class Recipe:
             slip_scale_mm=[round(s / 3**0.5, 2) for s in self.slip_mm], rate=self.rate if self.moves else 0.0,
             optics_weight=self.optics_weight, batch=self.batch, seed=self.seed, image=self.image, fwhm_nm=self.fwhm_nm,
             window=2 * int(WINDOW_UM / self.pitch_um / 2) + 1, focus_mm=self.focus_mm,
-            polynomials=35 if self.moves else len(self.asphere_rad), family="radial" if self.asphere_rad else "free",
+            polynomials=len(self.asphere_rad) or 35 * self.moves, family="radial" if self.asphere_rad else "free",
         )  # fmt: skip
 
 
