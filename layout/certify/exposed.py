@@ -159,12 +159,12 @@ class Simulation:
         exposure, resist = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
         e = self._edges
         _develop(kind, e.row, self.scene.kinds.dose, far, e.radius_um, e.own, THRESHOLD, exposure, resist)
-        kinds = self.scene.kinds
+        kinds, alone = self.scene.kinds, self._isolation(self._alone, (first, end), (x, y))
         if kinds.shapes is not None:
             drawn = kinds.drawn_um[kind] / nm
             resist = (drawn + (resist - kinds.size_um[kind] / nm) / kinds.share[kind]).astype(np.float32)
-            return Band(first, x, y, kind, exposure, resist, self.process.bias.made_nm(resist).astype(np.float32))
-        alone = self._isolation(self._alone, (first, end), (x, y))
+            etched = self.process.bias.made_nm(resist, alone).astype(np.float32)
+            return Band(first, x, y, kind, exposure, resist, etched)
         made = self.process.made_diameter_nm(resist, alone).astype(np.float32)
         return Band(first, x, y, kind, exposure, resist, made)
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from layout.dose.assign import Assigned, Fields, Ladder, classes
 from layout.dose.bodies import NONE, Body
+from layout.dose.drawn import Drawn
 from layout.dose.exposure import CLEARS, PointExposure
 from metalens.ground.arrays import Array
 
@@ -21,6 +22,7 @@ def sampled_error(fields: Fields, steps: Ladder, found: Assigned, *, point: Poin
     dose = np.zeros(NONE + 1)
     dose[: len(steps.factors)] = steps.factors
     distant = _distant(fields, steps, dose, (rows, columns))
+    own = _own(lens, (rows, columns), fields.table.drawn, point)
     worst = 0.0
     for n, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
         block, first = _around(lens, row)
@@ -30,9 +32,9 @@ def sampled_error(fields: Fields, steps: Ladder, found: Assigned, *, point: Poin
         fast = dose[chosen[row - first, column]] * fields.table.own[entry] + near
         left = max(column - _NEIGHBOURS, 0)
         here = slice(left, column + _NEIGHBOURS + 1)
-        exact = distant[n] + _close(
-            fields, (block[:, here], dose[chosen[:, here]]), (row - first, column - left), point
-        )
+        given = dose[chosen[:, here]]
+        beside = _close(fields, (block[:, here], given), (row - first, column - left), point)
+        exact = distant[n] + given[row - first, column - left] * own[entry] + beside
         worst = max(worst, abs(fast - exact) / (CLEARS * fields.table.goal[entry]))
     return float(worst)
 
@@ -52,6 +54,14 @@ def _some(body: Body, samples: int) -> tuple[Array, Array]:
         every = every[0] + first, every[1]
     pick = np.unique(np.linspace(0, len(every[0]) - 1, samples).astype(int))
     return every[0][pick], every[1][pick]
+
+
+def _own(body: Body, sites: tuple[Array, Array], drawn: Drawn, point: PointExposure) -> Array:
+    """(entries,) exposure of the edges of the pillars on these sites by themselves, at unit dose; each shape once."""
+    used = np.zeros(len(drawn.area_um2), bool)
+    for row in np.unique(sites[0]).tolist():
+        used[body.source(row, row + 1)[0][sites[1][sites[0] == row]]] = True
+    return drawn.edges(used, point)[0]
 
 
 def _around(body: Body, row: int) -> tuple[Array, int]:
@@ -102,14 +112,14 @@ def _own_block(mass: Array, first: int, sites: tuple[Array, Array], wx: Array, w
 
 
 def _close(fields: Fields, block: tuple[Array, Array], site: tuple[int, int], point: PointExposure) -> float:
-    """Exposure of the edges of one pillar by itself and by the shapes within 5 sites, exact."""
+    """Exposure of the edges of one pillar by the shapes within 5 sites, exact."""
     (index, given), (row, column), body, drawn = block, site, fields.bodies[0], fields.table.drawn
     y = (row - np.arange(index.shape[0])) * body.down_um  # rows run towards -y
     x = (np.arange(index.shape[1]) - column) * body.pitch_um
     mine = int(index[row, column])
     edge, others = drawn.edge_um(mine), index > 0
     others[row, column] = False
-    total = float(given[row, column] * drawn.edges(np.arange(len(drawn.area_um2)) == mine, point)[0][mine])
+    total = 0.0
     for entry in np.unique(index[others]).tolist():
         i, j = np.nonzero(others & (index == entry))
         at = edge[:, None] - np.stack([x[j], y[i]], -1)

@@ -147,8 +147,6 @@ def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, t
         disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
         if source.diameters.angle_rad is not None or not disc:
             return shaped.classes(source, process, unit_nm=UNIT_NM)
-        if not source.diameters.plain and process.bias.isolated_nm:
-            raise ProcessError("bias.isolated_nm is known for square lattices; need 0 for another lattice")
     found = cells.quantise(source.diameters if isinstance(source, Lens) else source, process)
     return found, _plain_classes(found.diameters_nm, process)
 

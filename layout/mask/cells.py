@@ -1,6 +1,5 @@
 """Diameter map to pillar classes: equal drawn diameters become one class, a site becomes a class number."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -78,28 +77,35 @@ def drawn_blocks(diameters: DiameterMap, process: Process) -> Iterator[tuple[int
     straight = np.rint(process.written_diameter_nm(table) / step)
     straight[0] = 0
     lookup = np.clip(straight, 0, 65535).astype(np.uint16)
-    reach = halo(process, pitch)
-    size = max(1, _BLOCK_SITES // max(1, design.shape[1]), 4 * reach)
-    for first in range(0, design.shape[0], size):
-        end, begin = min(first + size, design.shape[0]), max(0, first - reach)
-        around = np.asarray(design[begin : end + reach])
-        block = around[first - begin : end - begin]
+    for first, block, alone in with_isolation(diameters, process, _BLOCK_SITES):
         drawn = lookup.take(np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32))
-        if reach:
-            _add_isolation(drawn, around, first - begin, pitch, process)
+        if alone is not None:
+            _add_isolation(drawn, block, alone, process)
         _refuse_impossible(drawn, block, first, pitch, step)
         yield first, drawn
 
 
-def halo(process: Process, pitch_um: float) -> int:
-    """Rows beyond a block whose pillars bear on its diameters."""
-    return math.ceil(3 * process.bias.range_um / pitch_um) if process.bias.isolated_nm else 0
+def with_isolation(diameters: DiameterMap, process: Process, sites: int) -> Iterator[tuple[int, Array, Array | None]]:
+    """(first row, designed sizes, how alone each pillar stands) of blocks of rows of some ``sites``.
+
+    The third is None where the process asks for none.
+    """
+    design, bias = diameters.diameter_um, process.bias
+    reach = isolation.halo(diameters.steps_um[1], bias.range_um) if bias.isolated_nm else 0
+    size = max(1, sites // max(1, design.shape[1]), 4 * reach)
+    for first in range(0, design.shape[0], size):
+        end, begin = min(first + size, design.shape[0]), max(0, first - reach)
+        around = np.asarray(design[begin : end + reach])
+        here = slice(first - begin, end - begin)
+        alone = None
+        if reach:
+            lattice = diameters.lattice.centred
+            alone = isolation.isolation(around > 0, diameters.steps_um, bias.range_um, centred=lattice)[here]
+        yield first, around[here], alone
 
 
-def _add_isolation(drawn: Array, around: Array, first: int, pitch_um: float, process: Process) -> None:
-    """Replace, in place, the drawn diameters of pillars that lack neighbours; they are rows of ``around``."""
-    alone = isolation.isolation(around > 0, pitch_um, process.bias.range_um)[first : first + len(drawn)]
-    design = around[first : first + len(drawn)]
+def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) -> None:
+    """Replace, in place, the drawn diameters of pillars that lack neighbours."""
     rows, columns = np.nonzero((alone > 0) & (design > 0))
     if not len(rows):
         return

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask.cells import Cells
+from layout.mask.cells import Cells, with_isolation
 from layout.mask.held import hold
 from layout.mask.plan import MOST_CLASSES, PillarClass
 from layout.process import Process
@@ -39,7 +39,6 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
         LensError: no pillar.
     """
     d, cell = source.diameters, source.cell
-    _check(cell, process)
     turns = _turns(cell, d, process)
     counts: dict[int, int] = {}
     for _, block in _keys(d, process, turns):
@@ -55,18 +54,10 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
     kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
     numbered = ((first, _numbered(block, used, kind)) for first, block in _keys(d, process, turns))
     sites = hold(d.diameter_um.shape, kind, numbered)
-    made = tuple(_class(cell, int(key), process, turns, unit_nm) for key in used)
+    made = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
     across = np.array([2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made])
     found = np.array([counts[int(key)] for key in used])
     return Cells(sites, across, found, process.rules.diameter_step_nm / 2), made
-
-
-def _check(cell: Cell, process: Process) -> None:
-    if process.bias.isolated_nm:
-        raise ProcessError(
-            f"bias.isolated_nm = {process.bias.isolated_nm} is known for round pillars on a square lattice; need 0 for "
-            f"{cell.described}"
-        )
 
 
 def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
@@ -80,17 +71,23 @@ def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
 def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, Array]]:
     """(first row, key) of blocks of rows; 0 for no pillar.
 
-    key: drawn size in nm, plus the drawn length (0: by the shape) times ``_LENGTHS``; times the turns, plus the turn.
+    key: drawn size in nm, plus ``_LENGTHS`` times the second number of the shape; times the turns, plus the turn. The
+    second number is the drawn length of pillars of two sizes; of others the whole nm that the bias of the lone one
+    differs by, less the least (0 where the process knows none): two pillars that are drawn as wide, one of them
+    alone, are not of one design.
     """
-    size = max(1, _BLOCK_SITES // max(1, d.diameter_um.shape[1]))
-    for first in range(0, d.diameter_um.shape[0], size):
-        design = np.asarray(d.diameter_um[first : first + size], float) / nm
-        drawn = _steps(design, design, process)
+    lone = process.bias.isolated_nm
+    for first, block, alone in with_isolation(d, process, _BLOCK_SITES):
+        rows = slice(first, first + len(block))
+        design, beside = np.asarray(block, float) / nm, 0.0 if alone is None else alone
+        drawn = _steps(design, design, process, beside)
         if d.length_um is not None:
-            drawn += _LENGTHS * _steps(np.asarray(d.length_um[first : first + size], float) / nm, design, process)
+            drawn += _LENGTHS * _steps(np.asarray(d.length_um[rows], float) / nm, design, process, beside)
+        elif alone is not None:
+            drawn += _LENGTHS * np.rint(alone * abs(lone)).astype(np.int64)
         turn = np.zeros(design.shape, np.int64)
         if d.angle_rad is not None:
-            degrees = np.degrees(np.asarray(d.angle_rad[first : first + size], float))
+            degrees = np.degrees(np.asarray(d.angle_rad[rows], float))
             turn = np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
         yield first, np.where(design > 0, drawn * turns + turn, 0)
 
@@ -106,30 +103,35 @@ def _counted(block: Array) -> tuple[Array, Array]:
 
 def _numbered(block: Array, used: Array, kind: np.dtype[Any]) -> Array:
     """Place of every key among those in use, from 1; 0 for no pillar."""
-    if used[-1] >= _TABLED:
+    if block.max(initial=0) >= _TABLED:
         return np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind)
-    table = np.zeros(used[-1] + 1, kind)
-    table[used] = np.arange(1, len(used) + 1)
+    small = used[used < _TABLED]
+    table = np.zeros(int(small.max(initial=0)) + 1, kind)
+    table[small] = np.arange(1, len(small) + 1)
     return table[block]
 
 
-def _steps(size_nm: Array, design_nm: Array, process: Process) -> Array:
-    """Sizes as they are drawn, in whole steps."""
+def _steps(size_nm: Array, design_nm: Array, process: Process, alone: Array | float) -> Array:
+    """Sizes as they are drawn, in whole steps; ``alone``: as :meth:`metalens.made.Bias.drawn_nm` takes it."""
     step = process.rules.diameter_step_nm
-    drawn = np.rint(process.bias.drawn_nm(size_nm) / step).astype(np.int64) * step
+    drawn = np.rint(process.bias.drawn_nm(size_nm, alone) / step).astype(np.int64) * step
     if ((drawn < step) & (design_nm > 0)).any():
         raise ProcessError(f"a pillar would be drawn below one step of {step} nm; check the bias")
     return np.asarray(np.where(design_nm > 0, drawn, 0))
 
 
-def _class(cell: Cell, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
+def _class(source: Lens, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
     """What is drawn for a key."""
     both, turn = divmod(key, turns)
-    length, drawn = divmod(both, _LENGTHS)
+    second, drawn = divmod(both, _LENGTHS)
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
-    name = f"D{drawn:05}L{length:05}" if length else name
-    both_sizes = sized(cell, float(drawn), float(length)) if length else None  # each axis has the bias of its own size
-    made = both_sizes.outline(drawn * nm) if both_sizes else _biased(cell, drawn, process)
+    if source.diameters.length_um is not None:
+        name = f"D{drawn:05}L{second:05}"
+        made = sized(source.cell, float(drawn), float(second)).outline(drawn * nm)  # each axis by the bias of its size
+    else:
+        lone = process.bias.isolated_nm
+        name += f"I{second}" if second else ""
+        made = _biased(source.cell, drawn, process, second / abs(lone) if lone else 0.0)
     step_nm = process.rules.grid_nm * unit_nm
     turn_rad = math.radians(turn * process.rules.angle_step_deg)
     contours = [_gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm for part in made.parts]
@@ -158,13 +160,13 @@ def _gridded(part: Conic | Loop, turn_rad: float, step_nm: float, process: Proce
     return points
 
 
-def _biased(cell: Cell, drawn: int, process: Process) -> Outline:
+def _biased(cell: Cell, drawn: int, process: Process, alone: float) -> Outline:
     """The outline of a drawn size: all edges moved alike by the bias of the process.
 
     Raises:
         ProcessError: the bias closes a hole.
     """
-    made = float(process.bias.made_nm(np.array(float(drawn)))) * nm
+    made = float(process.bias.made_nm(np.array(float(drawn)), alone)) * nm
     outline = cell.outline(made, grow_um=drawn * nm - made)
     if len(outline.parts) != len(cell.outline(made).parts):
         raise ProcessError(f"a {cell.shape.name} drawn {drawn} nm wide would have no hole; need a larger size")

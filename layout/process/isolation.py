@@ -5,33 +5,64 @@ from collections.abc import Iterator
 import numpy as np
 
 from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+_LEAST = 4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
 
 
-def isolation(present: Array, pitch_um: float, range_um: float) -> Array:
-    """How alone each site is: 0 where all neighbours stand, 1 where none does (y, x), float32.
+def isolation(present: Array, steps_um: tuple[float, float], range_um: float, *, centred: bool = False) -> Array:
+    """How alone each site is: 0 where all neighbours of its lattice stand, 1 where none does (y, x), float32.
 
-    Neighbours count by exp(-r^2 / range^2) within 3 ranges; the site itself does not. Only tiles that are
-    neither empty nor full with all their surroundings are worked on.
+    Neighbours count by exp(-r^2 / range^2) from middle to middle, within 3 ranges along each axis; the site itself does
+    not. Only tiles that are neither empty nor full with all their surroundings are worked on.
 
     Args:
-        present: (y, x) true where a pillar stands.
+        present: (y, x) true where a pillar stands. steps_um: (x, y) distance of neighbouring columns and rows.
+        centred: every other place alone is a site, as on a hexagonal lattice
+            (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none, or those with it even.
+
+    Raises:
+        ProcessError: a range so short that nobody has neighbours, and a lone pillar nothing to lack.
     """
     from scipy.ndimage import correlate1d
 
-    reach = max(1, int(np.ceil(3 * range_um / pitch_um)))
-    weights = np.exp(-((np.arange(-reach, reach + 1) * pitch_um / range_um) ** 2)).astype(np.float32)
-    total = float(weights.sum()) ** 2 - 1
-    padded = np.pad(np.asarray(present, bool), reach)
+    across, up = (halo(step, range_um) for step in steps_um)
+    along_x, along_y = (
+        np.exp(-((np.arange(-n, n + 1) * step / range_um) ** 2)).astype(np.float32)
+        for n, step in zip((across, up), steps_um, strict=True)
+    )
+    total = _full(along_x, along_y, centred)
+    if total < _LEAST:
+        raise ProcessError(
+            f"bias.range_um = {range_um:g}: neighbours on steps of {steps_um[0]:.4g} and {steps_um[1]:.4g} um do not "
+            "count at that distance; need a third of the pitch or more, or isolated_nm = 0"
+        )
+    padded = np.pad(np.asarray(present, bool), ((up, up), (across, across)))
     alone = np.zeros(present.shape, np.float32)
     for rows, columns in _tiles(present.shape):
-        around = padded[rows.start : rows.stop + 2 * reach, columns.start : columns.stop + 2 * reach]
+        around = padded[rows.start : rows.stop + 2 * up, columns.start : columns.stop + 2 * across]
         here = np.asarray(present[rows, columns], np.float32)
-        if around.all() or not here.any():
+        every = around[:, 1:] | around[:, :-1] if centred else around
+        if every.all() or not here.any():
             continue
-        near = correlate1d(around.astype(np.float32), weights, axis=0)[reach:-reach]
-        near = correlate1d(near, weights, axis=1)[:, reach:-reach]
+        near = correlate1d(around.astype(np.float32), along_y, axis=0)[up:-up]
+        near = correlate1d(near, along_x, axis=1)[:, across:-across]
         alone[rows, columns] = np.clip(1 - (near - here) / total, 0, 1)
     return alone
+
+
+def halo(step_um: float, range_um: float) -> int:
+    """Rows (or columns) of this distance whose pillars bear on a pillar."""
+    return max(1, int(np.ceil(3 * range_um / step_um)))
+
+
+def _full(along_x: Array, along_y: Array, centred: bool) -> float:
+    """Weight of all neighbours: of every place, or of those whose row and column are odd or even together."""
+    every = float(along_x.sum()) * float(along_y.sum())
+    if not centred:
+        return every - 1
+    x, y = (float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2) for w in (along_x, along_y))
+    return (every + x * y) / 2 - 1
 
 
 def _tiles(shape: tuple[int, ...], side: int = 96) -> Iterator[tuple[slice, slice]]:

@@ -52,3 +52,24 @@ def test_discs_within_five_sites_to_either_side_are_exact(monkeypatch, site):
                     away = np.hypot(x - DIAMETER[2] / 2 * np.cos(turn), y - DIAMETER[2] / 2 * np.sin(turn))
                     exact += weight * DOSES[chosen[i, j]] * disc(away, DIAMETER[sites[i, j]], width).mean()
     assert got == pytest.approx(abs(DOSES[1] * OWN[2] + 0.071 - exact) / (CLEARS * GOAL[2]), rel=1e-9)
+
+
+def test_a_shape_by_itself_is_exposed_once_however_many_of_its_pillars_are_looked_at(monkeypatch):
+    asked = []
+
+    class Counted(Discs):
+        def edges(self, used, point):
+            asked.append(used)
+            return super().edges(used, point)
+
+    lens = Body(*SHAPE, PITCH, 2.0, 5.0, lambda first, end: SITES[first:end])
+    rows, columns = (v[:40] for v in np.nonzero(SITES))
+    monkeypatch.setattr(sampled, "classes", lambda fields, number, first, block, steps: CLASS[first:][: len(block)])
+    monkeypatch.setattr(sampled, "_some", lambda body, samples: (rows, columns))
+    monkeypatch.setattr(sampled, "_distant", lambda *_: np.zeros(40))
+    fields = SimpleNamespace(
+        bodies=[lens], table=SimpleNamespace(drawn=Counted(DIAMETER), goal=GOAL, own=OWN),
+        at=lambda *_: np.zeros((1, SHAPE[1])),
+    )  # fmt: skip
+    sampled.sampled_error(fields, Ladder(DOSES), SimpleNamespace(far=0, near=0), point=POINT, samples=40)
+    assert np.sum(asked, axis=0).tolist() == [0, 1, 1]

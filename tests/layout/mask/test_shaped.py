@@ -180,13 +180,66 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
     [
         (lens(Ring(0.01), turned=False), {}, "four steps of the grid"),
         (lens(Ring(0.05), turned=False), {"bias": Bias(table_nm=((80.0, -30.0), (300.0, -30.0)))}, "no hole"),
-        (hexagonal(), {"bias": dataclasses.replace(PROCESS.bias, isolated_nm=4.0)}, "isolated_nm"),
         (hexagonal(row_um=0.0), {}, "no multiple of the grid"),
     ],
 )
 def test_what_is_not_drawn_is_refused_by_name(made, change, words):
     with pytest.raises(ProcessError, match=words):
         build.prepare(made, dataclasses.replace(PROCESS, **change))
+
+
+LONE = dataclasses.replace(PROCESS, bias=Bias(isolated_nm=-14.0, range_um=0.6))
+
+
+def drawn_of(made, process):
+    """(y, x) class of every site, 0 for none."""
+    found = build.prepare(made, process)
+    return found.cells.classes, (None, *found.plan.classes)
+
+
+@pytest.mark.parametrize("shape", [Rectangle(0.55), Ellipse(1.4), Ring(0.45)])
+def test_edges_of_a_lone_pillar_of_any_shape_move_by_what_it_lacks(shape):
+    """It comes out 14 nm thinner: all its edges are drawn 7 nm further out, its two sides stay those of the design."""
+    size = np.full((31, 31), 0.2)
+    size[:, 22:] = 0
+    size[15, 28] = 0.2  # 3.5 ranges from all others
+    made = dataclasses.replace(lens(shape, turned=False), diameters=DiameterMap(size, 0.4))
+    number, kinds = drawn_of(made, LONE)
+    among, lone = kinds[number[15, 8]], kinds[number[15, 28]]
+    spread = np.ptp(lone.outline, axis=0) - np.ptp(among.outline, axis=0)
+    assert np.abs(spread - 14).max() <= 1  # corners on a grid of 1 nm on both sides, both of the same design
+    edge = kinds[number[15, 21]]  # at a straight rim
+    lost = sum(math.exp(-((0.4 * i / 0.6) ** 2)) for i in range(1, 9))
+    share = lost * (1 + 2 * lost) / ((1 + 2 * lost) ** 2 - 1)
+    assert abs(edge.diameter_nm - 200 - 14 * share) <= 1.01  # a step of 2 nm; the other side 1.4 of half a step
+    assert np.abs(np.ptp(edge.outline, axis=0) - np.ptp(among.outline, axis=0) - 14 * share).max() <= 3
+
+
+def test_a_round_pillar_of_a_hexagonal_lattice_lacks_what_is_missing_of_that_lattice():
+    """Half the places of the map hold no site: a pillar with all its neighbours must not count as half alone."""
+    size = np.full((31, 41), 0.16)
+    size[(np.arange(31)[:, None] + np.arange(41)) % 2 == 1] = 0
+    size[:, 30:] = 0
+    size[15, 39] = 0.16
+    source = hexagonal()
+    made = dataclasses.replace(source, diameters=dataclasses.replace(source.diameters, diameter_um=size))
+    number, kinds = drawn_of(made, LONE)
+    assert kinds[number[15, 15]].diameter_nm == 160
+    assert kinds[number[15, 39]].diameter_nm == 174
+
+
+def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
+    there = np.zeros((9, 12), bool)
+    axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
+    pairs = Pairs(np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf))
+    there[::3, 1::3] = True  # 1.2 um apart: 6 ranges
+    sizes = DiameterMap(np.where(there, 0.15, 0), 0.4, length_um=np.where(there, 0.24, 0))
+    made = Lens(sizes, Cell(0.4, shape=Rectangle()), pairs.proxy, 0.94, 77.0, math.inf, "map", pairs=pairs)
+    table = dataclasses.replace(LONE, bias=Bias(isolated_nm=-20.0, range_um=0.2))
+    number, kinds = drawn_of(made, table)
+    plain, before = drawn_of(made, PROCESS)
+    for now, was in {(int(a), int(b)) for a, b in zip(number.ravel(), plain.ravel(), strict=True) if a}:
+        assert np.abs(np.ptp(kinds[now].outline, axis=0) - np.ptp(before[was].outline, axis=0) - 20).max() <= 1
 
 
 def test_a_step_of_turns_divides_half_a_turn():
@@ -220,8 +273,8 @@ def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypat
 
 def test_all_edges_of_a_shape_move_by_the_bias_of_its_size():
     """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of both; no ratio of 240."""
-    process = SimpleNamespace(bias=SimpleNamespace(made_nm=lambda drawn: drawn - 12.0), rules=PROCESS.rules)
-    corners = shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process).parts[0].vertices(32)
+    process = SimpleNamespace(bias=SimpleNamespace(made_nm=lambda drawn, alone: drawn - 12.0), rules=PROCESS.rules)
+    corners = shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process, 0.0).parts[0].vertices(32)
     assert np.ptp(corners, axis=0) * 1e3 == pytest.approx([240.0, 0.55 * 228 + 12], abs=1e-9)
 
 

@@ -40,8 +40,8 @@ def test_isolation_is_zero_in_a_full_lattice_and_one_alone():
     full = np.ones((41, 41), bool)
     alone = np.zeros((41, 41), bool)
     alone[20, 20] = True
-    assert abs(isolation(full, 0.4, 1.0)[20, 20]) < 1e-5
-    assert isolation(alone, 0.4, 1.0)[20, 20] == pytest.approx(1, abs=1e-6)
+    assert abs(isolation(full, (0.4, 0.4), 1.0)[20, 20]) < 1e-5
+    assert isolation(alone, (0.4, 0.4), 1.0)[20, 20] == pytest.approx(1, abs=1e-6)
 
 
 def test_isolation_at_a_straight_edge_counts_the_missing_half():
@@ -51,7 +51,7 @@ def test_isolation_at_a_straight_edge_counts_the_missing_half():
     # with C the sum over the column and S = C^2 over the plane
     line = np.exp(-((np.arange(-8, 9) * 0.4) ** 2)).sum()
     want = (line**2 - line) / 2 / (line**2 - 1)
-    assert isolation(half, 0.4, 1.0)[50, 50] == pytest.approx(want, rel=1e-5)
+    assert isolation(half, (0.4, 0.4), 1.0)[50, 50] == pytest.approx(want, rel=1e-5)
 
 
 def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
@@ -59,7 +59,7 @@ def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
     present = rng.random((150, 170)) < 0.97
     present[:, 100:] = True
     present[40:, :60] = False
-    got = isolation(present, 0.4, 0.9)
+    got = isolation(present, (0.4, 0.4), 0.9)
     reach = 7  # ceil(3 range / pitch)
     steps = np.exp(-((np.arange(-reach, reach + 1) * 0.4 / 0.9) ** 2))
     weights = np.outer(steps, steps)
