@@ -62,7 +62,7 @@ def _full(along_x: Array, along_y: Array, centred: bool) -> float:
     if not centred:
         return every - 1
     x, y = (float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2) for w in (along_x, along_y))
-    return (every + x * y) / 2 - 1
+    return float((every + x * y) / 2 - 1)
 
 
 def _tiles(shape: tuple[int, ...], side: int = 96) -> Iterator[tuple[slice, slice]]:

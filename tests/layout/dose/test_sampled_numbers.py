@@ -60,6 +60,8 @@ def test_the_rim_sees_the_discs_of_a_block(site):
     assert SITES[site]
     fields = SimpleNamespace(bodies=[lens()], table=table())
     got = sampled._close(fields, (block, given), (row - rows.start, column - columns.start), POINT)
+    own = sampled._own(lens(), (np.array([row]), np.array([column])), table().drawn, POINT)
+    got += given[row - rows.start, column - columns.start] * own[SITES[site]]
     assert got == pytest.approx(rim(row, column, rows, columns, POINT), rel=1e-12)
 
 
