@@ -46,7 +46,7 @@ def image(contours: Contours, range_um: float) -> Image:
     gx, gy = step * np.arange(most + 1), step * np.arange(-most, most + 1)[:, None]
     factor = sum(np.sign(moments([c])[0]) * Loop(tuple(map(tuple, c.tolist()))).fourier(gx, gy) for c in contours)
     factor = factor * np.exp(-(gx**2 + gy**2) * range_um**2 / 4)
-    count = max(2 * most + 1, int(np.ceil(side / (_PIXEL * range_um)))) | 1  # odd: a pixel in the middle
+    count = int(np.ceil(side / (_PIXEL * range_um))) | 1  # odd: a pixel in the middle; above 2 most + 1
     spectrum = np.zeros((count, count // 2 + 1), complex)
     spectrum[np.arange(-most, most + 1), : most + 1] = factor
     found = np.fft.irfft2(spectrum, (count, count)) * (count / side) ** 2

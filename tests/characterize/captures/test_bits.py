@@ -127,3 +127,22 @@ def test_shares_of_which_no_counts_can_be_made_are_refused_where_counts_matter()
         with pytest.raises(CaptureError, match="multiply frames, dark and flat by the full scale"):
             right_align(shares, where="a.tif", **told)
     assert right_align(shares, None, "a.tif")[0] is shares  # a bead stack: nothing is said of its counts
+
+
+@pytest.mark.parametrize(
+    ("most", "off", "whole"), [(900, 0.008, True), (900, 0.012, False), (65_535, 0.0, True), (65_536, 0.0, False)]
+)
+def test_real_numbers_are_counts_where_they_are_whole_to_a_hundredth_and_fit_a_word(most, off, whole):
+    """float32 keeps a share of 65535 to 0.004; the next number would be 0 in a word of 16 bits."""
+    given = np.array([[[3.0, 17.0 - off, most + 0.0]]])
+    found, _, note, _ = right_align(given, None, "a.tif")
+    assert ("real numbers" in note) is not whole
+    assert found.tolist() == (np.rint(given) if whole else given).tolist()
+
+
+def test_counts_beside_shares_of_full_scale_are_left_and_shares_are_multiplied():
+    shares, dark = frames(4095) / 4095.0, np.array([[5.0, 64.0]])
+    beside = right_align(shares, 12, "a.tif", beside=[dark, dark / 4095.0, np.array([[0.25, 1.0]])])[3]
+    assert beside[0].tolist() == dark.tolist()
+    assert beside[1] == pytest.approx(dark)
+    assert beside[2] == pytest.approx(np.array([[0.25, 1.0]]) * 4095)

@@ -131,3 +131,24 @@ def test_notes_of_the_user_and_whole_bits_are_kept(tmp_path):
     found = stage.read_about(tmp_path)
     assert found == {"bits": 14, "offset": -3.5, "operator": "E. Q.", "camera": "XB-7"}
     assert isinstance(found["bits"], int)
+
+
+def test_what_may_be_0_and_tilts_to_either_side_are_taken(tmp_path):
+    (tmp_path / "capture.toml").write_text("read_noise_e = 0\nglass_um = 0.0\nglass_tilt_x_deg = -89.0\nbits = 32\n")
+    assert stage.read_about(tmp_path) == {"read_noise_e": 0, "glass_um": 0.0, "glass_tilt_x_deg": -89.0, "bits": 32}
+    for line in ("glass_tilt_x_deg = -90.5", "glass_tilt_y_deg = 90", "wavelength_um = 0"):
+        (tmp_path / "capture.toml").write_text(line + "\n")
+        with pytest.raises(CaptureError, match=line):
+            stage.read_about(tmp_path)
+
+
+def test_images_that_the_table_does_not_name_are_told_and_dark_ones_refused(tmp_path):
+    rows = stage.Rows.unknown(("sub/b.tif", "c.tif"))
+    every = [tmp_path / f"{name}.tif" for name in "abcdefgh"]
+    (told,) = stage.left_out(every, rows)
+    assert told.startswith("6 images that ")
+    assert told.endswith("left out: a.tif, d.tif, e.tif, f.tif, g.tif")
+    assert stage.left_out(every[1:3], rows) == ()
+    with pytest.raises(CaptureError, match=r"'darks_2.tif' is not named .* one stack dark.tif"):
+        stage.left_out([tmp_path / "darks_2.tif"], rows)
+    assert stage.left_out([tmp_path / "darkroom.tif"], rows)

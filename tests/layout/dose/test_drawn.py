@@ -71,3 +71,34 @@ def test_levels_of_a_certificate_are_those_of_a_disc():
     want = sum(w * chndtr(2 * (D / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
     contours = [polygon.contours[1][0] - OFF]
     assert raster.own_levels(contours, terms, radius) == pytest.approx(want, abs=2e-3 * want[4])
+
+
+def test_edges_are_seen_from_places_that_divide_them():
+    discs = Discs(np.array([0.0, 0.31, D]))
+    around = discs.edge_um(2)
+    assert np.hypot(*around.T) == pytest.approx(D / 2)
+    steps = np.linalg.norm(around - np.roll(around, -1, axis=0), axis=1)
+    assert steps == pytest.approx(D * math.sin(math.pi / len(around)))  # of a regular polygon
+    assert discs.edge_um(1) == pytest.approx(around * 0.31 / D)
+    box = Outlines([(), [np.array([[1.0, 2.0], [1.3, 2.0], [1.3, 2.1], [1.0, 2.1]])]]).edge_um(1)
+    assert len(box) == 48  # 18 along each long side, 6 along each short one
+    on = [np.isclose(box[:, k], place).sum() for k, place in ((1, 2.0), (0, 1.3), (1, 2.1), (0, 1.0))]
+    assert on == [18, 6, 18, 6]
+
+
+def test_the_widest_reach_farthest_along_the_steps_of_those_used():
+    """A long, a high and a large one that is not used; a small one behind."""
+    boxes = [(0.3, 0.05), (0.04, 0.2), (0.9, 0.9), (0.1, 0.1)]
+    outlines = [[np.array([[-a, -b], [a, -b], [a, b], [-a, b]])] for a, b in boxes]
+    used, steps = np.array([False, True, True, False, True]), np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]])
+    assert Outlines([(), *outlines]).widest(used, steps) == [1, 2]
+    assert Outlines([(), *outlines]).widest(used, steps[:1]) == [1]
+    assert Discs(np.array([0.0, 0.2, 0.3, 0.4])).widest(np.array([False, True, True, False]), steps) == [2]
+
+
+def test_what_is_not_used_has_no_edge():
+    polygon, disc = round_ones()
+    for shapes in (polygon, disc):
+        own, slope = shapes.edges(np.array([False, False]), POINT)
+        assert not own.any()
+        assert not slope.any()

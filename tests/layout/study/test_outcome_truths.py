@@ -1,132 +1,101 @@
-"""What a tolerance study says of draws, from light and curves that are typed in, by plain loops."""
+"""What studies say of draws: from the light of the model by plain loops, and from sums over pillars one by one."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from layout.study import spread_model, stitching, tolerance
-from layout.study.focus import Window
+from layout.mask import fields
+from layout.process.process import Process, WriteField
+from layout.study import focus, stitching, tolerance
+from layout.study.focus import Window, peak
+from layout.study.spread_model import reduce
 from layout.study.tolerance import Outcome
-from metalens.made import Draw
+from metalens.made import Draw, Spread, draws, transmission
+from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
+from tests.referees import plain_sum
 
-RNG = np.random.default_rng(23)
-WINDOW = Window(np.arange(5) * 0.7, np.arange(4) * 0.9, 500.0, 0.85, np.ones(5))
+DEPTHS_UM = np.array([500.0, 620.0, 760.0, 1100.0, 1240.0])  # of the design, and two pairs
 
 
-def test_numbers_of_draws_are_of_their_own_light_against_that_of_the_nominal_lens(monkeypatch):
-    """27 lenses, more than are worked on at once; a design depth and two pairs of depths 140 um apart."""
-    light = RNG.normal(size=(27, 5, 4, 5)) + 1j * RNG.normal(size=(27, 5, 4, 5))
-    monkeypatch.setattr(tolerance, "peak", lambda psf: np.asarray(psf).max((-2, -1)))
-    model = SimpleNamespace(
-        count=np.array([30.0, 17.0]),
-        focus=SimpleNamespace(window=WINDOW, case=SimpleNamespace(area_um2=0.16), light=lambda drawn: light[drawn]),
-        drawn=lambda states: np.array(states),
-    )
-    found = tolerance._outcome(model, list(range(27)), 140.0)
-    incident, nominal = 47 * 0.16, np.abs(light[0, 0]) ** 2
+@pytest.fixture(scope="module")
+def model():
+    lens = hyperbolic(61, 60.0, 500.0)
+    where = Window(np.arange(-2, 3) * 0.6, np.arange(-1, 3) * 0.9, 60.0, 0.85, DEPTHS_UM)
+    return reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=3)
+
+
+def test_numbers_of_draws_are_of_their_own_light_against_that_of_the_nominal_lens(model):
+    """27 lenses, more than are worked on at once; a design depth and two pairs of depths 140 um apart: float32."""
+    states = [draw.state() for draw in (Draw({}), *draws(Spread(), 26, seed=8))]
+    light = model.focus.light(model.drawn(states))
+    every = hyperbolic(61, 60.0, 500.0).diameters.diameter_um
+    found = tolerance._outcome(model, states, 140.0)
+    incident, nominal = (every > 0).sum() * 0.4**2, np.abs(light[0, 0]) ** 2
+    assert np.ptp(found.strehl) > 0.01
     for n in (0, 1, 24, 25, 26):
         psf = np.abs(light[n]) ** 2
-        assert found.strehl[n] == pytest.approx(psf[0].max() / nominal.max())
-        assert found.efficiency[n] == pytest.approx(psf[0].sum() * 0.63 / incident)
+        assert found.strehl[n] == pytest.approx(peak(psf[0]) / peak(nominal), rel=1e-5)
+        assert found.efficiency[n] == pytest.approx(psf[0].sum() * 0.6 * 0.9 / incident, rel=1e-5)
         change = math.sqrt(((psf[0] - nominal) ** 2).sum() / (nominal**2).sum())
-        assert found.psf_change[n] == pytest.approx(change, abs=1e-12)
-        assert found.psf[n] == pytest.approx(psf[0][2] / nominal.max())
+        assert found.psf_change[n] == pytest.approx(change, abs=1e-5)
+        assert found.psf[n] == pytest.approx(psf[0][2] / nominal.max(), rel=1e-5)
         for k, (near, far) in enumerate(((1, 2), (3, 4))):
             slope = (psf[far] / psf[far].sum() - psf[near] / psf[near].sum()) / 140.0
-            assert found.information[n, k] == pytest.approx((slope**2).sum())
+            assert found.information[n, k] == pytest.approx((slope**2).sum(), rel=1e-4)
 
 
-def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(monkeypatch):
-    """Information is summed over the depths first; of the pillars each number has its own worst sign."""
+def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(model):
+    """Information is summed over the depths first; of the pillars phase and level each have their own worst sign."""
     alone = Outcome(
         np.array([0.97, 0.91]), np.array([0.66, 0.63]), np.array([0.08, 0.05]),
         np.array([[2.0, 7.0], [4.0, 9.0]]), np.zeros((2, 3)),
     )  # fmt: skip
     nominal = Outcome(np.array([1.0]), np.array([0.6]), np.array([0.0]), np.array([[4.0, 6.0]]), np.zeros((1, 3)))
-    changes = iter([(0.11, 0.002), (0.07, 0.009)])
-    monkeypatch.setattr(tolerance, "_pillar_change", lambda model, state: next(changes))
-    found = tolerance._effect(None, (Draw({"bias_nm": -3.1}), Draw({"bias_nm": 3.1})), alone, nominal)
-    assert (found.cause, found.deviation) == ("bias_nm", 3.1)
-    assert (found.phase_rad, found.transmission) == (0.11, 0.009)
+    found = tolerance._effect(model, (Draw({"bias_nm": -31.0}), Draw({"bias_nm": 31.0})), alone, nominal)
+    assert (found.cause, found.deviation) == ("bias_nm", 31.0)
+    every = hyperbolic(61, 60.0, 500.0).diameters.diameter_um
+    before, *after = (transmission(PROXY, SENS, every[every > 0] + b, 0.85, np.zeros(3)) for b in (0, -0.031, 0.031))
+    turned = [np.angle(t / before * np.exp(-1j * np.angle((t / before).sum()))) for t in after]
+    phases = [float(np.sqrt((turn**2).mean())) for turn in turned]
+    levels = [float(np.sqrt(((np.abs(t) - np.abs(before)) ** 2).mean())) for t in after]
+    assert min(np.ptp(phases) / max(phases), np.ptp(levels) / max(levels)) > 0.01
+    assert found.phase_rad == pytest.approx(max(phases), rel=1e-3)  # diameters to 0.05 nm
+    assert found.transmission == pytest.approx(max(levels), rel=1e-3)
     assert found.strehl == pytest.approx(0.09)
     assert found.efficiency == pytest.approx(0.1)
     assert found.psf == 0.08
     assert found.information == pytest.approx(0.3)  # 13 of 10; 9 is off by less
 
 
-def test_what_the_basis_misses_is_the_worst_rms_of_any_draw_at_the_centre_and_both_edges():
-    """Over pillars of unlike count, relative to their own t: at right angles to a basis that is orthonormal so."""
-    count = np.array([3.0, 1.0, 5.0, 2.0])
-    first = np.array([0.4, 0.9, -0.2, 0.5])
-    first = first / math.sqrt((first**2 * count).sum())
-    curves = {k: RNG.normal(size=(3, 4)) + 1j * RNG.normal(size=(3, 4)) for k in (0, 1)}
-    asked = []
-
-    def curve(diameter, bias, state):
-        asked.append(bias)
-        return curves[len(asked) - 1]
-
-    model = SimpleNamespace(pillars=SimpleNamespace(curve=curve), diameter_um=None, count=count, basis=first[None])
-    draws = [Draw({"bias_x_nm": 2.0}, 0.7), Draw({"bias_nm": 1.5}, 0.0)]
-    found = spread_model.missed(model, draws)
-    worst = 0.0
-    for some in curves.values():
-        for t in some:
-            rest = t - (t * count * first).sum() * first
-            worst = max(worst, math.sqrt((np.abs(rest) ** 2 * count).sum() / (np.abs(t) ** 2 * count).sum()))
-    assert found == pytest.approx(worst, rel=1e-9)
-    assert asked[1] == pytest.approx([1.5e-3] * 3)
-    state = draws[0].state()
-    places = [(0.0, 0.0), (math.cos(0.7), math.sin(0.7)), (-math.cos(0.7), -math.sin(0.7))]
-    assert asked[0] == pytest.approx([float(state.bias_um(np.array([u]), np.array([v]))[0]) for u, v in places])
-
-
-def test_fields_that_stand_off_change_the_light_by_their_series_and_move_its_middle(monkeypatch):
-    """Three fields, offsets uniform within 17 nm less their mean, terms of the series by hand for every draw."""
-    monkeypatch.setattr(stitching, "prepare", lambda lens, window: SimpleNamespace(window=WINDOW))
-    monkeypatch.setattr(stitching, "window", lambda lens: WINDOW)
-    monkeypatch.setattr(stitching, "peak", lambda psf: np.asarray(psf).max((-2, -1)))
-    monkeypatch.setattr(stitching, "field_moments", lambda lens, plan, focus: (3, None))
-    still = 2 + RNG.normal(size=(4, 5)) + 1j * RNG.normal(size=(4, 5))
-    terms = 0.1 * (RNG.normal(size=(5, 3, 4, 5)) + 1j * RNG.normal(size=(5, 3, 4, 5)))
-    steps = []
-    monkeypatch.setattr(stitching, "_expansion", lambda focus, moments, step: steps.append(step) or (still, terms))
-    process = SimpleNamespace(write_field=SimpleNamespace(stitching_nm=17.0))
-    found = stitching.stitching(None, None, process, draws=4, seed=6)
-    assert steps == [pytest.approx(17e-3)]
-    offsets = np.random.default_rng(6).uniform(-1, 1, (4, 3, 2))
-    perfect = np.abs(still) ** 2
+def test_fields_that_stand_off_are_the_sum_over_pillars_that_do():
+    """Four draws of offsets within 17 nm less their mean, pillar by pillar: third order (k NA 17 nm)³, 1e-4, and the
+    parabola of the peak."""
+    lens, process = hyperbolic(61, 60.0, 500.0), Process(write_field=WriteField(9.0, "floating", 17.0))
+    plan = fields.split(lens.diameters, process)
+    found = stitching.stitching(lens, plan, process, draws=4, seed=6)
+    held = [block for block in plan.blocks() if lens.diameters.diameter_um[block].any()]
+    assert (found.fields, found.stitching_nm) == (len(held), 17.0)
+    offsets = np.random.default_rng(6).uniform(-0.017, 0.017, (4, len(held), 2))
+    offsets -= offsets.mean(1, keepdims=True)
+    number = np.zeros(lens.diameters.diameter_um.shape, int)
+    for k, block in enumerate(held):
+        number[block] = k
+    t = lens.transmission() * np.exp(1j * lens.phase_rad())
+    perfect, *moved = (
+        np.abs(plain_sum.field(lens, t, found.window, shift_um=shift)[0]) ** 2
+        for shift in (None, *(np.moveaxis(each[number], -1, 0) for each in offsets))
+    )
+    y, x = np.meshgrid(found.window.y_um, found.window.x_um, indexing="ij")
 
     def middle(psf):
-        y, x = np.meshgrid(WINDOW.y_um, WINDOW.x_um, indexing="ij")
         return np.array([(psf * x).sum(), (psf * y).sum()]) / psf.sum()
 
-    for n in range(4):
-        light = still.copy()
-        for f in range(3):
-            x, y = offsets[n, f] - offsets[n].mean(0)
-            light = light + sum(c * terms[k, f] for k, c in enumerate((x, y, x * x / 2, y * y / 2, x * y)))
-        psf = np.abs(light) ** 2
-        assert found.change[n] == pytest.approx(math.sqrt(((psf - perfect) ** 2).sum() / (perfect**2).sum()))
-        assert found.strehl[n] == pytest.approx(psf.max() / perfect.max())
-        assert found.moved_nm[n] == pytest.approx(1e3 * np.linalg.norm(middle(psf) - middle(perfect)))
-        if n == found.change.argmax():
-            assert found.worst_psf == pytest.approx(psf)
-    assert found.psf == pytest.approx(perfect)
-    assert (found.fields, found.stitching_nm) == (3, 17.0)
-
-
-def test_sites_send_the_light_of_their_own_pillars_and_none_where_none_stands(monkeypatch):
-    monkeypatch.setattr(stitching, "designed", lambda proxy, d, wave: (0.4 + d) * np.exp(1j * d / wave))
-    size = np.array([[0.12, 0.0, 0.21], [0.0, 0.18, 0.3]], np.float32)
-    lens = SimpleNamespace(
-        diameters=SimpleNamespace(diameter_um=size), proxy=SimpleNamespace(domain_um=(0.1, 0.3)), wavelength_um=0.85
-    )
-    got = stitching._amplitude(lens, slice(0, 2), slice(1, 3))
-    want = [
-        [0.0, (0.4 + 0.21) * np.exp(0.21j / 0.85)],
-        [(0.4 + 0.18) * np.exp(0.18j / 0.85), 0.7 * np.exp(0.3j / 0.85)],
-    ]
-    assert got == pytest.approx(np.array(want), rel=1e-6)
+    assert found.psf == pytest.approx(perfect, abs=1e-4 * perfect.max())
+    change = [math.sqrt(((psf - perfect) ** 2).sum() / (perfect**2).sum()) for psf in moved]
+    assert found.change == pytest.approx(change, rel=0.01)
+    assert found.strehl == pytest.approx([peak(psf) / peak(perfect) for psf in moved], abs=1e-5)
+    away = [1e3 * np.linalg.norm(middle(psf) - middle(perfect)) for psf in moved]
+    assert found.moved_nm == pytest.approx(away, rel=0.01)
+    worst = moved[int(np.argmax(change))]
+    assert found.worst_psf == pytest.approx(worst, abs=1e-4 * worst.max())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from layout.study import stitching
+from layout.study.focus import Window
 
 RNG = np.random.default_rng(10)
 
@@ -26,7 +27,7 @@ def test_derivatives_of_a_quadratic_are_its_own():
 
 
 def test_the_centroid_of_a_window_is_the_mean_place_of_its_light():
-    where = SimpleNamespace(x_um=np.array([-1.0, 0.5, 3.0]), y_um=np.array([2.0, 7.0]))
+    where = Window(np.array([-1.0, 0.5, 3.0]), np.array([2.0, 7.0]), 500.0, 0.85, np.ones(1))
     psf = np.array([[[1.0, 0.0, 3.0], [2.0, 4.0, 0.0]]])
     x = (-1 + 9 - 2 + 2) / 10
     y = (2 * 4 + 7 * 6) / 10
